@@ -1,0 +1,73 @@
+"""Golden numbers of the official code: where they lie and how a case is read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SYNTHETIC = REPOSITORY / "tests" / "parity" / "data"
+SHARED = REPOSITORY.parent / "shared" / "parity"
+REAL_SCANS = REPOSITORY.parent / "shared" / "data" / "real_scans"
+
+
+class Case:
+    """One ``.npz`` of golden numbers with its entry of ``cases.json``."""
+
+    def __init__(self, folder: Path, name: str):
+        self.folder = folder
+        self.config = json.loads((folder / "cases.json").read_text())[name]["config"]
+        with np.load(folder / f"{name}.npz") as arrays:
+            self.arrays = {key: arrays[key] for key in arrays.files}
+
+    def __getitem__(self, key: str) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(self.arrays[key]).copy())
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.arrays
+
+    def keys(self, prefix: str = "") -> list[str]:
+        return [key for key in self.arrays if key.startswith(prefix)]
+
+    def weights(self, prefix: str = "w/") -> dict[str, torch.Tensor]:
+        """Official state dict: the arrays below ``prefix``, without the prefix."""
+        return {key[len(prefix) :]: self[key] for key in self.keys(prefix)}
+
+
+@pytest.fixture(scope="session")
+def parity_dir(pytestconfig) -> Path:
+    given = pytestconfig.getoption("--parity-dir")
+    if given is not None:
+        if not (given / "cases.json").is_file():
+            raise pytest.UsageError(f"--parity-dir {given} holds no cases.json")
+        return given
+    return SHARED if (SHARED / "cases.json").is_file() else SYNTHETIC
+
+
+@pytest.fixture(scope="session")
+def load_case(parity_dir):
+    """``load_case(name)``; a case without its file is skipped only outside ``--parity-dir``."""
+
+    def load(name: str) -> Case:
+        if not (parity_dir / f"{name}.npz").is_file():
+            pytest.skip(f"{name}.npz is not in {parity_dir} (KITTI-derived, not redistributed)")
+        return Case(parity_dir, name)
+
+    return load
+
+
+def assert_close(actual, expected, atol=1e-5, rtol=1e-5):
+    """Tolerance of parity/README.md unless a test says otherwise; dtypes may differ."""
+    actual, expected = torch.as_tensor(actual), torch.as_tensor(expected)
+    torch.testing.assert_close(
+        actual.double(), expected.double(), atol=atol, rtol=rtol, check_device=False
+    )
+
+
+@pytest.fixture(scope="session")
+def close():
+    return assert_close
