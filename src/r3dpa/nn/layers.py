@@ -1,0 +1,270 @@
+"""Layers of the range-image networks: columns wrap around, rows end at the field of view.
+
+Letters: B batch, C channels, H x W image or latent size.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.distributed as dist
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+from torch.distributed.nn.functional import all_reduce
+
+__all__ = [
+    "AttentionBlock",
+    "CircularConv2d",
+    "Downsample",
+    "GroupNorm",
+    "ResBlock",
+    "SyncedBatchNorm2d",
+    "Upsample",
+    "at_least_float32",
+]
+
+Size = tuple[int, int]
+
+# stride -> kernel and (left, right, top, bottom) pads of the official weights
+_DOWNSAMPLE = {
+    (1, 2): ((3, 3), (0, 1, 1, 1)),
+    (1, 4): ((3, 5), (1, 1, 1, 1)),
+    (2, 1): ((3, 3), (1, 1, 1, 1)),
+    (2, 2): ((3, 3), (0, 1, 0, 1)),
+}
+# stride -> kernel after the interpolation
+_UPSAMPLE = {(1, 2): (1, 5), (1, 4): (1, 7), (2, 1): (5, 1), (2, 2): (3, 3)}
+
+
+def at_least_float32(values: Tensor) -> Tensor:
+    """The same numbers in float32, or in float64 if they came so (islands under autocast)."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
+
+
+class CircularConv2d(nn.Conv2d):
+    """Convolution over a range image whose first and last column are neighbours.
+
+    Columns wrap around and rows are padded with zeros, by default so that the size stays the
+    same; an even kernel then looks further right and down than left and up.
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels.
+        kernel_size: Rows and columns of the kernel.
+        stride: Step in rows and columns.
+        pads: Padded ``(left, right, top, bottom)`` pixels, ``top <= bottom``.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: Size,
+        stride: Size = (1, 1),
+        pads: tuple[int, int, int, int] | None = None,
+    ) -> None:
+        rows, columns = kernel_size
+        if pads is None:
+            pads = ((columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2)
+        left, right, top, bottom = pads
+        super().__init__(in_channels, out_channels, kernel_size, stride, padding=(top, 0))
+        self.column_pads = (left, right, 0, 0)
+        self.extra_row_pads = (0, 0, 0, bottom - top)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Convolve ``(B, C, H, W)``."""
+        if any(self.column_pads):
+            image = F.pad(image, self.column_pads, mode="circular")
+        if any(self.extra_row_pads):
+            image = F.pad(image, self.extra_row_pads)
+        return super().forward(image)
+
+
+class Downsample(nn.Module):
+    """Strided convolution, as in LiDM: one layer per stride, with the pads of official weights.
+
+    Args:
+        channels: Input and output channels.
+        stride: Reduction of rows and columns: (1, 2), (1, 4), (2, 1) or (2, 2).
+
+    Raises:
+        ValueError: If ``stride`` is another one.
+    """
+
+    def __init__(self, channels: int, stride: Size) -> None:
+        super().__init__()
+        kernel_size, pads = _DOWNSAMPLE[_supported(stride)]
+        self.conv = CircularConv2d(channels, channels, kernel_size, stride, pads)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to ``(B, C, H / stride rows, W / stride columns)``."""
+        return self.conv(image)
+
+
+class Upsample(nn.Module):
+    """Bilinear interpolation and a convolution.
+
+    The image is padded with its opposite border columns before it is interpolated (corners not
+    aligned) and cropped afterwards, so rotating the input by one column rotates the output by
+    exactly ``stride`` columns. LiDM and R3DPA interpolate with aligned corners and without
+    wrapping, which breaks that symmetry (numerics: error as large as the signal); their weights
+    need ``legacy``.
+
+    Args:
+        channels: Input and output channels.
+        stride: Enlargement of rows and columns: (1, 2), (1, 4), (2, 1) or (2, 2).
+        legacy: Interpolate as the official weights expect.
+
+    Raises:
+        ValueError: If ``stride`` is another one.
+    """
+
+    def __init__(self, channels: int, stride: Size, legacy: bool = False) -> None:
+        super().__init__()
+        self.stride = _supported(stride)
+        self.legacy = legacy
+        self.conv = CircularConv2d(channels, channels, _UPSAMPLE[self.stride])
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to ``(B, C, H * stride rows, W * stride columns)``."""
+        rows, columns = image.shape[-2] * self.stride[0], image.shape[-1] * self.stride[1]
+        if self.legacy:
+            image = F.interpolate(image, (rows, columns), mode="bilinear", align_corners=True)
+        else:
+            border = self.stride[1]
+            image = F.pad(image, (1, 1, 0, 0), mode="circular")
+            image = F.interpolate(image, (rows, columns + 2 * border), mode="bilinear")
+            image = image[..., border:-border]
+        return self.conv(image)
+
+
+def _supported(stride: Size) -> Size:
+    if stride not in _UPSAMPLE:
+        raise ValueError(f"stride (rows, columns) must be one of {list(_UPSAMPLE)}, got {stride}")
+    return stride
+
+
+class GroupNorm(nn.GroupNorm):
+    """Group norm with 32 groups and eps 1e-6, whose statistics are never in half precision.
+
+    Args:
+        channels: Channels of the image, a multiple of 32.
+
+    Raises:
+        ValueError: If ``channels`` is not a multiple of 32.
+    """
+
+    def __init__(self, channels: int) -> None:
+        if channels % 32:
+            raise ValueError(f"channels must be a multiple of 32 (norm groups), got {channels}")
+        super().__init__(32, channels, eps=1e-6)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Normalise ``(B, C, H, W)``; the result has the dtype of the input."""
+        values = at_least_float32(image)
+        weight, bias = self.weight.to(values.dtype), self.bias.to(values.dtype)
+        return F.group_norm(values, self.num_groups, weight, bias, self.eps).to(image.dtype)
+
+
+class ResBlock(nn.Module):
+    """Two convolutions, each after group norm and swish, around a shortcut.
+
+    Args:
+        in_channels: Input channels, a multiple of 32.
+        out_channels: Output channels, a multiple of 32; a 1x1 convolution adapts the shortcut.
+        kernel_size: Rows and columns of both kernels.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: Size = (3, 3)) -> None:
+        super().__init__()
+        self.norm1 = GroupNorm(in_channels)
+        self.conv1 = CircularConv2d(in_channels, out_channels, kernel_size)
+        self.norm2 = GroupNorm(out_channels)
+        self.conv2 = CircularConv2d(out_channels, out_channels, kernel_size)
+        self.nin_shortcut = (
+            nn.Identity()
+            if in_channels == out_channels
+            else nn.Conv2d(in_channels, out_channels, 1)
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, in_channels, H, W)`` to ``(B, out_channels, H, W)``."""
+        hidden = self.conv1(F.silu(self.norm1(image)))
+        hidden = self.conv2(F.silu(self.norm2(hidden)))
+        return self.nin_shortcut(image) + hidden
+
+
+class AttentionBlock(nn.Module):
+    """Attention with one head between all pixels, added to the input.
+
+    Args:
+        channels: Channels of the image, a multiple of 32.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = GroupNorm(channels)
+        self.q = nn.Conv2d(channels, channels, 1)
+        self.k = nn.Conv2d(channels, channels, 1)
+        self.v = nn.Conv2d(channels, channels, 1)
+        self.proj_out = nn.Conv2d(channels, channels, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Attend within each image of ``(B, C, H, W)``."""
+        hidden = self.norm(image)
+        query, key, value = (
+            rearrange(layer(hidden), "b c h w -> b 1 (h w) c") for layer in (self.q, self.k, self.v)
+        )
+        hidden = F.scaled_dot_product_attention(query, key, value)
+        hidden = rearrange(hidden, "b 1 (h w) c -> b c h w", h=image.shape[-2])
+        return image + self.proj_out(hidden)
+
+
+class SyncedBatchNorm2d(nn.BatchNorm2d):
+    """Batch norm whose training statistics run over the batches of all processes.
+
+    With one process it is ``nn.BatchNorm2d``, number for number; the state dict has the same
+    keys. Unlike ``nn.SyncBatchNorm`` it also runs on a CPU (gloo), and processes may hold
+    batches of different sizes. The variance is computed in two passes around the global mean,
+    in float32. Gradients are those of the sum of the losses of all processes, as data-parallel
+    training averages them.
+
+    Args:
+        channels: Channels of the image.
+        eps: Added to the variance.
+        momentum: Weight of the new statistics in the running ones.
+    """
+
+    momentum: float
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+
+    def __init__(self, channels: int, eps: float = 1e-5, momentum: float = 0.1) -> None:
+        super().__init__(channels, eps, momentum)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Normalise ``(B, C, H, W)``."""
+        distributed = dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+        if not (self.training and distributed):
+            return super().forward(image)
+        mean, variance, count = _global_moments(image)
+        with torch.no_grad():
+            unbiased = variance * (count / (count - 1))
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(unbiased, self.momentum)
+            self.num_batches_tracked.add_(1)
+        scale = torch.rsqrt(variance + self.eps) * self.weight
+        centred = at_least_float32(image) - mean.view(-1, 1, 1)
+        return (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
+
+
+def _global_moments(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, biased variance (C,) and number of values per channel over all processes."""
+    values = at_least_float32(image)
+    count = values.new_tensor([values.numel() / values.shape[1]])
+    sums = all_reduce(torch.cat([values.sum(dim=(0, 2, 3)), count]))
+    count = sums[-1]
+    mean = sums[:-1] / count
+    squares = (values - mean.view(-1, 1, 1)).square().sum(dim=(0, 2, 3))
+    return mean, all_reduce(squares) / count, count

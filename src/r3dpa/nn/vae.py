@@ -1,0 +1,278 @@
+"""Variational autoencoder of range images: image <-> raw latents.
+
+Letters: B batch, C latent channels, H x W image size, h x w latent size.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r3dpa.nn.layers import (
+    AttentionBlock,
+    CircularConv2d,
+    Downsample,
+    GroupNorm,
+    ResBlock,
+    Upsample,
+)
+from r3dpa.nn.posterior import Posterior
+
+__all__ = ["VAE", "Posterior"]
+
+Size = tuple[int, int]
+
+
+class VAE(nn.Module):
+    """Convolutional autoencoder whose columns wrap around, with the architecture of LiDM.
+
+    Level i of the encoder has ``channels * channel_multipliers[i]`` channels and is followed by
+    a strided convolution with ``strides[i]``; the decoder mirrors it. The encoder commutes with
+    rotations of the scan by the product of the column strides, and so does the decoder unless
+    ``legacy_upsample`` is set. Layouts with official weights (base 128, two blocks):
+
+    ======== ================ ==================== ========= ============
+    name     multipliers      strides              attention channels C
+    ======== ================ ==================== ========= ============
+    h2p4d8   1 2 2 4          1x2 2x2 2x2                    8
+    h1p4d4   1 2 4            2x2 2x2                        4
+    h16d4    1 1 2 2 4        1x2 four times       4         4
+    h16p2d16 1 1 2 2 2 4      1x2 four times, 2x2  4         16
+    ======== ================ ==================== ========= ============
+
+    Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
+    2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys are those of the official checkpoints.
+
+    Args:
+        in_channels: Channels of the range image.
+        latent_channels: Channels C of the latents.
+        channels: Base width, a multiple of 32.
+        channel_multipliers: Width of each level in units of the base width.
+        strides: Reduction of (rows, columns) between two levels, each (1, 2), (1, 4), (2, 1) or
+            (2, 2).
+        num_res_blocks: Residual blocks per encoder level; decoder levels have one more.
+        attention_levels: Levels with an attention block after each residual block.
+        legacy_upsample: Interpolate with aligned corners and without wrapping columns; needed
+            for official weights.
+
+    Raises:
+        ValueError: If the numbers of levels and strides do not fit, a stride is not supported,
+            or a width is not a multiple of 32.
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 1,
+        latent_channels: int = 8,
+        channels: int = 128,
+        channel_multipliers: tuple[int, ...] = (1, 2, 2, 4),
+        strides: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 2)),
+        num_res_blocks: int = 2,
+        attention_levels: tuple[int, ...] = (),
+        legacy_upsample: bool = False,
+    ) -> None:
+        super().__init__()
+        num_levels = len(channel_multipliers)
+        if len(strides) != num_levels - 1:
+            raise ValueError(
+                f"{num_levels} channel_multipliers need {num_levels - 1} strides between their "
+                f"levels, got {len(strides)}: {strides}"
+            )
+        if not set(attention_levels) <= set(range(num_levels)):
+            raise ValueError(
+                f"attention_levels must be among 0..{num_levels - 1}, got {attention_levels}"
+            )
+        self.in_channels = in_channels
+        self.latent_channels = latent_channels
+        self.stride = (math.prod(s[0] for s in strides), math.prod(s[1] for s in strides))
+        widths = [channels * multiplier for multiplier in channel_multipliers]
+        steps = [(rows, columns) for rows, columns in strides]
+        attention = [level in attention_levels for level in range(num_levels)]
+        self.encoder = _Encoder(
+            in_channels, 2 * latent_channels, widths, steps, num_res_blocks, attention
+        )
+        self.decoder = _Decoder(
+            latent_channels,
+            in_channels,
+            widths,
+            steps,
+            num_res_blocks + 1,
+            attention,
+            legacy_upsample,
+        )
+        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
+
+    def latent_size(self, image_size: Size) -> Size:
+        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image.
+
+        Raises:
+            ValueError: If the image cannot be divided by the strides.
+        """
+        rows, columns = image_size
+        if rows % self.stride[0] or columns % self.stride[1]:
+            raise ValueError(
+                f"image size (rows, columns) must be a multiple of {self.stride}, got {image_size}"
+            )
+        return rows // self.stride[0], columns // self.stride[1]
+
+    def encode(self, image: Tensor) -> Posterior:
+        """Distribution of the raw latents of range images.
+
+        Args:
+            image: ``(B, in_channels, H, W)`` encoded range in [-1, 1].
+
+        Raises:
+            ValueError: If ``image`` has another number of channels or a size that the strides
+                do not divide.
+        """
+        if image.shape[1] != self.in_channels:
+            raise ValueError(
+                f"image must be (B, {self.in_channels}, H, W), got {tuple(image.shape)}"
+            )
+        self.latent_size((image.shape[-2], image.shape[-1]))
+        return Posterior(self.quant_conv(self.encoder(image)))
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Range images of raw latents.
+
+        Args:
+            latents: ``(B, C, h, w)`` raw latents.
+
+        Returns:
+            ``(B, in_channels, H, W)`` encoded range, not limited to [-1, 1].
+        """
+        return self.decoder(self.post_quant_conv(latents))
+
+
+class _Encoder(nn.Module):
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        widths: list[int],
+        strides: list[Size],
+        num_blocks: int,
+        attention: list[bool],
+    ) -> None:
+        super().__init__()
+        self.conv_in = CircularConv2d(in_channels, widths[0], (3, 3))
+        before = [widths[0], *widths[:-1]]
+        self.down = nn.ModuleList(
+            _DownLevel(*level, num_blocks)
+            for level in zip(before, widths, attention, [*strides, None], strict=True)
+        )
+        self.mid = _Middle(widths[-1])
+        self.norm_out = GroupNorm(widths[-1])
+        self.conv_out = CircularConv2d(widths[-1], out_channels, (3, 3))
+
+    def forward(self, image: Tensor) -> Tensor:
+        hidden = self.conv_in(image)
+        for level in self.down:
+            hidden = level(hidden)
+        return self.conv_out(F.silu(self.norm_out(self.mid(hidden))))
+
+
+class _Decoder(nn.Module):
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        widths: list[int],
+        strides: list[Size],
+        num_blocks: int,
+        attention: list[bool],
+        legacy_upsample: bool,
+    ) -> None:
+        super().__init__()
+        self.conv_in = CircularConv2d(in_channels, widths[-1], (3, 3))
+        self.mid = _Middle(widths[-1])
+        before = [*widths[1:], widths[-1]]
+        self.up = nn.ModuleList(  # index 0 is the full resolution, as in the encoder
+            _UpLevel(*level, num_blocks, legacy_upsample)
+            for level in zip(before, widths, attention, [None, *strides], strict=True)
+        )
+        self.norm_out = GroupNorm(widths[0])
+        self.conv_out = CircularConv2d(widths[0], out_channels, (1, 4))
+
+    def forward(self, latents: Tensor) -> Tensor:
+        hidden = self.mid(self.conv_in(latents))
+        for level in reversed(self.up):
+            hidden = level(hidden)
+        return self.conv_out(F.silu(self.norm_out(hidden)))
+
+
+class _Level(nn.Module):
+    """Residual blocks of one resolution, each followed by attention if asked for."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        attention: bool,
+        num_blocks: int,
+        kernel_size: Size,
+    ) -> None:
+        super().__init__()
+        self.block = nn.ModuleList(
+            ResBlock(out_channels if index else in_channels, out_channels, kernel_size)
+            for index in range(num_blocks)
+        )
+        self.attn = nn.ModuleList(
+            AttentionBlock(out_channels) if attention else nn.Identity() for _ in self.block
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        for block, attn in zip(self.block, self.attn, strict=True):
+            hidden = attn(block(hidden))
+        return hidden
+
+
+class _DownLevel(_Level):
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        attention: bool,
+        stride: Size | None,
+        num_blocks: int,
+    ) -> None:
+        super().__init__(in_channels, out_channels, attention, num_blocks, (3, 3))
+        self.downsample = nn.Identity() if stride is None else Downsample(out_channels, stride)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.downsample(super().forward(hidden))
+
+
+class _UpLevel(_Level):
+    """Level whose kernels extend over columns only, unless it is enlarged in rows afterwards."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        attention: bool,
+        stride: Size | None,
+        num_blocks: int,
+        legacy_upsample: bool,
+    ) -> None:
+        kernel_size = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
+        super().__init__(in_channels, out_channels, attention, num_blocks, kernel_size)
+        self.upsample = (
+            nn.Identity() if stride is None else Upsample(out_channels, stride, legacy_upsample)
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.upsample(super().forward(hidden))
+
+
+class _Middle(nn.Sequential):
+    """Two residual blocks around attention, at the lowest resolution."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.block_1 = ResBlock(channels, channels)
+        self.attn_1 = AttentionBlock(channels)
+        self.block_2 = ResBlock(channels, channels)

@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.nn.functional as F
+from torch import nn
+
+from r3dpa.nn.layers import (
+    AttentionBlock,
+    CircularConv2d,
+    Downsample,
+    GroupNorm,
+    ResBlock,
+    SyncedBatchNorm2d,
+    Upsample,
+)
+
+STRIDES = [(1, 2), (1, 4), (2, 1), (2, 2)]
+
+
+def picking(kernel_size, row, column):
+    """Convolution of one channel that picks one tap of its kernel."""
+    conv = CircularConv2d(1, 1, kernel_size)
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias)
+    conv.weight.data[0, 0, row, column] = 1.0
+    return conv
+
+
+@pytest.mark.parametrize(
+    ("columns", "tap", "offset"), [(3, 0, -1), (3, 2, 1), (4, 0, -1), (4, 3, 2)]
+)
+def test_circular_conv_takes_columns_from_the_other_side(columns, tap, offset):
+    image = torch.randn(2, 1, 3, 8)
+    torch.testing.assert_close(
+        picking((1, columns), 0, tap)(image), image.roll(-offset, -1), atol=0, rtol=0
+    )
+
+
+def test_circular_conv_sees_zeros_above_and_below():
+    image = torch.randn(2, 1, 3, 8)
+    from_above, from_below = picking((3, 1), 0, 0)(image), picking((3, 1), 2, 0)(image)
+    assert from_above[:, :, 0].abs().max() == 0
+    assert from_below[:, :, -1].abs().max() == 0
+    assert torch.equal(from_above[:, :, 1:], image[:, :, :-1])
+    assert torch.equal(from_below[:, :, :-1], image[:, :, 1:])
+
+
+@pytest.mark.parametrize("stride", STRIDES)
+def test_downsample_divides_the_size_and_commutes_with_rotation(stride):
+    image, layer = torch.randn(2, 4, 8, 16), Downsample(4, stride)
+    smaller = layer(image)
+    assert smaller.shape == (2, 4, 8 // stride[0], 16 // stride[1])
+    torch.testing.assert_close(layer(image.roll(stride[1], -1)), smaller.roll(1, -1))
+
+
+@pytest.mark.parametrize("stride", STRIDES)
+def test_upsample_multiplies_the_size_and_commutes_with_rotation(stride):
+    image, layer = torch.randn(2, 4, 4, 8), Upsample(4, stride)
+    larger = layer(image)
+    assert larger.shape == (2, 4, 4 * stride[0], 8 * stride[1])
+    torch.testing.assert_close(layer(image.roll(3, -1)), larger.roll(3 * stride[1], -1))
+
+
+def test_upsample_of_official_weights_does_not_commute_with_rotation():
+    image, layer = torch.randn(2, 4, 4, 8), Upsample(4, (1, 2), legacy=True)
+    error = layer(image.roll(1, -1)) - layer(image).roll(2, -1)
+    assert error.abs().max() > 0.1
+
+
+def test_upsample_interpolates_between_the_last_and_the_first_column():
+    layer = Upsample(1, (1, 2))
+    nn.init.zeros_(layer.conv.weight)
+    nn.init.zeros_(layer.conv.bias)
+    layer.conv.weight.data[..., 2] = 1.0  # middle tap: the interpolation alone remains
+    image = torch.tensor([0.0, 4.0, 8.0, 16.0]).view(1, 1, 1, 4)
+    # New pixel centres lie a quarter of an old pixel beside the old centres.
+    expected = torch.tensor([4.0, 1.0, 3.0, 5.0, 7.0, 10.0, 14.0, 12.0]).view(1, 1, 1, 8)
+    torch.testing.assert_close(layer(image), expected)
+
+
+@pytest.mark.parametrize("layer", [Downsample, Upsample])
+def test_unknown_stride_is_named(layer):
+    with pytest.raises(ValueError, match=r"stride .* got \(3, 3\)"):
+        layer(32, (3, 3))
+
+
+def test_group_norm_normalises_each_group_of_each_image():
+    image = torch.randn(2, 64, 4, 8) * 3 + 5
+    groups = GroupNorm(64)(image).unflatten(1, (32, 2)).flatten(2)
+    torch.testing.assert_close(groups.mean(-1), torch.zeros(2, 32), atol=1e-6, rtol=0)
+    torch.testing.assert_close(groups.var(-1, correction=0), torch.ones(2, 32))
+
+
+def test_group_norm_refuses_channels_that_do_not_fill_the_groups():
+    with pytest.raises(ValueError, match=r"multiple of 32.*48"):
+        GroupNorm(48)
+
+
+@pytest.mark.numerics
+def test_group_norm_of_half_precision_images_has_float32_statistics():
+    image = 300 * torch.randn(1, 32, 8, 8)
+    expected = GroupNorm(32)(image)
+    actual = GroupNorm(32).half()(image.half())
+    torch.testing.assert_close(actual.float(), expected, atol=5e-3, rtol=0)
+    assert actual.dtype == torch.float16
+    naive_variance = image.half().square().flatten(2).mean(-1)
+    assert naive_variance.isinf().any()
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_group_norm_of_an_empty_scan_is_finite(dtype):
+    image = torch.full((1, 32, 8, 8), -1.0, dtype=dtype, requires_grad=True)
+    result = GroupNorm(32).to(dtype)(image)
+    result.square().sum().backward()
+    assert result.isfinite().all()
+    assert image.grad.isfinite().all()
+    spread = image.detach() - image.detach().mean()
+    assert (spread / spread.std()).isnan().all()  # without eps
+
+
+def test_res_block_starts_from_its_shortcut():
+    image = torch.randn(1, 32, 4, 8)
+    for out_channels in (32, 64):
+        block = ResBlock(32, out_channels, (1, 4))
+        nn.init.zeros_(block.conv2.weight)
+        nn.init.zeros_(block.conv2.bias)
+        assert torch.equal(block(image), block.nin_shortcut(image))
+    assert isinstance(ResBlock(32, 32).nin_shortcut, nn.Identity)
+
+
+def test_attention_equals_the_written_out_formula():
+    block, image = AttentionBlock(32), torch.randn(2, 32, 3, 4)
+    hidden = block.norm(image)
+    query, key, value = (layer(hidden).flatten(2) for layer in (block.q, block.k, block.v))
+    weights = (torch.einsum("bci,bcj->bij", query, key) / 32**0.5).softmax(-1)
+    mixed = torch.einsum("bij,bcj->bci", weights, value).view_as(image)
+    torch.testing.assert_close(block(image), image + block.proj_out(mixed), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.numerics
+def test_attention_with_large_queries_survives_half_precision():
+    block, image = AttentionBlock(512), torch.randn(1, 512, 4, 4)
+    for layer in (block.q, block.k):
+        layer.weight.data = 12 * torch.eye(512)[..., None, None]
+    expected = block(image)
+    actual = block.half()(image.half()).float()
+    torch.testing.assert_close(actual, expected, atol=0.01 * expected.abs().max().item(), rtol=0)
+    query = block.q(block.norm(image.half())).flatten(2)
+    assert (query.transpose(1, 2) @ query).isinf().any()  # scaled after the product
+
+
+def test_synced_batch_norm_in_one_process_is_batch_norm():
+    ours, plain = SyncedBatchNorm2d(3), nn.BatchNorm2d(3)
+    assert list(ours.state_dict()) == list(plain.state_dict())
+    for _ in range(2):
+        image = torch.randn(2, 3, 4, 5)
+        assert torch.equal(ours(image), plain(image))
+    ours.eval()
+    plain.eval()
+    assert torch.equal(ours(image), plain(image))
+    for key, value in plain.state_dict().items():
+        assert torch.equal(ours.state_dict()[key], value)
+
+
+def batches(offset):
+    """What each of two processes gets: batches of different sizes and distributions."""
+    generator = torch.Generator().manual_seed(3)
+    narrow = torch.randn(2, 3, 4, 5, generator=generator)
+    wide = 2 * torch.randn(3, 3, 4, 5, generator=generator) + 1
+    return [narrow + offset, wide + offset]
+
+
+def run_layer(layer, image):
+    """Output, input gradient and weight gradient of a loss that is a sum over the pixels."""
+    nn.init.constant_(layer.weight, 1.5)
+    image.requires_grad_()
+    output = layer(image)
+    (output.sin() * torch.linspace(0, 1, 5)).sum().backward()
+    state = {key: value.clone() for key, value in layer.state_dict().items()}
+    return output.detach(), image.grad, layer.weight.grad, state
+
+
+def run_process(rank, folder):
+    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    results = {offset: run_layer(SyncedBatchNorm2d(3), batches(offset)[rank]) for offset in OFFSETS}
+    evaluated = SyncedBatchNorm2d(3).eval()(batches(0)[rank])
+    torch.save((results, evaluated), f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
+
+
+OFFSETS = (0, 3000)
+
+
+@pytest.mark.ddp
+@pytest.mark.numerics
+def test_synced_batch_norm_in_two_processes_equals_one_with_both_batches(tmp_path):
+    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
+    (first, evaluated), (second, _) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    torch.testing.assert_close(evaluated, nn.BatchNorm2d(3).eval()(batches(0)[0]))
+    for offset, tolerance in zip(OFFSETS, (1e-6, 1e-3), strict=True):
+        plain = nn.BatchNorm2d(3).double()
+        image = torch.cat(batches(offset)).double()
+        output, image_grad, weight_grad, state = run_layer(plain, image)
+        actual = [torch.cat([first[offset][i], second[offset][i]]) for i in range(2)]
+        for ours, expected in zip(actual, (output, image_grad), strict=True):
+            torch.testing.assert_close(ours.double(), expected, atol=tolerance, rtol=tolerance)
+        summed = first[offset][2] + second[offset][2]
+        torch.testing.assert_close(summed.double(), weight_grad, atol=10 * tolerance, rtol=1e-5)
+        for result in (first, second):
+            for key, value in state.items():
+                ours = result[offset][3][key]
+                torch.testing.assert_close(ours.to(value.dtype), value, atol=1e-6, rtol=1e-6)
+    narrow = torch.cat(batches(OFFSETS[-1])).transpose(0, 1).flatten(1)
+    naive = narrow.square().mean(1) - narrow.mean(1).square()
+    assert ((naive / narrow.var(1) - 1).abs() > 0.01).any()  # one pass, float32
+
+
+def test_half_precision_batch_norm_keeps_its_dtype():
+    with torch.autocast("cpu", torch.bfloat16):
+        image = F.conv2d(torch.randn(2, 1, 8, 8), torch.randn(3, 1, 3, 3))
+        assert SyncedBatchNorm2d(3)(image).dtype == image.dtype == torch.bfloat16

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.distributions import Normal, kl_divergence
+
+from r3dpa.nn.vae import VAE, Posterior
+
+SMALL = {"latent_channels": 4, "channels": 32, "channel_multipliers": (1, 1, 2, 2)}
+
+
+@pytest.fixture
+def vae():
+    torch.manual_seed(0)
+    return VAE(**SMALL, num_res_blocks=1, attention_levels=(2,))
+
+
+def test_latents_are_smaller_by_the_product_of_the_strides(vae):
+    posterior = vae.encode(torch.randn(2, 1, 8, 64))
+    assert posterior.mean.shape == posterior.std.shape == (2, vae.latent_channels, 2, 8)
+    assert vae.latent_size((8, 64)) == (2, 8)
+    assert vae.decode(posterior.mean).shape == (2, 1, 8, 64)
+
+
+@pytest.mark.parametrize(
+    "strides", [((1, 4), (2, 1)), ((2, 2), (1, 2))], ids=lambda strides: str(strides)
+)
+def test_any_strides_of_the_layers_give_back_the_image_size(strides):
+    vae = VAE(1, 4, 32, (1, 1, 2), strides, num_res_blocks=1)
+    latents = vae.encode(torch.randn(1, 1, 8, 32)).mean
+    assert tuple(latents.shape[-2:]) == vae.latent_size((8, 32))
+    assert vae.decode(latents).shape == (1, 1, 8, 32)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 7])
+@torch.no_grad()
+def test_rotating_the_scan_rotates_the_latents_and_back(vae, columns):
+    image, latents = torch.randn(1, 1, 16, 64), torch.randn(1, 4, 4, 8)
+    pixels = columns * vae.stride[1]
+    encoded, decoded = vae.encode(image).mean, vae.decode(latents)
+    encoder_error = vae.encode(image.roll(pixels, -1)).mean - encoded.roll(columns, -1)
+    decoder_error = vae.decode(latents.roll(columns, -1)) - decoded.roll(pixels, -1)
+    assert encoder_error.norm() < 1e-5 * encoded.norm()
+    assert decoder_error.norm() < 1e-5 * decoded.norm()
+
+
+@torch.no_grad()
+def test_legacy_upsampling_breaks_the_rotation(vae):
+    legacy = VAE(**SMALL, num_res_blocks=1, attention_levels=(2,), legacy_upsample=True)
+    legacy.load_state_dict(vae.state_dict())
+    latents = torch.randn(1, 4, 4, 8)
+    decoded = legacy.decode(latents)
+    error = legacy.decode(latents.roll(1, -1)) - decoded.roll(8, -1)
+    assert error.norm() > 0.05 * decoded.norm()
+
+
+def test_every_parameter_learns(vae):
+    image = torch.randn(2, 1, 8, 64)
+    posterior = vae.encode(image)
+    reconstruction = vae.decode(posterior.sample(torch.randn_like(posterior.mean)))
+    ((reconstruction - image).abs().mean() + 1e-3 * posterior.kl().mean()).backward()
+    without = [name for name, weight in vae.named_parameters() if not weight.grad.abs().sum() > 0]
+    # A constant added to all keys of an attention cancels in its softmax: rounding decides.
+    assert not [name for name in without if not name.endswith(".k.bias")]
+
+
+def test_default_is_the_full_size_of_the_paper():
+    with torch.device("meta"):
+        vae = VAE()
+    assert sum(weight.numel() for weight in vae.parameters()) == 59_660_649
+    assert (vae.latent_channels, *vae.latent_size((64, 1024))) == (8, 16, 128)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"strides": ((1, 2),)}, "4 channel_multipliers need 3 strides"),
+        ({"strides": ((1, 2), (2, 2), (3, 3))}, r"stride .* got \(3, 3\)"),
+        ({"attention_levels": (4,)}, r"among 0\.\.3, got \(4,\)"),
+        ({"channels": 48}, "multiple of 32"),
+    ],
+)
+def test_impossible_layouts_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        VAE(**options)
+
+
+def test_images_that_do_not_fit_are_refused(vae):
+    with pytest.raises(ValueError, match=r"\(B, 1, H, W\), got \(2, 3, 8, 64\)"):
+        vae.encode(torch.randn(2, 3, 8, 64))
+    with pytest.raises(ValueError, match=r"multiple of \(4, 8\), got \(8, 60\)"):
+        vae.encode(torch.randn(2, 1, 8, 60))
+
+
+def test_posterior_agrees_with_torch_distributions():
+    moments, latents = torch.randn(2, 6, 2, 4), torch.randn(2, 3, 2, 4)
+    posterior = Posterior(moments)
+    normal = Normal(moments[:, :3], (0.5 * moments[:, 3:]).exp())
+    expected = kl_divergence(normal, Normal(0.0, 1.0)).sum(dim=(1, 2, 3))
+    torch.testing.assert_close(posterior.kl(), expected)
+    torch.testing.assert_close(posterior.nll(latents), -normal.log_prob(latents).sum((1, 2, 3)))
+    torch.testing.assert_close(posterior.sample(latents), normal.mean + normal.stddev * latents)
+
+
+def test_kl_of_one_shifted_latent_is_half_its_squared_mean():
+    moments = torch.zeros(2, 4, 1, 1)
+    moments[1, 0] = 3.0
+    assert Posterior(moments).kl().tolist() == [0.0, 4.5]
+
+
+@pytest.mark.numerics
+def test_log_variance_beyond_the_clamp_comes_back():
+    def fit(logvar_of):
+        raw = torch.tensor([25.0, -35.0], requires_grad=True)
+        optimiser = torch.optim.SGD([raw], lr=0.5)
+        for _ in range(50):
+            optimiser.zero_grad()
+            logvar_of(raw).sub(1.0).square().sum().backward()
+            torch.nn.utils.clip_grad_norm_(raw, 1.0)
+            optimiser.step()
+        return raw.detach()
+
+    def straight_through(raw):
+        return Posterior(torch.cat([torch.zeros(2), raw]).view(1, 4, 1, 1)).logvar.flatten()
+
+    recovered = fit(straight_through)
+    assert recovered.min() > -30
+    assert recovered.max() < 20
+    assert fit(lambda raw: raw.clamp(-30.0, 20.0)).tolist() == [25.0, -35.0]
+
+
+@pytest.mark.numerics
+def test_kl_of_half_precision_moments_is_finite():
+    moments = torch.full((1, 4, 2, 2), 18.0, dtype=torch.float16)
+    divergence = Posterior(moments).kl()
+    assert divergence.dtype == torch.float32
+    assert divergence.isfinite()
+    assert moments.exp().isinf().all()
+
+
+@pytest.mark.numerics
+def test_empty_scan_and_far_latents_are_finite_in_bf16(vae):
+    image = torch.full((1, 1, 8, 64), -1.0)
+    with torch.autocast("cpu", torch.bfloat16):
+        posterior = vae.encode(image)
+        decoded = vae.decode(10 * torch.randn(1, 4, 2, 8))
+    assert posterior.mean.dtype == posterior.kl().dtype == torch.float32
+    (posterior.kl().sum() + decoded.float().square().mean()).backward()
+    assert decoded.isfinite().all()
+    assert all(weight.grad.isfinite().all() for weight in vae.parameters())

@@ -1,0 +1,166 @@
+"""The VAE against ``vae.npz`` and ``vae_state_dicts.json`` (official weights load as they are)."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from r3dpa.nn.layers import Downsample, Upsample
+from r3dpa.nn.vae import VAE, Posterior
+
+
+@pytest.fixture(scope="module")
+def case(load_case):
+    return load_case("vae")
+
+
+def build(case, **options):
+    config = case.config
+    assert config["in_channels"] == config["out_ch"]
+    vae = VAE(
+        in_channels=config["in_channels"],
+        latent_channels=config["z_channels"],
+        channels=config["ch"],
+        channel_multipliers=config["ch_mult"],
+        strides=config["strides"],
+        num_res_blocks=config["num_res_blocks"],
+        attention_levels=config["attn_levels"],
+        **options,
+    )
+    vae.load_state_dict(case.weights())
+    return vae
+
+
+@pytest.fixture
+def vae(case):
+    return build(case, legacy_upsample=True)
+
+
+@torch.no_grad()
+def encoding(case, vae):
+    posterior = vae.encode(case["in/x"])
+    encoder = vae.encoder(case["in/x"])
+    return {
+        "out/encoder": encoder,
+        "out/moments": vae.quant_conv(encoder),
+        "out/mean": posterior.mean,
+        "out/logvar": posterior.logvar,
+        "out/std": posterior.std,
+        "out/kl": posterior.kl(),
+        "out/nll_of_z": posterior.nll(case["in/z"]),
+        "out/z_sampled": posterior.sample(case["in/posterior_noise"]),
+    }
+
+
+@torch.no_grad()
+def decoding(case, vae):
+    latents = vae.encode(case["in/x"]).sample(case["in/posterior_noise"])
+    return {"out/decode": vae.decode(case["in/z"]), "out/recon": vae.decode(latents)}
+
+
+@torch.no_grad()
+def rotation(case, vae):
+    image, latents, stride = case["in/x"], case["in/z"], vae.stride[1]
+    encoded = vae.encode(image.roll(stride, -1)).mean
+    decoded = vae.decode(latents.roll(1, -1))
+    return {
+        "out/horizontal_stride": stride,
+        "out/encode_mean_of_input_rolled_by_stride": encoded,
+        "out/decode_of_z_rolled_by_1": decoded,
+        "out/enc_roll_max_err": (encoded - vae.encode(image).mean.roll(1, -1)).abs().max(),
+        "out/dec_roll_max_err": (decoded - vae.decode(latents).roll(stride, -1)).abs().max(),
+    }
+
+
+def gradients(case, vae):
+    image = case["in/x"]
+    posterior = vae.encode(image)
+    reconstruction = vae.decode(posterior.sample(case["in/posterior_noise"]))
+    loss = (reconstruction - image).abs().mean() + 0.01 * posterior.kl().mean()
+    loss.backward()
+    prefix = "out/grad/"
+    recorded = [key.removeprefix(prefix) for key in case.keys(prefix)]
+    outputs = {prefix + name: vae.get_parameter(name).grad for name in recorded}
+    return outputs | {"out/loss_l1_plus_0.01kl": loss.detach()}
+
+
+def clamp(case, vae):
+    posterior = Posterior(case["in/clamp_params"])
+    return {
+        "out/clamp_logvar": posterior.logvar,
+        "out/clamp_std": posterior.std,
+        "out/clamp_kl": posterior.kl(),
+    }
+
+
+@torch.no_grad()
+def strided_layers(case, vae):
+    outputs = {}
+    for key in case.keys("in/layer_"):
+        image, name = case[key], key.removeprefix("in/layer_")
+        stride = tuple(int(size) for size in name.split("x"))
+        down = Downsample(image.shape[1], stride)
+        down.load_state_dict(case.weights(f"w_down_{name}/"))
+        up = Upsample(image.shape[1], stride, legacy=True)
+        up.load_state_dict(case.weights(f"w_up_{name}/"))
+        outputs |= {f"out/down_{name}": down(image), f"out/up_{name}": up(image)}
+    return outputs
+
+
+GROUPS = [encoding, decoding, rotation, gradients, clamp, strided_layers]
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: f"vae-{group.__name__}")
+def test_vae_outputs(case, vae, close, group):
+    for key, value in group(case, vae).items():
+        close(value, case[key])
+
+
+def test_vae_every_recorded_output_is_compared(case, vae):
+    compared = set().union(*(group(case, vae) for group in GROUPS))
+    assert compared == set(case.keys("out/"))
+
+
+def test_vae_default_upsampling_repairs_the_recorded_rotation_error(case):
+    vae = build(case)
+    error = rotation(case, vae)["out/dec_roll_max_err"]
+    assert error < 1e-5 * vae.decode(case["in/z"]).abs().max()
+    assert case["out/dec_roll_max_err"] > 1e3 * error
+
+
+LAYOUTS = {
+    "h2p4d8": {},
+    "h1p4d4": {
+        "latent_channels": 4,
+        "channel_multipliers": (1, 2, 4),
+        "strides": ((2, 2), (2, 2)),
+    },
+    "h16d4": {
+        "latent_channels": 4,
+        "channel_multipliers": (1, 1, 2, 2, 4),
+        "strides": ((1, 2),) * 4,
+        "attention_levels": (4,),
+    },
+    "h16p2d16": {
+        "latent_channels": 16,
+        "channel_multipliers": (1, 1, 2, 2, 2, 4),
+        "strides": (*((1, 2),) * 4, (2, 2)),
+        "attention_levels": (4,),
+    },
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS, ids=lambda name: f"vae-{name}")
+def test_vae_official_layouts_have_our_keys_and_shapes(parity_dir, name):
+    official = json.loads((parity_dir / "vae_state_dicts.json").read_text())[name]
+    with torch.device("meta"):
+        vae = VAE(**LAYOUTS[name])
+    ours = {key: list(value.shape) for key, value in vae.state_dict().items()}
+    assert ours == official["state_dict"]
+    for part, network in (("total", vae), ("encoder", vae.encoder), ("decoder", vae.decoder)):
+        count = sum(parameter.numel() for parameter in network.parameters())
+        assert count == official[f"param_count_{part}"]
+    latent_shape = [vae.latent_channels, *vae.latent_size((64, 1024))]
+    assert latent_shape == official["latent_shape_for_64x1024"]
