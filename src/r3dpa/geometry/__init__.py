@@ -1,0 +1,31 @@
+"""Sensor, projections and range images: the one place that maps points to pixels."""
+
+from r3dpa.geometry.projection import (
+    EMPTY_RANGE_M,
+    Projection,
+    RingProjection,
+    SphericalProjection,
+    in_range,
+    points_of,
+    pool_cells,
+    range_image,
+    unproject,
+)
+from r3dpa.geometry.range_image import RangeCodec
+from r3dpa.geometry.scan_geometry import ScanGeometry
+from r3dpa.geometry.sensor import LidarSensor
+
+__all__ = [
+    "EMPTY_RANGE_M",
+    "LidarSensor",
+    "Projection",
+    "RangeCodec",
+    "RingProjection",
+    "ScanGeometry",
+    "SphericalProjection",
+    "in_range",
+    "points_of",
+    "pool_cells",
+    "range_image",
+    "unproject",
+]

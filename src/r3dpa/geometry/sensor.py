@@ -1,0 +1,61 @@
+"""The LiDAR sensor as the rest of the package sees it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LidarSensor:
+    """Size of the range image, vertical field of view and range limits of a spinning LiDAR.
+
+    The defaults are the ones R3DPA uses for the HDL-64E of KITTI-360.
+
+    Args:
+        beams: Rows H of the range image.
+        columns: Columns W of the range image, one turn of the sensor.
+        inclination_max_deg: Upper border of the first row, degrees above the horizon.
+        inclination_min_deg: Lower border of the last row, degrees above the horizon.
+        range_min_m: Points at this distance or nearer are dropped, metres.
+        range_max_m: Points at this distance or farther are dropped, metres.
+
+    Raises:
+        ValueError: If a count is below one or an interval is empty or out of bounds.
+    """
+
+    beams: int = 64
+    columns: int = 1024
+    inclination_max_deg: float = 3.0
+    inclination_min_deg: float = -25.0
+    range_min_m: float = 1.0
+    range_max_m: float = 56.0
+
+    def __post_init__(self) -> None:
+        """Check counts and limits."""
+        if self.beams < 1 or self.columns < 1:
+            raise ValueError(
+                "a sensor needs at least one beam and one column, "
+                f"got beams={self.beams}, columns={self.columns}"
+            )
+        if not -90.0 <= self.inclination_min_deg < self.inclination_max_deg <= 90.0:
+            raise ValueError(
+                "the vertical field of view must satisfy -90 <= min < max <= 90 degrees, got "
+                f"inclination_min_deg={self.inclination_min_deg}, "
+                f"inclination_max_deg={self.inclination_max_deg}"
+            )
+        if not 0.0 <= self.range_min_m < self.range_max_m < math.inf:
+            raise ValueError(
+                "the range limits must satisfy 0 <= min < max < infinity metres, got "
+                f"range_min_m={self.range_min_m}, range_max_m={self.range_max_m}"
+            )
+
+    @property
+    def inclination_max_rad(self) -> float:
+        """Upper border of the first row, radians."""
+        return math.radians(self.inclination_max_deg)
+
+    @property
+    def inclination_min_rad(self) -> float:
+        """Lower border of the last row, radians."""
+        return math.radians(self.inclination_min_deg)

@@ -1,0 +1,407 @@
+import math
+import time
+
+import pytest
+import torch
+
+import r3dpa.geometry
+from r3dpa.geometry import (
+    EMPTY_RANGE_M,
+    LidarSensor,
+    SphericalProjection,
+    in_range,
+    points_of,
+    pool_cells,
+    range_image,
+    unproject,
+)
+from r3dpa.geometry.range_image import RangeCodec
+
+SMALL = LidarSensor(beams=8, columns=16, inclination_max_deg=20.0, inclination_min_deg=-20.0)
+SENSORS = [LidarSensor(), SMALL, LidarSensor(5, 37, 60.0, -90.0, 0.0, 120.0)]
+
+
+def random_points(count, seed=0, farthest=70.0):
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.randn(count, 3, generator=generator)
+    direction = direction * torch.tensor([1.0, 1.0, 0.2])
+    distance = farthest * torch.rand(count, 1, generator=generator)
+    return torch.nn.functional.normalize(direction, dim=-1) * distance
+
+
+def range_image_by_loop(points, projection, values):
+    """Independent version: one point after the other, float64 of the standard library."""
+    sensor = projection.sensor
+    range_m = torch.full((sensor.beams, sensor.columns), EMPTY_RANGE_M)
+    image = torch.zeros(values.shape[1], sensor.beams, sensor.columns)
+    top, bottom = sensor.inclination_max_deg, sensor.inclination_min_deg
+    for (x, y, z), value in zip(points.tolist(), values, strict=True):
+        distance = math.sqrt(x * x + y * y + z * z)
+        if not sensor.range_min_m < distance < sensor.range_max_m:
+            continue
+        inclination = math.degrees(math.asin(z / distance))
+        row = math.floor((top - inclination) / (top - bottom) * sensor.beams)
+        row = min(max(row, 0), sensor.beams - 1)
+        column = math.floor((180 - math.degrees(math.atan2(y, x))) / 360 * sensor.columns)
+        column %= sensor.columns
+        if range_m[row, column] < 0 or distance < range_m[row, column]:
+            range_m[row, column] = distance
+            image[:, row, column] = value
+    return range_m, image
+
+
+def test_module_of_the_same_name_does_not_hide_the_function():
+    assert callable(r3dpa.geometry.range_image)
+    assert RangeCodec is r3dpa.geometry.RangeCodec
+
+
+def test_documented_pixel():
+    row, column = SphericalProjection(LidarSensor()).pixel_of(torch.tensor([10.0, 0.0, 0.0]))
+    assert (row.item(), column.item()) == (6, 512)
+    assert row.dtype == column.dtype == torch.int64
+
+
+def test_axes():
+    """Up is row 0; left of the sensor (+y) is a quarter of the way, right three quarters."""
+    points = torch.tensor([[10.0, 0, 9], [10, 0, -9], [-10, 0, 0], [0, 10, 0], [0, -10, 0]])
+    row, column = SphericalProjection(SMALL).pixel_of(points)
+    assert row[:2].tolist() == [0, 7]
+    assert column.tolist() == [8, 8, 0, 4, 12]
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: f"{sensor.beams}x{sensor.columns}")
+def test_equals_a_loop(sensor):
+    points, projection = random_points(1000), SphericalProjection(sensor)
+    values = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1))
+    range_m, image = range_image(points, projection, values)
+    expected_range, expected_image = range_image_by_loop(points, projection, values)
+    torch.testing.assert_close(range_m, expected_range)
+    assert torch.equal(image, expected_image)
+
+
+def test_nearest_return_wins_whatever_the_order():
+    points = torch.tensor([[30.0, 0, 0], [10.0, 0, 0], [20.0, 0, 0]])
+    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        values = points[order][:, :1] * 2
+        range_m, image = range_image(points[order], SphericalProjection(SMALL), values)
+        assert range_m[4, 8] == 10
+        assert image[0, 4, 8] == 20
+        assert (range_m > 0).sum() == 1
+
+
+def test_first_of_equal_returns_wins():
+    points = torch.tensor([[10.0, 0, 0]] * 5)
+    values = torch.arange(5).unsqueeze(1)
+    _, image = range_image(points, SphericalProjection(SMALL), values)
+    assert image.dtype == torch.int64
+    assert image[0, 4, 8] == 0
+    _, image = range_image(points, SphericalProjection(SMALL), values.flip(0))
+    assert image[0, 4, 8] == 4
+
+
+def test_range_limits_are_exclusive_and_fov_is_not():
+    above, below = math.nextafter(1.0, 2.0), math.nextafter(56.0, 0.0)
+    points = torch.tensor([[1.0, 0, 0], [0, 56.0, 0]], dtype=torch.float64)
+    assert not in_range(points, LidarSensor()).any()
+    # Ranges are float32, so one float64 step inside rounds to the limit itself ...
+    points = torch.tensor([[above, 0, 0], [0, below, 0]], dtype=torch.float64)
+    assert not in_range(points, LidarSensor()).any()
+    # ... and one float32 step inside does not.
+    one, far = torch.tensor(1.0), torch.tensor(56.0)
+    points = torch.stack([one.nextafter(far), far.nextafter(one)]).diag_embed()
+    points = torch.nn.functional.pad(points, (0, 1))
+    assert in_range(points, LidarSensor()).all()
+    steep = torch.tensor([[0.0, 0.0, 10.0], [1.0, 0.0, -10.0]])
+    range_m, _ = range_image(steep, SphericalProjection(LidarSensor()))
+    assert (range_m[0] > 0).sum() == (range_m[-1] > 0).sum() == 1
+
+
+def test_padding_and_batches():
+    points, projection = random_points(500), SphericalProjection(SMALL)
+    values = torch.rand(500, 2, generator=torch.Generator().manual_seed(2))
+    padded_points = torch.full((2, 600, 3), math.nan)
+    padded_values = torch.full((2, 600, 2), math.nan)
+    padded_points[0, :500], padded_values[0, :500] = points, values
+    padded_points[1, 50:350], padded_values[1, 50:350] = points[:300], values[:300]
+    range_m, image = range_image(padded_points, projection, padded_values)
+    assert range_m.shape == (2, 8, 16)
+    assert image.shape == (2, 2, 8, 16)
+    for index, count in enumerate((500, 300)):
+        single_range, single_image = range_image(points[:count], projection, values[:count])
+        assert torch.equal(range_m[index], single_range)
+        assert torch.equal(image[index], single_image)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (2, 0, 3), (0, 5, 3)], ids=str)
+def test_empty_scans(shape):
+    points, projection = torch.zeros(shape), SphericalProjection(SMALL)
+    range_m, image = range_image(points, projection, torch.zeros(*shape[:-1], 4))
+    assert range_m.shape == (*shape[:-2], 8, 16)
+    assert image.shape == (*shape[:-2], 4, 8, 16)
+    assert (range_m == EMPTY_RANGE_M).all()
+    assert (image == 0).all()
+
+
+def test_scans_of_one_and_two_points():
+    for count in (1, 2):
+        points = torch.tensor([[5.0, 0, 0], [0, 5.0, 0]])[:count]
+        range_m, _ = range_image(points, SphericalProjection(SMALL))
+        assert (range_m > 0).sum() == count
+        means, counts = pool_cells(points, points, SphericalProjection(SMALL), (2, 4))
+        assert counts.sum() == count
+        assert means.isfinite().all()
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: f"{sensor.beams}x{sensor.columns}")
+@pytest.mark.parametrize("corner", [False, True])
+def test_rays_are_unit_vectors_through_their_pixels(sensor, corner):
+    projection = SphericalProjection(sensor)
+    rays = projection.ray_directions(corner, torch.float64)
+    assert rays.shape == (sensor.beams, sensor.columns, 3)
+    torch.testing.assert_close(rays.norm(dim=-1), torch.ones_like(rays[..., 0]))
+    if corner:  # a corner lies on a border; half a pixel further is the centre
+        inclination, azimuth = projection.ray_angles(corner=True)
+        centre_inclination, centre_azimuth = projection.ray_angles()
+        pitch = math.radians(sensor.inclination_max_deg - sensor.inclination_min_deg)
+        half_row = torch.full_like(inclination, pitch / sensor.beams / 2)
+        torch.testing.assert_close(inclination - centre_inclination, half_row)
+        half_column = torch.full_like(azimuth, math.pi / sensor.columns)
+        torch.testing.assert_close(azimuth - centre_azimuth, half_column)
+    else:
+        row, column = projection.pixel_of(rays)
+        expected = torch.meshgrid(
+            torch.arange(sensor.beams), torch.arange(sensor.columns), indexing="ij"
+        )
+        assert torch.equal(row, expected[0])
+        assert torch.equal(column, expected[1])
+
+
+def test_image_survives_a_round_trip():
+    projection = SphericalProjection(LidarSensor())
+    range_m, _ = range_image(random_points(20000), projection)
+    cloud = points_of(range_m, projection)
+    assert cloud.shape == ((range_m > 0).sum(), 3)
+    torch.testing.assert_close(cloud.norm(dim=-1), range_m[range_m > 0])
+    again, _ = range_image(cloud, projection)
+    torch.testing.assert_close(again, range_m)
+    # Empty pixels unproject to the origin, which is dropped like any other near point.
+    points = unproject(range_m, projection)
+    assert (points[range_m == EMPTY_RANGE_M] == 0).all()
+    again, _ = range_image(points.flatten(0, 1), projection)
+    torch.testing.assert_close(again, range_m)
+
+
+def test_unproject_batches_and_gradients():
+    projection = SphericalProjection(SMALL)
+    range_m = (10 * torch.rand(2, 3, 8, 16) + 2).requires_grad_()
+    points = unproject(range_m, projection)
+    assert points.shape == (2, 3, 8, 16, 3)
+    assert torch.equal(points[1, 2], unproject(range_m[1, 2], projection))
+    points.square().sum().backward()
+    torch.testing.assert_close(range_m.grad, 2 * range_m.detach())
+
+
+def test_cached_rays_cannot_be_spoilt():
+    projection = SphericalProjection(LidarSensor(beams=3, columns=7))
+    with torch.inference_mode():  # the first call fills the cache
+        unproject(torch.ones(3, 7), projection)
+    range_m = torch.ones(3, 7, requires_grad=True)
+    unproject(range_m, projection).sum().backward()
+    projection.ray_directions().zero_()
+    assert projection.ray_directions().norm(dim=-1).min() > 0.99
+
+
+def test_pooling_equals_a_loop():
+    points, projection = random_points(2000), SphericalProjection(SMALL)
+    values = torch.randn(2000, 5, generator=torch.Generator().manual_seed(3))
+    means, counts = pool_cells(points, values, projection, (4, 8))
+    row, column = projection.pixel_of(points)
+    kept = in_range(points, SMALL)
+    for cell in range(32):
+        members = kept & (row // 2 == cell // 8) & (column // 2 == cell % 8)
+        assert counts[cell] == members.sum()
+        expected = values[members].double().mean(dim=0) if members.any() else torch.zeros(5)
+        torch.testing.assert_close(means[cell], expected.float())
+    unfiltered = pool_cells(points, values, projection, (4, 8), range_filter=False)[1]
+    assert unfiltered.sum() == len(points) > counts.sum()
+
+
+def test_pooling_at_image_size_counts_the_occupied_pixels():
+    points, projection = random_points(3000), SphericalProjection(SMALL)
+    _, counts = pool_cells(points, points, projection, (8, 16))
+    range_m, _ = range_image(points, projection)
+    assert torch.equal(counts.reshape(8, 16) > 0, range_m > 0)
+
+
+def test_pooling_keeps_double_and_raises_half_precision():
+    points = random_points(10)
+    for given, expected in (("float16", "float32"), ("float32", "float32"), ("float64", "float64")):
+        values = torch.ones(10, 1, dtype=getattr(torch, given))
+        means, _ = pool_cells(points, values, SphericalProjection(SMALL), (2, 2))
+        assert means.dtype == getattr(torch, expected)
+
+
+def test_wrong_shapes_are_refused():
+    projection = SphericalProjection(SMALL)
+    with pytest.raises(ValueError, match=r"\(7, 4\)"):
+        projection.pixel_of(torch.zeros(7, 4))
+    with pytest.raises(ValueError, match=r"\(2, 2, 5, 3\)"):
+        range_image(torch.zeros(2, 2, 5, 3), projection)
+    with pytest.raises(ValueError, match=r"\(6, 1\)"):
+        range_image(torch.zeros(5, 3), projection, torch.zeros(6, 1))
+    with pytest.raises(ValueError, match=r"\(8, 15\)"):
+        unproject(torch.zeros(8, 15), projection)
+    with pytest.raises(ValueError, match="one by one"):
+        points_of(torch.zeros(1, 8, 16), projection)
+    with pytest.raises(ValueError, match="3 x 4"):
+        pool_cells(torch.zeros(5, 3), torch.zeros(5, 1), projection, (3, 4))
+    with pytest.raises(ValueError, match=r"\(4, 1\)"):
+        pool_cells(torch.zeros(5, 3), torch.zeros(4, 1), projection, (2, 4))
+
+
+def test_a_full_scan_is_fast():
+    points = random_points(120_000)
+    projection = SphericalProjection(LidarSensor())
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        range_image(points, projection)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.1  # 0.01 s alone on one core; the bound leaves room for a busy machine
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_equals_cpu():
+    points, projection = random_points(50_000), SphericalProjection(LidarSensor())
+    values = torch.rand(50_000, 3, generator=torch.Generator().manual_seed(4))
+    range_m, image = range_image(points, projection, values)
+    cuda_range, cuda_image = range_image(points.cuda(), projection, values.cuda())
+    # libm and CUDA may round an angle on a pixel border differently.
+    assert (cuda_range.cpu() != range_m).sum() <= 2
+    assert (cuda_image.cpu() != image).sum() <= 6
+    means, _ = pool_cells(points.cuda(), values.cuda(), projection)
+    torch.testing.assert_close(
+        means.cpu(), pool_cells(points, values, projection)[0], atol=1e-3, rtol=0
+    )
+    again = range_image(points.cuda(), projection, values.cuda())
+    assert torch.equal(again[0], cuda_range)
+    assert torch.equal(again[1], cuda_image)
+    torch.testing.assert_close(
+        unproject(cuda_range, projection).cpu(), unproject(cuda_range.cpu(), projection)
+    )
+
+
+# Hard numerical cases of the design notes, section 3, each with the naive computation.
+
+
+@pytest.mark.numerics
+def test_points_without_a_direction_are_dropped_and_counted():
+    bad = [
+        [0.0, 0.0, 0.0],
+        [1e-30, 1e-30, 1e-30],
+        [math.inf, 0.0, 0.0],
+        [1.0, -math.inf, math.inf],
+        [math.nan, 1.0, 1.0],
+        [3e38, 3e38, 3e38],
+    ]
+    points = torch.tensor([*bad, [10.0, 0.0, 0.0]])
+    naive = torch.arcsin(points[:, 2] / points.square().sum(dim=-1).sqrt())
+    assert naive[:5].isnan().sum() == 4
+    projection = SphericalProjection(LidarSensor())
+    row, column = projection.pixel_of(points)
+    assert ((row >= 0) & (row < 64) & (column >= 0) & (column < 1024)).all()
+    assert row[[0, 2, 3, 4]].unique().tolist() == [6]  # not finite: the pixel of the origin
+    assert column[[0, 2, 3, 4]].unique().tolist() == [512]
+    assert (~in_range(points, projection.sensor)).sum() == len(bad)
+    range_m, _ = range_image(points, projection)
+    assert (range_m > 0).sum() == 1
+    means, counts = pool_cells(points, points, projection, range_filter=False)
+    assert counts.sum() == 4  # the finite ones: the origin, a denormal, a far and a good point
+    assert means.isfinite().all()
+
+
+@pytest.mark.numerics
+def test_inclination_near_the_zenith():
+    """float32 arcsin is off by up to 4e-4 rad towards the pole, a row of a fine sensor."""
+    angle_to_pole = torch.logspace(-6, -2, 2000, dtype=torch.float64)
+    points = torch.stack(
+        [10 * angle_to_pole.sin(), 0 * angle_to_pole, 10 * angle_to_pole.cos()], dim=-1
+    ).float()
+    x, _, z = points.double().unbind(-1)
+    exact = math.pi / 2 - torch.atan(x / z)
+    unit = points / points.norm(dim=-1, keepdim=True)
+    naive = torch.arcsin(unit[:, 2].clamp(-1, 1))
+    assert (naive - exact).abs().max() > 1e-4
+    pitch = 1e-6  # rows of 1e-6 rad below the pole measure the inclination itself
+    fine = LidarSensor(20_000, 4, 90.0, 90.0 - math.degrees(20_000 * pitch))
+    row, _ = SphericalProjection(fine).pixel_of(points)
+    assert (math.pi / 2 - (row + 0.5) * pitch - exact).abs().max() < 1e-6
+    for pole in ([0.0, 0.0, 5.0], [0.0, 0.0, -5.0]):
+        assert (range_image(torch.tensor([pole]), SphericalProjection(SMALL))[0] > 0).sum() == 1
+
+
+@pytest.mark.numerics
+def test_eight_compass_directions():
+    """arctan(y / x), as printed in the paper, loses the quadrant and divides by zero."""
+    azimuth = math.pi - (torch.arange(8, dtype=torch.float64) + 0.5) * (2 * math.pi / 8)
+    compass = torch.stack([azimuth.cos(), azimuth.sin(), 0 * azimuth], dim=-1)
+    naive = torch.arctan(compass[:, 1] / compass[:, 0])
+    assert ((naive - azimuth).abs() > 1).sum() == 4
+    assert torch.arctan(torch.tensor(0.0) / torch.tensor(0.0)).isnan()
+    _, column = SphericalProjection(LidarSensor(4, 8)).pixel_of(compass)
+    assert column.tolist() == list(range(8))
+
+
+@pytest.mark.numerics
+def test_signed_zero_behind_the_sensor():
+    points = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, -0.0, 0.0]])
+    azimuth = torch.atan2(points[:, 1], points[:, 0]).double()
+    naive = ((math.pi - azimuth.clamp(-math.pi, math.pi)) / (2 * math.pi) * 1024).floor()
+    assert naive.clamp(0, 1023).tolist() == [0, 1023]
+    _, column = SphericalProjection(LidarSensor()).pixel_of(points)
+    assert column.tolist() == [0, 0]
+    _, column = SphericalProjection(LidarSensor(), legacy_seam=True).pixel_of(points)
+    assert column.tolist() == [0, 1023]
+    beside = torch.tensor([[-13.0, 1e-7, 0.0], [-13.0, -1e-7, 0.0]])
+    assert torch.atan2(beside[1, 1], beside[1, 0]) == -torch.tensor(math.pi)  # float32
+    assert SphericalProjection(LidarSensor()).pixel_of(beside)[1].tolist() == [0, 1023]
+
+
+@pytest.mark.numerics
+def test_mean_angle_of_a_round_trip():
+    """Pixel corners turn every point up by half a row and aside by half a column."""
+    sensor = LidarSensor()
+    projection = SphericalProjection(sensor)
+    generator = torch.Generator().manual_seed(0)
+    inclination, azimuth = torch.rand(2, 20_000, generator=generator, dtype=torch.float64)
+    inclination = (inclination * 28 - 25).deg2rad()
+    azimuth = (azimuth * 359.6 - 179.8).deg2rad()  # clear of the seam, so that angles subtract
+    horizontal = inclination.cos()
+    points = torch.stack(
+        [horizontal * azimuth.cos(), horizontal * azimuth.sin(), inclination.sin()], dim=-1
+    )
+    row, column = projection.pixel_of(points)
+
+    def mean_residual_deg(corner):
+        rays = projection.ray_directions(corner, torch.float64)[row, column]
+        up = torch.asin(rays[:, 2]) - inclination
+        aside = torch.atan2(rays[:, 1], rays[:, 0]) - azimuth
+        aside = torch.remainder(aside + math.pi, 2 * math.pi) - math.pi
+        return up.rad2deg().mean().item(), aside.rad2deg().mean().item()
+
+    assert mean_residual_deg(corner=True) == pytest.approx((0.219, 0.176), abs=0.01)
+    assert mean_residual_deg(corner=False) == pytest.approx((0.0, 0.0), abs=0.01)
+
+
+@pytest.mark.numerics
+def test_pooling_many_points_in_one_cell():
+    """A running float32 sum stops growing properly long before 2^24 equal terms."""
+    count, value = 200_000, 0.1
+    points = torch.tensor([[10.0, 0.0, 0.0]]).expand(count, 3)
+    values = torch.full((count, 1), value)
+    naive = torch.zeros(1).index_add(0, torch.zeros(count, dtype=torch.int64), values[:, 0])
+    assert (naive / count - value).abs() > 1e-5
+    means, counts = pool_cells(points, values, SphericalProjection(SMALL), (1, 1))
+    assert counts.tolist() == [count]
+    torch.testing.assert_close(means, torch.full((1, 1), value), atol=1e-8, rtol=0)
