@@ -1,4 +1,4 @@
-"""Exponential moving average of network weights, kept as explicit state."""
+"""Exponential moving average of the flow transformer, kept as explicit state."""
 
 from __future__ import annotations
 
@@ -6,26 +6,31 @@ import copy
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import nn
+
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
 
 __all__ = ["EMA"]
 
 
 class EMA(nn.Module):
-    """Averaged float32 copies of named networks.
+    """Averaged float32 copies of a SiT and of its latent statistics.
 
     Parameters follow ``average = decay * average + (1 - decay) * weight`` after every optimiser
     step. Buffers (the latent statistics, which are an average already) are copied by default: at
     decay 0.9999 an averaged statistic lags about 1e4 steps behind the VAE. The official code
     averages floating-point buffers too; ``buffers="decay"`` does the same.
 
-    The copies are attributes under the names given, so ``EMA({"sit": sit}).sit`` is the averaged
-    network and the state dict holds ``sit.*``.
-
     Args:
-        networks: Networks to average; copied, never changed.
+        sit: Network to average; copied, never changed.
+        latent_norm: Statistics that belong to it.
         decay: Weight of the old average, in [0, 1).
         buffers: ``copy`` or ``decay``.
+
+    Attributes:
+        sit: Averaged network.
+        latent_norm: Its statistics.
 
     Raises:
         ValueError: If ``decay`` or ``buffers`` is out of range.
@@ -33,7 +38,8 @@ class EMA(nn.Module):
 
     def __init__(
         self,
-        networks: dict[str, nn.Module],
+        sit: SiT,
+        latent_norm: LatentNorm,
         decay: float = 0.9999,
         buffers: Literal["copy", "decay"] = "copy",
     ) -> None:
@@ -43,38 +49,31 @@ class EMA(nn.Module):
         if buffers not in ("copy", "decay"):
             raise ValueError(f"EMA buffers must be 'copy' or 'decay', got {buffers!r}")
         self.decay = decay
-        self.buffer_rule = buffers
-        for name, network in networks.items():
-            average = copy.deepcopy(network).float().eval().requires_grad_(False)
-            self.add_module(name, average)
+        self.decays_buffers = buffers == "decay"
+        self.sit = copy.deepcopy(sit).float().eval().requires_grad_(False)
+        self.latent_norm = copy.deepcopy(latent_norm).float().eval().requires_grad_(False)
 
     @torch.no_grad()
-    def update(self, networks: dict[str, nn.Module]) -> None:
-        """Moves the averages one step towards ``networks`` (same names and shapes as given)."""
-        for name, network in networks.items():
-            average = self.get_submodule(name)
-            self._lerp(list(average.parameters()), list(network.parameters()))
-            old, new = list(average.buffers()), list(network.buffers())
-            decayed = [
-                self.buffer_rule == "decay" and buffer.is_floating_point() for buffer in new
-            ]
-            self._lerp(
-                [b for b, moves in zip(old, decayed, strict=True) if moves],
-                [b for b, moves in zip(new, decayed, strict=True) if moves],
-            )
-            for target, source, moves in zip(old, new, decayed, strict=True):
-                if not moves:
+    def update(self, sit: SiT, latent_norm: LatentNorm) -> None:
+        """Moves the averages one step towards the present weights."""
+        for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
+            pairs = list(zip(average.parameters(), network.parameters(), strict=True))
+            for target, source in zip(average.buffers(), network.buffers(), strict=True):
+                if self.decays_buffers and source.is_floating_point():
+                    pairs.append((target, source))
+                else:
                     target.copy_(source)
+            if pairs:
+                targets, sources = zip(*pairs, strict=True)
+                torch._foreach_lerp_(
+                    targets, [source.float() for source in sources], 1.0 - self.decay
+                )
 
     @torch.no_grad()
-    def reset(self, networks: dict[str, nn.Module]) -> None:
+    def reset(self, sit: SiT, latent_norm: LatentNorm) -> None:
         """Sets the averages to the present weights, as at the start of a training stage."""
-        for name, network in networks.items():
-            self.get_submodule(name).load_state_dict(network.state_dict())
-
-    def _lerp(self, averages: list[Tensor], values: list[Tensor]) -> None:
-        if averages:
-            torch._foreach_lerp_(averages, [v.float() for v in values], 1.0 - self.decay)
+        self.sit.load_state_dict(sit.state_dict())
+        self.latent_norm.load_state_dict(latent_norm.state_dict())
 
     def train(self, mode: bool = True) -> EMA:
         """Keeps the averages in evaluation mode whatever the surrounding module does."""

@@ -1,0 +1,68 @@
+"""Scans on disk, feature grids, data sets and Lightning data modules.
+
+The data modules need Lightning, which takes seconds to import: they are loaded on first use.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from r3dpa.data.datasets import LidarBatch, LidarDataset, LidarSample
+from r3dpa.data.feature_grids import (
+    Extractor,
+    FeatureGridError,
+    FeatureGrids,
+    default_features_dir,
+    write_feature_grids,
+)
+from r3dpa.data.scans import (
+    KITTI360_DRIVES,
+    CheckReport,
+    Scan,
+    ScanError,
+    check,
+    find_scans,
+    kitti360_scans,
+    read_npz,
+    read_ply,
+    read_scan,
+    write_bin,
+    write_npz,
+    write_ply,
+)
+
+if TYPE_CHECKING:
+    from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
+
+__all__ = [
+    "KITTI360_DRIVES",
+    "CheckReport",
+    "Extractor",
+    "FeatureGridError",
+    "FeatureGrids",
+    "KITTI360DataModule",
+    "LidarBatch",
+    "LidarDataModule",
+    "LidarDataset",
+    "LidarSample",
+    "Scan",
+    "ScanError",
+    "SimulatedDataModule",
+    "check",
+    "default_features_dir",
+    "find_scans",
+    "kitti360_scans",
+    "read_npz",
+    "read_ply",
+    "read_scan",
+    "write_bin",
+    "write_feature_grids",
+    "write_npz",
+    "write_ply",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the data modules on first use."""
+    if name in {"KITTI360DataModule", "LidarDataModule", "SimulatedDataModule"}:
+        return getattr(import_module("r3dpa.data.datamodules"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,361 @@
+"""Lightning data modules: scans in, :class:`LidarBatch` out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from glob import has_magic
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from lightning.pytorch import LightningDataModule
+from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
+from torch import nn
+from torch.utils.data import DataLoader
+
+from r3dpa.data.datasets import LidarDataset
+from r3dpa.data.feature_grids import (
+    Extractor,
+    FeatureGrids,
+    default_features_dir,
+    stored_feature_dim,
+    write_feature_grids,
+)
+from r3dpa.data.loaders import training_loader
+from r3dpa.data.scans import KITTI360_DRIVES, Scan, find_scans, kitti360_scans, read_scan
+from r3dpa.geometry import (
+    LidarSensor,
+    Projection,
+    RangeCodec,
+    RingProjection,
+    ScanGeometry,
+    SphericalProjection,
+)
+from r3dpa.simulation import simulate
+
+_SENSOR = LidarSensor()
+_CODEC = RangeCodec()
+_SCALR_DIM = 768  # width of the published feature grids
+_SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
+
+
+class LidarDataModule(LightningDataModule):
+    """Scans of a folder, file, glob, or list of these.
+
+    Validation and test use the held-out scans, prediction all scans in order. No augmentation.
+    The order of training scans depends on ``seed`` and the epoch alone; a resumed run goes on
+    with the very next batch. On several nodes that share a disk, set ``prepare_data_per_node`` to
+    False, so that one process prepares the data.
+
+    Args:
+        scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
+        sensor: Image size, field of view and range limits.
+        projection: ``"spherical"``: rows of equal pitch; ``"rings"``: one row per laser, for scans
+            stored ring after ring.
+        ring_inclinations_deg: Inclination of each row for ``"rings"``, degrees above the horizon;
+            measured in the first training scans if None.
+        codec: Metres to [-1, 1].
+        grid_size: Rows and columns (h, w) of the feature grid.
+        extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
+            missing before training. Without it, ``features_dir`` must hold all of them.
+        features_dir: Folder of the feature grids; with an extractor and a single folder of scans,
+            ``<scans>/feature_grids/<extractor>_<h>x<w>`` if None. Without either, no grids.
+        batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
+            processes x ``accumulate_grad_batches`` scans.
+        num_workers: Loader processes per training process; also extract features on the CPU.
+        seed: Seed of the order of training scans.
+        val_every: Every this many scans, one is held out; None for none. Neighbours in a recording
+            look alike: hold out whole recordings by ``val_drives`` for an honest score.
+        val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
+        limit: Use this many scans of each split at most, spread evenly over it.
+
+    Attributes:
+        feature_dim: Width D of the feature grids; 768, that of ScaLR, where none are used.
+        projection_kind: The argument ``projection``.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        scans: str | list[str],
+        sensor: LidarSensor = _SENSOR,
+        projection: Literal["spherical", "rings"] = "spherical",
+        ring_inclinations_deg: list[float] | None = None,
+        codec: RangeCodec = _CODEC,
+        grid_size: tuple[int, int] = (8, 64),
+        extractor: nn.Module | None = None,
+        features_dir: str | None = None,
+        batch_size: int = 8,
+        num_workers: int = 0,
+        seed: int = 0,
+        val_every: int | None = 10,
+        val_drives: list[str] | None = None,
+        limit: int | None = None,
+    ) -> None:
+        super().__init__()
+        if projection not in ("spherical", "rings"):
+            raise ValueError(f"projection must be 'spherical' or 'rings', got {projection!r}.")
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("num_workers", num_workers, 0),
+            ("seed", seed, 0),
+            ("val_every", val_every, 2),
+            ("limit", limit, 1),
+        ):
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}.")
+        self.scans = scans
+        self.sensor = sensor
+        self.projection_kind = projection
+        self.ring_inclinations_deg = ring_inclinations_deg
+        self.codec = codec
+        self.grid_size = (grid_size[0], grid_size[1])
+        self.extractor = extractor
+        self.features_dir = self._find_features_dir(features_dir)
+        self.batch_size = batch_size
+        self.num_workers = num_workers
+        self.seed = seed
+        self.val_every = val_every
+        self.val_drives = val_drives
+        self.limit = limit
+        self.train_set: LidarDataset | None = None
+        self.val_set: LidarDataset | None = None
+        self.all_set: LidarDataset | None = None
+
+    @property
+    def feature_dim(self) -> int:
+        """Width D of the feature grids; 768, that of ScaLR, where none are used.
+
+        Raises:
+            FeatureGridError: If ``features_dir`` is given, is empty and there is no extractor.
+        """
+        if self.extractor is not None:
+            return cast(Extractor, self.extractor).dim
+        return _SCALR_DIM if self.features_dir is None else stored_feature_dim(self.features_dir)
+
+    @property
+    def geometry(self) -> ScanGeometry:
+        """Projection, codec and grid size, known after ``setup``."""
+        return ScanGeometry(self.projection, self.codec, self.grid_size)
+
+    def split(self) -> tuple[list[Scan], list[Scan]]:
+        """Training scans and held-out scans, each sorted, before ``limit`` is applied.
+
+        Raises:
+            ValueError: If there are no scans, or a name in ``val_drives`` is none of theirs.
+        """
+        scans = find_scans(self.scans)
+        if self.val_drives:
+            drives = {scan.drive for scan in scans}
+            if unknown := set(self.val_drives) - drives:
+                raise ValueError(
+                    f"val_drives names {sorted(unknown)}, but the scans are of {sorted(drives)}."
+                )
+            held_out = {scan for scan in scans if scan.drive in self.val_drives}
+        else:
+            held_out = set(scans[:: self.val_every] if self.val_every else [])
+        return [scan for scan in scans if scan not in held_out], sorted(held_out)
+
+    def prepare_data(self) -> None:
+        """Make the feature grids that are missing, if there is an extractor."""
+        if self.extractor is None or self.features_dir is None:
+            return
+        train, val = self._limited_split()
+        tensors = (*self.extractor.parameters(), *self.extractor.buffers())
+        on_gpu = any(tensor.is_cuda for tensor in tensors)
+        write_feature_grids(
+            train + val,
+            cast(Extractor, self.extractor.eval()),
+            self._make_projection(train),
+            self.grid_size,
+            self.features_dir,
+            workers=0 if on_gpu else self.num_workers,
+            progress=_log_progress,
+        )
+
+    def setup(self, stage: str) -> None:
+        """Index the scans and open the feature grids.
+
+        Args:
+            stage: ``"fit"``, ``"validate"``, ``"test"``, or ``"predict"``, which needs no grids.
+        """
+        train, val = self._limited_split()
+        self.projection: Projection = self._make_projection(train)
+        scans, grids = sorted(train + val), None
+        if self.features_dir is not None and stage != "predict":
+            extractor = cast(Extractor | None, self.extractor)
+            grids = FeatureGrids(
+                self.features_dir, scans, self.projection, self.grid_size, extractor
+            )
+        self.train_set = LidarDataset(train, self.projection, self.codec, grids)
+        self.val_set = LidarDataset(val, self.projection, self.codec, grids)
+        self.all_set = LidarDataset(scans, self.projection, self.codec, grids)
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
+        dataset = _ready(self.train_set)
+        if getattr(self.trainer, "overfit_batches", 0) > 0:
+            return self._ordered_loader(dataset)
+        num_replicas, rank = self._place()
+        return training_loader(
+            dataset,
+            self.batch_size,
+            num_workers=self.num_workers,
+            seed=self.seed,
+            num_replicas=num_replicas,
+            rank=rank,
+            limit_batches=1.0 if self.trainer is None else self.trainer.limit_train_batches,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+    def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
+        """Held-out scans in order, none twice; no loader where nothing is held out."""
+        dataset = _ready(self.val_set)
+        return self._ordered_loader(dataset) if len(dataset) else []
+
+    def test_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
+        """The same as for validation."""
+        return self.val_dataloader()
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """All scans in order, none twice."""
+        return self._ordered_loader(_ready(self.all_set))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Projection of the images, without which they cannot be turned into points."""
+        rings = getattr(self.projection, "ring_inclinations_deg", None)
+        return {"projection": self.projection_kind, "ring_inclinations_deg": rings}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Check that the rows of the images are those of the checkpoint.
+
+        Raises:
+            ValueError: If the projection or its ring inclinations are others.
+        """
+        if state_dict != self.state_dict():
+            raise ValueError(
+                f"The checkpoint was trained with {state_dict}, this run has {self.state_dict()}: "
+                "set projection and ring_inclinations_deg to those of the checkpoint."
+            )
+
+    def _find_features_dir(self, features_dir: str | None) -> Path | None:
+        if features_dir is not None:
+            return Path(features_dir)
+        if self.extractor is None:
+            return None
+        if not isinstance(self.scans, str) or has_magic(self.scans):
+            raise ValueError(
+                f"features_dir is needed for scans given as {self.scans!r}: only a single folder "
+                "has a default place for its feature grids."
+            )
+        return default_features_dir(
+            self.scans, cast(Extractor, self.extractor).name, self.grid_size
+        )
+
+    def _limited_split(self) -> tuple[list[Scan], list[Scan]]:
+        train, val = self.split()
+        return _spread(train, self.limit), _spread(val, self.limit)
+
+    def _make_projection(self, train: Sequence[Scan]) -> Projection:
+        if self.projection_kind == "spherical":
+            return SphericalProjection(self.sensor)
+        if self.ring_inclinations_deg is not None:
+            return RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
+        scans = (
+            torch.from_numpy(read_scan(scan.path, self.sensor)[:, :3])
+            for scan in train[:_SCANS_TO_FIT]
+        )
+        return RingProjection.fit(scans, self.sensor)
+
+    def _place(self) -> tuple[int, int]:
+        """Number of processes and which of them this is."""
+        return (
+            (1, 0) if self.trainer is None else (self.trainer.world_size, self.trainer.global_rank)
+        )
+
+    def _ordered_loader(self, dataset: LidarDataset) -> DataLoader[Any]:
+        num_replicas, rank = self._place()
+        if len(dataset) < num_replicas:
+            raise ValueError(
+                f"{len(dataset)} scans are fewer than the {num_replicas} processes, each of which "
+                "needs one: use more scans or fewer devices."
+            )
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            # Lightning's default pads the last batch with scans that then count twice.
+            sampler=UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False),
+            num_workers=self.num_workers,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+            generator=torch.Generator(),  # the default would draw from the global random state
+        )
+
+
+class KITTI360DataModule(LidarDataModule):
+    """KITTI-360 with the split of R2DM and RangeLDM: drives 0 and 2 are held out.
+
+    Only ``data_3d_raw`` is needed.
+
+    Args:
+        root: Folder that holds ``data_3d_raw``.
+        kwargs: Arguments of :class:`LidarDataModule`.
+    """
+
+    def __init__(self, root: str, **kwargs: Any) -> None:
+        super().__init__(
+            scans=root, val_every=None, val_drives=list(KITTI360_DRIVES["val"]), **kwargs
+        )
+        self.root = root
+
+    def split(self) -> tuple[list[Scan], list[Scan]]:
+        """Scans of the official training and validation drives that are present."""
+        return kitti360_scans(self.root, "train"), kitti360_scans(self.root, "val")
+
+
+class SimulatedDataModule(KITTI360DataModule):
+    """Simulated streets in the KITTI-360 layout, made before the first use.
+
+    Args:
+        root: Folder of the data set; filled where it is not complete.
+        num_scans: Scans to simulate, over all drives.
+        simulation_seed: Seed of the streets.
+        kwargs: Arguments of :class:`LidarDataModule`.
+    """
+
+    def __init__(
+        self, root: str, num_scans: int = 1000, simulation_seed: int = 0, **kwargs: Any
+    ) -> None:
+        super().__init__(root, **kwargs)
+        self.num_scans = num_scans
+        self.simulation_seed = simulation_seed
+
+    def prepare_data(self) -> None:
+        """Simulate the scans and make the feature grids that are missing."""
+        simulate(
+            Path(self.root),
+            scans=self.num_scans,
+            seed=self.simulation_seed,
+            workers=max(1, self.num_workers),
+        )
+        super().prepare_data()
+
+
+def _ready(dataset: LidarDataset | None) -> LidarDataset:
+    if dataset is None:
+        raise ValueError("Call prepare_data() and setup('fit') before asking for a loader.")
+    return dataset
+
+
+def _spread(scans: list[Scan], limit: int | None) -> list[Scan]:
+    if limit is None or limit >= len(scans):
+        return scans
+    return [scans[i * len(scans) // limit] for i in range(limit)]
+
+
+def _log_progress(done: int, total: int) -> None:
+    if done == 1 or done == total or done * 100 // total > (done - 1) * 100 // total:
+        rank_zero_info(f"feature grids: {done} of {total}")

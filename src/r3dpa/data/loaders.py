@@ -1,0 +1,172 @@
+"""Training loader that restarts at any batch and does not depend on the number of processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sized
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+
+class EpochSampler(DistributedSampler[int]):
+    """Seeded shuffle of each epoch, dealt out to the processes in turn.
+
+    Position p of an epoch goes to process ``p % processes``, so that a batch over all processes
+    holds the same samples whatever their number, as long as ``batch_size * processes`` is the
+    same. The order is a function of (seed, epoch) alone. A rest smaller than the number of
+    processes is dropped.
+
+    Args:
+        dataset: Its length is used.
+        seed: Seed of the order, not negative.
+        num_replicas: Number of processes.
+        rank: This process, in ``[0, num_replicas)``.
+
+    Attributes:
+        start: Samples of this process that the next pass skips; nothing of them is read.
+        epoch_shift: Added to the epoch that the trainer sets.
+    """
+
+    def __init__(
+        self, dataset: Dataset[Any], seed: int = 0, num_replicas: int = 1, rank: int = 0
+    ) -> None:
+        super().__init__(dataset, num_replicas, rank, shuffle=True, seed=seed, drop_last=True)
+        self.start = 0
+        self.epoch_shift = 0
+
+    def __iter__(self) -> Iterator[int]:
+        """Indices of this process in the current epoch, from ``start`` on."""
+        generator = np.random.default_rng((self.seed, self.epoch + self.epoch_shift))
+        order = generator.permutation(len(cast(Sized, self.dataset)))
+        own = order[self.rank : self.total_size : self.num_replicas]
+        return iter(own[self.start :].tolist())
+
+
+class ResumableLoader(DataLoader[Any]):
+    """Loader whose state is its place in the data: epoch, and samples of it handed out.
+
+    Lightning saves the state in every checkpoint and gives it back when a run is resumed; the
+    next batch is then the one that the interrupted run would have received. Batches that loader
+    processes have prefetched but not handed out are not counted. The loader draws nothing from
+    the global random state.
+
+    Build it with :func:`training_loader`, for Lightning rebuilds loaders from the arguments of
+    ``DataLoader``.
+
+    Attributes:
+        batches_per_epoch: Batches that the trainer takes of each epoch.
+    """
+
+    batches_per_epoch = 0
+    _epoch = 0  # epoch of the current or last pass
+    _handed_out = 0  # batches of it
+    _resume_at: tuple[int, int] | None = None  # epoch and batch at which the next pass starts
+
+    @property
+    def _samples_per_batch(self) -> int:
+        return cast(int, self.batch_size) * cast(EpochSampler, self.sampler).num_replicas
+
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        """Batches of the epoch, or of the rest of it after a resume.
+
+        A generator, so that nothing is read before the first batch is asked for: Lightning makes
+        the iterator first and sets the epoch of the sampler later.
+        """
+        sampler = cast(EpochSampler, self.sampler)
+        first = 0
+        if self._resume_at is not None:
+            # A trainer that stopped at max_steps within an epoch counts this epoch as complete
+            # when it saves afterwards, and goes on with the rest of it under the next number.
+            epoch, first = self._resume_at
+            sampler.epoch_shift, self._resume_at = epoch - sampler.epoch, None
+        sampler.start = first * cast(int, self.batch_size)
+        self._epoch, self._handed_out = sampler.epoch + sampler.epoch_shift, first
+        for batch in super().__iter__():
+            self._handed_out += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """Place of the next batch: epoch, samples before it in the epoch over all processes."""
+        epoch, batches = self._resume_at or (self._epoch, self._handed_out)
+        if batches >= (self.batches_per_epoch or len(self)):
+            epoch, batches = epoch + 1, 0
+        return {
+            "epoch": epoch,
+            "samples": batches * self._samples_per_batch,
+            "dataset_size": len(cast(Sized, self.dataset)),
+            "seed": cast(EpochSampler, self.sampler).seed,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Go on at a saved place.
+
+        Raises:
+            ValueError: If the place lies within an epoch over other data, or of another order, or
+                within one batch of this loader.
+        """
+        samples, num_scans = state_dict["samples"], len(cast(Sized, self.dataset))
+        seed = cast(EpochSampler, self.sampler).seed
+        if samples and (state_dict["dataset_size"], state_dict["seed"]) != (num_scans, seed):
+            raise ValueError(
+                f"The checkpoint was saved within an epoch over {state_dict['dataset_size']} scans "
+                f"in the order of seed {state_dict['seed']}, but this run has {num_scans} scans "
+                f"and seed {seed}: resume with the same data and seed, or start a new run from "
+                "the weights."
+            )
+        if samples % self._samples_per_batch:
+            raise ValueError(
+                f"The checkpoint was saved after {samples} scans of an epoch, which is no multiple "
+                f"of this run's batch of {self._samples_per_batch} scans (batch_size x processes): "
+                "resume with the same total batch."
+            )
+        self._resume_at = (state_dict["epoch"], samples // self._samples_per_batch)
+
+
+def training_loader(
+    dataset: Dataset[Any],
+    batch_size: int,
+    *,
+    num_workers: int = 0,
+    seed: int = 0,
+    num_replicas: int = 1,
+    rank: int = 0,
+    limit_batches: float = 1.0,
+    pin_memory: bool = False,
+) -> ResumableLoader:
+    """Shuffled, resumable loader of full batches.
+
+    Args:
+        dataset: Map-style data set without randomness of its own.
+        batch_size: Samples per batch and process.
+        num_workers: Loader processes; the order of the batches does not depend on it.
+        seed: Seed of the order.
+        num_replicas: Number of training processes.
+        rank: This training process.
+        limit_batches: ``limit_train_batches`` of the trainer: an int is a number of batches of each
+            epoch, a float a share of them.
+        pin_memory: Copy batches to page-locked memory for a GPU.
+
+    Raises:
+        ValueError: If the data set is smaller than one batch over all processes.
+    """
+    num_scans = len(cast(Sized, dataset))
+    if num_scans < batch_size * num_replicas:
+        raise ValueError(
+            f"{num_scans} training scans do not fill one batch of {batch_size} scans for each of "
+            f"{num_replicas} processes: use a smaller batch_size or more scans."
+        )
+    loader = ResumableLoader(
+        dataset,
+        batch_size=batch_size,
+        sampler=EpochSampler(dataset, seed, num_replicas, rank),
+        num_workers=num_workers,
+        drop_last=True,
+        pin_memory=pin_memory,
+        persistent_workers=num_workers > 0,
+        generator=torch.Generator(),  # the default one would draw from the global random state
+    )
+    batches = limit_batches if isinstance(limit_batches, int) else limit_batches * len(loader)
+    loader.batches_per_epoch = min(int(batches), len(loader))
+    return loader

@@ -1,0 +1,229 @@
+"""Point features without any training: local shape, height and direction, lifted at random."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
+
+# Neighbourhood in pixels: wider than high, as a spinning sensor samples more densely in azimuth.
+_ROW_OFFSETS = (-2, -1, 0, 1, 2)
+_COLUMN_OFFSETS = (-6, -3, -1, 0, 1, 3, 6)
+# One image for all sensors: 0.42 deg per row, finer than the beams of a 64-beam sensor.
+_IMAGE = LidarSensor(
+    beams=96,
+    columns=1024,
+    inclination_max_deg=15.0,
+    inclination_min_deg=-25.0,
+    range_min_m=0.0,
+    range_max_m=1e6,
+)
+_PROJECTION = SphericalProjection(_IMAGE)
+# A neighbour belongs to the surface of the centre if the ranges differ by less than this.
+_GATE_M, _GATE_SHARE = 0.3, 0.05
+# Spread below which a direction counts as not covered: the noise of a range measurement.
+_NOISE_M = 0.01
+_SENSOR_HEIGHT_M = 1.73
+# Mean and standard deviation of the nine `descriptors` over points of real HDL-64E scans.
+_CENTRES = (0.47, 0.64, 0.13, -0.27, 0.0, 0.54, 0.61, 2.3, 0.26)
+_SPREADS = (0.18, 0.23, 0.13, 0.34, 0.36, 0.63, 0.85, 0.63, 0.15)
+_BANDWIDTH = 2.0  # of the Gaussian kernel, in standard deviations
+_KERNEL_WIDTH = 64
+
+
+class GeometricFeatures(nn.Module):
+    """Frozen, label-free feature extractor: what a point's surroundings look like.
+
+    Nine values per point (see :meth:`descriptors`) are standardised with fixed constants and
+    lifted to ``dim`` values of unit norm, whose inner product is a Gaussian kernel of the nine::
+
+        phi(x) = [cos(W x), sin(W x)] / sqrt(K / 2),    features = Q phi(x),    Q^T Q = I
+
+    Source of the lift: Rahimi and Recht, "Random Features for Large-Scale Kernel Machines"
+    (NeurIPS 2007); of the shape values: eigenvalue features as in Demantké et al.,
+    "Dimensionality based scale selection in 3D LiDAR point clouds" (2011).
+
+    Args:
+        dim: Width D of the features, even.
+        seed: Seed of W and Q.
+
+    Attributes:
+        name: ``"geometric"``.
+        settings: What determines the features, see :class:`r3dpa.data.Extractor`.
+
+    Raises:
+        ValueError: If ``dim`` is odd or below 2.
+    """
+
+    frequencies: Tensor
+    basis: Tensor
+
+    def __init__(self, dim: int = 768, seed: int = 0) -> None:
+        super().__init__()
+        if dim < 2 or dim % 2:
+            raise ValueError(f"dim must be even and at least 2, got {dim}.")
+        self.name = "geometric"
+        self.dim = dim
+        self.settings: dict[str, Any] = {"seed": seed, "version": 1}
+        width = min(dim, _KERNEL_WIDTH)
+        generator = torch.Generator().manual_seed(seed)
+        frequencies = torch.randn(len(_CENTRES), width // 2, generator=generator) / _BANDWIDTH
+        q, r = torch.linalg.qr(torch.randn(dim, width, generator=generator, dtype=torch.float64))
+        basis = q * r.diagonal().sign()  # LAPACK libraries differ in the signs of Q
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.register_buffer("basis", basis.float(), persistent=False)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Features of unit norm.
+
+        Args:
+            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
+
+        Returns:
+            ``(P, dim)`` float32.
+        """
+        return self.lift(self.point_features(points))
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Kernel features ``phi`` of unit norm, ``(P, min(dim, 64))``, before the linear lift."""
+        descriptors = self.descriptors(points)
+        centre, spread = descriptors.new_tensor(_CENTRES), descriptors.new_tensor(_SPREADS)
+        phase = ((descriptors - centre) / spread) @ self.frequencies
+        return torch.cat([phase.cos(), phase.sin()], dim=1) / math.sqrt(phase.shape[1])
+
+    def lift(self, features: Tensor) -> Tensor:
+        """Linear, norm-preserving map of ``point_features``, or of means of them, to ``dim``."""
+        return features @ self.basis.T
+
+    def descriptors(self, points: Tensor) -> Tensor:
+        """Nine values per point that describe its surroundings.
+
+        With the standard deviations s1 >= s2 >= s3 of the neighbours along their principal axes
+        and the normal n, the axis of s3, turned towards the sensor:
+
+        0. linearity 1 - s2/s1 (1 where the neighbours lie on a line),
+        1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane however sampled),
+        2. sphericity s3/s1,
+        3. n along the horizontal viewing direction, 4. n across it, 5. n upwards,
+        6. height above the ground for a sensor 1.73 m up, metres,
+        7. natural logarithm of the range in metres,
+        8. intensity.
+
+        Values 3 and 4 turn with the ray: rotating the scan about z rotates the features with it.
+
+        Args:
+            points: ``(P, 4)`` x, y, z in metres, intensity.
+
+        Returns:
+            ``(P, 9)`` float32. A point with fewer than three neighbours has shape and normal 0.
+        """
+        xyz = points[:, :3].float()
+        radius = torch.linalg.vector_norm(xyz, dim=1)
+        row, column = _PROJECTION.pixel_of(xyz)
+        pixel = row * _IMAGE.columns + column
+        shape, normal = _local_shape(xyz, pixel)
+        azimuth = torch.atan2(xyz[:, 1], xyz[:, 0])
+        cos, sin = azimuth.cos(), azimuth.sin()
+        along = normal[:, 0] * cos + normal[:, 1] * sin
+        across = normal[:, 1] * cos - normal[:, 0] * sin
+        height = xyz[:, 2] + _SENSOR_HEIGHT_M
+        log_range = radius.clamp_min(0.1).log()
+        own = [along, across, normal[:, 2], height, log_range, points[:, 3].float()]
+        return torch.cat([shape, torch.stack(own, dim=1)], dim=1)
+
+
+def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Linearity, planarity, sphericity ``(P, 3)`` and normal ``(P, 3)`` of each point's pixel.
+
+    The neighbours of a pixel are the nearest returns of the pixels around it, columns wrapping,
+    whose range is close to its own.
+    """
+    rows, columns = _IMAGE.beams, _IMAGE.columns
+    range_m, nearest = range_image(xyz, _PROJECTION, xyz)
+    assert nearest is not None
+    image = torch.cat([nearest, torch.where(range_m > 0, range_m, torch.inf)[None]])
+    occupied = torch.nonzero(range_m.flatten() > 0)[:, 0]
+    # Wrap columns, add empty rows above and below, so that each offset is one slice of memory.
+    pad_rows, pad_columns = max(_ROW_OFFSETS), max(_COLUMN_OFFSETS)
+    image = torch.cat([image[..., -pad_columns:], image, image[..., :pad_columns]], dim=2)
+    border = image.new_zeros(4, pad_rows, image.shape[2])
+    border[3] = torch.inf
+    image = torch.cat([border, image, border], dim=1)
+    width = image.shape[2]
+    image = image.reshape(4, -1)
+    centre = (occupied // columns + pad_rows) * width + occupied % columns + pad_columns
+    own = image[:, centre]
+    gate = _GATE_M + _GATE_SHARE * own[3]
+    count = torch.zeros_like(own[3])
+    first = torch.zeros_like(own[:3])
+    second = own.new_zeros(6, len(centre))
+    for row_offset in _ROW_OFFSETS:
+        for column_offset in _COLUMN_OFFSETS:
+            other = image[:, centre + (row_offset * width + column_offset)]
+            near = ((other[3] - own[3]).abs() < gate).float()
+            x, y, z = (other[:3] - own[:3]) * near
+            count += near
+            first += torch.stack([x, y, z])
+            second += torch.stack([x * x, y * y, z * z, x * y, x * z, y * z])
+    mean = first / count
+    mx, my, mz = mean
+    second = second / count - torch.stack([mx * mx, my * my, mz * mz, mx * my, mx * mz, my * mz])
+    values, normal = _symmetric_eigen(second.double())
+    s1, s2, s3 = values.clamp_min(0).sqrt()
+    shape = torch.stack(
+        [
+            1 - s2 / s1.clamp_min(1e-9),
+            (s2 - s3) / (s2 + _NOISE_M),
+            s3 / s1.clamp_min(1e-9),
+        ]
+    )
+    normal = normal * torch.where((normal * own[:3]).sum(dim=0) > 0, -1.0, 1.0)
+    both = torch.cat([shape, normal]) * (count >= 3)
+    table = xyz.new_zeros(rows * columns, 6)
+    table[occupied] = both.T.float()
+    per_point = table[pixel]
+    return per_point[:, :3], per_point[:, 3:]
+
+
+def _symmetric_eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues ``(3, N)``, descending, and unit eigenvector ``(3, N)`` of the smallest one.
+
+    Closed form (trigonometric solution of the characteristic cubic); LAPACK needs ten times
+    longer for so many small matrices.
+
+    Args:
+        matrix: ``(6, N)`` float64 entries xx, yy, zz, xy, xz, yz.
+    """
+    xx, yy, zz, xy, xz, yz = matrix
+    mean = (xx + yy + zz) / 3
+    off = xy * xy + xz * xz + yz * yz
+    scale = (((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6).sqrt()
+    scale = scale.clamp_min(1e-12)
+    a, b, c = (xx - mean) / scale, (yy - mean) / scale, (zz - mean) / scale
+    d, e, f = xy / scale, xz / scale, yz / scale
+    half_determinant = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
+    angle = half_determinant.clamp(-1, 1).acos() / 3
+    largest = mean + 2 * scale * angle.cos()
+    smallest = mean + 2 * scale * (angle + 2 * math.pi / 3).cos()
+    values = torch.stack([largest, 3 * mean - largest - smallest, smallest])
+    # The rows of A - smallest * I span the plane across the eigenvector: take their largest
+    # cross product.
+    row_x = torch.stack([xx - smallest, xy, xz])
+    row_y = torch.stack([xy, yy - smallest, yz])
+    row_z = torch.stack([xz, yz, zz - smallest])
+    products = torch.stack(
+        [
+            torch.linalg.cross(row_x, row_y, dim=0),
+            torch.linalg.cross(row_x, row_z, dim=0),
+            torch.linalg.cross(row_y, row_z, dim=0),
+        ]
+    )
+    lengths = torch.linalg.vector_norm(products, dim=1)
+    best = lengths.argmax(dim=0)
+    columns = torch.arange(best.shape[0], device=best.device)
+    vector = products[best, :, columns].T
+    return values, vector / lengths[best, columns].clamp_min(torch.finfo(torch.float64).tiny)

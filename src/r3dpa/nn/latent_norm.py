@@ -1,0 +1,181 @@
+"""Statistics of the raw latents: normalise for the flow, denormalise for the decoder.
+
+Letters: B batch, C latent channels, h x w latent size.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.nn.functional import all_reduce
+
+from r3dpa.nn.layers import at_least_float32
+
+__all__ = ["LatentNorm"]
+
+
+class LatentNorm(nn.Module):
+    """Per-channel normalisation of latents with running statistics and an exact inverse.
+
+    A batch norm without weights whose two roles are two methods: :meth:`update` (training, batch
+    statistics) and :meth:`normalise` (running statistics). The mode of the module plays no part.
+    Both compute in at least float32 and return that dtype. State-dict names are those of
+    ``torch.nn.BatchNorm2d``.
+
+    Source: the batch norm inside SiT of REPA-E (Leng et al. 2025) and R3DPA (ICRA 2026).
+
+    Args:
+        channels: Latent channels C.
+        eps: Added to the variance inside the root.
+        momentum: Weight of the new batch in the running statistics.
+        legacy_inverse: Leave ``eps`` out of :meth:`denormalise`, as the official code does; it is
+            then 5e-5 off at variance 1 and 29 % at variance 1e-4.
+        replace_non_finite: Official handling of broken latents: NaN becomes 0 and infinities the
+            largest number. It hides the fault from the loss; the running statistics are safe
+            either way.
+
+    Raises:
+        ValueError: If ``channels`` is below 1 or ``eps`` is not above 0.
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+
+    def __init__(
+        self,
+        channels: int,
+        eps: float = 1e-4,
+        momentum: float = 0.1,
+        legacy_inverse: bool = False,
+        replace_non_finite: bool = False,
+    ) -> None:
+        super().__init__()
+        if channels < 1 or eps <= 0:
+            raise ValueError(f"channels >= 1 and eps > 0 are needed, got {channels} and {eps}")
+        self.channels = channels
+        self.eps = eps
+        self.momentum = momentum
+        self.legacy_inverse = legacy_inverse
+        self.replace_non_finite = replace_non_finite
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+        self.register_buffer("num_batches_tracked", torch.tensor(0, dtype=torch.long))
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the running statistics have seen a batch or come from a checkpoint that has.
+
+        Generation must check it: fresh statistics (0, 1) denormalise to the wrong scale.
+        """
+        return bool(self.num_batches_tracked > 0)
+
+    def normalise(self, latents: Tensor) -> Tensor:
+        """Normalise with the running statistics; a later :meth:`update` does not touch this pass.
+
+        Formula: ``(x - mean) / sqrt(var + eps)``.
+
+        Args:
+            latents: ``(B, C, h, w)`` raw latents.
+
+        Returns:
+            ``(B, C, h, w)`` latents, float32 or wider.
+
+        Raises:
+            ValueError: If ``latents`` has another number of axes or channels.
+        """
+        latents = self._repair(self._widen(latents))
+        # The root is a new tensor, so the graph holds no buffer that a later update overwrites
+        # (an eval-mode BatchNorm2d reads its buffers again in backward).
+        return (latents - _per_channel(self.running_mean, latents)) * _per_channel(
+            torch.rsqrt(self.running_var + self.eps), latents
+        )
+
+    def update(self, latents: Tensor) -> Tensor:
+        """Normalise with the statistics of this batch and move the running statistics.
+
+        The batch is that of all processes when ``torch.distributed`` is initialised; gradients
+        then flow through the shared statistics too, so every process must call it. The biased
+        variance normalises, the unbiased one enters the running statistics. A batch with a
+        non-finite latent anywhere leaves mean, variance and count as they were.
+
+        Args:
+            latents: ``(B, C, h, w)`` raw latents.
+
+        Returns:
+            ``(B, C, h, w)`` latents, float32 or wider.
+
+        Raises:
+            ValueError: If ``latents`` has another number of axes or channels, or a single value
+                per channel, which has no variance.
+        """
+        latents = self._widen(latents)
+        positions = latents.numel() // self.channels
+        distributed = dist.is_available() and dist.is_initialized()
+        if positions * (dist.get_world_size() if distributed else 1) < 2:
+            raise ValueError(
+                "batch statistics need at least two values per channel, got latents of shape "
+                f"{tuple(latents.shape)}; use a larger batch, or normalise() with the running "
+                "statistics"
+            )
+        num_broken = (~latents.isfinite()).sum(dtype=torch.float64)
+
+        # Two passes in float64: the sum of squares minus the squared mean would cancel.
+        wide = self._repair(latents).double()
+        counts = torch.stack([num_broken.new_tensor(positions), num_broken])
+        totals = torch.cat([counts, wide.sum(dim=(0, 2, 3))])
+        if distributed:
+            totals = all_reduce(totals)
+        count, num_broken = totals[0].detach(), totals[1].detach()
+        mean = totals[2:] / count
+        squares = (wide - _per_channel(mean, wide)).square().sum(dim=(0, 2, 3))
+        if distributed:
+            squares = all_reduce(squares)
+        normalised = (wide - _per_channel(mean, wide)) * _per_channel(
+            torch.rsqrt(squares / count + self.eps), wide
+        )
+        self._move_statistics(mean.detach(), squares.detach() / (count - 1), num_broken == 0)
+        return normalised.to(latents.dtype)
+
+    def denormalise(self, latents: Tensor) -> Tensor:
+        """Exact inverse of :meth:`normalise`.
+
+        Formula: ``x * sqrt(var + eps) + mean``; ``eps`` is left out with ``legacy_inverse``.
+
+        Args:
+            latents: ``(B, C, h, w)`` latents.
+
+        Returns:
+            ``(B, C, h, w)`` raw latents, float32 or wider.
+
+        Raises:
+            ValueError: If ``latents`` has another number of axes or channels.
+        """
+        latents = self._widen(latents)
+        variance = self.running_var if self.legacy_inverse else self.running_var + self.eps
+        return latents * _per_channel(variance.sqrt(), latents) + _per_channel(
+            self.running_mean, latents
+        )
+
+    def _widen(self, latents: Tensor) -> Tensor:
+        if latents.dim() != 4 or latents.shape[1] != self.channels:
+            raise ValueError(
+                f"latents must have shape (B, {self.channels}, h, w), got {tuple(latents.shape)}"
+            )
+        return at_least_float32(latents)
+
+    def _repair(self, latents: Tensor) -> Tensor:
+        return latents.nan_to_num() if self.replace_non_finite else latents
+
+    @torch.no_grad()
+    def _move_statistics(self, mean: Tensor, variance: Tensor, usable: Tensor) -> None:
+        usable = usable & mean.isfinite().all() & variance.isfinite().all()
+        for running, new in ((self.running_mean, mean), (self.running_var, variance)):
+            moved = running.double().lerp(new, self.momentum).to(running.dtype)
+            running.copy_(torch.where(usable, moved, running))
+        self.num_batches_tracked += usable
+
+
+def _per_channel(values: Tensor, latents: Tensor) -> Tensor:
+    return values.to(latents.dtype)[None, :, None, None]

@@ -1,0 +1,415 @@
+"""SiT, the flow transformer that predicts velocities and projected 3D features.
+
+Letters: B batch, C latent channels, h x w latent size, N tokens, D token width, F feature width.
+Module names follow the official state dict, except that the projection head is ``projector`` and
+the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.LatentNorm`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+
+from r3dpa.nn.layers import at_least_float32
+
+__all__ = ["SiT", "SiTOutput", "sincos_position_embedding", "time_frequencies"]
+
+_TIME_WIDTH = 256
+_MAX_PERIOD = 10_000.0
+_TOKEN_NORM_EPS = 1e-6
+_TABLE_STD = 0.02
+
+
+class SiTOutput(NamedTuple):
+    """What one evaluation of :class:`SiT` predicts.
+
+    Attributes:
+        velocity: ``(B, C, h, w)`` d x_t / d t of the normalised latents.
+        features: ``(B, N, F)`` projected features, not of unit length.
+    """
+
+    velocity: Tensor
+    features: Tensor
+
+
+def time_frequencies(time: Tensor, width: int = _TIME_WIDTH) -> Tensor:
+    """Sinusoidal features of the flow time, cosines before sines.
+
+    The time enters unscaled, so that the features of t in [0, 1] stay those of the official
+    weights. In bfloat16 neighbouring times would coincide: pass float32 or float64.
+
+    Formula: ``cos(t f_k), sin(t f_k)`` with ``f_k = 10000^(-k / (width / 2))``.
+
+    Args:
+        time: ``(B,)`` flow times in [0, 1].
+        width: Even number of features.
+
+    Returns:
+        ``(B, width)`` in [-1, 1], dtype of ``time``.
+    """
+    half = width // 2
+    exponents = torch.arange(half, dtype=time.dtype, device=time.device) / half
+    angles = time[:, None] * torch.exp(-math.log(_MAX_PERIOD) * exponents)
+    return torch.cat([angles.cos(), angles.sin()], dim=1)
+
+
+def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
+    """Fixed sine-cosine code of the token positions on a grid, row-major.
+
+    The first half of the channels encodes the column, the second half the row; each half holds
+    sines, then cosines, of ``position * 10000^(-k / (width / 4))``.
+
+    Args:
+        width: Token width, a multiple of 4.
+        grid_size: Rows and columns of the token grid.
+
+    Returns:
+        ``(1, rows * columns, width)`` in [-1, 1], float32.
+
+    Raises:
+        ValueError: If ``width`` is not a multiple of 4.
+    """
+    if width % 4:
+        raise ValueError(f"position embedding needs a width divisible by 4, got {width}")
+    rows, columns = grid_size
+    exponents = torch.arange(width // 4, dtype=torch.float64) / (width // 4)
+    frequencies = torch.exp(-math.log(_MAX_PERIOD) * exponents)
+
+    def axis_code(positions: Tensor) -> Tensor:
+        angles = positions.double()[:, None] * frequencies
+        return torch.cat([angles.sin(), angles.cos()], dim=1)
+
+    row_index, column_index = torch.arange(rows), torch.arange(columns)
+    code = torch.cat(
+        [
+            axis_code(column_index.repeat(rows)),
+            axis_code(row_index.repeat_interleave(columns)),
+        ],
+        dim=1,
+    )
+    return code[None].float()
+
+
+class SiT(nn.Module):
+    """Scalable interpolant transformer with a feature projection head (REPA).
+
+    Tokens are patches of the latents in row-major order. Each block is modulated by the embedding
+    of time and class (adaLN-zero). After block ``alignment_depth`` a three-layer MLP projects the
+    tokens to the width of the 3D features. SiT-B/2 is the default; SiT-XL/2 has ``hidden_size``
+    1152, ``depth`` 28, ``num_heads`` 16 and ``alignment_depth`` 8. The network only predicts:
+    times, noise, targets and losses live outside.
+
+    Source: SiT (Ma et al. 2024) with the alignment head of REPA (Yu et al. 2025), as used by
+    R3DPA (ICRA 2026).
+
+    Args:
+        input_size: Latent rows and columns ``(h, w)``.
+        in_channels: Latent channels C.
+        patch_size: Side of a square patch, in latent pixels.
+        hidden_size: Token width D, a multiple of 4 and of ``num_heads``.
+        depth: Number of transformer blocks.
+        num_heads: Attention heads per block.
+        mlp_ratio: Width of a block's MLP divided by ``hidden_size``.
+        alignment_depth: Number of blocks before the projection head, counted from 1.
+        feature_dim: Width F of the 3D features.
+        projector_dim: Width of the projection head.
+        num_classes: Rows of the class table.
+        class_dropout: Add a last row to the class table for "no class", as models trained with
+            label dropout have; pass its index ``num_classes`` as label to use it.
+        qk_norm: Layer-normalise queries and keys.
+        learn_pos_embed: Train the position embedding, which is otherwise a fixed buffer.
+
+    Attributes:
+        grid_size: Rows and columns of the token grid, ``(h / patch_size, w / patch_size)``.
+
+    Raises:
+        ValueError: If sizes do not divide or ``alignment_depth`` is not in [1, depth].
+    """
+
+    pos_embed: Tensor
+
+    def __init__(
+        self,
+        input_size: tuple[int, int] = (16, 128),
+        in_channels: int = 8,
+        patch_size: int = 2,
+        hidden_size: int = 768,
+        depth: int = 12,
+        num_heads: int = 12,
+        mlp_ratio: float = 4.0,
+        alignment_depth: int = 4,
+        feature_dim: int = 768,
+        projector_dim: int = 2048,
+        num_classes: int = 1,
+        class_dropout: bool = False,
+        qk_norm: bool = False,
+        learn_pos_embed: bool = False,
+    ) -> None:
+        super().__init__()
+        rows, columns = input_size
+        if rows % patch_size or columns % patch_size:
+            raise ValueError(
+                f"latents of {rows} x {columns} do not divide into patches of {patch_size}; "
+                "choose a patch_size that divides both"
+            )
+        if hidden_size % num_heads:
+            raise ValueError(
+                f"hidden_size {hidden_size} is not a multiple of num_heads {num_heads}"
+            )
+        if not 1 <= alignment_depth <= depth:
+            raise ValueError(
+                f"alignment_depth must lie in 1..depth = 1..{depth}, got {alignment_depth}"
+            )
+        self.input_size = (rows, columns)
+        self.in_channels = in_channels
+        self.patch_size = patch_size
+        self.grid_size = (rows // patch_size, columns // patch_size)
+        self.alignment_depth = alignment_depth
+        self.feature_dim = feature_dim
+        self.num_classes = num_classes
+
+        self.x_embedder = _PatchEmbedding(in_channels, hidden_size, patch_size)
+        self.t_embedder = _TimeEmbedding(hidden_size)
+        self.y_embedder = _ClassEmbedding(num_classes + int(class_dropout), hidden_size)
+        position = sincos_position_embedding(hidden_size, self.grid_size)
+        if learn_pos_embed:
+            self.pos_embed = nn.Parameter(position)
+        else:
+            self.register_buffer("pos_embed", position)
+        self.blocks = nn.ModuleList(
+            _Block(hidden_size, num_heads, mlp_ratio, qk_norm) for _ in range(depth)
+        )
+        self.projector = nn.Sequential(
+            _xavier(nn.Linear(hidden_size, projector_dim)),
+            nn.SiLU(),
+            _xavier(nn.Linear(projector_dim, projector_dim)),
+            nn.SiLU(),
+            _xavier(nn.Linear(projector_dim, feature_dim)),
+        )
+        self.final_layer = _FinalLayer(hidden_size, patch_size**2 * in_channels)
+
+    def forward(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> SiTOutput:
+        """Velocity and projected features from one pass through all blocks.
+
+        Args:
+            latents: ``(B, C, h, w)`` noisy normalised latents.
+            time: ``(B,)`` flow times, 0 data, 1 noise.
+            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
+
+        Returns:
+            Velocity ``(B, C, h, w)`` and features ``(B, N, F)``.
+
+        Raises:
+            ValueError: If a shape does not fit the network, or a model of several classes gets
+                no labels.
+        """
+        tokens, conditioning = self._aligned_tokens(latents, time, labels)
+        return SiTOutput(self._finish(tokens, conditioning), self.projector(tokens))
+
+    def velocity(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> Tensor:
+        """Velocity alone; the projection head is not evaluated.
+
+        Args:
+            latents: ``(B, C, h, w)`` noisy normalised latents.
+            time: ``(B,)`` flow times, 0 data, 1 noise.
+            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
+
+        Returns:
+            ``(B, C, h, w)`` d x_t / d t.
+
+        Raises:
+            ValueError: As :meth:`forward`.
+        """
+        return self._finish(*self._aligned_tokens(latents, time, labels))
+
+    def project_features(
+        self, latents: Tensor, time: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
+        """Projected features alone; only the first ``alignment_depth`` blocks are evaluated.
+
+        Args:
+            latents: ``(B, C, h, w)`` noisy normalised latents.
+            time: ``(B,)`` flow times, 0 data, 1 noise.
+            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
+
+        Returns:
+            ``(B, N, F)``, not of unit length.
+
+        Raises:
+            ValueError: As :meth:`forward`.
+        """
+        return self.projector(self._aligned_tokens(latents, time, labels)[0])
+
+    def _aligned_tokens(
+        self, latents: Tensor, time: Tensor, labels: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens ``(B, N, D)`` after block ``alignment_depth`` and conditioning ``(B, D)``."""
+        self._check(latents, time, labels)
+        if labels is None:
+            labels = torch.zeros(len(latents), dtype=torch.long, device=latents.device)
+        tokens = self.x_embedder(latents) + self.pos_embed
+        conditioning = (self.t_embedder(time) + self.y_embedder(labels)).to(tokens.dtype)
+        for block in self.blocks[: self.alignment_depth]:
+            tokens = block(tokens, conditioning)
+        return tokens, conditioning
+
+    def _finish(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
+        for block in self.blocks[self.alignment_depth :]:
+            tokens = block(tokens, conditioning)
+        patches = self.final_layer(tokens, conditioning)
+        return rearrange(
+            patches,
+            "B (row column) (p q C) -> B C (row p) (column q)",
+            row=self.grid_size[0],
+            p=self.patch_size,
+            q=self.patch_size,
+        )
+
+    def _check(self, latents: Tensor, time: Tensor, labels: Tensor | None) -> None:
+        expected = (self.in_channels, *self.input_size)
+        if latents.shape[1:] != expected:
+            raise ValueError(
+                f"SiT was built for latents of shape (B, {', '.join(map(str, expected))}), "
+                f"got {tuple(latents.shape)}"
+            )
+        if time.shape != latents.shape[:1]:
+            raise ValueError(
+                f"time must hold one value per sample, shape ({len(latents)},), "
+                f"got {tuple(time.shape)}"
+            )
+        if labels is None and self.num_classes > 1:
+            raise ValueError(f"a model of {self.num_classes} classes needs labels")
+        if labels is not None and labels.shape != latents.shape[:1]:
+            raise ValueError(
+                f"labels must hold one class per sample, shape ({len(latents)},), "
+                f"got {tuple(labels.shape)}"
+            )
+
+
+def _xavier(layer: nn.Linear) -> nn.Linear:
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _zero(layer: nn.Linear) -> nn.Linear:
+    """Start of all modulations and of the output: every block is the identity, the velocity 0."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class _PatchEmbedding(nn.Module):
+    def __init__(self, in_channels: int, hidden_size: int, patch_size: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(in_channels, hidden_size, patch_size, stride=patch_size)
+        nn.init.xavier_uniform_(self.proj.weight.flatten(1))
+        nn.init.zeros_(self.proj.get_parameter("bias"))
+
+    def forward(self, latents: Tensor) -> Tensor:
+        return rearrange(self.proj(latents), "B D row column -> B (row column) D")
+
+
+class _WideLinear(nn.Linear):
+    """Linear layer in at least float32, whatever the rest of the network runs in."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        weight, bias = at_least_float32(self.weight), at_least_float32(self.bias)
+        with torch.autocast(device_type=inputs.device.type, enabled=False):
+            return F.linear(inputs.to(weight.dtype), weight, bias)
+
+
+class _TimeEmbedding(nn.Module):
+    """Time to token width, kept apart from bfloat16, in which neighbouring times coincide."""
+
+    def __init__(self, hidden_size: int) -> None:
+        super().__init__()
+        first, second = _WideLinear(_TIME_WIDTH, hidden_size), _WideLinear(hidden_size, hidden_size)
+        for layer in (first, second):
+            nn.init.normal_(layer.weight, std=_TABLE_STD)
+            nn.init.zeros_(layer.bias)
+        self.mlp = nn.Sequential(first, nn.SiLU(), second)
+
+    def forward(self, time: Tensor) -> Tensor:
+        return self.mlp(time_frequencies(at_least_float32(time)))
+
+
+class _ClassEmbedding(nn.Module):
+    def __init__(self, num_rows: int, hidden_size: int) -> None:
+        super().__init__()
+        self.embedding_table = nn.Embedding(num_rows, hidden_size)
+        nn.init.normal_(self.embedding_table.weight, std=_TABLE_STD)
+
+    def forward(self, labels: Tensor) -> Tensor:
+        return self.embedding_table(labels)
+
+
+class _Attention(nn.Module):
+    def __init__(self, hidden_size: int, num_heads: int, qk_norm: bool) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.qkv = _xavier(nn.Linear(hidden_size, 3 * hidden_size))
+        head_width = hidden_size // num_heads
+        self.q_norm = nn.LayerNorm(head_width) if qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(head_width) if qk_norm else nn.Identity()
+        self.proj = _xavier(nn.Linear(hidden_size, hidden_size))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        query, key, value = rearrange(
+            self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads
+        )
+        # Layer norm answers in float32 under autocast; attention wants one dtype.
+        query, key = self.q_norm(query).to(value.dtype), self.k_norm(key).to(value.dtype)
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
+
+
+class _Mlp(nn.Module):
+    def __init__(self, hidden_size: int, mlp_size: int) -> None:
+        super().__init__()
+        self.fc1 = _xavier(nn.Linear(hidden_size, mlp_size))
+        self.fc2 = _xavier(nn.Linear(mlp_size, hidden_size))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(tokens), approximate="tanh"))
+
+
+def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:
+    return nn.Sequential(nn.SiLU(), _zero(nn.Linear(hidden_size, num_vectors * hidden_size)))
+
+
+def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    normalised = F.layer_norm(tokens, tokens.shape[-1:], eps=_TOKEN_NORM_EPS)
+    return normalised * (1 + scale[:, None]) + shift[:, None]
+
+
+class _Block(nn.Module):
+    def __init__(self, hidden_size: int, num_heads: int, mlp_ratio: float, qk_norm: bool) -> None:
+        super().__init__()
+        self.attn = _Attention(hidden_size, num_heads, qk_norm)
+        self.mlp = _Mlp(hidden_size, int(hidden_size * mlp_ratio))
+        self.adaLN_modulation = _modulation(hidden_size, 6)
+
+    def forward(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
+        shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp = self.adaLN_modulation(
+            conditioning
+        ).chunk(6, dim=1)
+        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn))
+        tokens = tokens + gate_attn[:, None] * attended
+        return tokens + gate_mlp[:, None] * self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp))
+
+
+class _FinalLayer(nn.Module):
+    def __init__(self, hidden_size: int, patch_values: int) -> None:
+        super().__init__()
+        self.linear = _zero(nn.Linear(hidden_size, patch_values))
+        self.adaLN_modulation = _modulation(hidden_size, 2)
+
+    def forward(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
+        shift, scale = self.adaLN_modulation(conditioning).chunk(2, dim=1)
+        return self.linear(_modulated_norm(tokens, shift, scale))

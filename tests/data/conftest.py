@@ -1,0 +1,71 @@
+"""Small scans and a small extractor for the tests of r3dpa.data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from r3dpa.geometry import LidarSensor
+
+
+class ScaledPoints(nn.Module):
+    """Extractor whose features are the points times a gain."""
+
+    name = "scaled"
+    dim = 4
+
+    def __init__(self, gain=1.0, fail_after=None):
+        super().__init__()
+        self.settings = {"gain": gain}
+        self.fail_after = fail_after
+        self.calls = 0
+
+    def forward(self, points):
+        self.calls += 1
+        if self.fail_after is not None and self.calls > self.fail_after:
+            raise RuntimeError("interrupted")
+        return points * self.settings["gain"]
+
+
+def random_points(seed, count=300):
+    generator = np.random.default_rng(seed)
+    direction = generator.normal(size=(count, 3)) * (1, 1, 0.1)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = direction * generator.uniform(2, 50, (count, 1))
+    return np.concatenate([points, generator.uniform(0, 1, (count, 1))], 1).astype(np.float32)
+
+
+@pytest.fixture
+def sensor():
+    return LidarSensor(beams=8, columns=32)
+
+
+@pytest.fixture
+def make_scans():
+    """Function that writes `count` different scans into a folder."""
+
+    def make(folder, count, seed=0):
+        folder.mkdir(parents=True, exist_ok=True)
+        for frame in range(count):
+            points = random_points(1000 * seed + frame)
+            (folder / f"{frame:010d}.bin").write_bytes(points.tobytes())
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def scaled_points():
+    """The extractor class."""
+    return ScaledPoints
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Loader processes and the suite share few cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from r3dpa.data import LidarDataset, find_scans
+from r3dpa.data.feature_grids import FeatureGrids, write_feature_grids
+from r3dpa.data.scans import ScanError
+from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
+
+
+@pytest.fixture
+def projection(sensor):
+    return SphericalProjection(sensor)
+
+
+def write(folder, points):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "000000.bin").write_bytes(np.array(points, "<f4").tobytes())
+    return find_scans(folder)
+
+
+def test_one_point_falls_into_its_pixel_with_its_range(tmp_path, projection):
+    # 14 m straight ahead: centre column; inclination 0 is 3 of 28 degrees below the top: row 0.
+    (sample,) = LidarDataset(write(tmp_path, [[14, 0, 0, 1]]), projection, RangeCodec())
+    assert sample["range_image"].shape == (1, 8, 32)
+    assert sample["valid_mask"].nonzero().tolist() == [[0, 0, 16]]
+    assert sample["range_image"][0, 0, 16].item() == pytest.approx(2 * 14 / 56 - 1)
+    assert sample["range_image"].sum().item() == pytest.approx(-255 - 0.5)
+    assert (sample["index"], sample["name"]) == (0, f"{tmp_path.name}/000000")
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_with_grids(tmp_path, make_scans, projection, scaled_points, workers):
+    scans = find_scans(make_scans(tmp_path / "scans", 5))
+    write_feature_grids(scans, scaled_points(), projection, (2, 4), tmp_path / "grids")
+    grids = FeatureGrids(tmp_path / "grids", scans, projection, (2, 4))
+    dataset = LidarDataset(scans, projection, RangeCodec("log2"), grids)
+    single = [dataset[index] for index in range(5)]
+    batches = list(DataLoader(dataset, batch_size=3, num_workers=workers))
+    for key in ("range_image", "valid_mask", "feature_grid"):
+        joined = torch.cat([batch[key] for batch in batches])
+        assert torch.equal(joined, torch.stack([sample[key] for sample in single]))
+    assert batches[1]["index"].tolist() == [3, 4]
+    assert batches[1]["name"] == ["scans/0000000003", "scans/0000000004"]
+    assert batches[0]["feature_grid"].shape == (3, 8, 4)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_bad_scan_is_named_from_any_process(tmp_path, make_scans, projection, workers):
+    folder = make_scans(tmp_path / "scans", 3)
+    (folder / "0000000001.bin").write_bytes(b"12345")
+    dataset = LidarDataset(find_scans(folder), projection, RangeCodec())
+    with pytest.raises(ScanError, match=r"0000000001\.bin.*5 bytes"):
+        list(DataLoader(dataset, num_workers=workers))
+
+
+def test_scan_in_no_ring_order_is_named(tmp_path, make_scans):
+    sensor = LidarSensor(beams=4, columns=32)
+    scans = find_scans(make_scans(tmp_path / "scans", 1))
+    rings = RingProjection(sensor, (0.0, -5.0, -10.0, -15.0))
+    with pytest.raises(ScanError, match=r"0000000000\.bin: cannot be projected: .*ring"):
+        LidarDataset(scans, rings, RangeCodec())[0]

@@ -1,0 +1,131 @@
+from itertools import chain
+
+import pytest
+import torch
+from torch.utils.data import Dataset
+
+from r3dpa.data.loaders import training_loader
+
+
+class Numbers(Dataset):
+    def __init__(self, count):
+        self.count = count
+        self.read = []
+
+    def __len__(self):
+        return self.count
+
+    def __getitem__(self, index):
+        self.read.append(index)
+        return index
+
+
+def batches(loader, epoch):
+    loader.sampler.set_epoch(epoch)
+    return [batch.tolist() for batch in loader]
+
+
+@pytest.mark.parametrize("count", [64, 70, 79])
+def test_global_batches_do_not_depend_on_the_number_of_processes(count):
+    per_count = {}
+    for processes in (1, 2, 4):
+        ranks = [
+            batches(
+                training_loader(Numbers(count), 8 // processes, num_replicas=processes, rank=rank),
+                epoch=3,
+            )
+            for rank in range(processes)
+        ]
+        # Position i of rank r is position i * processes + r of the global batch.
+        per_count[processes] = [
+            [sample for group in zip(*parts, strict=True) for sample in group]
+            for parts in zip(*ranks, strict=True)
+        ]
+    assert per_count[1] == per_count[2] == per_count[4]
+    assert len(per_count[1]) == count // 8
+    seen = list(chain(*per_count[1]))
+    assert len(set(seen)) == len(seen)
+
+
+def test_order_is_a_function_of_seed_and_epoch():
+    orders = [
+        tuple(map(tuple, batches(training_loader(Numbers(32), 4, seed=seed), epoch)))
+        for seed in (0, 1)
+        for epoch in (0, 1)
+    ]
+    assert len(set(orders)) == 4  # seed + epoch, the rule of the base class, would give three
+    again = training_loader(Numbers(32), 4, seed=1)
+    assert tuple(map(tuple, batches(again, 1))) == orders[3]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_state_counts_what_was_handed_out_not_what_was_prefetched(workers):
+    loader = training_loader(Numbers(40), 4, num_workers=workers)
+    whole = batches(loader, 0)
+    iterator = iter(loader)
+    first = [next(iterator).tolist() for _ in range(3)]
+    state = loader.state_dict()
+    assert (state["epoch"], state["samples"]) == (0, 12)
+    data = Numbers(40)
+    resumed = training_loader(data, 4, num_workers=workers)
+    resumed.load_state_dict(state)
+    assert resumed.state_dict() == state
+    assert first + batches(resumed, 0) == whole
+    if workers == 0:
+        assert sorted(data.read) == sorted(chain(*whole[3:]))  # nothing was read to be skipped
+    assert batches(resumed, 1) == batches(loader, 1)
+
+
+def test_an_old_iterator_that_dies_late_does_not_disturb_the_next_pass():
+    loader = training_loader(Numbers(40), 4)
+    expected = batches(loader, 1)
+    loader.sampler.set_epoch(0)
+    old = iter(loader)
+    next(old)
+    loader.sampler.set_epoch(1)
+    new = iter(loader)
+    old.close()
+    assert [batch.tolist() for batch in new] == expected
+    assert loader.state_dict()["epoch"] == 2
+
+
+def test_resume_with_another_number_of_processes_of_the_same_total_batch():
+    one = training_loader(Numbers(40), 8)
+    whole = batches(one, 0)
+    iterator = iter(one)
+    next(iterator)
+    state = one.state_dict()
+    ranks = []
+    for rank in range(2):
+        two = training_loader(Numbers(40), 4, num_replicas=2, rank=rank)
+        two.load_state_dict(state)
+        ranks.append(batches(two, 0))
+    joined = [
+        [sample for pair in zip(*parts, strict=True) for sample in pair]
+        for parts in zip(*ranks, strict=True)
+    ]
+    assert joined == whole[1:]
+
+
+def test_place_in_other_data_or_within_a_batch_is_refused():
+    loader = training_loader(Numbers(40), 4)
+    iterator = iter(loader)
+    next(iterator)
+    state = loader.state_dict()
+    with pytest.raises(ValueError, match=r"over 40 scans .* this run has 41 scans"):
+        training_loader(Numbers(41), 4).load_state_dict(state)
+    with pytest.raises(ValueError, match="order of seed 0"):
+        training_loader(Numbers(40), 4, seed=1).load_state_dict(state)
+    with pytest.raises(ValueError, match=r"after 4 scans .* batch of 8"):
+        training_loader(Numbers(40), 8).load_state_dict(state)
+    for _ in iterator:
+        pass
+    # At the border of an epoch other data are fine.
+    training_loader(Numbers(41), 8, seed=1).load_state_dict(loader.state_dict())
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_global_random_state_is_left_alone(workers):
+    before = torch.get_rng_state()
+    batches(training_loader(Numbers(16), 4, num_workers=workers), 0)
+    assert torch.equal(torch.get_rng_state(), before)

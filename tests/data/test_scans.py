@@ -1,0 +1,217 @@
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.data import scans as scans_module
+from r3dpa.data.scans import (
+    KITTI360_DRIVES,
+    ScanError,
+    check,
+    find_scans,
+    kitti360_scans,
+    read_npz,
+    read_ply,
+    read_scan,
+    write_bin,
+    write_npz,
+    write_ply,
+)
+from r3dpa.geometry import LidarSensor
+
+POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
+
+
+def test_points_are_little_endian_float32_rows(tmp_path):
+    file = tmp_path / "a.bin"
+    file.write_bytes(struct.pack("<8f", 1.5, -2, 3, 0.25, 4, 5, 6, 1))
+    points = read_scan(file)
+    assert points.dtype == np.float32
+    assert points.tolist() == [[1.5, -2, 3, 0.25], [4, 5, 6, 1]]
+
+
+def broken(kind):
+    values = POINTS.copy()
+    if kind == "nan":
+        values[1, 2] = np.nan
+    elif kind == "inf":
+        values[2, 3] = np.inf
+    elif kind == "near":
+        values[:, :3] = 0.5
+    data = values.tobytes()
+    return {"short": data[:-3], "empty": b""}.get(kind, data)
+
+
+REASONS = {
+    "short": "45 bytes, not a multiple of 16",
+    "empty": "is empty",
+    "nan": "NaN or infinite values in 1 of 3 points",
+    "inf": "NaN or infinite values in 1 of 3 points",
+    "near": r"no point within the sensor's range 1\.\.56 m",
+}
+
+
+@pytest.mark.parametrize("kind", REASONS)
+def test_broken_scan_is_named_with_its_reason(tmp_path, kind):
+    file = tmp_path / f"{kind}.bin"
+    file.write_bytes(broken(kind))
+    with pytest.raises(ScanError, match=f"{kind}.bin: .*{REASONS[kind]}"):
+        read_scan(file, LidarSensor())
+    report = check(tmp_path)
+    assert not report.ok
+    assert [bad for bad, _ in report.bad] == [file]
+    assert f"{kind}.bin" in str(report)
+
+
+def test_unreadable_scan_is_named(tmp_path):
+    with pytest.raises(ScanError, match=r"gone\.bin: cannot be read"):
+        read_scan(tmp_path / "gone.bin")
+    (tmp_path / "folder.bin").mkdir()
+    with pytest.raises(ScanError, match=r"folder\.bin: cannot be read"):
+        read_scan(tmp_path / "folder.bin")
+
+
+@pytest.mark.parametrize("width", [3, 4])
+def test_round_trips(tmp_path, width):
+    points = POINTS[:, :width]
+    write_bin(tmp_path / "new/a.bin", points)
+    expected = np.concatenate([POINTS[:, :3], POINTS[:, 3:] * (width == 4)], 1)
+    assert np.array_equal(read_scan(tmp_path / "new/a.bin"), expected)
+    write_ply(tmp_path / "a.ply", torch.from_numpy(points))
+    assert np.array_equal(read_ply(tmp_path / "a.ply"), points)
+    write_npz(tmp_path / "a.npz", {"one": points, "two": torch.from_numpy(points[:1])})
+    archive = read_npz(tmp_path / "a.npz")
+    assert np.array_equal(archive["one"], points)
+    assert np.array_equal(archive["two"], points[:1])
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.npz", "a.ply", "new"]
+
+
+def test_ply_of_other_programs(tmp_path):
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment made elsewhere\nelement vertex 1\n"
+        "property double x\nproperty double y\nproperty double z\nproperty uchar red\nend_header\n"
+    )
+    (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack("<3dB", 1, 2, 3, 255))
+    assert read_ply(tmp_path / "a.ply").tolist() == [[1, 2, 3]]
+    (tmp_path / "b.ply").write_bytes(header.encode() + b"12")
+    with pytest.raises(ScanError, match=r"b\.ply: holds 2 bytes for 1 points of 25"):
+        read_ply(tmp_path / "b.ply")
+    (tmp_path / "c.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(ScanError, match=r"c\.ply: is not a binary little-endian"):
+        read_ply(tmp_path / "c.ply")
+
+
+def test_interrupted_write_leaves_the_old_file(tmp_path):
+    file = tmp_path / "a.bin"
+    write_bin(file, POINTS)
+
+    def interrupted_write():
+        with scans_module.atomic_path(file) as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError("interrupted")
+
+    with pytest.raises(RuntimeError, match="interrupted"):
+        interrupted_write()
+    assert np.array_equal(read_scan(file), POINTS)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_writers_refuse_what_no_reader_would_take(tmp_path):
+    with pytest.raises(ValueError, match=r"got \(3, 2\)"):
+        write_bin(tmp_path / "a.bin", POINTS[:, :2])
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        write_ply(tmp_path / "a.ply", np.full((1, 3), np.nan))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_find_scans_in_folder_glob_list_and_file(tmp_path, make_scans):
+    make_scans(tmp_path / "udacity/data_1", 2)
+    make_scans(tmp_path / "kitti", 1)
+    names = ["kitti/0000000000", "udacity/data_1/0000000000", "udacity/data_1/0000000001"]
+    assert [scan.name for scan in find_scans(tmp_path)] == names
+    assert [scan.name for scan in find_scans(f"{tmp_path}/**/*.bin")] == names
+    both = [f"{tmp_path}/udacity", str(tmp_path / "kitti/0000000000.bin")]
+    assert [scan.name for scan in find_scans(both)] == names
+    (single,) = find_scans(str(tmp_path / "kitti/0000000000.bin"))
+    assert single.name == "kitti/0000000000"
+    assert [scan.name for scan in find_scans(tmp_path / "kitti")] == names[:1]
+    with pytest.raises(ValueError, match=r"No scan found in .*nowhere"):
+        find_scans(str(tmp_path / "nowhere"))
+    with pytest.raises(ValueError, match=r"given twice: .*kitti/0000000000\.bin"):
+        find_scans([f"{tmp_path}/kitti", f"{tmp_path}/**/*.bin"])
+
+
+def make_kitti360(root, make_scans, drives):
+    for seed, drive in enumerate(drives):
+        make_scans(root / "data_3d_raw" / drive / "velodyne_points/data", 2, seed)
+
+
+def test_official_layout(tmp_path, make_scans):
+    drives = KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]
+    make_kitti360(tmp_path, make_scans, drives)
+    assert check(tmp_path).ok
+    assert {scan.drive for scan in kitti360_scans(tmp_path, "val")} == set(KITTI360_DRIVES["val"])
+    assert set(find_scans(tmp_path)) == {
+        scan for split in ("train", "val") for scan in kitti360_scans(tmp_path, split)
+    }
+    assert check(tmp_path).num_scans == dict.fromkeys(sorted(drives), 2)
+
+
+def test_missing_folders_are_named(tmp_path, make_scans):
+    assert [str(f) for f in check(tmp_path / "none").missing] == [str(tmp_path / "none")]
+    assert check(tmp_path).missing == (tmp_path / "data_3d_raw",)
+    (tmp_path / "data_poses").mkdir()
+    assert check(tmp_path).missing == (tmp_path / "data_3d_raw",)
+    drives = sorted(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"])
+    make_kitti360(tmp_path, make_scans, drives[:-2])
+    (tmp_path / "data_3d_raw" / drives[-2]).mkdir()
+    raw = tmp_path / "data_3d_raw"
+    missing = (raw / drives[-2] / "velodyne_points/data", raw / drives[-1])
+    assert check(tmp_path).missing == missing
+    assert all(str(folder) in str(check(tmp_path)) for folder in missing)
+    with pytest.raises(ValueError, match="r3dpa check"):
+        kitti360_scans(tmp_path / "none", "train")
+
+
+def test_simulated_set_is_held_against_its_manifest(tmp_path, make_scans):
+    drives = ["2013_05_28_drive_0003_sync", "2013_05_28_drive_0000_sync"]
+    make_kitti360(tmp_path, make_scans, drives)
+    manifest = tmp_path / "simulation.json"
+    # One scan of up to seven goes to validation, the others to training.
+    manifest.write_text(json.dumps({"scans": 3, "drives": ["0003", "0000"]}))
+    assert check(tmp_path).ok
+    manifest.write_text(json.dumps({"scans": 4, "drives": ["0003", "0000"]}))
+    assert check(tmp_path).bad == (
+        (tmp_path / "data_3d_raw" / drives[0], "holds 2 of 3 scans; simulate again to complete it"),
+    )
+    manifest.write_text(json.dumps({"scans": 4, "drives": ["0003", "0004", "0000"]}))
+    assert [f.name for f in check(tmp_path).missing] == ["2013_05_28_drive_0004_sync"]
+    manifest.write_text("{")
+    with pytest.raises(ValueError, match="simulate the data set again"):
+        check(tmp_path)
+
+
+def test_plain_folder_needs_no_layout(tmp_path, make_scans):
+    make_scans(tmp_path / "a", 3)
+    report = check(tmp_path)
+    assert report.ok
+    assert report.num_scans == {"a": 3}
+    assert "3 scans in 1 drives, all usable" in str(report)
+
+
+@pytest.mark.data
+def test_real_scans():
+    folder = Path("/work/shared/data/real_scans")
+    if not folder.is_dir():
+        pytest.skip("the real scans are not on this machine")
+    report = check(folder)
+    assert report.ok
+    assert report.num_scans == {
+        "kitti_object_vis/velodyne": 3,
+        "patchwork_plusplus": 6,
+        "udacity_sfnd/data_1": 10,
+        "udacity_sfnd/data_2": 11,
+    }

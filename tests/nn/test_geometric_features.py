@@ -1,0 +1,182 @@
+import math
+
+import pytest
+import torch
+
+from r3dpa.nn.backbones import GeometricFeatures
+from r3dpa.nn.backbones.geometric import _symmetric_eigen
+
+LINEARITY, PLANARITY, SPHERICITY, ALONG, ACROSS, UP, HEIGHT, LOG_RANGE, INTENSITY = range(9)
+
+
+def rays(inclinations_deg, azimuths_deg):
+    inclination, azimuth = torch.meshgrid(
+        torch.deg2rad(inclinations_deg), torch.deg2rad(azimuths_deg), indexing="ij"
+    )
+    horizontal = inclination.cos()
+    parts = [horizontal * azimuth.cos(), horizontal * azimuth.sin(), inclination.sin()]
+    return torch.stack(parts, -1).reshape(-1, 3)
+
+
+def scan(points, intensity=0.3):
+    return torch.cat([points, torch.full((len(points), 1), intensity)], dim=1)
+
+
+def ground(radius_limit=25.0):
+    directions = rays(torch.arange(-24, -3, 0.42), torch.arange(-180, 180, 0.18))
+    points = directions * (-1.73 / directions[:, 2:])
+    return scan(points[points.norm(dim=1) < radius_limit])
+
+
+def wall(distance=12.0, azimuth_deg=0.0):
+    directions = rays(torch.arange(-7, 3, 0.42), torch.arange(-25, 25, 0.18))
+    points = directions * (distance / directions[:, :1])
+    turn = math.radians(azimuth_deg)
+    rotation = torch.tensor(
+        [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]]
+    )
+    return scan(points @ rotation.T)
+
+
+def pole():
+    directions = rays(torch.arange(-8, 8, 0.42), torch.tensor([0.1]))
+    return scan(directions * (10 / directions[:, :1]))
+
+
+def foliage():
+    generator = torch.Generator().manual_seed(0)
+    directions = rays(torch.arange(-8, 8, 0.42), torch.arange(-20, 20, 0.18))
+    jitter = torch.rand(len(directions), 1, generator=generator)
+    return scan(directions * (8 + 0.5 * jitter))
+
+
+@pytest.fixture(scope="module")
+def extractor():
+    return GeometricFeatures(dim=96)
+
+
+def inner(values):
+    """Without the few neighbourhoods at the border of the surface."""
+    return values.sort().values[len(values) // 10 : -len(values) // 10]
+
+
+def test_ground_is_a_plane_facing_up_at_height_zero(extractor):
+    values = extractor.descriptors(ground())
+    assert inner(values[:, PLANARITY]).min() > 0.85
+    assert inner(values[:, UP]).min() > 0.99
+    assert values[:, HEIGHT].abs().max() < 1e-4
+    assert inner(values[:, SPHERICITY]).max() < 0.05
+
+
+def test_wall_is_a_plane_facing_the_sensor(extractor):
+    points = wall()
+    values = extractor.descriptors(points)
+    assert inner(values[:, PLANARITY]).min() > 0.8
+    assert inner(values[:, UP].abs()).max() < 0.05
+    # The normal is -x: against the ray in front, aside of it by its azimuth elsewhere.
+    azimuth = torch.atan2(points[:, 1], points[:, 0])
+    expected = torch.stack([-azimuth.cos(), azimuth.sin()], dim=1)
+    error = (values[:, [ALONG, ACROSS]] - expected).abs().amax(dim=1)
+    assert inner(error).max() < 0.05
+
+
+def test_pole_is_a_line_and_foliage_neither_line_nor_plane(extractor):
+    pole_values, foliage_values = (extractor.descriptors(s) for s in (pole(), foliage()))
+    assert inner(pole_values[:, LINEARITY]).min() > 0.95
+    assert inner(pole_values[:, PLANARITY]).max() < 0.3
+    assert foliage_values[:, SPHERICITY].median() > 0.3
+    assert foliage_values[:, LINEARITY].median() < 0.5
+
+
+def test_a_surface_does_not_mix_with_what_is_behind_it(extractor):
+    near, far = wall(10.0), wall(20.0)
+    column = far[:, 1] / far[:, 0] > 0.05  # the near wall hides the other half
+    both = torch.cat([near[near[:, 1] / near[:, 0] <= 0.05], far[column]])
+    values = extractor.descriptors(both)
+    assert values[:, PLANARITY].quantile(0.02) > 0.7
+
+
+def test_own_values(extractor):
+    points = torch.tensor([[3.0, 4.0, -1.0, 0.7], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 9.0, 1.0]])
+    values = extractor.descriptors(points)
+    assert values[0, [HEIGHT, LOG_RANGE, INTENSITY]].tolist() == pytest.approx(
+        [0.73, 0.5 * math.log(26), 0.7]
+    )
+    # Single points have no neighbourhood; none of them, the origin included, gives NaN.
+    assert values[:, :6].abs().max() == 0
+    assert torch.isfinite(extractor(points)).all()
+    assert extractor(points[:0]).shape == (0, 96)
+
+
+def test_rotating_the_scan_about_z_keeps_the_features(extractor):
+    turn = 2 * math.pi * 129 / 1024  # whole columns, so that the pixels move as one
+    rotation = torch.tensor(
+        [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    points = torch.cat([wall(9.0), ground(), foliage() + torch.tensor([0.0, 9.0, 0.0, 0.0])])
+    turned = points.clone()
+    turned[:, :3] = (points[:, :3].double() @ rotation.T).float()
+    similarity = (extractor(points) * extractor(turned)).sum(dim=1)
+    assert similarity.quantile(0.02) > 0.99
+
+
+def test_features_have_unit_norm_and_follow_the_kernel():
+    # Inner products are a Gaussian kernel of the standardised descriptors, up to the error of 32
+    # random frequencies (standard deviation below 1 / sqrt(2 * 32) = 0.125).
+    extractor = GeometricFeatures(dim=128)
+    points = torch.cat([wall(), ground(), pole(), foliage()])
+    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:300]]
+    features = extractor(points)
+    assert torch.allclose(features.norm(dim=1), torch.ones(300), atol=1e-5)
+    from r3dpa.nn.backbones.geometric import _BANDWIDTH, _CENTRES, _SPREADS
+
+    standard = (extractor.descriptors(points) - torch.tensor(_CENTRES)) / torch.tensor(_SPREADS)
+    expected = torch.exp(-(torch.cdist(standard, standard) ** 2) / (2 * _BANDWIDTH**2))
+    error = features @ features.T - expected
+    assert error.square().mean().sqrt() < 0.125
+
+
+def test_surfaces_can_be_told_apart(extractor):
+    means = torch.stack(
+        [extractor(points).mean(dim=0) for points in (ground(), wall(), pole(), foliage())]
+    )
+    cosines = (
+        torch.nn.functional.normalize(means, dim=1) @ torch.nn.functional.normalize(means, dim=1).T
+    )
+    assert (cosines - torch.eye(4)).max() < 0.8
+    assert cosines[0, 1] < 0.5
+    left, right = extractor(wall())[::2].mean(dim=0), extractor(wall())[1::2].mean(dim=0)
+    assert torch.cosine_similarity(left, right, dim=0) > 0.95
+
+
+def test_lift_is_linear_and_the_seed_decides():
+    points = wall()
+    one, same, other = GeometricFeatures(64), GeometricFeatures(64), GeometricFeatures(64, seed=1)
+    assert torch.equal(one(points), same(points))
+    assert not torch.allclose(one(points), other(points), atol=0.01)
+    assert one.settings != other.settings
+    pooled = one.lift(one.point_features(points).mean(dim=0, keepdim=True))
+    assert torch.allclose(pooled, one(points).mean(dim=0, keepdim=True), atol=1e-5)
+    assert not list(one.parameters())
+    assert not one.state_dict()
+    with pytest.raises(ValueError, match="dim must be even and at least 2, got 3"):
+        GeometricFeatures(3)
+
+
+def test_closed_form_agrees_with_lapack():
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(500, 3, 3, generator=generator, dtype=torch.float64)
+    root = root * torch.tensor([1.0, 0.3, 0.01], dtype=torch.float64)
+    matrix = root @ root.mT
+    entries = torch.stack(
+        [matrix[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    )
+    values, vector = _symmetric_eigen(entries)
+    expected, vectors = torch.linalg.eigh(matrix)
+    assert torch.allclose(values.T.flip(1), expected, atol=1e-9)
+    assert ((vector.T * vectors[..., 0]).sum(dim=1).abs() - 1).abs().max() < 1e-6
+    isotropic = torch.tensor([2.0, 2, 2, 0, 0, 0], dtype=torch.float64)[:, None]
+    values, vector = _symmetric_eigen(isotropic)
+    assert torch.allclose(values, torch.full((3, 1), 2.0, dtype=torch.float64))
+    assert torch.isfinite(vector).all()

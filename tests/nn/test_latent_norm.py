@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.distributed as dist
+from torch import nn
+
+from r3dpa.nn.latent_norm import LatentNorm
+
+
+def raw_latents(batch=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([0.5, 1.0, 4.0])[:, None, None]
+    return 3 + scale * torch.randn(batch, 3, 4, 6, generator=generator)
+
+
+def state(norm):
+    return {key: value.clone() for key, value in norm.state_dict().items()}
+
+
+def test_update_and_normalise_are_the_two_modes_of_batch_norm():
+    ours, plain = LatentNorm(3), nn.BatchNorm2d(3, eps=1e-4, momentum=0.1, affine=False)
+    assert list(ours.state_dict()) == list(plain.state_dict())
+    for seed in range(3):
+        latents = raw_latents(seed=seed).requires_grad_()
+        twin = latents.detach().clone().requires_grad_()
+        actual, expected = ours.update(latents), plain(twin)
+        torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-5)
+        actual.sin().sum().backward()
+        expected.sin().sum().backward()
+        torch.testing.assert_close(latents.grad, twin.grad, atol=1e-5, rtol=1e-4)
+    for key, value in plain.state_dict().items():
+        torch.testing.assert_close(ours.state_dict()[key], value)
+    torch.testing.assert_close(ours.normalise(latents), plain.eval()(latents))
+
+
+def test_the_mode_of_the_module_plays_no_part():
+    norm, latents = LatentNorm(3), raw_latents()
+    training, evaluating = norm.update(latents), LatentNorm(3).eval().update(latents)
+    assert torch.equal(training, evaluating)
+
+
+def test_batch_statistics_give_mean_zero_and_deviation_one():
+    latents = LatentNorm(3, eps=1e-8).update(raw_latents())
+    torch.testing.assert_close(latents.mean((0, 2, 3)), torch.zeros(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(latents.var((0, 2, 3), correction=0), torch.ones(3))
+
+
+def test_an_unfitted_norm_says_so():
+    norm = LatentNorm(3)
+    assert not norm.fitted
+    norm.update(raw_latents())
+    assert norm.fitted
+    loaded = LatentNorm(3)
+    loaded.load_state_dict(norm.state_dict())
+    assert loaded.fitted
+
+
+@pytest.mark.numerics
+def test_denormalise_inverts_normalise_for_any_variance():
+    norm = LatentNorm(13)
+    norm.running_var.copy_(10.0 ** torch.arange(-6, 7))
+    norm.running_mean.uniform_(-1, 1)
+    latents = norm.running_var.sqrt()[:, None, None] * torch.randn(2, 13, 4, 6)
+    restored = norm.denormalise(norm.normalise(latents))
+    scale = (norm.running_var + norm.eps).sqrt()[:, None, None]
+    assert ((restored - latents) / scale).abs().max() < 1e-5
+    legacy = LatentNorm(13, legacy_inverse=True)
+    legacy.load_state_dict(norm.state_dict())
+    kept = (
+        legacy.denormalise(legacy.normalise(torch.ones(1, 13, 1, 1)))
+        - norm.running_mean[:, None, None]
+    )
+    kept = kept / (1 - norm.running_mean[:, None, None])
+    assert (1 - kept)[0, 2].item() == pytest.approx(0.29, abs=0.01)  # variance 1e-4
+    assert (1 - kept)[0, 3].item() == pytest.approx(0.047, abs=0.001)  # variance 1e-3
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("value", [torch.inf, -torch.inf, torch.nan])
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_broken_latent_leaves_the_statistics_alone(value, replace):
+    norm = LatentNorm(3, replace_non_finite=replace)
+    norm.update(raw_latents())
+    before, broken = state(norm), raw_latents(seed=1)
+    broken[1, 2, 0, 3] = value
+    result = norm.update(broken)
+    assert result.isfinite().all() == replace
+    assert norm.normalise(broken).isfinite().all() == replace
+    for key, value_before in before.items():
+        assert torch.equal(norm.state_dict()[key], value_before)
+    naive = nn.BatchNorm2d(3, affine=False)
+    naive(torch.nan_to_num(torch.full((2, 3, 2, 2), torch.inf)) * torch.rand(2, 3, 2, 2))
+    assert naive.running_var.isinf().all()  # and stays so for good
+
+
+@pytest.mark.numerics
+def test_statistics_survive_a_large_mean():
+    latents = raw_latents() - 3
+    far = 3000 + latents
+    norm = LatentNorm(3, momentum=1.0)
+    norm.update(far)
+    expected = far.double().var((0, 2, 3))
+    torch.testing.assert_close(norm.running_var.double(), expected, atol=0, rtol=1e-6)
+    count = far.numel() // 3
+    naive = (far.square().mean((0, 2, 3)) - far.mean((0, 2, 3)).square()) * count / (count - 1)
+    assert ((naive - expected).abs() / expected).max() > 0.1
+
+
+@pytest.mark.numerics
+def test_a_later_update_does_not_change_the_backward_of_an_earlier_pass():
+    def gradient(normalise, update):
+        latents = raw_latents().requires_grad_()
+        normalised = normalise(latents)
+        update(raw_latents(seed=1))
+        normalised.sum().backward()
+        return latents.grad
+
+    norm = LatentNorm(3)
+    expected = torch.full((4, 3, 4, 6), 1.0001**-0.5)  # variance 1 of the fresh norm
+    torch.testing.assert_close(gradient(norm.normalise, norm.update), expected)
+
+    plain = nn.BatchNorm2d(3, affine=False)
+    naive = gradient(lambda x: plain.eval()(x), lambda x: plain.train()(x))
+    assert (naive - 1).abs().max() > 0.1
+
+
+def test_normalise_leaves_the_statistics_alone():
+    norm = LatentNorm(3)
+    norm.update(raw_latents())
+    before = state(norm)
+    norm.normalise(raw_latents(seed=1))
+    norm.denormalise(raw_latents(seed=2))
+    for key, value in before.items():
+        assert torch.equal(norm.state_dict()[key], value)
+
+
+def test_a_batch_of_one_trains_but_a_single_value_has_no_variance():
+    norm = LatentNorm(3)
+    assert norm.update(raw_latents(batch=1)).isfinite().all()
+    with pytest.raises(ValueError, match=r"two values per channel.*\(1, 3, 1, 1\)"):
+        norm.update(torch.zeros(1, 3, 1, 1))
+
+
+def test_half_precision_latents_are_normalised_in_float32():
+    norm, latents = LatentNorm(3), raw_latents().bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        for result in (norm.update(latents), norm.normalise(latents), norm.denormalise(latents)):
+            assert result.dtype == torch.float32
+    twin = LatentNorm(3)
+    twin.update(latents.float())
+    assert torch.equal(norm.running_var, twin.running_var)
+
+
+@pytest.mark.parametrize("method", ["normalise", "update", "denormalise"])
+def test_latents_of_another_shape_are_named(method):
+    with pytest.raises(ValueError, match=r"\(B, 3, h, w\), got \(2, 4, 4, 6\)"):
+        getattr(LatentNorm(3), method)(torch.zeros(2, 4, 4, 6))
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ValueError, match="got 0 and"):
+        LatentNorm(0)
+    with pytest.raises(ValueError, match=r"3 and 0\.0"):
+        LatentNorm(3, eps=0.0)
+
+
+def run_norm(norm, latents):
+    latents.requires_grad_()
+    normalised = norm.update(latents)
+    (normalised.sin() * torch.linspace(0, 1, 6)).sum().backward()
+    broken = latents.detach().clone()
+    return normalised.detach(), latents.grad, state(norm), broken
+
+
+def run_process(rank, folder):
+    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    norm, latents = LatentNorm(3), raw_latents(batch=5)
+    part = latents[:2] if rank == 0 else latents[2:]  # processes with different batch sizes
+    normalised, gradient, statistics, broken = run_norm(norm, part)
+    if rank == 1:
+        broken[0, 0, 0, 0] = torch.nan
+    norm.update(broken)
+    torch.save((normalised, gradient, statistics, state(norm)), f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
+
+
+@pytest.mark.ddp
+def test_two_processes_share_their_statistics(tmp_path):
+    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
+    parts = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
+    normalised, gradient, statistics, _ = run_norm(LatentNorm(3), raw_latents(batch=5))
+    torch.testing.assert_close(torch.cat([part[0] for part in parts]), normalised)
+    torch.testing.assert_close(
+        torch.cat([part[1] for part in parts]), gradient, atol=1e-6, rtol=1e-5
+    )
+    for part in parts:
+        torch.testing.assert_close(part[2], statistics)
+        assert all(torch.equal(part[3][key], part[2][key]) for key in statistics)
