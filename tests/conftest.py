@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from r3dpa.cli import main
+
 
 def pytest_addoption(parser):
     parser.addoption(
@@ -13,3 +17,35 @@ def pytest_addoption(parser):
         help="folder with cases.json and the .npz files of golden numbers "
         "(default: the shared folder where it is present, else the synthetic files)",
     )
+
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CONF = REPOSITORY / "conf"
+REAL_SCANS = REPOSITORY.parent / "shared" / "data" / "real_scans"
+
+
+@pytest.fixture(scope="session")
+def smoke_root(tmp_path_factory) -> Path:
+    """Root of the simulated scans of conf/smoke.yaml; made by whoever trains first."""
+    return tmp_path_factory.mktemp("smoke") / "data"
+
+
+@pytest.fixture(scope="session")
+def smoke_args(smoke_root):
+    """``smoke_args(stage, run_dir, *more)``: command line that trains a stage at smoke size."""
+
+    def arguments(stage: str, run_dir: Path, *more: str) -> list[str]:
+        configs = [CONF / "trainer.yaml", CONF / "experiment" / f"{stage}.yaml"]
+        words = [word for path in [*configs, CONF / "smoke.yaml"] for word in ("--config", path)]
+        words += ["--data.init_args.root", smoke_root, "--run_dir", run_dir]
+        return ["fit", *map(str, words), *more]
+
+    return arguments
+
+
+@pytest.fixture(scope="session")
+def vae_checkpoint(smoke_args, tmp_path_factory) -> Path:
+    """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
+    run_dir = tmp_path_factory.mktemp("vae_alignment")
+    main(smoke_args("vae_alignment", run_dir, "--trainer.logger=false"))
+    return run_dir / "checkpoints" / "last.ckpt"

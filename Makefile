@@ -1,0 +1,69 @@
+# `make help` lists the targets. Every target sets up what it needs.
+
+PYTHON ?= python3
+# The CPU build of the tests; on a GPU machine: make install TORCH="torch"
+TORCH ?= torch==2.13.0
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.installed
+
+# What `make demo` reads: simulated scans, or every .bin below DATA.
+DATA ?=
+OUT ?= runs/demo
+ifeq ($(DATA),)
+SOURCE := --config conf/data/demo.yaml --data.init_args.root $(OUT)/data
+else
+SOURCE := --config conf/data/demo_folder.yaml --data.init_args.scans $(DATA) \
+	--data.init_args.features_dir $(OUT)/feature_grids
+endif
+FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
+
+.DEFAULT_GOAL := help
+.PHONY: help install format lint types test test-all notebooks demo clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-12s %s\n", $$1, $$2}'
+
+install: $(READY) ## set .venv up; does nothing when it is up to date
+
+$(READY): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet $(TORCH)
+	$(BIN)/pip install --quiet --editable ".[dev]"
+	touch $@
+
+format: $(READY) ## format the code
+	$(BIN)/ruff format src tests
+	$(BIN)/ruff check --fix src tests
+
+lint: $(READY) ## ruff and mypy
+	$(BIN)/ruff format --check src tests
+	$(BIN)/ruff check src tests
+	$(BIN)/mypy
+
+types: $(READY) ## mypy alone
+	$(BIN)/mypy
+
+test: $(READY) ## default tests, a few minutes on two cores
+	$(BIN)/pytest -m "not slow and not gpu and not weights"
+
+test-all: $(READY) ## every test that this machine can run
+	$(BIN)/pytest
+
+notebooks: $(READY) ## run the notebooks, keeping their outputs
+	$(BIN)/pytest --nbmake --nbmake-timeout=300 --overwrite notebooks
+
+demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin scans]
+	rm -rf $(OUT)/vae_alignment $(OUT)/joint
+	$(FIT) --config conf/experiment/vae_alignment.yaml \
+		--config conf/experiment/vae_alignment_demo.yaml --run_dir $(OUT)/vae_alignment
+	$(FIT) --config conf/experiment/joint.yaml --config conf/experiment/joint_demo.yaml \
+		--run_dir $(OUT)/joint \
+		--model.init_args.init_from $(OUT)/vae_alignment/checkpoints/last.ckpt
+	$(BIN)/r3dpa sample --ckpt $(OUT)/joint/checkpoints/last.ckpt --out $(OUT)/scenes \
+		--num 16 --steps 64 --batch_size 16 --overwrite true
+	$(BIN)/r3dpa report --run $(OUT)/vae_alignment
+	$(BIN)/r3dpa report --run $(OUT)/joint
+
+clean: ## remove caches and runs, keep .venv
+	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

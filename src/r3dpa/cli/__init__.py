@@ -1,0 +1,158 @@
+"""The ``r3dpa`` command: LightningCLI for the stages, plain functions for everything else.
+
+Heavy imports stay inside the commands, so that ``r3dpa --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+__all__ = ["main"]
+
+_STAGE_COMMANDS = {
+    "fit": "train a stage",
+    "validate": "evaluate a checkpoint on the validation split",
+    "test": "evaluate a checkpoint on the test split",
+    "predict": "reconstruct scans with a checkpoint",
+    "features": "write the feature grids that a data configuration asks for",
+}
+
+
+def simulate(
+    out: Path, scans: int = 100, seed: int = 0, workers: int = 1, drives: list[str] | None = None
+) -> None:
+    """Write simulated scans of a street in the KITTI-360 layout.
+
+    Args:
+        out: Root of the data set to write.
+        scans: Number of scans over all drives.
+        seed: Seed of streets and instrument.
+        workers: Processes; the bytes written do not depend on it.
+        drives: Four-digit drives to fill; all official ones where not given.
+    """
+    from r3dpa.simulation import simulate as write
+
+    _print(write(out, scans, seed=seed, workers=workers, drives=drives))
+
+
+def check(path: Path) -> None:
+    """List every bad scan and missing folder of a data set; exits with 1 if there is any.
+
+    Args:
+        path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans.
+    """
+    from r3dpa.data.scans import check as check_scans
+
+    report = check_scans(path)
+    _print(report)
+    if not report.ok:
+        sys.exit(1)
+
+
+def sample(
+    ckpt: Path,
+    out: Path,
+    num: int = 16,
+    seed: int = 0,
+    solver: Literal["euler", "heun", "euler_maruyama"] = "euler_maruyama",
+    steps: int = 256,
+    batch_size: int = 8,
+    precision: Literal["fp32", "bf16"] = "fp32",
+    device: str = "auto",
+    weights: Literal["ema", "last"] = "ema",
+    overwrite: bool = False,
+) -> None:
+    """Generate scenes from a checkpoint.
+
+    Args:
+        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
+        out: Folder for scenes, pictures and metadata; must not hold other scenes.
+        num: Number of scenes.
+        seed: Scene i depends on (seed, i) alone, not on the batch size.
+        solver: ODE (euler, heun) or SDE (euler_maruyama) solver.
+        steps: Solver steps.
+        batch_size: Scenes sampled together.
+        precision: Precision of the networks.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        weights: Averaged (``ema``) or last weights of the SiT.
+        overwrite: Write into a folder that holds scenes already.
+    """
+    from r3dpa.cli.scenes import sample as generate
+    from r3dpa.generation import SamplerConfig
+
+    sampler = SamplerConfig(solver=solver, steps=steps)
+    generate(ckpt, out, num, seed, sampler, batch_size, precision, device, weights, overwrite)
+
+
+def convert(
+    source: Path, out: Path, to: Literal["r3dpa", "official"] = "r3dpa", overwrite: bool = False
+) -> None:
+    """Convert official checkpoints into ours, or ours into official ones.
+
+    Args:
+        source: Official ``.pt``, Lightning ``.ckpt`` or exported ``.safetensors``.
+        out: File to write.
+        to: Layout of the result.
+        overwrite: Replace ``out`` where it exists.
+    """
+    from r3dpa.checkpoints import convert as convert_checkpoint
+
+    _print(convert_checkpoint(source, out, to, overwrite=overwrite).table())
+
+
+def report(run: Path) -> None:
+    """Draw the loss curves of a run and print where each loss started and ended.
+
+    Args:
+        run: Folder given to ``r3dpa fit`` as ``--run_dir``.
+    """
+    from r3dpa.cli.scenes import report as draw
+
+    _print(draw(run))
+
+
+_COMMANDS: dict[str, Callable[..., None]] = {
+    command.__name__: command for command in (simulate, check, sample, convert, report)
+}
+
+
+def _print(text: Any) -> None:
+    sys.stdout.write(f"{text}\n")
+
+
+def _help() -> str:
+    summaries = _STAGE_COMMANDS | {
+        name: (command.__doc__ or "").splitlines()[0] for name, command in _COMMANDS.items()
+    }
+    lines = [f"  {name:<10} {summary}" for name, summary in summaries.items()]
+    head = ["usage: r3dpa COMMAND [options]", "", "Generate LiDAR scenes (R3DPA).", ""]
+    return "\n".join([*head, *lines, "", "r3dpa COMMAND --help lists the options of a command."])
+
+
+def main(args: list[str] | None = None) -> None:
+    """Runs the command line.
+
+    Args:
+        args: Words after ``r3dpa``; those of the process where None.
+    """
+    args = sys.argv[1:] if args is None else args
+    if not args or args[0] in ("-h", "--help"):
+        _print(_help())
+    elif args[0] == "--version":
+        from r3dpa import __version__
+
+        _print(__version__)
+    elif args[0] in _STAGE_COMMANDS:
+        from r3dpa.cli.stages import run
+
+        run(args)
+    elif args[0] in _COMMANDS:
+        from jsonargparse import auto_cli
+
+        auto_cli(_COMMANDS[args[0]], args=args[1:], prog=f"r3dpa {args[0]}", as_positional=False)
+    else:
+        _print(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
+        sys.exit(2)

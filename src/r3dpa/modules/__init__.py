@@ -1,0 +1,15 @@
+"""Training stages as LightningModules."""
+
+from r3dpa.modules.base import GenerativeModule, LossWeights, OptimizerConfig
+from r3dpa.modules.flow_matching import FlowMatching
+from r3dpa.modules.joint_alignment import JointAlignment
+from r3dpa.modules.vae_alignment import VAEAlignment
+
+__all__ = [
+    "FlowMatching",
+    "GenerativeModule",
+    "JointAlignment",
+    "LossWeights",
+    "OptimizerConfig",
+    "VAEAlignment",
+]

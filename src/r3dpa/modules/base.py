@@ -1,0 +1,483 @@
+"""What the three training modules share: draws, step losses, optimiser, clipping, EMA, logging."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import lightning as L
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from r3dpa import losses
+from r3dpa.checkpoints import load_into, read_checkpoint, transfer_rgb
+from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.datasets import LidarBatch
+from r3dpa.flow import Interpolant, sample_time
+from r3dpa.geometry import ScanGeometry
+from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT
+
+__all__ = ["GenerativeModule", "LossWeights", "OptimizerConfig", "PathDraws", "frozen"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the training losses; a loss of weight 0 is not computed.
+
+    Args:
+        reconstruction: Weight of the reconstruction error.
+        reconstruction_norm: ``l1`` (official code) or ``l2`` (paper).
+        kl: Weight of the Kullback-Leibler term, summed per sample.
+        adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
+        discriminator: Factor of the discriminator's hinge loss.
+        adversarial_start: First step at which both adversarial losses count.
+        vae_alignment: lambda1, weight of the alignment loss that reaches the VAE.
+        denoising: Weight of the velocity error.
+        sit_alignment: lambda2, weight of the alignment loss that reaches the SiT.
+        skip_empty_cells: Leave empty grid cells out of the mean of the alignment loss.
+    """
+
+    reconstruction: float = 1.0
+    reconstruction_norm: Literal["l1", "l2"] = "l1"
+    kl: float = 1e-6
+    adversarial: float = 3e-4
+    discriminator: float = 1e-3
+    adversarial_start: int = 0
+    vae_alignment: float = 1.5
+    denoising: float = 1.0
+    sit_alignment: float = 0.5
+    skip_empty_cells: bool = False
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW, one parameter group per network, constant rate.
+
+    Args:
+        lr: Learning rate.
+        betas: Decay of the first and second moments.
+        weight_decay: Applied to every trained parameter, as officially.
+        eps: Added to the root of the second moment.
+    """
+
+    lr: float = 1e-4
+    betas: tuple[float, float] = (0.9, 0.999)
+    weight_decay: float = 0.03
+    eps: float = 1e-8
+
+
+class PathDraws(NamedTuple):
+    """Random numbers of one training step.
+
+    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``.
+    """
+
+    posterior_noise: Tensor
+    time: Tensor
+    noise: Tensor
+
+
+@contextmanager
+def frozen(*networks: nn.Module) -> Iterator[None]:
+    """Records the forward pass inside without gradients to the networks' own parameters.
+
+    Gradients still flow through the networks to their inputs.
+    """
+    parameters = [p for network in networks for p in network.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+
+
+class GenerativeModule(L.LightningModule):
+    """Base of the training modules.
+
+    A subclass names its stage, lists its networks in :meth:`trainable` and writes one
+    ``training_step`` out of the step losses below. All losses of a step come from the same forward
+    values, so one optimiser with a parameter group per network and one backward pass equal the
+    official three optimisers stepped in turn; ``accumulate_grad_batches``, ``gradient_clip_val``
+    (per network), plain ``ddp`` and ``global_step`` keep their usual meaning.
+
+    Random numbers of a step are a function of ``(seed, batch, sample)`` alone: they do not depend
+    on the number of processes and need no state for an exact resume.
+
+    Args:
+        vae: Range-image autoencoder.
+        sit: Flow transformer over its latents.
+        discriminator: Patch discriminator, or None where the stage trains none.
+        weights: Loss weights.
+        optimizer: Optimiser settings.
+        path: Interpolant between latents (time 0) and noise (time 1).
+        time_sampling: Density of the training times.
+        ema_decay: Decay of the averaged SiT.
+        ema_buffers: ``copy`` the latent statistics, or ``decay`` them as the official code does.
+        latent_norm: Latent statistics; None makes a fresh one.
+        init_from: Checkpoint of the stage before.
+        init_networks: Which networks are taken from ``init_from``; None means ``default_init``.
+        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours; None starts from random values.
+        keep_projector: Keep the RGB model's projection head where its shape fits.
+        seed: Key of the training draws.
+        max_skipped_steps: Consecutive steps with a non-finite gradient before training stops.
+    """
+
+    stage: str
+    default_init: tuple[str, ...] = ()
+    trains_velocity: bool = True
+
+    def __init__(
+        self,
+        vae: VAE,
+        sit: SiT,
+        discriminator: PatchDiscriminator | None = None,
+        weights: LossWeights = LossWeights(),
+        optimizer: OptimizerConfig = OptimizerConfig(),
+        path: Literal["linear", "cosine"] = "linear",
+        time_sampling: Literal["uniform", "lognormal"] = "uniform",
+        ema_decay: float = 0.9999,
+        ema_buffers: Literal["copy", "decay"] = "copy",
+        latent_norm: LatentNorm | None = None,
+        init_from: str | None = None,
+        init_networks: list[str] | None = None,
+        rgb_weights: str | None = None,
+        keep_projector: bool = False,
+        seed: int = 0,
+        max_skipped_steps: int = 10,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        if sit.in_channels != vae.latent_channels:
+            raise ValueError(
+                f"sit.in_channels is {sit.in_channels}, but the VAE has "
+                f"{vae.latent_channels} latent channels; give both the same number"
+            )
+        self.vae = vae
+        self.sit = sit
+        self.discriminator = discriminator
+        self.latent_norm = latent_norm or LatentNorm(vae.latent_channels)
+        self.weights = weights
+        self.optimizer_config = optimizer
+        self.interpolant = Interpolant(path)
+        self.time_sampling = time_sampling
+        self.init_from = init_from
+        self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
+        self.rgb_weights = rgb_weights
+        self.keep_projector = keep_projector
+        self.seed = seed
+        self.max_skipped_steps = max_skipped_steps
+        self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
+        self.geometry: ScanGeometry | None = None
+        self._skipped_in_a_row = 0
+
+    # What a stage declares
+
+    def trainable(self) -> dict[str, nn.Module]:
+        """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
+        raise NotImplementedError
+
+    def needs_features(self) -> bool:
+        """Whether a training batch must hold feature grids."""
+        return self.weights.vae_alignment != 0 or self.weights.sit_alignment != 0
+
+    # Starting a stage
+
+    def setup(self, stage: str) -> None:
+        """Checks data against networks and, before a fresh fit, loads the stage before."""
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if not isinstance(datamodule, LidarDataModule):
+            raise ValueError(
+                f"{type(self).__name__} needs a LidarDataModule, got {type(datamodule).__name__}"
+            )
+        self.geometry = datamodule.geometry
+        has_features = datamodule.features_dir is not None
+        self._check_sizes(self.geometry, datamodule.feature_dim if has_features else None)
+        if stage == "fit" and self.trainer.ckpt_path is None:
+            self.load_previous_stage()
+
+    def load_previous_stage(self) -> None:
+        """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
+
+        Raises:
+            ValueError: Listing everything in the file that does not fit this stage.
+        """
+        if self.rgb_weights is not None:
+            report = transfer_rgb(
+                read_checkpoint(self.rgb_weights),
+                self.sit,
+                self.latent_norm,
+                keep_projector=self.keep_projector,
+            )
+            self.print(report.table())
+        if self.init_from is not None:
+            networks = {name: self.get_submodule(name) for name in self.init_networks}
+            load_into(networks, read_checkpoint(self.init_from), stage=self.stage)
+        self.ema.reset(self.sit, self.latent_norm)
+
+    def _check_sizes(self, geometry: ScanGeometry, feature_dim: int | None) -> None:
+        sensor = geometry.projection.sensor
+        image_size = (sensor.beams, sensor.columns)
+        latent_size = self.vae.latent_size(image_size)
+        if tuple(latent_size) != tuple(self.sit.input_size):
+            raise ValueError(
+                f"a {image_size} range image gives {latent_size} latents, but sit.input_size is "
+                f"{tuple(self.sit.input_size)}; set sit.input_size to {latent_size}"
+            )
+        if not self.needs_features():
+            return
+        if feature_dim is None:
+            raise ValueError(
+                f"stage {self.stage} aligns with 3D features, but the data module has none; give "
+                "it an extractor or features_dir, or set the alignment weights to 0"
+            )
+        if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
+            raise ValueError(
+                f"feature grids are {geometry.grid_size}, but the SiT has "
+                f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
+            )
+        if feature_dim != self.sit.feature_dim:
+            raise ValueError(
+                f"features have width {feature_dim}, but sit.feature_dim is {self.sit.feature_dim}"
+            )
+
+    # Losses of one step
+
+    def draw_path(self, image: Tensor, batch_number: int, stream: int = 0) -> PathDraws:
+        """Posterior noise, times and path noise for this process's part of a global batch.
+
+        Args:
+            image: ``(B, 1, H, W)`` batch on this process.
+            batch_number: Number of the batch since the start of training, or of the split.
+            stream: Separates training (0) from evaluation draws.
+        """
+        world, rank = self.trainer.world_size, self.trainer.global_rank
+        key = np.random.SeedSequence([self.seed, stream, batch_number]).generate_state(1)
+        generator = torch.Generator(image.device).manual_seed(int(key[0]))
+        total = image.shape[0] * world
+        shape = (
+            total,
+            self.vae.latent_channels,
+            *self.vae.latent_size((image.shape[-2], image.shape[-1])),
+        )
+        drawn = PathDraws(
+            torch.randn(shape, generator=generator, device=image.device),
+            sample_time(total, self.time_sampling, generator=generator),
+            torch.randn(shape, generator=generator, device=image.device),
+        )
+        return PathDraws(*(values[rank::world] for values in drawn))
+
+    @property
+    def batch_number(self) -> int:
+        """Training batches before this one, over all epochs and resumed runs."""
+        return self.trainer.fit_loop.epoch_loop.total_batch_idx
+
+    def vae_losses(
+        self, image: Tensor, posterior: Posterior, reconstruction: Tensor
+    ) -> dict[str, Tensor]:
+        """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
+        weights = self.weights
+        parts = {
+            "reconstruction": weights.reconstruction
+            * losses.reconstruction_loss(reconstruction, image, weights.reconstruction_norm),
+            "kl": weights.kl * posterior.kl().mean(),
+        }
+        started = self.global_step >= weights.adversarial_start
+        if self.discriminator is not None and weights.adversarial != 0 and started:
+            with frozen(self.discriminator):
+                logits = self.discriminator(reconstruction)
+            parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
+        return parts
+
+    def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
+        """Hinge loss on scans and detached reconstructions; factor 0 before its start.
+
+        It is computed before the start too: under DDP each trained network must take part in each
+        step.
+        """
+        if self.discriminator is None:
+            return {}
+        real = self.discriminator(image)
+        fake = self.discriminator(reconstruction.detach())
+        started = self.global_step >= self.weights.adversarial_start
+        factor = self.weights.discriminator * float(started)
+        return {"discriminator": factor * losses.discriminator_loss(real, fake)}
+
+    def vae_alignment_losses(
+        self, latents: Tensor, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        """lambda1 L_align with running latent statistics: the gradient reaches the encoder."""
+        if self.weights.vae_alignment == 0:
+            return {}
+        normalised = self.latent_norm.normalise(latents)
+        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
+        projected = self.sit.project_features(noisy, draws.time)
+        return {"vae_alignment": self.weights.vae_alignment * self._aligned(projected, features)}
+
+    def flow_losses(
+        self, latents: Tensor, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        """L_denoise + lambda2 L_align on detached latents; updates the latent statistics."""
+        normalised = self.latent_norm.update(latents.detach())
+        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
+        target = self.interpolant.target(normalised, draws.noise, draws.time)
+        if self.weights.sit_alignment == 0:
+            velocity, projected = self.sit.velocity(noisy, draws.time), None
+        else:
+            velocity, projected = self.sit(noisy, draws.time)
+        denoising = losses.flow_matching_loss(velocity, target).mean()
+        parts = {"denoising": self.weights.denoising * denoising}
+        if projected is not None:
+            parts["sit_alignment"] = self.weights.sit_alignment * self._aligned(projected, features)
+        return parts
+
+    def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
+        """Sums weighted losses and logs each of them, as weighted, under ``train/``."""
+        total = torch.stack(list(parts.values())).sum()
+        values = {f"train/{name}": value.detach() for name, value in parts.items()}
+        self.log_dict({**values, "train/loss": total.detach()})
+        return total
+
+    def _aligned(self, projected: Tensor, features: Tensor | None) -> Tensor:
+        if features is None:
+            raise ValueError(
+                f"stage {self.stage} aligns with 3D features, but the batch holds no feature_grid"
+            )
+        return losses.alignment_loss(
+            projected, features, skip_empty_cells=self.weights.skip_empty_cells
+        ).mean()
+
+    # Optimisation
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One AdamW with a parameter group per trained network."""
+        groups = [
+            {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
+            for name, network in self.trainable().items()
+        ]
+        return torch.optim.AdamW(groups, **asdict(self.optimizer_config))
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``.
+
+        A non-finite norm drops the whole step: no weight, moment or average moves.
+
+        Raises:
+            RuntimeError: After ``max_skipped_steps`` such steps in a row.
+        """
+        if gradient_clip_algorithm not in (None, "norm"):
+            raise ValueError(
+                f"gradients are clipped by norm per network, got {gradient_clip_algorithm!r}"
+            )
+        limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
+        norms = {
+            group["name"]: nn.utils.get_total_norm(
+                [p.grad for p in group["params"] if p.grad is not None]
+            )
+            for group in optimizer.param_groups
+        }
+        self.log_dict({f"grad_norm/{name}": norm for name, norm in norms.items()})
+        if not torch.stack(list(norms.values())).isfinite().all():
+            self._skip_step(optimizer, norms)
+            return
+        self._skipped_in_a_row = 0
+        for group in optimizer.param_groups:
+            nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
+
+    def _skip_step(self, optimizer: torch.optim.Optimizer, norms: dict[str, Tensor]) -> None:
+        optimizer.zero_grad(set_to_none=True)
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= self.max_skipped_steps:
+            found = ", ".join(f"{name} {float(norm):.3g}" for name, norm in norms.items())
+            raise RuntimeError(
+                f"{self._skipped_in_a_row} steps in a row had a non-finite gradient ({found}) at "
+                f"step {self.global_step}; lower the learning rate, train in bf16 or fp32 instead "
+                "of fp16, or check the scans with `r3dpa check`"
+            )
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Steps the optimiser, then the averages, unless the step was dropped."""
+        super().optimizer_step(*args, **kwargs)
+        if self._skipped_in_a_row == 0:
+            self.ema.update(self.sit, self.latent_norm)
+
+    # Evaluation
+
+    def reconstruct(self, image: Tensor) -> Tensor:
+        """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
+        return self.vae.decode(self.vae.encode(image).mean)
+
+    def evaluate(self, batch: LidarBatch, batch_idx: int, prefix: str) -> None:
+        """Logs reconstruction error in metres and the averaged SiT's losses on held-out scans."""
+        image, mask = batch["range_image"], batch["valid_mask"]
+        codec = self.scan_geometry.codec
+        draws = self.draw_path(image, batch_idx, stream=1)
+        posterior = self.vae.encode(image)
+        reconstruction = self.vae.decode(posterior.mean)
+        error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
+        latents = self.ema.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
+        target = self.interpolant.target(latents, draws.noise, draws.time)
+        velocity, projected = self.ema.sit(noisy, draws.time)
+        values = {
+            "reconstruction": losses.reconstruction_loss(reconstruction, image),
+            "range_error_m": error_m[mask].mean(),
+            "denoising": losses.flow_matching_loss(velocity, target).mean(),
+        }
+        if "feature_grid" in batch:
+            values["alignment"] = losses.alignment_loss(projected, batch["feature_grid"]).mean()
+        self.log_dict(
+            {f"{prefix}/{name}": value for name, value in values.items()},
+            batch_size=image.shape[0],
+            sync_dist=True,
+        )
+
+    def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
+        """Evaluates a batch of the validation split under ``val/``."""
+        self.evaluate(batch, batch_idx, "val")
+
+    def test_step(self, batch: LidarBatch, batch_idx: int) -> None:
+        """Evaluates a batch of the test split under ``test/``."""
+        self.evaluate(batch, batch_idx, "test")
+
+    def predict_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""
+        geometry = self.scan_geometry
+        image = self.reconstruct(batch["range_image"])
+        return geometry.codec.decode(image[:, 0], geometry.projection.sensor)
+
+    # Checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Adds stage and scan geometry, so that a checkpoint is enough to sample from."""
+        checkpoint["r3dpa"] = {"stage": self.stage, "geometry": self.scan_geometry.to_dict()}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses the checkpoint of another stage.
+
+        Raises:
+            ValueError: Naming both stages.
+        """
+        found = checkpoint.get("r3dpa", {}).get("stage")
+        if found != self.stage:
+            raise ValueError(
+                f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
+                "from another one, give model.init_from instead of ckpt_path"
+            )
+        self.geometry = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
+
+    @property
+    def scan_geometry(self) -> ScanGeometry:
+        """Geometry of the scans it trains on, known from setup or from a checkpoint."""
+        if self.geometry is None:
+            raise RuntimeError("the module has no scan geometry yet: set it up with a data module")
+        return self.geometry

@@ -1,0 +1,78 @@
+"""Stage 1: a VAE trained against a frozen, RGB-pretrained SiT."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from r3dpa.data.datasets import LidarBatch
+from r3dpa.modules.base import GenerativeModule
+from r3dpa.nn import VAE, PatchDiscriminator, SiT
+
+__all__ = ["VAEAlignment"]
+
+
+class VAEAlignment(GenerativeModule):
+    """VAE alignment: L_AE + lambda1 L_align through a frozen transformer.
+
+    Trained are the VAE, the discriminator, the projection head and the patch embedding; the
+    transformer's blocks keep their RGB-pretrained values. With ``weights.vae_alignment`` 0 this is
+    the plain VAE of the ablations and the SiT takes no part. The latent statistics follow the VAE,
+    so that the frozen blocks see unit variance and the joint stage starts from fitted statistics
+    (the official code leaves them at mean 0, variance 1).
+
+    Source: R3DPA (ICRA 2026), section "VAE Alignment for RGB Image Priors".
+
+    Args:
+        vae: Range-image autoencoder, trained from scratch.
+        sit: Flow transformer, frozen but for projector and patch embedding.
+        discriminator: Patch discriminator.
+        train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
+        keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
+        **kwargs: See :class:`GenerativeModule`.
+    """
+
+    stage = "vae_alignment"
+    default_init = ("vae",)
+    trains_velocity = False
+
+    def __init__(
+        self,
+        vae: VAE,
+        sit: SiT,
+        discriminator: PatchDiscriminator,
+        train_patch_embed: bool = True,
+        keep_projector: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(vae, sit, discriminator, keep_projector=keep_projector, **kwargs)
+        self.sit.requires_grad_(False)
+        if self.weights.vae_alignment != 0:
+            self.sit.projector.requires_grad_(True)
+            self.sit.x_embedder.requires_grad_(train_patch_embed)
+
+    def needs_features(self) -> bool:
+        """Only lambda1 counts: the velocity is not trained in this stage."""
+        return self.weights.vae_alignment != 0
+
+    def trainable(self) -> dict[str, nn.Module]:
+        """VAE, discriminator and, when aligning, what is not frozen of the SiT."""
+        networks: dict[str, nn.Module] = {
+            "vae": self.vae,
+            "discriminator": self.get_submodule("discriminator"),
+        }
+        return networks | ({"sit": self.sit} if self.needs_features() else {})
+
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """One step on a batch of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+        image, features = batch["range_image"], batch.get("feature_grid")
+        draws = self.draw_path(image, self.batch_number)
+        posterior = self.vae.encode(image)
+        latents = posterior.sample(draws.posterior_noise)
+        reconstruction = self.vae.decode(latents)
+        losses = self.vae_losses(image, posterior, reconstruction)
+        losses |= self.vae_alignment_losses(latents, features, draws)
+        losses |= self.discriminator_losses(image, reconstruction)
+        self.latent_norm.update(latents.detach())
+        return self.weigh_and_log(losses)

@@ -1,0 +1,151 @@
+"""The three stages through the real command line, at the size of conf/smoke.yaml."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+import wandb
+import yaml
+
+from r3dpa.cli import main
+
+STAGES = ("vae_alignment", "joint", "flow_matching")
+
+
+def from_previous(stage, vae_checkpoint):
+    return [] if stage == "vae_alignment" else ["--model.init_args.init_from", str(vae_checkpoint)]
+
+
+def load(run_dir):
+    return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_stage_trains_logs_and_draws(stage, smoke_args, vae_checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    main(smoke_args(stage, tmp_path, *from_previous(stage, vae_checkpoint)))
+    wandb.finish()  # or the next logger of this process would join the run
+    content = load(tmp_path)
+    assert content["global_step"] == 3
+    assert content["r3dpa"]["stage"] == stage
+    (metrics,) = tmp_path.glob("version_*/metrics.csv")
+    columns = set(metrics.read_text().splitlines()[0].split(","))
+    expected = {
+        "vae_alignment": {"reconstruction", "kl", "adversarial", "discriminator", "vae_alignment"},
+        "joint": {"reconstruction", "vae_alignment", "discriminator", "denoising", "sit_alignment"},
+        "flow_matching": {"denoising"},
+    }[stage]
+    assert {f"train/{name}" for name in expected} <= columns
+    networks = {"vae_alignment": 3, "joint": 3, "flow_matching": 1}[stage]
+    assert sum(column.startswith("grad_norm/") for column in columns) == networks
+    assert "val/range_error_m" in columns
+    pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert "val_reconstruction_0000003.png" in pictures
+    assert ("val_samples_0000003.png" in pictures) == (stage != "vae_alignment")
+    assert list(tmp_path.glob("wandb/offline-run-*"))
+
+
+def test_vae_alignment_freezes_the_blocks(smoke_args, vae_checkpoint):
+    content = torch.load(vae_checkpoint, weights_only=True)
+    (group,) = [g for g in content["optimizer_states"][0]["param_groups"] if g["name"] == "sit"]
+    sit = {k for k in content["state_dict"] if k.startswith("sit.")}
+    trained = {k for k in sit if "projector" in k or "x_embedder" in k}
+    assert len(group["params"]) == len(trained)
+    assert content["state_dict"]["latent_norm.num_batches_tracked"] == 3
+
+
+def test_flow_matching_leaves_the_vae_alone(smoke_args, vae_checkpoint, tmp_path):
+    more = ["--trainer.logger=false", *from_previous("flow_matching", vae_checkpoint)]
+    main(smoke_args("flow_matching", tmp_path, *more))
+    before, after = torch.load(vae_checkpoint, weights_only=True), load(tmp_path)
+    vae = [key for key in after["state_dict"] if key.startswith("vae.")]
+    assert vae
+    for key in vae:
+        assert torch.equal(before["state_dict"][key], after["state_dict"][key])
+
+
+def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, tmp_path):
+    """At learning rate 0 the loaded weights are still there after three steps."""
+    still = ["--model.init_args.optimizer.lr", "0", "--trainer.logger=false"]
+    main(smoke_args("joint", tmp_path, *from_previous("joint", vae_checkpoint), *still))
+    before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
+    after = load(tmp_path)["state_dict"]
+    for prefix in ("vae.", "sit."):
+        keys = [key for key in before if key.startswith(prefix)]
+        assert keys
+        for key in keys:
+            torch.testing.assert_close(after[key], before[key])
+    torch.testing.assert_close(after["ema.sit.pos_embed"], before["sit.pos_embed"])
+
+
+def test_resume_is_exact(smoke_args, vae_checkpoint, tmp_path):
+    """Six steps equal three, a resume, and three more, bit for bit."""
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+    more += from_previous("joint", vae_checkpoint)
+    main(smoke_args("joint", tmp_path / "whole", *more, "--trainer.max_steps", "6"))
+    main(smoke_args("joint", tmp_path / "parts", *more))
+    last = str(tmp_path / "parts" / "checkpoints" / "last.ckpt")
+    resume = ["--trainer.max_steps", "6", "--ckpt_path", last]
+    main(smoke_args("joint", tmp_path / "parts", *more, *resume))
+    whole, parts = load(tmp_path / "whole"), load(tmp_path / "parts")
+    assert whole["global_step"] == parts["global_step"] == 6
+    for key, value in whole["state_dict"].items():
+        assert torch.equal(value, parts["state_dict"][key]), key
+    whole, parts = (c["optimizer_states"][0]["state"] for c in (whole, parts))
+    for index, state in whole.items():
+        for key, value in state.items():
+            assert torch.equal(value, parts[index][key]), (index, key)
+
+
+def test_accumulation_counts_optimiser_steps(smoke_args, tmp_path):
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+    more += ["--data.init_args.batch_size", "1", "--trainer.accumulate_grad_batches", "2"]
+    main(smoke_args("joint", tmp_path, *more))
+    content = load(tmp_path)
+    progress = content["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]
+    assert content["global_step"] == 3
+    assert progress["ready"] == 6
+
+
+def test_bf16_mixed_keeps_weights_and_average_in_float32(smoke_args, tmp_path):
+    more = ["--trainer.logger=false", "--trainer.precision", "bf16-mixed"]
+    main(smoke_args("joint", tmp_path, *more))
+    for key, value in load(tmp_path)["state_dict"].items():
+        assert not value.is_floating_point() or value.dtype == torch.float32, key
+        assert value.isfinite().all(), key
+
+
+@pytest.mark.ddp
+@pytest.mark.parametrize("stage", STAGES)
+def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_checkpoint, tmp_path):
+    """Same data, same draws, synchronised batch statistics: only the order of sums differs.
+
+    A sum in another order changes a float32 gradient by about 1e-7 of its terms. AdamW divides by
+    the gradient's own size, so where the true gradient is zero (biases in front of a group norm of
+    one channel) it would turn that rounding into a full step; eps = 1e-3 keeps such steps at
+    lr * 1e-7 / 1e-3. With lr = 1e-2, three steps of about 1e-2 must then agree to 1e-5.
+    """
+    runs = {"one": (1, "2", "auto"), "two": (2, "1", "ddp")}
+    contents = {}
+    for name, (devices, batch_size, strategy) in runs.items():
+        more = ["--trainer.devices", str(devices), "--data.init_args.batch_size", batch_size]
+        more += ["--trainer.strategy", strategy, "--trainer.logger=false"]
+        more += ["--trainer.limit_val_batches=0", *from_previous(stage, vae_checkpoint)]
+        more += ["--model.init_args.optimizer", "{lr: 1.0e-2, eps: 1.0e-3}"]
+        command = [sys.executable, "-m", "r3dpa", *smoke_args(stage, tmp_path / name, *more)]
+        subprocess.run(command, check=True, timeout=300, capture_output=True)
+        contents[name] = load(tmp_path / name)["state_dict"]
+    for key, value in contents["one"].items():
+        torch.testing.assert_close(contents["two"][key], value, atol=1e-5, rtol=1e-5, msg=key)
+
+
+def test_saved_config_names_what_ran(smoke_args, tmp_path):
+    main(smoke_args("joint", tmp_path, "--trainer.logger=false", "--trainer.limit_val_batches=0"))
+    config = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
+    assert config["trainer"]["max_steps"] == 3
+    json.dumps(config)

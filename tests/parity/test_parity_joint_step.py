@@ -1,0 +1,257 @@
+"""Two official REPA-E steps, run here by a real Trainer with one optimiser and one backward."""
+
+from __future__ import annotations
+
+import lightning as L
+import pytest
+from torch.utils.data import DataLoader
+
+from r3dpa import losses
+from r3dpa.data import LidarDataModule
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.modules import JointAlignment, LossWeights, OptimizerConfig
+from r3dpa.modules.base import PathDraws
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
+
+
+class RecordedData(LidarDataModule):
+    """The recorded images and features in place of scans."""
+
+    def __init__(self, case, num_steps):
+        L.LightningDataModule.__init__(self)
+        image = case["in/step0/image"]
+        sensor = LidarSensor(beams=image.shape[2], columns=image.shape[3])
+        self.projection, self.codec = SphericalProjection(sensor), RangeCodec()
+        self.projection_kind = "spherical"
+        patch = case.config["sit"]["patch_size"]
+        self.grid_size = tuple(size // patch for size in case.config["sit"]["input_size"])
+        self.features_dir, self.extractor = "recorded", None
+        self.width = case["in/step0/features"].shape[-1]
+        self.batches = [
+            {
+                "range_image": case[f"in/step{step}/image"],
+                "feature_grid": case[f"in/step{step}/features"],
+            }
+            for step in range(num_steps)
+        ]
+
+    feature_dim = property(lambda self: self.width)
+    geometry = property(lambda self: ScanGeometry(self.projection, self.codec, self.grid_size))
+
+    def prepare_data(self):
+        pass
+
+    def setup(self, stage):
+        pass
+
+    def train_dataloader(self):
+        return DataLoader(self.batches, batch_size=None)
+
+    def val_dataloader(self):
+        return []
+
+    def state_dict(self):
+        return {}
+
+
+class Recording(JointAlignment):
+    """Takes the recorded draws and keeps what the official loop logged."""
+
+    def attach(self, case):
+        self.case, self.steps = case, []
+
+    def load_previous_stage(self):
+        """Keeps the recorded average, which differs from the weights."""
+
+    def draw_path(self, image, batch_number, stream=0):
+        self.steps.append({})
+        values = f"in/step{batch_number}"
+        return PathDraws(
+            self.case[f"{values}/posterior_noise"],
+            self.case[f"{values}/time_input"].flatten(),
+            self.case[f"{values}/noises"],
+        )
+
+    def weigh_and_log(self, parts):
+        self.steps[-1]["parts"] = {name: value.detach().clone() for name, value in parts.items()}
+        return super().weigh_and_log(parts)
+
+    def configure_gradient_clipping(self, *args, **kwargs):
+        super().configure_gradient_clipping(*args, **kwargs)
+        self.steps[-1]["norms"] = dict(self.trainer.callback_metrics)
+        self.steps[-1]["gradients"] = {
+            name: p.grad.clone() for name, p in self.named_parameters() if p.grad is not None
+        }
+
+    def optimizer_step(self, *args, **kwargs):
+        super().optimizer_step(*args, **kwargs)
+        self.steps[-1]["weights"] = {k: v.clone() for k, v in self.state_dict().items()}
+
+
+def ours(official: str) -> str:
+    """Our name of an official weight such as ``sit.bn.running_mean``."""
+    network, _, key = official.partition(".")
+    prefix = "ema." if network == "ema" else ""
+    if network in ("sit", "ema"):
+        key = key.replace("projectors.0.", "projector.")
+        if key.startswith("bn."):
+            return f"{prefix}latent_norm.{key.removeprefix('bn.')}"
+        return f"{prefix}sit.{key}"
+    return official
+
+
+def recorder(module, name, loss):
+    def recording(*args, **kwargs):
+        result = loss(*args, **kwargs)
+        module.steps[-1].setdefault(name, []).append(result.detach().clone())
+        return result
+
+    return recording
+
+
+@pytest.fixture(scope="module")
+def recorded(load_case):
+    return load_case("joint_step")
+
+
+@pytest.fixture(scope="module")
+def run(recorded):
+    config = recorded.config
+    vae_loss = config["loss_config"]["losses"]
+    sit, vae, disc = config["sit"], config["vae"], config["discriminator"]
+    module = Recording(
+        vae=VAE(
+            in_channels=vae["in_channels"],
+            latent_channels=vae["z_channels"],
+            channels=vae["ch"],
+            channel_multipliers=tuple(vae["ch_mult"]),
+            strides=tuple(tuple(stride) for stride in vae["strides"]),
+            num_res_blocks=vae["num_res_blocks"],
+            attention_levels=tuple(vae["attn_levels"]),
+            legacy_upsample=True,
+        ),
+        sit=SiT(
+            input_size=tuple(sit["input_size"]),
+            in_channels=sit["in_channels"],
+            patch_size=sit["patch_size"],
+            hidden_size=sit["hidden_size"],
+            depth=sit["depth"],
+            num_heads=sit["num_heads"],
+            alignment_depth=sit["encoder_depth"],
+            feature_dim=sit["z_dims"][0],
+            projector_dim=sit["projector_dim"],
+            num_classes=sit["num_classes"],
+            class_dropout=sit["class_dropout_prob"] > 0,
+            qk_norm=sit["qk_norm"],
+            learn_pos_embed=True,
+        ),
+        discriminator=PatchDiscriminator(disc["input_nc"], disc["ndf"], disc["n_layers"]),
+        weights=LossWeights(
+            reconstruction=vae_loss["reconstruction_weight"],
+            reconstruction_norm=vae_loss["reconstruction_loss"],
+            kl=float(vae_loss["kl_weight"]),
+            adversarial=vae_loss["discriminator_weight"] * vae_loss["discriminator_factor"],
+            discriminator=vae_loss["discriminator_factor"],
+            adversarial_start=vae_loss["discriminator_start"],
+            vae_alignment=config["vae_align_proj_coeff"],
+            sit_alignment=config["proj_coeff"],
+        ),
+        optimizer=OptimizerConfig(
+            config["lr"], tuple(config["betas"]), config["weight_decay"], config["eps"]
+        ),
+        latent_norm=LatentNorm(sit["in_channels"], momentum=sit["bn_momentum"]),
+        ema_decay=config["ema_decay"],
+        ema_buffers="decay",
+    )
+    module.load_state_dict({ours(key): value for key, value in recorded.weights().items()})
+    module.attach(recorded)
+    trainer = L.Trainer(
+        accelerator="cpu",
+        max_steps=config["steps"],
+        gradient_clip_val=config["max_grad_norm"],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("alignment_loss", "flow_matching_loss", "generator_loss"):
+            patch.setattr(losses, name, recorder(module, name, getattr(losses, name)))
+        hinge = losses.discriminator_loss
+
+        def recorded_hinge(real, fake):
+            module.steps[-1]["logits"] = (real.mean().detach(), fake.mean().detach())
+            return hinge(real, fake)
+
+        patch.setattr(losses, "discriminator_loss", recorded_hinge)
+        trainer.fit(module, datamodule=RecordedData(recorded, config["steps"]))
+    assert len(module.steps) == config["steps"]
+    return module.steps
+
+
+@pytest.fixture(scope="module")
+def values(recorded, run):
+    """What we computed, under the name of the recorded array."""
+    found = {}
+    for step, ours_ in enumerate(run):
+        parts, out = ours_["parts"], f"out/step{step}"
+        vae = parts["reconstruction"] + parts["kl"] + parts["adversarial"]
+        found |= {
+            f"{out}/vae/generator_total": vae,
+            f"{out}/vae/total": vae + parts["vae_alignment"],
+            f"{out}/vae/reconstruction_loss": parts["reconstruction"],
+            f"{out}/vae/kl_loss": parts["kl"],
+            f"{out}/vae/weighted_gan_loss": parts["adversarial"],
+            f"{out}/vae/gan_loss": ours_["generator_loss"][0],
+            f"{out}/vae/align_proj_loss": ours_["alignment_loss"][0],
+            f"{out}/disc/loss": parts["discriminator"],
+            f"{out}/disc/logits_real": ours_["logits"][0],
+            f"{out}/disc/logits_fake": ours_["logits"][1],
+            f"{out}/sit/denoising_loss": ours_["flow_matching_loss"][0],
+            f"{out}/sit/proj_loss": ours_["alignment_loss"][1],
+            f"{out}/sit/total": parts["denoising"] + parts["sit_alignment"],
+        }
+        for official, network in {"vae": "vae", "disc": "discriminator", "sit": "sit"}.items():
+            found[f"{out}/{official}/grad_norm"] = ours_["norms"][f"grad_norm/{network}"]
+            for key in recorded.keys(prefix := f"{out}/{official}/grad_clipped/"):
+                name = ours(f"{network}.{key.removeprefix(prefix)}")
+                found[key] = ours_["gradients"][name]
+        for key in recorded.keys(prefix := f"{out}/weights/"):
+            weights = run[steps_seen(recorded, step) - 1]["weights"]
+            found[key] = weights[ours(key.removeprefix(prefix))]
+    return found
+
+
+def steps_seen(recorded, step):
+    """Steps after which the weights of a step were stored.
+
+    The recorder of the shared file kept references instead of copies: the arrays it calls step 0
+    equal those of step 1 bit for bit. The batch-norm counter inside tells how old they are; the
+    true weights after step 0 show in the losses and gradients of step 1.
+    """
+    counter = "sit.bn.num_batches_tracked"
+    seen = recorded[f"out/step{step}/weights/{counter}"] - recorded[f"w/{counter}"]
+    assert step + 1 <= seen <= recorded.config["steps"]
+    return int(seen)
+
+
+def test_joint_step_leaves_nothing_unchecked(recorded, values):
+    assert set(values) == set(recorded.keys("out/"))
+
+
+def test_joint_step_losses_and_gradients(recorded, values, close):
+    for key, value in values.items():
+        if "/weights/" not in key:
+            close(value, recorded[key])
+
+
+def test_joint_step_weights_statistics_and_ema(recorded, values, close):
+    start, checked = recorded.weights(), set()
+    for key, value in values.items():
+        _, separator, official = key.partition("/weights/")
+        if separator:
+            close(value, recorded[key], atol=5e-6, rtol=1e-5)
+            moved = recorded[key].double() - start[official].double()
+            close(value.double() - start[official].double(), moved, atol=5e-6, rtol=0.0)
+            checked.add(official.partition(".")[0])
+    assert checked == {"vae", "sit", "ema", "discriminator"}
