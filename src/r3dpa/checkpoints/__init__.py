@@ -1,0 +1,24 @@
+"""Checkpoints: our files, Lightning's and the official ones, with strict loading."""
+
+from r3dpa.checkpoints.convert import ConversionReport, convert
+from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint, source_commit
+from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
+from r3dpa.checkpoints.official import from_official, to_official
+from r3dpa.checkpoints.transfer import TransferReport, TransferRow, transfer_rgb
+
+__all__ = [
+    "NETWORK_NAMES",
+    "Checkpoint",
+    "ConversionReport",
+    "NetworkState",
+    "TransferReport",
+    "TransferRow",
+    "convert",
+    "from_official",
+    "load_into",
+    "read_checkpoint",
+    "save_checkpoint",
+    "source_commit",
+    "to_official",
+    "transfer_rgb",
+]

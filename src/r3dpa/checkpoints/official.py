@@ -1,0 +1,419 @@
+"""Official R3DPA checkpoints: keys and options of valeoai/R3DPA, translated in both directions.
+
+An official SiT holds the latent batch norm as ``bn.*`` and its projector as ``projectors.0.*``;
+everything else has the same name here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState
+from r3dpa.nn.discriminator import PatchDiscriminator
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
+from r3dpa.nn.vae import VAE
+
+__all__ = ["from_official", "is_official", "statistics_of", "to_official"]
+
+StateDict = Mapping[str, Tensor]
+Encoding = Literal["linear", "log2"]
+
+_OFFICIAL_PREFIX, _OUR_PREFIX, _NORM_PREFIX = "projectors.0.", "projector.", "bn."
+_NUM_HEADS = {384: 6, 768: 12, 1024: 16, 1152: 16}  # SiT-S, -B, -L, -XL by token width
+_SIZE_NAMES = {(384, 12): "S", (768, 12): "B", (1024, 24): "L", (1152, 28): "XL"}
+_SIT_NETWORKS = {"model": ("sit", "latent_norm"), "ema": ("ema", "ema_latent_norm")}
+_OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
+_STATISTICS = {"latents_scale", "latents_bias"}
+_DATASET_CONFIGS: dict[Encoding, str] = {"linear": "kitti.yaml", "log2": "kitti_logscale.yaml"}
+_OFFICIAL_PROJECTION: dict[str, Any] = {
+    "kind": "spherical",
+    "sensor": {
+        "beams": 64,
+        "columns": 1024,
+        "inclination_max_deg": 3.0,
+        "inclination_min_deg": -25.0,
+        "range_min_m": 1.0,
+        "range_max_m": 56.0,
+    },
+}
+
+
+def is_official(content: Any) -> bool:
+    """Whether what a ``.pt`` file holds is one of the four official layouts."""
+    return isinstance(content, Mapping) and (
+        any(isinstance(content.get(key), Mapping) for key in _SIT_NETWORKS)
+        or set(content) == _STATISTICS
+        or _is_vae(content)
+        or _is_discriminator(content)
+    )
+
+
+def from_official(
+    content: Mapping[str, Any],
+    path: Path,
+    *,
+    args: Mapping[str, Any] | None = None,
+    sit_args: Mapping[str, Any] | None = None,
+    encoding: Encoding | None = None,
+) -> Checkpoint:
+    """Checkpoint from the content of an official file; every key is translated or left out by name.
+
+    Args:
+        content: A training checkpoint (``model``, ``ema``, ``vae``, ``discriminator``, ``steps``,
+            ``args``, optimisers), or the weights of a VAE, of a discriminator, or latent
+            statistics (``latents_scale``, ``latents_bias``) alone.
+        path: File that held it.
+        args: Options of the official training script, where ``content`` has no ``args``.
+        sit_args: Arguments of SiT that override what weights and options tell.
+        encoding: Encoding of the range image; taken from the options where None.
+
+    Returns:
+        Its networks, and what was not read with the reason. The geometry is known if the options
+        or ``encoding`` tell the encoding of a SiT for range images.
+
+    Raises:
+        ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
+            can neither be read nor inferred.
+    """
+    found = content.get("args", args)
+    options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
+    if _is_vae(content):
+        content = {"vae": content}
+    elif _is_discriminator(content):
+        content = {"discriminator": content}
+    networks: dict[str, NetworkState] = {}
+    left_out: dict[str, str] = {}
+    if set(content) >= _STATISTICS:
+        networks["latent_norm"] = _norm_from_statistics(content)
+        content = {key: value for key, value in content.items() if key not in _STATISTICS}
+    strides = _vae_strides(content.get("vae", {}), options)
+    for key, value in content.items():
+        if key in _SIT_NETWORKS:
+            parts = _sit(_weights(key, value), options, sit_args or {}, strides)
+            networks |= dict(zip(_SIT_NETWORKS[key], parts, strict=True))
+        elif key == "vae" and not _is_vae(value):
+            left_out[key] = "that of the file is not for range images"
+        elif key == "vae":
+            networks[key] = _vae(_weights(key, value))
+        elif key == "discriminator":
+            networks[key] = _discriminator(_weights(key, value))
+        elif key in _OPTIMISERS:
+            left_out[key] = f"optimiser of the {_OPTIMISERS[key]}: training starts with a new one"
+        elif key not in ("args", "steps"):
+            left_out[key] = "no part of an official checkpoint"
+    for name, state in networks.items():
+        try:
+            state.check()
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    return Checkpoint(
+        path=path,
+        stage="official",
+        networks=networks,
+        step=content.get("steps"),
+        geometry=_geometry(networks, options, encoding) if strides is not None else None,
+        official_args=options,
+        left_out=left_out,
+    )
+
+
+def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What an official training checkpoint would hold, without optimisers.
+
+    The statistics of ``ema`` are those of ``latent_norm`` if the checkpoint has no others. Without
+    the options of an official run, ``args`` is made from the arguments of the networks.
+
+    Args:
+        checkpoint: Checkpoint in any format.
+
+    Returns:
+        The networks it has under ``model``, ``ema``, ``vae``, ``discriminator``; ``steps``, and
+        ``args`` as a ``Namespace``.
+
+    Raises:
+        ValueError: If a network has no official counterpart.
+    """
+    content: dict[str, Any] = {}
+    for key, (sit_name, norm_name) in _SIT_NETWORKS.items():
+        if sit_name in checkpoint.networks:
+            sit = _official_part(checkpoint, sit_name, SiT)
+            norm = checkpoint.networks.get(norm_name) or checkpoint.network("latent_norm")
+            content[key] = {
+                _renamed(k, _OUR_PREFIX, _OFFICIAL_PREFIX): v for k, v in sit.state_dict.items()
+            } | {f"{_NORM_PREFIX}{k}": v for k, v in norm.state_dict.items()}
+    if "vae" in checkpoint.networks:
+        vae = _official_part(checkpoint, "vae", VAE)
+        if not vae.arguments["legacy_upsample"]:
+            raise ValueError(
+                f"the VAE of {checkpoint.path} wraps columns when it upsamples, the official one "
+                "does not, so its weights would decode to other images there: only a VAE built "
+                "with legacy_upsample=True has an official counterpart"
+            )
+        content["vae"] = dict(vae.state_dict)
+    if "discriminator" in checkpoint.networks:
+        state = _official_part(checkpoint, "discriminator", PatchDiscriminator)
+        content["discriminator"] = dict(state.state_dict)
+    if checkpoint.step is not None:
+        content["steps"] = checkpoint.step
+    args = dict(checkpoint.official_args) or _args_of(checkpoint)
+    return content | {"args": argparse.Namespace(**args)}
+
+
+def statistics_of(norm: StateDict) -> dict[str, Tensor]:
+    """Official latent statistics: scale ``1 / sqrt(variance)`` and bias, each ``(1, C, 1, 1)``."""
+    scale, bias = norm["running_var"].rsqrt(), norm["running_mean"]
+    return {"latents_scale": scale[None, :, None, None], "latents_bias": bias[None, :, None, None]}
+
+
+def _official_part(checkpoint: Checkpoint, name: str, kind: type[nn.Module]) -> NetworkState:
+    state = checkpoint.network(name)
+    if state.kind is not kind:
+        raise ValueError(
+            f"{name} of {checkpoint.path} is a {state.class_path}, which has no official "
+            f"counterpart; {_path_of(kind)} has"
+        )
+    return state
+
+
+def _path_of(kind: type[nn.Module]) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _is_vae(content: Any) -> bool:
+    """Whether these are weights of a VAE for one-channel range images."""
+    conv_in = content.get("encoder.conv_in.weight") if isinstance(content, Mapping) else None
+    return isinstance(conv_in, Tensor) and conv_in.dim() == 4 and conv_in.shape[1] == 1
+
+
+def _weights(key: str, value: Any) -> StateDict:
+    if not isinstance(value, Mapping) or not all(isinstance(v, Tensor) for v in value.values()):
+        raise ValueError(f"entry {key!r} holds no weights but {type(value).__name__}")
+    return value
+
+
+def _is_discriminator(content: Mapping[str, Any]) -> bool:
+    return len(content) > 0 and all(str(key).startswith("main.") for key in content)
+
+
+def _renamed(key: str, old: str, new: str) -> str:
+    return new + key.removeprefix(old) if key.startswith(old) else key
+
+
+def _sit(
+    weights: StateDict,
+    args: Mapping[str, Any],
+    sit_args: Mapping[str, Any],
+    strides: tuple[int, int] | None,
+) -> tuple[NetworkState, NetworkState]:
+    """SiT and its latent statistics from an official SiT."""
+    norm = {
+        key.removeprefix(_NORM_PREFIX): value
+        for key, value in weights.items()
+        if key.startswith(_NORM_PREFIX)
+    }
+    sit = {
+        _renamed(key, _OFFICIAL_PREFIX, _OUR_PREFIX): value
+        for key, value in weights.items()
+        if not key.startswith(_NORM_PREFIX)
+    }
+    init_args = _sit_args(sit, args, sit_args, strides)
+    norm_args = {
+        "channels": init_args["in_channels"],
+        "momentum": args.get("bn_momentum", 0.1),
+        "legacy_inverse": True,
+    }
+    return (
+        NetworkState(_path_of(SiT), init_args, sit),
+        NetworkState(_path_of(LatentNorm), norm_args, norm),
+    )
+
+
+def _sit_args(
+    sit: StateDict,
+    args: Mapping[str, Any],
+    given: Mapping[str, Any],
+    strides: tuple[int, int] | None,
+) -> dict[str, Any]:
+    try:
+        hidden_size, in_channels, patch_size, _ = sit["x_embedder.proj.weight"].shape
+        num_rows = len(sit["y_embedder.embedding_table.weight"])
+        inferred: dict[str, Any] = {
+            "in_channels": in_channels,
+            "patch_size": patch_size,
+            "hidden_size": hidden_size,
+            "depth": len({key.split(".")[1] for key in sit if key.startswith("blocks.")}),
+            "mlp_ratio": len(sit["blocks.0.mlp.fc1.weight"]) / hidden_size,
+            "feature_dim": len(sit["projector.4.weight"]),
+            "projector_dim": len(sit["projector.0.weight"]),
+            "qk_norm": "blocks.0.attn.q_norm.weight" in sit,
+        }
+        num_tokens = sit["pos_embed"].shape[1]
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"the weights are not those of an official SiT ({error}); the official UNet and other "
+            "backbones cannot be read"
+        ) from error
+    num_classes = {**args, **given}.get("num_classes", max(1, num_rows - 1))
+    if num_rows not in (num_classes, num_classes + 1):
+        raise ValueError(
+            f"the label table has {num_rows} rows, which fits no model of {num_classes} classes"
+        )
+    inferred |= {"num_classes": num_classes, "class_dropout": num_rows > num_classes}
+    if "encoder_depth" in args:
+        inferred["alignment_depth"] = args["encoder_depth"]
+    if hidden_size in _NUM_HEADS:
+        inferred["num_heads"] = _NUM_HEADS[hidden_size]
+    input_size = _input_size(num_tokens, patch_size, strides)
+    if input_size is not None:
+        inferred["input_size"] = list(input_size)
+    init_args = inferred | dict(given)
+    unknown = {"alignment_depth", "num_heads", "input_size"} - set(init_args)
+    if unknown:
+        raise ValueError(
+            f"neither weights nor training options (args, args.json) tell {sorted(unknown)} of "
+            f"this SiT with {num_tokens} tokens of width {hidden_size}; give them as sit_args"
+        )
+    return init_args
+
+
+def _input_size(
+    num_tokens: int, patch_size: int, strides: tuple[int, int] | None
+) -> tuple[int, int] | None:
+    """Latent rows and columns: of the official range image, else of a square image."""
+    if strides is not None:
+        sensor = _OFFICIAL_PROJECTION["sensor"]
+        rows, columns = sensor["beams"] // strides[0], sensor["columns"] // strides[1]
+        return (rows, columns) if rows * columns == num_tokens * patch_size**2 else None
+    side = round(num_tokens**0.5)
+    return (side * patch_size, side * patch_size) if side**2 == num_tokens else None
+
+
+def _vae_strides(vae: StateDict, args: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Rows and columns of the image per latent, of a range-image VAE or of its official name.
+
+    ``h2p4d8``: patches of 4 x 4 pixels, twice as long horizontally, 8 channels.
+    """
+    if _is_vae(vae):
+        strides = _vae(vae).init_args["strides"]
+        return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
+    name = re.fullmatch(r"h(\d+)(?:p(\d+))?d\d+", str(args.get("vae", "")))
+    if name is None:
+        return None
+    patch = int(name[2] or 1)
+    return patch, patch * int(name[1])
+
+
+def _vae(weights: StateDict) -> NetworkState:
+    """Range-image VAE; its decoder kernels are 1x5 above a (1, 2) upsampling, 3x3 above (2, 2)."""
+    try:
+        channels = len(weights["encoder.conv_in.weight"])
+        levels = range(len({k.split(".")[2] for k in weights if k.startswith("encoder.down.")}))
+        widths = [len(weights[f"encoder.down.{i}.block.0.conv1.weight"]) for i in levels]
+        ups = [weights[f"decoder.up.{i}.upsample.conv.weight"] for i in levels[1:]]
+        kernels = [(int(up.shape[2]), int(up.shape[3])) for up in ups]
+        latent_channels = len(weights["post_quant_conv.weight"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(f"the weights of the VAE are incomplete: {error}") from error
+    strides = {(1, 5): [1, 2], (3, 3): [2, 2]}
+    if not set(kernels) <= set(strides):
+        raise ValueError(
+            f"the VAE's upsampling kernels {kernels} are not those of an official VAE, "
+            f"{list(strides)}"
+        )
+    blocks = {key.split(".")[4] for key in weights if key.startswith("encoder.down.0.block.")}
+    init_args = {
+        "in_channels": weights["encoder.conv_in.weight"].shape[1],
+        "latent_channels": latent_channels,
+        "channels": channels,
+        "channel_multipliers": [width // channels for width in widths],
+        "strides": [strides[kernel] for kernel in kernels],
+        "num_res_blocks": len(blocks),
+        "attention_levels": [i for i in levels if f"encoder.down.{i}.attn.0.q.weight" in weights],
+        "legacy_upsample": True,
+    }
+    return NetworkState(_path_of(VAE), init_args, dict(weights))
+
+
+def _discriminator(weights: StateDict) -> NetworkState:
+    first = weights.get("main.0.weight")
+    num_convolutions = sum(value.dim() == 4 for value in weights.values())
+    if first is None or first.dim() != 4 or num_convolutions < 3:
+        raise ValueError(
+            "the weights are not those of a patch discriminator, which has at least 3 convolutions "
+            f"from main.0 on: {num_convolutions} found"
+        )
+    init_args = {
+        "in_channels": first.shape[1],
+        "channels": len(first),
+        "num_layers": num_convolutions - 2,
+    }
+    return NetworkState(_path_of(PatchDiscriminator), init_args, dict(weights))
+
+
+def _norm_from_statistics(content: StateDict) -> NetworkState:
+    """Latent statistics; the number of batches is not recorded, 1 marks them as fitted."""
+    scale, bias = (content[key].flatten() for key in ("latents_scale", "latents_bias"))
+    weights = {
+        "running_mean": bias,
+        "running_var": scale.double().pow(-2).to(scale.dtype),
+        "num_batches_tracked": torch.tensor(1),
+    }
+    init_args = {"channels": len(bias), "legacy_inverse": True}
+    return NetworkState(_path_of(LatentNorm), init_args, weights)
+
+
+def _geometry(
+    networks: Mapping[str, NetworkState],
+    args: Mapping[str, Any],
+    encoding: Encoding | None,
+) -> dict[str, Any] | None:
+    """Plain values of the official ``ScanGeometry``; None without a SiT or a known encoding."""
+    if encoding is None and "dataset_config" in args:
+        by_config = {config: key for key, config in _DATASET_CONFIGS.items()}
+        encoding = by_config.get(Path(str(args["dataset_config"])).name)
+    sit = next((networks[name] for name in ("sit", "ema") if name in networks), None)
+    if encoding is None or sit is None:
+        return None
+    patch_size = sit.init_args["patch_size"]
+    return {
+        "projection": _OFFICIAL_PROJECTION,
+        "codec": {"encoding": encoding, "scale": None, "legacy_inverse": False},
+        "grid_size": [side // patch_size for side in sit.init_args["input_size"]],
+    }
+
+
+def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The options that the official scripts read, as far as the checkpoint tells them."""
+    args: dict[str, Any] = {}
+    if "vae" in checkpoint.networks:
+        vae = checkpoint.network("vae").arguments
+        rows, columns = (math.prod(stride[axis] for stride in vae["strides"]) for axis in (0, 1))
+        patch = f"p{rows}" if rows > 1 else ""
+        args["vae"] = f"h{columns // rows}{patch}d{vae['latent_channels']}"
+    sit_name = next((name for name in ("sit", "ema") if name in checkpoint.networks), None)
+    if sit_name is not None:
+        sit = checkpoint.network(sit_name).arguments
+        args |= {
+            "num_classes": sit["num_classes"],
+            "cfg_prob": 0.1 if sit["class_dropout"] else 0.0,
+            "encoder_depth": sit["alignment_depth"],
+            "qk_norm": sit["qk_norm"],
+            "bn_momentum": checkpoint.network("latent_norm").arguments["momentum"],
+        }
+        size = _SIZE_NAMES.get((sit["hidden_size"], sit["depth"]))
+        if size is not None:
+            args["model"] = f"SiT-{size}/{sit['patch_size']}"
+    if checkpoint.geometry is not None:
+        projection, codec = checkpoint.geometry["projection"], checkpoint.geometry["codec"]
+        if all(projection[key] == value for key, value in _OFFICIAL_PROJECTION.items()):
+            args["dataset_config"] = f"configs/{_DATASET_CONFIGS[codec['encoding']]}"
+    return args

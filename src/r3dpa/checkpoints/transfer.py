@@ -1,0 +1,171 @@
+"""RGB weights to range images: what is kept, and what starts afresh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor
+
+from r3dpa.checkpoints.networks import Checkpoint, format_table, load_into
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
+
+__all__ = ["TransferReport", "TransferRow", "transfer_rgb"]
+
+Fate = Literal["kept", "fresh", "truncated"]
+Groups = Mapping[str, Mapping[str, Tensor]]
+
+_NORM = "latent_norm."
+
+
+@dataclass(frozen=True)
+class TransferRow:
+    """One group of weights: what became of it, and why.
+
+    Args:
+        group: Common beginning of the keys.
+        num_tensors: Number of tensors of the group in the receiving network.
+        fate: ``kept``, ``fresh`` (initial value of this run) or ``truncated``.
+        source: Shape of the group's first tensor in the RGB checkpoint, ``-`` if absent.
+        target: The same in the receiving network.
+        reason: Why.
+    """
+
+    group: str
+    num_tensors: int
+    fate: Fate
+    source: str
+    target: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """What :func:`transfer_rgb` did, group by group."""
+
+    path: Path
+    rows: tuple[TransferRow, ...]
+
+    def table(self) -> str:
+        """The report as text, one line per group."""
+        header = ("weights", "tensors", "fate", "first tensor, RGB", "here", "reason")
+        rows = [
+            (row.group, str(row.num_tensors), row.fate, row.source, row.target, row.reason)
+            for row in self.rows
+        ]
+        return f"RGB weights from {self.path}\n{format_table(header, rows)}"
+
+
+def transfer_rgb(
+    checkpoint: Checkpoint,
+    sit: SiT,
+    latent_norm: LatentNorm,
+    *,
+    keep_projector: bool,
+    source: Literal["sit", "ema"] = "sit",
+) -> TransferReport:
+    """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
+
+    Patch embedding, output layer and latent statistics stay fresh if the number of latent channels
+    differs, the position table if the latent size differs, the projector if it is not asked for or
+    does not fit. A label table of several rows is cut to the first if this run has one. All other
+    weights must fit.
+
+    Source: tuning stages of valeoai/R3DPA, which keep the position table of another latent size if
+    it has as many tokens.
+
+    Args:
+        checkpoint: RGB checkpoint, official or ours.
+        sit: Receives the weights, in place.
+        latent_norm: Receives the statistics, in place.
+        keep_projector: Also take the projector, as VAE alignment does.
+        source: Network of the checkpoint to take: ``sit``, or ``ema`` for its average.
+
+    Returns:
+        The fate of every group of weights; fresh ones keep the values they have in ``sit``.
+
+    Raises:
+        ValueError: If anything beside those groups does not fit; nothing is changed then.
+    """
+    rgb = checkpoint.network(source)
+    averaged = source == "ema" and "ema_latent_norm" in checkpoint.networks
+    statistics = checkpoint.network("ema_latent_norm" if averaged else "latent_norm")
+    theirs = _grouped({**rgb.state_dict, **_prefixed(statistics.state_dict)})
+    ours = _grouped({**sit.state_dict(), **_prefixed(latent_norm.state_dict())})
+    same_grid = tuple(rgb.arguments["input_size"]) == tuple(sit.input_size)
+    rows: list[TransferRow] = []
+    merged: dict[str, Tensor] = {}
+    for group in dict.fromkeys((*ours, *theirs)):
+        rgb_part, own_part = theirs.get(group, {}), ours.get(group, {})
+        fate, reason = _fate(group, theirs, ours, keep_projector, same_grid)
+        if fate == "fresh":
+            merged |= own_part
+        elif fate == "truncated":
+            merged |= {key: value[:1] for key, value in rgb_part.items()}
+        else:
+            merged |= rgb_part
+        shapes = _first_shape(rgb_part), _first_shape(own_part)
+        rows.append(TransferRow(group, len(own_part), fate, *shapes, reason))
+    init_args = rgb.arguments | {"input_size": sit.input_size}
+    if any(row.group == "projector" and row.fate == "fresh" for row in rows):
+        init_args["alignment_depth"] = sit.alignment_depth  # a new head may look at another block
+    norm = {k.removeprefix(_NORM): v for k, v in merged.items() if k.startswith(_NORM)}
+    weights = {k: v for k, v in merged.items() if not k.startswith(_NORM)}
+    merged_networks = {
+        "sit": replace(rgb, init_args=init_args, state_dict=weights),
+        "latent_norm": replace(statistics, state_dict=norm),
+    }
+    load_into(
+        {"sit": sit, "latent_norm": latent_norm},
+        replace(checkpoint, networks=merged_networks),
+        stage="RGB transfer",
+    )
+    return TransferReport(checkpoint.path, tuple(rows))
+
+
+def _fate(
+    group: str, theirs: Groups, ours: Groups, keep_projector: bool, same_grid: bool
+) -> tuple[Fate, str]:
+    """What becomes of a group of weights and why, by the rules of the official tuning stages."""
+    of_channels = group in ("x_embedder", "final_layer.linear", "latent_norm")
+    if of_channels and _length(theirs, "x_embedder", 1) != _length(ours, "x_embedder", 1):
+        return "fresh", "other number of latent channels"
+    if group == "pos_embed" and not same_grid:
+        return "fresh", "other latent size"
+    if group == "projector" and not keep_projector:
+        return "fresh", "not asked for"
+    if group == "projector" and _shapes(theirs.get(group, {})) != _shapes(ours[group]):
+        return "fresh", "asked for, but its shapes differ"
+    if group == "y_embedder" and _length(ours, group, 0) == 1 < _length(theirs, group, 0):
+        return "truncated", "one row here: the first is taken"
+    return "kept", "fits"
+
+
+def _grouped(weights: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """Weights by the beginning of their key that decides their fate."""
+    groups: dict[str, dict[str, Tensor]] = {}
+    for key, value in weights.items():
+        parts = key.split(".")
+        group = ".".join(parts[: 2 if parts[0] == "final_layer" else 1])
+        groups.setdefault(group, {})[key] = value
+    return groups
+
+
+def _prefixed(statistics: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {_NORM + key: value for key, value in statistics.items()}
+
+
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(value.shape) for key, value in weights.items()}
+
+
+def _length(groups: Groups, group: str, axis: int) -> int:
+    """Size along an axis of a group's first tensor; 0 if there is no such group."""
+    return next((value.shape[axis] for value in groups.get(group, {}).values()), 0)
+
+
+def _first_shape(weights: Mapping[str, Tensor]) -> str:
+    return next((str(shape) for shape in _shapes(weights).values()), "-")

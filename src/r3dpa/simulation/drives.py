@@ -1,0 +1,255 @@
+"""Simulated data sets on disk, in the layout of KITTI-360.
+
+::
+
+    simulation.json                                      what was asked for
+    data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/
+        timestamps.txt                                   one line a scan, 10 Hz
+        data/%010d.bin                                   (P, 4) float32 x, y, z, intensity
+        labels/%010d.label                               (P,) uint32 semantic | instance << 16
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.sensor import HDL64E
+from r3dpa.simulation.street import Street, generator_for
+
+TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
+VAL_DRIVES = ("0000", "0002")
+VAL_SHARE = 0.2
+
+_MANIFEST = "simulation.json"
+# Raised whenever the same request gives other scans than before.
+_SIMULATOR_VERSION = 1
+# Neighbouring scans share their blocks of street, so a worker takes a few in a row.
+_SCANS_PER_TASK = 8
+_FIRST_SCAN = datetime(2013, 5, 28, 8, 46, 2)
+_SCAN_PERIOD = timedelta(seconds=0.1)
+
+
+@dataclass(frozen=True)
+class SimulationReport:
+    """What a call of ``simulate`` did.
+
+    Args:
+        scans_per_drive: Scans that the data set holds, by drive (four digits).
+        num_written: Scans simulated by this call; the others were there already.
+        ms_per_scan: Mean time of one written scan on one core, milliseconds, writing included;
+            0 where none was written.
+    """
+
+    scans_per_drive: dict[str, int]
+    num_written: int
+    ms_per_scan: float
+
+
+def simulate(
+    out: Path,
+    scans: int,
+    seed: int = 0,
+    workers: int = 1,
+    shots: int = 2083,
+    drives: Sequence[str] | None = None,
+) -> SimulationReport:
+    """Write a simulated data set in the layout of KITTI-360, or complete one.
+
+    Each scan follows from (seed, drive, number) alone: the files are the same bytes for any number
+    of workers. A file appears under its name only when it is whole, so an interrupted call is
+    completed by the same call; a complete data set is left as it is.
+
+    Args:
+        out: Root folder of the data set; made if missing.
+        scans: Scans of all drives together, 1 or more.
+        seed: Seed of the streets, 0 or greater.
+        workers: Processes; more than one needs an importable main module, as ``spawn`` does.
+        shots: Shots per laser and turn, see ``HDL64E``.
+        drives: Four-digit drives to write; by default all official training and validation
+            drives. Where there are drives of both splits, a fifth of the scans (at least one, if
+            there are two or more) goes to validation.
+
+    Returns:
+        Scans per drive and the time per scan.
+
+    Raises:
+        ValueError: If a value is out of range, a drive is unknown or named twice, or ``out`` holds
+            other data or the data set of another request.
+    """
+    if scans < 1:
+        raise ValueError(f"scans must be 1 or greater, got {scans}")
+    if workers < 1:
+        raise ValueError(f"workers must be 1 or greater, got {workers}")
+    if seed < 0:
+        raise ValueError(f"seed must be 0 or greater, got {seed}")
+    sensor = HDL64E(shots=shots)
+    names = (*TRAIN_DRIVES, *VAL_DRIVES) if drives is None else tuple(drives)
+    counts = split_scans(scans, names)
+    request = {
+        "simulator_version": _SIMULATOR_VERSION,
+        "seed": seed,
+        "scans": scans,
+        "drives": list(names),
+        "sensor": asdict(sensor),
+    }
+    _claim(out, request)
+    for drive, count in counts.items():
+        _make_drive(_points_folder(out, drive), count)
+    tasks = [
+        task
+        for drive, count in counts.items()
+        for task in _missing(out, drive, count, seed, sensor)
+    ]
+    if workers == 1 or len(tasks) < 2:
+        seconds = [_run(task) for task in tasks]
+    else:
+        # spawn: forking a process that runs threads (torch, CUDA) can deadlock.
+        pool = ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn"))
+        with pool:
+            seconds = list(pool.map(_run, tasks))
+    num_written = sum(len(task.numbers) for task in tasks)
+    return SimulationReport(
+        counts, num_written, 1000 * sum(seconds) / num_written if num_written else 0.0
+    )
+
+
+def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
+    """Scans of each drive: a fifth of them for validation, evenly within each split.
+
+    Args:
+        scans: All scans, 1 or more.
+        drives: Four-digit official drives.
+
+    Returns:
+        Count by drive, training drives first; drives that get none are left out.
+
+    Raises:
+        ValueError: If a drive is not an official one, is named twice, or there is none.
+    """
+    unknown = sorted(set(drives) - {*TRAIN_DRIVES, *VAL_DRIVES})
+    if unknown or not drives or len(set(drives)) < len(drives):
+        raise ValueError(
+            f"drives must be different ones of {', '.join((*TRAIN_DRIVES, *VAL_DRIVES))}, "
+            f"got {', '.join(drives) or 'none'}"
+        )
+    train = [drive for drive in TRAIN_DRIVES if drive in drives]
+    val = [drive for drive in VAL_DRIVES if drive in drives]
+    if not train:
+        num_val = scans
+    elif not val or scans < 2:
+        num_val = 0
+    else:
+        num_val = max(1, round(VAL_SHARE * scans))
+    return _share(scans - num_val, train) | _share(num_val, val)
+
+
+def _share(scans: int, drives: list[str]) -> dict[str, int]:
+    counts = {
+        drive: scans // len(drives) + (place < scans % len(drives))
+        for place, drive in enumerate(drives)
+    }
+    return {drive: count for drive, count in counts.items() if count}
+
+
+class _Task(NamedTuple):
+    """Scans of one drive for one worker to write."""
+
+    folder: Path
+    drive: str
+    numbers: tuple[int, ...]
+    seed: int
+    sensor: HDL64E
+
+
+def _points_folder(out: Path, drive: str) -> Path:
+    return out / "data_3d_raw" / f"2013_05_28_drive_{drive}_sync" / "velodyne_points"
+
+
+def _scan_files(folder: Path, number: int) -> tuple[Path, Path]:
+    return folder / "data" / f"{number:010d}.bin", folder / "labels" / f"{number:010d}.label"
+
+
+def _claim(out: Path, request: dict[str, Any]) -> None:
+    """Write the request into a new data set; refuse a folder that holds anything else."""
+    manifest = out / _MANIFEST
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; give the folder of the data set")
+    if not manifest.exists():
+        if (out / "data_3d_raw").exists():
+            raise ValueError(
+                f"{out} holds a data set that was not simulated ({_MANIFEST} is missing); "
+                f"give another folder"
+            )
+        out.mkdir(parents=True, exist_ok=True)
+        _write(manifest, (json.dumps(request, indent=2) + "\n").encode())
+        return
+    try:
+        stored = json.loads(manifest.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{manifest} is not valid JSON ({error}); give another folder") from error
+    different = [key for key in request if stored.get(key) != request[key]]
+    if different:
+        listed = "; ".join(
+            f"{key} {stored.get(key)} there, {request[key]} now" for key in different
+        )
+        raise ValueError(
+            f"{out} holds a data set of another request ({listed}); give another folder, "
+            f"or delete it"
+        )
+
+
+def _make_drive(folder: Path, count: int) -> None:
+    for name in ("data", "labels"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    stamps = (_FIRST_SCAN + number * _SCAN_PERIOD for number in range(count))
+    # KITTI-360 stores nanoseconds.
+    lines = "".join(f"{stamp:%Y-%m-%d %H:%M:%S.%f}000\n" for stamp in stamps)
+    if not (folder / "timestamps.txt").exists():
+        _write(folder / "timestamps.txt", lines.encode())
+
+
+def _missing(out: Path, drive: str, count: int, seed: int, sensor: HDL64E) -> Iterator[_Task]:
+    folder = _points_folder(out, drive)
+    for first in range(0, count, _SCANS_PER_TASK):
+        numbers = tuple(
+            number
+            for number in range(first, min(first + _SCANS_PER_TASK, count))
+            if not all(file.exists() for file in _scan_files(folder, number))
+        )
+        if numbers:
+            yield _Task(folder, drive, numbers, seed, sensor)
+
+
+def _run(task: _Task) -> float:
+    """Simulate and write the scans of a task; seconds that it took."""
+    street = Street(task.seed, int(task.drive))
+    start = time.perf_counter()
+    for number in task.numbers:
+        scene = street.scene(number, task.sensor.mount_height_m)
+        generator = generator_for(task.seed, "effects", street.drive, number)
+        scan = simulate_scan(scene, task.sensor, generator)
+        points_file, labels_file = _scan_files(task.folder, number)
+        _write(labels_file, scan.labels.astype("<u4").tobytes())
+        _write(points_file, scan.points.astype("<f4").tobytes())
+    return time.perf_counter() - start
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file so that its name never stands for part of the content."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,255 @@
+"""Official state-dict listings: strict into our networks and back, key by key, without loss."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from r3dpa.checkpoints import convert, from_official, read_checkpoint, to_official, transfer_rgb
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
+
+PATH = Path("official.pt")
+
+
+def listing(parity_dir, name):
+    return json.loads((parity_dir / f"{name}.json").read_text())
+
+
+def weights_of(shapes, first=0):
+    """Tensors of the listed shapes, each of one value of its own and one element of memory."""
+    return {
+        key: torch.tensor(float(first + i)).expand(shape) if shape else torch.tensor(first + i)
+        for i, (key, shape) in enumerate(shapes.items())
+    }
+
+
+def args_of(sit):
+    config = sit["config"]
+    return argparse.Namespace(
+        model=sit["constructor"],
+        encoder_depth=config["encoder_depth"],
+        cfg_prob=config["class_dropout_prob"],
+        num_classes=config["num_classes"],
+        bn_momentum=config["bn_momentum"],
+        qk_norm=config["qk_norm"],
+    )
+
+
+def assert_same(actual, expected):
+    assert set(actual) == set(expected)
+    for key, value in expected.items():
+        assert actual[key].dtype == value.dtype, key
+        assert torch.equal(actual[key], value), key
+
+
+def through_our_networks(checkpoint):
+    """The checkpoint after its weights were loaded into networks, without copying them."""
+    networks = {}
+    for name, state in checkpoint.networks.items():
+        with torch.device("meta"):
+            network = state.new()
+        network.load_state_dict(state.state_dict, strict=True, assign=True)
+        networks[name] = type(state)(state.class_path, state.init_args, network.state_dict())
+    return type(checkpoint)(**{**vars(checkpoint), "networks": networks})
+
+
+def test_every_sit_state_dict(parity_dir):
+    sits = listing(parity_dir, "sit_state_dicts")
+    for name, sit in sits.items():
+        config, kitti = sit["config"], not isinstance(sit["config"]["input_size"], int)
+        args = args_of(sit)
+        if kitti:
+            args.vae = name.rpartition("_")[2]
+        official = {
+            "model": weights_of(sit["state_dict"]),
+            "ema": weights_of(sit["state_dict"], first=1000),
+            "steps": 12,
+            "args": args,
+        }
+        checkpoint = from_official(official, PATH)
+        built = checkpoint.network("sit").init_args
+        side = config["input_size"]
+        assert built["input_size"] == (side if kitti else [side, side]), name
+        assert built["alignment_depth"] == config["encoder_depth"], name
+        assert built["class_dropout"] == (config["class_dropout_prob"] > 0), name
+        assert [built["feature_dim"]] == config["z_dims"], name
+        parameters = sum(
+            value.numel() for key, value in checkpoint.network("sit").state_dict.items()
+        )
+        assert parameters == sit["param_count_total"], name
+        back = to_official(through_our_networks(checkpoint))
+        assert set(back) == set(official), name
+        assert_same(back["model"], official["model"])
+        assert_same(back["ema"], official["ema"])
+        assert (back["steps"], back["args"]) == (12, args)
+
+
+def test_every_vae_state_dict(parity_dir):
+    for name, vae in listing(parity_dir, "vae_state_dicts").items():
+        official = {"model": {}, "vae": weights_of(vae["state_dict"])}
+        checkpoint = from_official({"vae": official["vae"]}, PATH)
+        with torch.device("meta"):
+            network = checkpoint.network("vae").new()
+        channels, *size = vae["latent_shape_for_64x1024"]
+        assert network.latent_channels == channels, name
+        assert list(network.latent_size((64, 1024))) == size, name
+        assert sum(p.numel() for p in network.parameters()) == vae["param_count_total"], name
+        back = to_official(through_our_networks(checkpoint))
+        assert_same(back["vae"], official["vae"])
+        assert vars(back["args"])["vae"] == name
+
+
+def test_discriminator_state_dict(parity_dir):
+    official = weights_of(listing(parity_dir, "discriminator_state_dict")["state_dict"])
+    checkpoint = from_official(official, PATH)
+    assert_same(to_official(through_our_networks(checkpoint))["discriminator"], official)
+
+
+def test_checkpoint_layout_through_our_file(parity_dir, tmp_path):
+    """A whole training checkpoint: official .pt -> our .safetensors -> official .pt."""
+    layout = listing(parity_dir, "checkpoint_layout")
+    sits = listing(parity_dir, "sit_state_dicts")
+    name, sit = next(
+        (name, sit)
+        for name, sit in sits.items()
+        if not isinstance(sit["config"]["input_size"], int)
+    )
+    vae = listing(parity_dir, "vae_state_dicts")[name.rpartition("_")[2]]
+    discriminator = listing(parity_dir, "discriminator_state_dict")
+    args = args_of(sit)
+    args.dataset_config = "configs/kitti.yaml"
+    parts = {
+        "model": weights_of(sit["state_dict"]),
+        "ema": weights_of(sit["state_dict"], first=500),
+        "vae": weights_of(vae["state_dict"], first=1000),
+        "discriminator": weights_of(discriminator["state_dict"], first=2000),
+        "opt": {"state": {}},
+        "opt_vae": {"state": {}},
+        "opt_disc": {"state": {}},
+        "args": args,
+        "steps": 400_000,
+    }
+    official = {key: parts[key] for key in layout["train_repae_saved_keys"]}
+    torch.save(official, tmp_path / "0400000.pt")
+    checkpoint = read_checkpoint(tmp_path / "0400000.pt")
+    assert set(checkpoint.left_out) == {"opt", "opt_vae", "opt_disc"}
+    back = to_official(checkpoint)
+    assert set(back) == set(official) - set(checkpoint.left_out)
+    for key in ("model", "ema", "vae", "discriminator"):
+        assert_same(back[key], official[key])
+    assert (back["steps"], back["args"]) == (400_000, args)
+
+
+def test_joint_step_through_our_files(load_case, tmp_path):
+    """Real recorded values through every file format, bit for bit, also of odd sizes."""
+    case = load_case("joint_step")
+    config = case.config["sit"]
+    args = argparse.Namespace(
+        encoder_depth=config["encoder_depth"],
+        num_classes=config["num_classes"],
+        bn_momentum=config["bn_momentum"],
+    )
+    official = {
+        "model": case.weights("w/sit."),
+        "ema": case.weights("w/ema."),
+        "vae": case.weights("w/vae."),
+        "discriminator": case.weights("w/discriminator."),
+        "steps": 1,
+        "args": args,
+    }
+    torch.save(official, tmp_path / "in.pt")
+    sit_args = {"num_heads": config["num_heads"], "input_size": config["input_size"]}
+    convert(tmp_path / "in.pt", tmp_path / "ours.safetensors", sit_args=sit_args)
+    convert(tmp_path / "ours.safetensors", tmp_path / "out.pt", "official")
+    with torch.serialization.safe_globals([argparse.Namespace]):
+        back = torch.load(tmp_path / "out.pt", weights_only=True)
+    assert set(back) == set(official)
+    for key in ("model", "ema", "vae", "discriminator"):
+        assert_same(back[key], official[key])
+    assert (back["steps"], back["args"]) == (1, args)
+
+    ours = read_checkpoint(tmp_path / "ours.safetensors")
+    vae, theirs = ours.network("vae").arguments, case.config["vae"]
+    assert vae["channels"] == theirs["ch"]
+    assert [list(stride) for stride in vae["strides"]] == theirs["strides"]
+    assert list(vae["channel_multipliers"]) == theirs["ch_mult"]
+    assert vae["num_res_blocks"] == theirs["num_res_blocks"]
+    sit = ours.network("ema").build()
+    assert torch.equal(sit.projector[0].weight, official["ema"]["projectors.0.0.weight"])
+    norm = ours.network("ema_latent_norm").build()
+    assert torch.equal(norm.running_var, official["ema"]["bn.running_var"])
+
+
+def test_rgb_transfer_of_the_imagenet_variants(parity_dir):
+    sits = listing(parity_dir, "sit_state_dicts")
+    rules = listing(parity_dir, "checkpoint_layout")["rgb_transfer_in_tuning_stage"]
+    kitti = next(s for n, s in sits.items() if "kitti" in n and s["constructor"] == "SiT-B/2")
+    config = kitti["config"]
+    for name, rgb in sits.items():
+        if "imagenet" not in name or rgb["constructor"] != kitti["constructor"]:
+            continue
+        source = weights_of(rgb["state_dict"], first=1)
+        checkpoint = from_official({"model": source, "args": args_of(rgb)}, PATH)
+        for keep_projector in (False, True):
+            with torch.device("meta"):
+                sit = SiT(
+                    input_size=tuple(config["input_size"]),
+                    in_channels=config["in_channels"],
+                    alignment_depth=config["encoder_depth"],
+                )
+            sit.to_empty(device="cpu")
+            sit = sit.bfloat16()
+            for parameter in (*sit.parameters(), *sit.buffers()):
+                parameter.data.zero_()
+            norm = LatentNorm(config["in_channels"])
+            report = transfer_rgb(checkpoint, sit, norm, keep_projector=keep_projector)
+
+            fresh = [
+                *rules["dropped_if_in_channels_differ"],
+                rules["dropped_if_token_count_differs"][0],
+                *([] if keep_projector else rules["dropped_unless_train_vae_only"]),
+            ]
+            stems = tuple(key.removesuffix("*") for key in fresh)
+            kept = {key for key in source if not key.startswith(stems)}
+            own = {
+                key.replace("projector.", "projectors.0.", 1): value
+                for key, value in sit.state_dict().items()
+            }
+            for key, value in own.items():
+                if key in kept:
+                    assert value.flatten()[0] == source[key].flatten()[0].bfloat16(), (name, key)
+                else:
+                    assert not value.any(), (name, key)
+            assert torch.equal(norm.running_var, torch.ones(config["in_channels"]))
+
+            fates = {row.group: row.fate for row in report.rows}
+            assert fates["projector"] == ("kept" if keep_projector else "fresh")
+            assert fates["x_embedder"] == fates["final_layer.linear"] == "fresh"
+            assert fates["latent_norm"] == fates["pos_embed"] == "fresh"
+            cut = rgb["config"]["class_dropout_prob"] > 0
+            assert fates["y_embedder"] == ("truncated" if cut else "kept")
+            assert fates["blocks"] == fates["t_embedder"] == "kept"
+            assert fates["final_layer.adaLN_modulation"] == "kept"
+            assert sum(row.num_tensors for row in report.rows) == len(kitti["state_dict"])
+
+
+@pytest.mark.parametrize("change", ["missing", "unknown", "shape"])
+def test_a_listing_that_differs_by_one_key_is_refused(parity_dir, change):
+    sit = next(iter(listing(parity_dir, "sit_state_dicts").values()))
+    shapes = dict(sit["state_dict"])
+    if change == "missing":
+        del shapes["blocks.3.attn.proj.bias"]
+    elif change == "unknown":
+        shapes["projectors.1.0.bias"] = [4]
+    else:
+        shapes["blocks.3.attn.proj.bias"] = [5]
+    args = args_of(sit)
+    args.vae = "h2p4d8"
+    key = "projectors.1.0.bias" if change == "unknown" else "blocks.3.attn.proj.bias"
+    with pytest.raises(ValueError, match=key):
+        from_official({"model": weights_of(shapes), "args": args}, PATH)

@@ -1,0 +1,546 @@
+import argparse
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from torch import nn
+
+from r3dpa.checkpoints import (
+    Checkpoint,
+    NetworkState,
+    convert,
+    from_official,
+    load_into,
+    read_checkpoint,
+    save_checkpoint,
+    to_official,
+    transfer_rgb,
+)
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.nn.discriminator import PatchDiscriminator
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
+from r3dpa.nn.vae import VAE
+
+SIT_ARGS = {
+    "input_size": (4, 8),
+    "in_channels": 4,
+    "hidden_size": 8,
+    "depth": 3,
+    "num_heads": 2,
+    "alignment_depth": 2,
+    "feature_dim": 6,
+    "projector_dim": 10,
+}
+VAE_ARGS = {
+    "latent_channels": 4,
+    "channels": 32,
+    "channel_multipliers": (1, 2, 2),
+    "strides": ((1, 2), (2, 2)),
+    "num_res_blocks": 1,
+    "attention_levels": (1,),
+    "legacy_upsample": True,
+}
+GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(8, 32)), RangeCodec("log2"), (2, 4))
+NETWORKS = {
+    "vae": (VAE, VAE_ARGS),
+    "discriminator": (PatchDiscriminator, {"channels": 4}),
+    "sit": (SiT, SIT_ARGS),
+    "latent_norm": (LatentNorm, {"channels": 4}),
+    "ema": (SiT, SIT_ARGS),
+    "ema_latent_norm": (LatentNorm, {"channels": 4}),
+}
+
+
+def randomised(network):
+    for value in network.state_dict().values():
+        value.copy_(torch.rand_like(value) if value.is_floating_point() else torch.tensor(7))
+    return network
+
+
+@pytest.fixture
+def checkpoint():
+    torch.manual_seed(0)
+    networks = {
+        name: NetworkState.of(randomised(kind(**args)), args)
+        for name, (kind, args) in NETWORKS.items()
+    }
+    return Checkpoint(
+        Path("run.ckpt"), "joint", networks, step=30, geometry=GEOMETRY.to_dict(), commit="abc"
+    )
+
+
+@pytest.fixture
+def lightning_content(checkpoint):
+    prefixes = {name: f"{name}." for name in NETWORKS}
+    prefixes |= {"ema": "ema.sit.", "ema_latent_norm": "ema.latent_norm."}
+    configs = {
+        name: {
+            "class_path": state.class_path,
+            "init_args": json.loads(json.dumps(state.init_args)),
+        }
+        for name, state in checkpoint.networks.items()
+        if "ema" not in name
+    }
+    return {
+        "pytorch-lightning_version": "2.6.6",
+        "global_step": 30,
+        "state_dict": {
+            prefixes[name] + key: value
+            for name, state in checkpoint.networks.items()
+            for key, value in state.state_dict.items()
+        },
+        "hyper_parameters": {**configs, "_class_path": "r3dpa.modules.JointAlignment"},
+        "r3dpa": {"stage": "joint", "geometry": GEOMETRY.to_dict()},
+    }
+
+
+def assert_same_networks(actual, expected):
+    assert set(actual.networks) == set(expected.networks)
+    for name, state in expected.networks.items():
+        own = actual.network(name)
+        assert own.class_path == state.class_path
+        assert own.arguments == state.arguments
+        assert set(own.state_dict) == set(state.state_dict)
+        for key, value in state.state_dict.items():
+            assert own.state_dict[key].dtype == value.dtype
+            assert torch.equal(own.state_dict[key], value), (name, key)
+
+
+class TestOurFiles:
+    def test_round_trip(self, checkpoint, tmp_path):
+        path = save_checkpoint(checkpoint, tmp_path / "new" / "run.v1.safetensors")
+        read = read_checkpoint(path)
+        assert_same_networks(read, checkpoint)
+        assert (read.stage, read.step) == ("joint", 30)
+        assert ScanGeometry.from_dict(read.geometry) == GEOMETRY
+        assert {p.name for p in path.parent.iterdir()} == {"run.v1.safetensors", "run.v1.yaml"}
+        sit = read.network("sit").build()
+        latents, time = torch.randn(1, 4, 4, 8), torch.tensor([0.3])
+        assert torch.equal(
+            sit.velocity(latents, time), checkpoint.network("sit").build().velocity(latents, time)
+        )
+
+    def test_tensors_that_share_memory(self, checkpoint, tmp_path):
+        shared = {**checkpoint.networks, "ema": checkpoint.network("sit")}
+        shared = replace(checkpoint, networks=shared)
+        path = save_checkpoint(shared, tmp_path / "a.safetensors")
+        assert_same_networks(read_checkpoint(path), shared)
+
+    def test_nothing_is_overwritten_unless_asked(self, checkpoint, tmp_path):
+        path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
+        before = path.read_bytes()
+        with pytest.raises(ValueError, match=r"a.safetensors, .*a.yaml exists"):
+            save_checkpoint(replace(checkpoint, networks={}), path)
+        assert path.read_bytes() == before
+        save_checkpoint(replace(checkpoint, step=31), path, overwrite=True)
+        assert read_checkpoint(path).step == 31
+
+    def test_a_failed_save_leaves_no_file(self, checkpoint, tmp_path):
+        odd = replace(checkpoint, official_args={"device": torch.device("cpu")})
+        with pytest.raises(ValueError, match="plain values"):
+            save_checkpoint(odd, tmp_path / "a.safetensors")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_name(self, checkpoint, tmp_path):
+        with pytest.raises(ValueError, match=r"<name>.safetensors"):
+            save_checkpoint(checkpoint, tmp_path / "a.pt")
+
+    @pytest.mark.parametrize(
+        ("damage", "message"),
+        [
+            (lambda p: p.write_bytes(p.read_bytes()[:-1]), "SHA-256"),
+            (lambda p: p.write_bytes(p.read_bytes()[:-1] + b"x"), "SHA-256"),
+            (lambda p: p.with_suffix(".yaml").unlink(), "not beside it"),
+            (lambda p: p.with_suffix(".yaml").write_text("a: [1"), "damaged"),
+            (lambda p: p.with_suffix(".yaml").write_text("a: 1"), "does not describe"),
+            (lambda p: p.unlink(), "no checkpoint file"),
+        ],
+    )
+    def test_damaged_files(self, checkpoint, tmp_path, damage, message):
+        path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
+        damage(path)
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            read_checkpoint(path)
+
+    @pytest.mark.parametrize(
+        "class_path",
+        [
+            "torch.nn.Linear",
+            "os.system",
+            "r3dpa.nnx.SiT",
+            "r3dpa.modules.JointAlignment",
+            "r3dpa.nn.sit.nn.Linear",
+            "r3dpa.nn.sit.nn",
+            "r3dpa.nn.sit.SiTOutput",
+            "r3dpa.nn.vae.math",
+            "SiT",
+        ],
+    )
+    def test_only_our_networks_are_built(self, checkpoint, tmp_path, class_path):
+        path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
+        description = path.with_suffix(".yaml")
+        about = yaml.safe_load(description.read_text())
+        about["networks"]["sit"]["class_path"] = class_path
+        description.write_text(yaml.safe_dump(about))
+        with pytest.raises(ValueError, match=class_path):
+            read_checkpoint(path)
+
+    def test_a_class_imported_into_our_package_is_not_ours(self, monkeypatch):
+        monkeypatch.setattr("r3dpa.nn.Linear", nn.Linear, raising=False)
+        state = NetworkState("r3dpa.nn.Linear", {"in_features": 1, "out_features": 1}, {})
+        with pytest.raises(ValueError, match="not allowed"):
+            state.new()
+
+    def test_arguments_that_do_not_rebuild_the_network(self):
+        with pytest.raises(ValueError, match=r"shape of main.0.weight.*\(4, 1, 4, 4\).*\(8, 1"):
+            NetworkState.of(PatchDiscriminator(channels=4), {"channels": 8})
+        with pytest.raises(ValueError, match="does not accept the arguments"):
+            NetworkState.of(PatchDiscriminator(channels=4), {"width": 4})
+
+
+class TestLightning:
+    def test_round_trip(self, checkpoint, lightning_content, tmp_path):
+        lightning_content["state_dict"]["metric.total"] = torch.zeros(1)
+        torch.save(lightning_content, tmp_path / "last.ckpt")
+        read = read_checkpoint(tmp_path / "last.ckpt")
+        assert_same_networks(read, checkpoint)
+        assert (read.stage, read.step, set(read.left_out)) == ("joint", 30, {"metric"})
+        assert ScanGeometry.from_dict(read.geometry) == GEOMETRY
+
+    def test_no_discriminator_and_a_default_latent_norm(self, lightning_content, tmp_path):
+        weights = lightning_content["state_dict"]
+        lightning_content["state_dict"] = {
+            key: value for key, value in weights.items() if not key.startswith("discriminator.")
+        }
+        lightning_content["hyper_parameters"] |= {"discriminator": None, "latent_norm": None}
+        torch.save(lightning_content, tmp_path / "last.ckpt")
+        read = read_checkpoint(tmp_path / "last.ckpt")
+        assert "discriminator" not in read.networks
+        assert read.network("latent_norm").build().channels == 4
+
+    def test_without_recorded_arguments(self, lightning_content, tmp_path):
+        del lightning_content["hyper_parameters"]["sit"]
+        torch.save(lightning_content, tmp_path / "last.ckpt")
+        with pytest.raises(ValueError, match=r"which class and arguments its sit has.*r3dpa fit"):
+            read_checkpoint(tmp_path / "last.ckpt")
+
+    def test_pickled_networks(self, lightning_content, tmp_path):
+        lightning_content["hyper_parameters"]["sit"] = SiT(**SIT_ARGS)
+        torch.save(lightning_content, tmp_path / "last.ckpt")
+        with pytest.raises(ValueError, match=r"pickled r3dpa.nn.sit.SiT, as a module built by"):
+            read_checkpoint(tmp_path / "last.ckpt")
+
+
+class TestLoadInto:
+    def test_exactly_the_named_networks(self, checkpoint):
+        vae, average = VAE(**VAE_ARGS), SiT(**SIT_ARGS)
+        load_into({"vae": vae, "sit": average}, checkpoint, stage="joint")
+        for name, network in (("vae", vae), ("sit", average)):
+            for key, value in checkpoint.network(name).state_dict.items():
+                assert torch.equal(network.state_dict()[key], value)
+
+    def test_everything_that_does_not_fit_in_one_error(self, checkpoint):
+        networks = {k: v for k, v in checkpoint.networks.items() if k != "discriminator"}
+        source = replace(checkpoint, networks=networks, stage="flow_matching")
+        targets = {
+            "vae": VAE(**VAE_ARGS),
+            "discriminator": PatchDiscriminator(),
+            "sit": SiT(**{**SIT_ARGS, "feature_dim": 5, "depth": 2}),
+            "latent_norm": LatentNorm(5),
+        }
+        before = {k: v.clone() for k, v in targets["vae"].state_dict().items()}
+        with pytest.raises(ValueError, match="joint cannot start") as caught:
+            load_into(targets, source, stage="joint")
+        text = str(caught.value)
+        assert "of stage 'flow_matching' and has no discriminator" in text
+        assert "joint needs: vae, discriminator, sit, latent_norm" in text
+        assert "sit: shape of projector.4.weight: checkpoint (6, 10), network (5, 10)" in text
+        assert "sit: unknown to the network: blocks.2.attn.qkv.weight (24, 8)" in text
+        assert "latent_norm: shape of running_mean: checkpoint (4,), network (5,)" in text
+        assert "vae:" not in text
+        for key, value in targets["vae"].state_dict().items():
+            assert torch.equal(value, before[key])
+
+    def test_long_lists_are_shortened(self, checkpoint):
+        deeper = SiT(**{**SIT_ARGS, "depth": 5})
+        with pytest.raises(ValueError, match=r"sit: \.\.\. and 10 more"):
+            load_into({"sit": deeper}, checkpoint, stage="joint")  # 20 keys: 10 per block
+
+    @pytest.mark.parametrize(
+        ("name", "network", "message"),
+        [
+            ("sit", SiT(**{**SIT_ARGS, "num_heads": 4}), "num_heads: checkpoint 2, network 4"),
+            ("sit", SiT(**{**SIT_ARGS, "alignment_depth": 3}), "alignment_depth: checkpoint 2"),
+            ("sit", SiT(**{**SIT_ARGS, "input_size": (8, 4)}), r"input_size: checkpoint \(4, 8\)"),
+            (
+                "vae",
+                VAE(**{**VAE_ARGS, "legacy_upsample": False}),
+                "legacy_upsample: checkpoint True, network False",
+            ),
+            ("latent_norm", LatentNorm(4, eps=1e-5), "eps: checkpoint 0.0001, network 1e-05"),
+        ],
+    )
+    def test_settings_that_no_shape_shows(self, checkpoint, name, network, message):
+        with pytest.raises(ValueError, match=message):
+            load_into({name: network}, checkpoint, stage="joint")
+
+
+@pytest.fixture
+def official(checkpoint):
+    content = to_official(checkpoint)
+    content["args"] = argparse.Namespace(vae="h2p2d4", encoder_depth=2, num_classes=1)
+    return content
+
+
+OFFICIAL_SIT_ARGS = {"num_heads": 2, "input_size": (4, 8)}
+
+
+class Exploit:
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (self.marker,)
+
+
+class TestOfficial:
+    def test_a_namespace_is_read(self, checkpoint, official, tmp_path):
+        torch.save(official, tmp_path / "0000030.pt")
+        read = read_checkpoint(tmp_path / "0000030.pt", sit_args=OFFICIAL_SIT_ARGS)
+        assert (read.stage, read.step) == ("official", 30)
+        assert read.official_args == vars(official["args"])
+        for name in NETWORKS:
+            ours, theirs = checkpoint.network(name).state_dict, read.network(name).state_dict
+            assert set(ours) == set(theirs)
+            assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
+        assert read.network("vae").arguments == checkpoint.network("vae").arguments
+        assert read.network("latent_norm").init_args["legacy_inverse"] is True
+
+    def test_code_in_a_file_is_not_run(self, official, tmp_path):
+        official["extra"] = Exploit(str(tmp_path / "marker"))
+        torch.save(official, tmp_path / "a.pt")
+        with pytest.raises(ValueError, match=r"would run \S*mkdir.*when loaded"):
+            read_checkpoint(tmp_path / "a.pt")
+        assert not (tmp_path / "marker").exists()
+
+    @pytest.mark.parametrize("keep", [0.0, 0.01, 0.5, 0.9, 0.999])
+    def test_a_truncated_file(self, official, tmp_path, keep):
+        torch.save(official, tmp_path / "a.pt")
+        whole = (tmp_path / "a.pt").read_bytes()
+        (tmp_path / "a.pt").write_bytes(whole[: int(keep * len(whole))])
+        with pytest.raises(ValueError, match=r"cannot read .*a.pt: the file is damaged"):
+            read_checkpoint(tmp_path / "a.pt")
+
+    def test_something_else(self, tmp_path):
+        (tmp_path / "a.pt").write_text("not a checkpoint")
+        with pytest.raises(ValueError, match="damaged"):
+            read_checkpoint(tmp_path / "a.pt")
+        torch.save({"weights": torch.zeros(1)}, tmp_path / "b.pt")
+        with pytest.raises(ValueError, match=r"holds \['weights'\]; expected"):
+            read_checkpoint(tmp_path / "b.pt")
+        torch.save([1], tmp_path / "c.pt")
+        with pytest.raises(ValueError, match="holds list"):
+            read_checkpoint(tmp_path / "c.pt")
+
+    def test_what_the_file_cannot_tell_is_asked_for(self, official):
+        del official["args"]
+        with pytest.raises(ValueError, match=r"\['alignment_depth', 'input_size', 'num_heads'\]"):
+            from_official(official, Path("a.pt"))
+
+    def test_another_backbone(self, official):
+        with pytest.raises(ValueError, match="UNet"):
+            from_official({**official, "model": {"conv.weight": torch.zeros(1)}}, Path("a.pt"))
+
+    def test_an_image_vae_is_left_out_by_name(self, official):
+        official["vae"] = {"encoder.conv_in.weight": torch.zeros(8, 3, 3, 3)}
+        read = from_official(official, Path("rgb.pt"), sit_args=OFFICIAL_SIT_ARGS)
+        with pytest.raises(ValueError, match=r"no vae \(that of the file is not for range images"):
+            read.network("vae")
+
+    def test_options_beside_the_file(self, official, tmp_path):
+        (tmp_path / "args.json").write_text(json.dumps(vars(official.pop("args"))))
+        (tmp_path / "checkpoints").mkdir()
+        torch.save(official, tmp_path / "checkpoints" / "a.pt")
+        read = read_checkpoint(tmp_path / "checkpoints" / "a.pt", sit_args=OFFICIAL_SIT_ARGS)
+        assert read.network("sit").init_args["alignment_depth"] == 2
+
+    def test_latent_size_and_geometry_of_the_official_image(self, checkpoint):
+        sit_args = {**SIT_ARGS, "input_size": (32, 256), "hidden_size": 8}
+        networks = dict(checkpoint.networks)
+        networks["sit"] = NetworkState.of(randomised(SiT(**sit_args)), sit_args)
+        content = to_official(replace(checkpoint, networks=networks))
+        del content["ema"]
+        for config, encoding in (("kitti", "linear"), ("kitti_logscale", "log2")):
+            content["args"] = argparse.Namespace(
+                encoder_depth=2, dataset_config=f"configs/{config}.yaml"
+            )
+            read = from_official(content, Path("a.pt"), sit_args={"num_heads": 2})
+            assert read.network("sit").init_args["input_size"] == [32, 256]
+            geometry = ScanGeometry.from_dict(read.geometry)
+            assert geometry == ScanGeometry(
+                SphericalProjection(LidarSensor()), RangeCodec(encoding), (16, 128)
+            )
+        del content["args"].dataset_config
+        assert from_official(content, Path("a.pt"), sit_args={"num_heads": 2}).geometry is None
+
+    def test_a_vae_with_wrapped_upsampling_has_no_counterpart(self, checkpoint):
+        args = {**VAE_ARGS, "legacy_upsample": False}
+        networks = {"vae": NetworkState.of(VAE(**args), args)}
+        with pytest.raises(ValueError, match="legacy_upsample=True"):
+            to_official(replace(checkpoint, networks=networks))
+
+    def test_options_are_made_from_our_arguments(self, checkpoint):
+        args = vars(to_official(checkpoint)["args"])
+        assert args == {
+            "vae": "h2p2d4",
+            "num_classes": 1,
+            "cfg_prob": 0.0,
+            "encoder_depth": 2,
+            "qk_norm": False,
+            "bn_momentum": 0.1,
+        }
+        official_sensor = ScanGeometry(SphericalProjection(LidarSensor()), RangeCodec(), (2, 4))
+        content = to_official(replace(checkpoint, geometry=official_sensor.to_dict()))
+        assert content["args"].dataset_config == "configs/kitti.yaml"
+
+    def test_a_short_class_path_is_the_same_class(self, checkpoint):
+        vae = replace(checkpoint.network("vae"), class_path="r3dpa.nn.VAE")
+        assert "vae" in to_official(replace(checkpoint, networks={"vae": vae}))
+
+
+class TestConvert:
+    def test_a_vae_and_its_neighbours(self, checkpoint, tmp_path):
+        names = ("vae", "discriminator", "latent_norm")
+        part = replace(checkpoint, networks={name: checkpoint.network(name) for name in names})
+        ours = save_checkpoint(part, tmp_path / "a.safetensors")
+        report = convert(ours, tmp_path / "vae.pt", "official")
+        assert {path.name for path in report.outputs} == {
+            "vae.pt",
+            "vae-latents-stats.pt",
+            "vae-discriminator-ckpt.pt",
+        }
+        statistics = torch.load(tmp_path / "vae-latents-stats.pt", weights_only=True)
+        norm = checkpoint.network("latent_norm").state_dict
+        assert statistics["latents_scale"].shape == (1, 4, 1, 1)
+        torch.testing.assert_close(
+            statistics["latents_scale"].flatten(), 1 / norm["running_var"].sqrt()
+        )
+        assert torch.equal(statistics["latents_bias"].flatten(), norm["running_mean"])
+
+        back = read_checkpoint(tmp_path / "vae.pt")
+        assert set(back.networks) == set(names)
+        for name in ("vae", "discriminator"):
+            for key, value in part.network(name).state_dict.items():
+                assert torch.equal(back.network(name).state_dict[key], value)
+        torch.testing.assert_close(
+            back.network("latent_norm").state_dict["running_var"], norm["running_var"]
+        )
+        assert back.network("latent_norm").build().fitted
+
+    def test_report_and_refusals(self, checkpoint, official, tmp_path):
+        official["opt"] = {"state": {}}
+        torch.save(official, tmp_path / "a.pt")
+        out = tmp_path / "a.safetensors"
+        report = convert(tmp_path / "a.pt", out, sit_args=OFFICIAL_SIT_ARGS)
+        table = report.table()
+        assert all(name in table for name in NETWORKS)
+        assert "not converted: opt (optimiser of the SiT" in table
+        with pytest.raises(ValueError, match="exists already"):
+            convert(tmp_path / "a.pt", out, sit_args=OFFICIAL_SIT_ARGS)
+        with pytest.raises(ValueError, match=r"a.pt exists already"):
+            convert(out, tmp_path / "a.pt", "official")
+        with pytest.raises(ValueError, match=r"<name>.pt"):
+            convert(out, tmp_path / "b.ckpt", "official")
+        with pytest.raises(ValueError, match="'official' checkpoints"):
+            convert(out, tmp_path / "b.pt", "other")
+
+
+class TestTransfer:
+    def source(self, **changes):
+        args = {**SIT_ARGS, **changes}
+        norm_args = {"channels": args["in_channels"]}
+        networks = {
+            "sit": NetworkState.of(randomised(SiT(**args)), args),
+            "ema": NetworkState.of(randomised(SiT(**args)), args),
+            "latent_norm": NetworkState.of(randomised(LatentNorm(**norm_args)), norm_args),
+        }
+        return Checkpoint(Path("rgb.pt"), "rgb", networks)
+
+    def fates(self, report):
+        return {row.group: row.fate for row in report.rows}
+
+    def test_a_twin_keeps_everything_from_the_network_asked_for(self):
+        for name in ("sit", "ema"):
+            source, sit, norm = self.source(), SiT(**SIT_ARGS), LatentNorm(4)
+            report = transfer_rgb(source, sit, norm, keep_projector=True, source=name)
+            assert set(self.fates(report).values()) == {"kept"}
+            for key, value in source.network(name).state_dict.items():
+                assert torch.equal(sit.state_dict()[key], value)
+            expected = source.network("latent_norm").state_dict["running_mean"]
+            assert torch.equal(norm.running_mean, expected)
+
+    def test_fresh_weights_keep_their_values(self):
+        source = self.source(in_channels=3, input_size=(4, 4), class_dropout=True, num_classes=9)
+        sit, norm = randomised(SiT(**SIT_ARGS)), randomised(LatentNorm(4))
+        before = {k: v.clone() for k, v in {**sit.state_dict(), **norm.state_dict()}.items()}
+        report = transfer_rgb(source, sit, norm, keep_projector=False)
+        after, rgb = {**sit.state_dict(), **norm.state_dict()}, source.network("sit").state_dict
+        for key, value in after.items():
+            group = key.split(".")[0]
+            fresh = group in ("x_embedder", "pos_embed", "projector", *norm.state_dict())
+            if key == "y_embedder.embedding_table.weight":
+                assert torch.equal(value, rgb[key][:1])
+            elif fresh or key.startswith("final_layer.linear"):
+                assert torch.equal(value, before[key]), key
+            else:
+                assert torch.equal(value, rgb[key]), key
+        table = report.table()
+        assert "x_embedder" in table
+        assert "(8, 3, 2, 2)" in table
+        assert "(8, 4, 2, 2)" in table
+        assert "other number of latent channels" in table
+        assert self.fates(report)["y_embedder"] == "truncated"
+
+    def test_a_projector_of_another_width_is_fresh_and_said_so(self):
+        report = transfer_rgb(
+            self.source(feature_dim=5), SiT(**SIT_ARGS), LatentNorm(4), keep_projector=True
+        )
+        row = next(row for row in report.rows if row.group == "projector")
+        assert (row.fate, row.reason) == ("fresh", "asked for, but its shapes differ")
+
+    def test_positions_of_another_grid_with_as_many_tokens_are_fresh(self):
+        source = self.source(input_size=(8, 4))
+        report = transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
+        assert self.fates(report)["pos_embed"] == "fresh"
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"depth": 4}, "unknown to the network: blocks.3"),
+            ({"depth": 2}, "missing in the checkpoint: blocks.2"),
+            ({"hidden_size": 16}, r"shape of blocks.0.attn.qkv.weight"),
+            ({"num_heads": 4}, "num_heads: checkpoint 4, network 2"),
+            ({"alignment_depth": 1}, "alignment_depth: checkpoint 1, network 2"),
+        ],
+    )
+    def test_anything_else_is_an_error_before_any_change(self, changes, message):
+        sit = SiT(**SIT_ARGS)
+        before = {key: value.clone() for key, value in sit.state_dict().items()}
+        with pytest.raises(ValueError, match=message):
+            transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
+        assert all(torch.equal(value, before[key]) for key, value in sit.state_dict().items())
+
+    def test_a_fresh_projector_may_look_at_another_block(self):
+        source, sit = self.source(alignment_depth=1), SiT(**SIT_ARGS)
+        report = transfer_rgb(source, sit, LatentNorm(4), keep_projector=False)
+        assert self.fates(report)["blocks"] == "kept"
+
+
+def test_a_module_that_only_wraps_ours_is_refused():
+    with pytest.raises(ValueError, match="not allowed"):
+        NetworkState.of(nn.Sequential(nn.Linear(1, 1)), {})
