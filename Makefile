@@ -62,8 +62,8 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 		--model.init_args.init_from $(OUT)/vae_alignment/checkpoints/last.ckpt
 	$(BIN)/r3dpa sample --ckpt $(OUT)/joint/checkpoints/last.ckpt --out $(OUT)/scenes \
 		--num 16 --steps 64 --batch_size 16 --overwrite true
-	$(BIN)/r3dpa report --run $(OUT)/vae_alignment
-	$(BIN)/r3dpa report --run $(OUT)/joint
+	$(BIN)/r3dpa report $(OUT)/vae_alignment
+	$(BIN)/r3dpa report $(OUT)/joint
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

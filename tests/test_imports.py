@@ -20,7 +20,7 @@ ALLOWED = {
     "checkpoints": {"nn"},
     "generation": {"geometry", "nn", "flow"},
     "modules": CORE | {"data", "checkpoints", "generation"},
-    "callbacks": {"geometry", "data", "generation", "modules", "viz"},
+    "callbacks": {"geometry", "data", "generation", "modules", "nn", "viz"},
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz"},

@@ -14,6 +14,7 @@ from r3dpa import viz
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.modules import GenerativeModule
+from r3dpa.nn import EMA
 
 __all__ = ["PictureLogger"]
 
@@ -57,8 +58,8 @@ class PictureLogger(L.Callback):
         if datamodule.val_set:
             image = datamodule.val_set[len(datamodule.val_set) // 2]["range_image"]
             pictures["reconstruction"] = self._reconstruction(module, image)
-        if self.num_scenes and module.trains_velocity:
-            pictures["samples"] = self._samples(module)
+        if self.num_scenes and module.ema is not None:
+            pictures["samples"] = self._samples(module, module.ema)
         folder = Path(trainer.default_root_dir) / "pictures"
         for name, figure in pictures.items():
             path = viz.save(figure, folder / f"{split}_{name}_{trainer.global_step:07d}.png")
@@ -78,10 +79,10 @@ class PictureLogger(L.Callback):
         agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
 
-    def _samples(self, module: GenerativeModule) -> Figure:
+    def _samples(self, module: GenerativeModule, average: EMA) -> Figure:
         geometry = module.scan_geometry
         generator = SceneGenerator(
-            module.vae, module.ema.sit, module.ema.latent_norm, geometry, self.sampler
+            module.vae, average.sit, average.latent_norm, geometry, self.sampler
         )
         training = module.training
         scenes = generator.generate(range(self.num_scenes), self.seed)

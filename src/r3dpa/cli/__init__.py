@@ -152,7 +152,12 @@ def main(args: list[str] | None = None) -> None:
     elif args[0] in _COMMANDS:
         from jsonargparse import auto_cli
 
-        auto_cli(_COMMANDS[args[0]], args=args[1:], prog=f"r3dpa {args[0]}", as_positional=False)
+        auto_cli(
+            _COMMANDS[args[0]],
+            args=args[1:],
+            prog=f"r3dpa {args[0]}",
+            as_positional=args[0] in ("check", "convert", "report"),
+        )
     else:
         _print(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
         sys.exit(2)

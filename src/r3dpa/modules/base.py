@@ -171,7 +171,9 @@ class GenerativeModule(L.LightningModule):
         self.keep_projector = keep_projector
         self.seed = seed
         self.max_skipped_steps = max_skipped_steps
-        self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
+        self.ema: EMA | None = None
+        if self.trains_velocity:
+            self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.geometry: ScanGeometry | None = None
         self._skipped_in_a_row = 0
 
@@ -217,7 +219,8 @@ class GenerativeModule(L.LightningModule):
         if self.init_from is not None:
             networks = {name: self.get_submodule(name) for name in self.init_networks}
             load_into(networks, read_checkpoint(self.init_from), stage=self.stage)
-        self.ema.reset(self.sit, self.latent_norm)
+        if self.ema is not None:
+            self.ema.reset(self.sit, self.latent_norm)
 
     def _check_sizes(self, geometry: ScanGeometry, feature_dim: int | None) -> None:
         sensor = geometry.projection.sensor
@@ -407,7 +410,7 @@ class GenerativeModule(L.LightningModule):
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the averages, unless the step was dropped."""
         super().optimizer_step(*args, **kwargs)
-        if self._skipped_in_a_row == 0:
+        if self.ema is not None and self._skipped_in_a_row == 0:
             self.ema.update(self.sit, self.latent_norm)
 
     # Evaluation
@@ -417,24 +420,29 @@ class GenerativeModule(L.LightningModule):
         return self.vae.decode(self.vae.encode(image).mean)
 
     def evaluate(self, batch: LidarBatch, batch_idx: int, prefix: str) -> None:
-        """Logs reconstruction error in metres and the averaged SiT's losses on held-out scans."""
+        """Logs the losses on held-out scans, and the reconstruction error in metres.
+
+        The SiT is the averaged one where the stage has an average.
+        """
         image, mask = batch["range_image"], batch["valid_mask"]
         codec = self.scan_geometry.codec
         draws = self.draw_path(image, batch_idx, stream=1)
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
-        latents = self.ema.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
-        target = self.interpolant.target(latents, draws.noise, draws.time)
-        velocity, projected = self.ema.sit(noisy, draws.time)
         values = {
             "reconstruction": losses.reconstruction_loss(reconstruction, image),
             "range_error_m": error_m[mask].mean(),
-            "denoising": losses.flow_matching_loss(velocity, target).mean(),
         }
-        if "feature_grid" in batch:
-            values["alignment"] = losses.alignment_loss(projected, batch["feature_grid"]).mean()
+        networks = self if self.ema is None else self.ema
+        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
+        velocity, projected = networks.sit(noisy, draws.time)
+        if self.trains_velocity:
+            target = self.interpolant.target(latents, draws.noise, draws.time)
+            values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
+        if self.needs_features():
+            values["alignment"] = self._aligned(projected, batch.get("feature_grid"))
         self.log_dict(
             {f"{prefix}/{name}": value for name, value in values.items()},
             batch_size=image.shape[0],

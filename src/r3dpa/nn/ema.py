@@ -6,7 +6,7 @@ import copy
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -57,7 +57,9 @@ class EMA(nn.Module):
     def update(self, sit: SiT, latent_norm: LatentNorm) -> None:
         """Moves the averages one step towards the present weights."""
         for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
-            pairs = list(zip(average.parameters(), network.parameters(), strict=True))
+            pairs: list[tuple[Tensor, Tensor]] = list(
+                zip(average.parameters(), network.parameters(), strict=True)
+            )
             for target, source in zip(average.buffers(), network.buffers(), strict=True):
                 if self.decays_buffers and source.is_floating_point():
                     pairs.append((target, source))

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.flow.interpolant import Interpolant, sample_time
+
+PATHS = ["linear", "cosine"]
+
+
+def draws(*, batch=5, dtype=torch.float64, low=0.0):
+    generator = torch.Generator().manual_seed(0)
+    data, noise = torch.randn(2, batch, 3, 4, generator=generator, dtype=dtype)
+    return data, noise, low + (1 - low) * torch.rand(batch, generator=generator, dtype=dtype)
+
+
+def gaussian_field(path, x, time, spread):
+    """Exact velocity and score of data that are Gaussian with this standard deviation."""
+    alpha, sigma, d_alpha, d_sigma = (c[:, None, None] for c in path.coefficients(time))
+    variance = (alpha * spread).square() + sigma.square()
+    velocity = (d_alpha * alpha * spread**2 + d_sigma * sigma) / variance * x
+    return velocity, -x / variance
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_path_goes_from_data_to_noise(path):
+    data, noise, _ = draws()
+    path = Interpolant(path)
+    zeros, ones = torch.zeros(5).double(), torch.ones(5).double()
+    assert torch.equal(path.interpolate(data, noise, zeros), data)
+    torch.testing.assert_close(path.interpolate(data, noise, ones), noise, atol=1e-14, rtol=0)
+
+
+def test_linear_path_by_hand():
+    data, noise, time = torch.tensor([4.0]), torch.tensor([8.0]), torch.tensor([0.25])
+    assert Interpolant().interpolate(data, noise, time).item() == 5.0
+    assert Interpolant().target(data, noise, time).item() == 4.0
+
+
+def test_cosine_path_by_hand():
+    data, noise, time = torch.tensor([1.0]), torch.tensor([2.0]), torch.tensor([1 / 3])
+    path = Interpolant("cosine")  # angle of 30 degrees
+    middle = path.interpolate(data, noise, time).item()
+    assert middle == pytest.approx(math.sqrt(3) / 2 + 2 * 0.5)
+    target = path.target(data, noise, time).item()
+    assert target == pytest.approx(math.pi / 2 * (-0.5 + 2 * math.sqrt(3) / 2))
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_target_is_the_time_derivative_of_the_path(path):
+    data, noise, time = draws()
+    path = Interpolant(path)
+    derivative = torch.func.jvp(
+        lambda t: path.interpolate(data, noise, t), (time,), (torch.ones_like(time),)
+    )[1]
+    torch.testing.assert_close(path.target(data, noise, time), derivative)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_denoise_undoes_interpolate_given_the_true_velocity(path):
+    data, noise, time = draws()
+    path = Interpolant(path)
+    x, velocity = path.interpolate(data, noise, time), path.target(data, noise, time)
+    torch.testing.assert_close(path.denoise(velocity, x, time), data)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_score_of_gaussian_data_is_exact(path):
+    x, _, time = draws(low=0.05)
+    path = Interpolant(path)
+    velocity, score = gaussian_field(path, x, time, spread=0.3)
+    torch.testing.assert_close(path.score(velocity, x, time), score)
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("path", PATHS)
+def test_sde_drift_equals_the_divided_form_and_is_finite_at_both_ends(path):
+    velocity, x, _ = draws(batch=1000)
+    time = torch.linspace(0.001, 1, 1000).double()
+    path = Interpolant(path)
+    divided = velocity - time[:, None, None] * path.score(velocity, x, time)
+    drift = path.sde_drift(velocity, x, time)
+    torch.testing.assert_close(drift, divided, atol=1e-12, rtol=1e-12)
+    for dtype in (torch.float64, torch.float32, torch.bfloat16):
+        v, y, ends = velocity[:2].to(dtype), x[:2].to(dtype), torch.tensor([0, 1]).to(dtype)
+        assert path.sde_drift(v, y, ends).isfinite().all()
+        assert path.denoise(v, y, ends).isfinite().all()
+        naive = v - ends[:, None, None] * path.score(v, y, ends)
+        assert not naive.isfinite().all()
+
+
+def test_sde_drift_by_hand():
+    velocity, x, time = torch.tensor([3.0, 3.0]), torch.tensor([1.0, 1.0]), torch.tensor([0.0, 1.0])
+    assert Interpolant().sde_drift(velocity, x, time).tolist() == [7.0, 4.0]
+    # t score tends to -(4 / pi^2) v at the data end of the cosine path.
+    cosine = Interpolant("cosine").sde_drift(velocity, x, time)
+    torch.testing.assert_close(cosine, torch.tensor([3 + 12 / math.pi**2, 4.0]))
+
+
+def test_float32_time_keeps_half_precision_latents_apart():
+    data, noise, _ = draws(batch=2)
+    time = torch.tensor([0.5, 0.5009])  # one number in bfloat16
+    noisy = Interpolant().interpolate(data[:1].bfloat16(), noise[:1].bfloat16(), time[:1])
+    later = Interpolant().interpolate(data[:1].bfloat16(), noise[:1].bfloat16(), time[1:])
+    assert noisy.dtype == torch.float32
+    assert not torch.equal(noisy, later)
+
+
+def test_unknown_path_and_wrong_times_are_refused():
+    with pytest.raises(ValueError, match="'linear' or 'cosine', got 'straight'"):
+        Interpolant("straight")
+    data, noise, time = draws()
+    with pytest.raises(ValueError, match=r"\(5,\), got \(4,\)"):
+        Interpolant().interpolate(data, noise, time[:4])
+
+
+def test_sampled_times_follow_their_distribution():
+    generator = torch.Generator().manual_seed(0)
+    uniform = sample_time(20_000, generator=generator)
+    assert uniform.dtype == torch.float32
+    assert 0 <= uniform.min() < 0.001
+    assert 0.999 < uniform.max() <= 1
+    assert uniform.mean().item() == pytest.approx(0.5, abs=0.01)  # 5 standard errors
+    lognormal = sample_time(20_000, "lognormal", generator=generator)
+    # A standard Gaussian lies below 1 with probability 0.8413.
+    share = (lognormal < 1 / (1 + math.exp(-1))).float().mean().item()
+    assert share == pytest.approx(0.8413, abs=0.013)
+    assert lognormal.median().item() == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "lognormal"])
+def test_sampled_times_repeat_with_the_generator(kind):
+    first = sample_time(4, kind, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(first, sample_time(4, kind, generator=torch.Generator().manual_seed(3)))
+    torch.manual_seed(3)
+    assert torch.equal(first, sample_time(4, kind, device="cpu"))
+
+
+def test_unknown_distribution_of_times_is_refused():
+    with pytest.raises(ValueError, match="got 'beta'"):
+        sample_time(2, "beta")

@@ -1,0 +1,39 @@
+"""The SiT of a recorded case as our network and norm; used by the cases `sit`, `samplers`."""
+
+from __future__ import annotations
+
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
+
+
+def our_name(official: str) -> str:
+    return official.replace("projectors.0.", "projector.")
+
+
+def build_sit(case, **options):
+    config = case.config
+    (feature_dim,) = config["z_dims"]
+    sit = SiT(
+        input_size=tuple(config["input_size"]),
+        in_channels=config["in_channels"],
+        patch_size=config["patch_size"],
+        hidden_size=config["hidden_size"],
+        depth=config["depth"],
+        num_heads=config["num_heads"],
+        alignment_depth=config["encoder_depth"],
+        feature_dim=feature_dim,
+        projector_dim=config["projector_dim"],
+        num_classes=config["num_classes"],
+        class_dropout=config["class_dropout_prob"] > 0,
+        qk_norm=config["qk_norm"],
+        **options,
+    )
+    weights = case.weights().items()
+    sit.load_state_dict({our_name(k): v for k, v in weights if not k.startswith("bn.")})
+    return sit
+
+
+def build_norm(case, **options):
+    norm = LatentNorm(case.config["in_channels"], momentum=case.config["bn_momentum"], **options)
+    norm.load_state_dict(case.weights("w/bn."))
+    return norm

@@ -1,0 +1,203 @@
+"""SiT, latent norm and losses against ``sit.npz`` and ``sit_state_dicts.json``."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from official_sit import build_norm, build_sit, our_name
+
+from r3dpa.flow import FeatureGuidance, Interpolant
+from r3dpa.losses import alignment_loss, flow_matching_loss
+from r3dpa.nn.sit import SiT, sincos_position_embedding, time_frequencies
+
+
+@pytest.fixture(scope="module")
+def case(load_case):
+    return load_case("sit")
+
+
+def training_pass(case, sit, latents, path):
+    """Outputs of one pass over normalised latents, named as the official code does."""
+    time, noise = case["in/time_input"].flatten(), case["in/noises"]
+    output = sit(path.interpolate(latents, noise, time), time, case["in/y"])
+    return {
+        "zs_tilde": output.features,
+        "model_output": output.velocity,
+        "denoising_loss": flow_matching_loss(output.velocity, path.target(latents, noise, time)),
+        "proj_loss": alignment_loss(output.features, case["in/zs"]),
+    }
+
+
+def under(prefix, outputs):
+    return {prefix + key: value.detach() for key, value in outputs.items()}
+
+
+def embeddings(case):
+    width, frequencies = case.config["hidden_size"], case["out/t_freq"].shape[1]
+    return {
+        "out/pos_embed_init": sincos_position_embedding(width, build_sit(case).grid_size),
+        "out/t_freq": time_frequencies(case["in/time_input"].flatten(), frequencies),
+    }
+
+
+def evaluation(case):
+    latents = build_norm(case).normalise(case["in/x"])
+    path = Interpolant(case.config["path_type"])
+    return under("out/eval/", training_pass(case, build_sit(case), latents, path))
+
+
+def evaluation_on_the_cosine_path(case):
+    latents = build_norm(case).normalise(case["in/x"])
+    outputs = training_pass(case, build_sit(case), latents, Interpolant("cosine"))
+    return under("out/eval_cosine/", outputs)
+
+
+def training(case):
+    sit, norm = build_sit(case), build_norm(case)
+    latents = norm.update(case["in/x"])
+    outputs = training_pass(case, sit, latents, Interpolant(case.config["path_type"]))
+    loss = outputs["denoising_loss"].mean()
+    loss = loss + case.config["proj_coeff"] * outputs["proj_loss"].mean()
+    loss.backward()
+    gradients = [p.grad for p in sit.parameters() if p.grad is not None]
+    outputs |= {f"bn.{key}": value for key, value in norm.state_dict().items()}
+    outputs |= {"loss": loss, "grad_total_norm": torch.cat([g.flatten() for g in gradients]).norm()}
+    for name in case.weights("out/train/grad/"):
+        outputs[f"grad/{name}"] = sit.get_parameter(our_name(name)).grad
+    return under("out/train/", outputs)
+
+
+def alignment_only(case):
+    (gradient_key,) = case.keys("out/eval_align_only/grad_x_of_")
+    coefficient = float(gradient_key.split("_of_")[1].split("_")[0])
+    raw, time = case["in/x"].requires_grad_(), case["in/time_input"].flatten()
+    latents = build_norm(case).normalise(raw)
+    noisy = Interpolant(case.config["path_type"]).interpolate(latents, case["in/noises"], time)
+    features = build_sit(case).project_features(noisy, time, case["in/y"])
+    loss = alignment_loss(features, case["in/zs"])
+    (coefficient * loss.mean()).backward()
+    outputs = under("out/eval_align_only/", {"zs_tilde": features, "proj_loss": loss})
+    return outputs | {gradient_key: raw.grad}
+
+
+def broken_latent(case):
+    raw = case["in/x"]
+    raw[1, 2, 1, 3] = torch.nan
+    latents = build_norm(case, replace_non_finite=True).normalise(raw)
+    outputs = training_pass(case, build_sit(case), latents, Interpolant(case.config["path_type"]))
+    return {"out/eval_nan_latent/denoising_loss": outputs["denoising_loss"]}
+
+
+def inference(case):
+    sit, norm = build_sit(case), build_norm(case, legacy_inverse=True)
+    x, time, labels = case["in/inference_x"], case["in/inference_t"], case["in/y"]
+    unit = torch.ones(1, case.config["in_channels"], 1, 1)
+    shift = norm.denormalise(0 * unit)
+    return {
+        "out/inference/v": sit.velocity(x, time, labels),
+        "out/forward_feats": sit.project_features(x, time, labels),
+        "out/latents_scale": (1 / (norm.denormalise(unit) - shift)).flatten(),
+        "out/latents_bias": shift.flatten(),
+    }
+
+
+def feature_guidance(case):
+    sit, outputs = build_sit(case), {}
+    x, time, labels = case["in/inference_x"], case["in/inference_t"], case["in/y"]
+    for name, mask in (("nomask", None), ("mask", case["in/token_mask"])):
+        guidance = FeatureGuidance(
+            lambda x, t: sit.velocity(x, t, labels),
+            lambda x, t: sit.project_features(x, t, labels),
+            case["in/zs"],
+            mask,
+            scale=case.config["v_feat_scale"],
+            legacy=True,
+        )
+        guidance(x, time)
+        outputs |= {
+            f"out/cond_feats_{name}/v": guidance.velocity(x, time),
+            f"out/cond_feats_{name}/v_feat": guidance.term(x, time),
+            f"out/cond_feats_{name}/proj_loss": guidance.history[0].energy.sum(),
+        }
+    return outputs
+
+
+GROUPS = [
+    embeddings,
+    evaluation,
+    evaluation_on_the_cosine_path,
+    training,
+    alignment_only,
+    broken_latent,
+    inference,
+    feature_guidance,
+]
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: f"sit-{group.__name__}")
+def test_sit_outputs(case, close, group):
+    for key, value in group(case).items():
+        close(value, case[key])
+
+
+def test_sit_every_recorded_output_is_compared(case):
+    assert set().union(*(group(case) for group in GROUPS)) == set(case.keys("out/"))
+
+
+def test_sit_guided_velocity_is_the_recorded_sum(case, close):
+    outputs = feature_guidance(case)
+    for name in ("nomask", "mask"):
+        prefix = f"out/cond_feats_{name}/"
+        assert outputs[prefix + "v_feat"].abs().max() > 1e-2
+        close(
+            outputs[prefix + "v"] + outputs[prefix + "v_feat"],
+            case[prefix + "v"] + case[prefix + "v_feat"],
+        )
+
+
+def test_sit_train_statistics_need_the_unbiased_variance(case):
+    norm = build_norm(case)
+    norm.update(case["in/x"])
+    biased = case["in/x"].var(dim=(0, 2, 3), correction=0)
+    naive = torch.lerp(build_norm(case).running_var, biased, norm.momentum)
+    assert (naive - case["out/train/bn.running_var"]).abs().max() > 1e-4
+
+
+LAYOUTS = [
+    "SiT-B/2_kitti360_h2p4d8",
+    "SiT-B/2_imagenet_f8d4_cfgprob0.1",
+    "SiT-B/2_imagenet_f8d4_cfgprob0",
+    "SiT-XL/2_kitti360_h2p4d8",
+]
+
+WIDTHS = {
+    "SiT-B/2": {},
+    "SiT-XL/2": {"hidden_size": 1152, "depth": 28, "num_heads": 16},
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS, ids=lambda name: f"sit-{name}")
+def test_sit_official_layouts_have_our_keys_and_shapes(parity_dir, name):
+    official = json.loads((parity_dir / "sit_state_dicts.json").read_text())[name]
+    config = official["config"]
+    size = config["input_size"]
+    with torch.device("meta"):
+        sit = SiT(
+            input_size=tuple(size) if isinstance(size, list) else (size, size),
+            in_channels=config["in_channels"],
+            alignment_depth=config["encoder_depth"],
+            feature_dim=config["z_dims"][0],
+            class_dropout=config["class_dropout_prob"] > 0,
+            learn_pos_embed=True,
+            **WIDTHS[official["constructor"]],
+        )
+    ours = {key: list(value.shape) for key, value in sit.state_dict().items()}
+    expected = {our_name(key): shape for key, shape in official["state_dict"].items()}
+    assert ours == {k: shape for k, shape in expected.items() if not k.startswith("bn.")}
+    assert sum(p.numel() for p in sit.parameters()) == official["param_count_total"]
+    projector = sum(p.numel() for p in sit.projector.parameters())
+    assert projector == official["param_count_projectors"]
+    trained = official["param_count_total"] - sit.pos_embed.numel()
+    assert trained == official["param_count_trainable"]
