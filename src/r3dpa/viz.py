@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from r3dpa.atomic import atomic_path
 from r3dpa.geometry.projection import Projection, points_of
 from r3dpa.geometry.sensor import LidarSensor
 
@@ -528,18 +528,13 @@ def save(picture: Figure | Pixels, path: str | Path) -> Path:
         ValueError: If the suffix is not a known format or the pixels are not uint8.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")
-    try:
+    with atomic_path(path) as temporary:
         if isinstance(picture, Figure):
             picture.savefig(temporary)
         elif picture.dtype == np.uint8:
             Image.fromarray(picture).save(temporary)
         else:
             raise ValueError(f"pixels are {picture.dtype}; give uint8 from 0 to 255")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r3dpa.data import scans as scans_module
+from r3dpa.atomic import atomic_path
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     ScanError,
@@ -109,7 +109,7 @@ def test_interrupted_write_leaves_the_old_file(tmp_path):
     write_bin(file, POINTS)
 
     def interrupted_write():
-        with scans_module.atomic_path(file) as temporary:
+        with atomic_path(file) as temporary:
             temporary.write_bytes(b"half")
             raise RuntimeError("interrupted")
 

@@ -103,6 +103,7 @@ def test_an_empty_mask_means_no_guidance(legacy):
     guidance, x = build(mask=mask, legacy=legacy), latents()
     assert torch.equal(heun(guidance, x, ode_times(4)), heun(velocity, x, ode_times(4)))
     assert guidance.num_dropped == 0
+    assert all(record.energy.abs().max() == 0 for record in guidance.history)
     naive = energy_of(x[0], times()[0], target()[0], mask[0])
     assert naive.isnan()
 

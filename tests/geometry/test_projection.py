@@ -4,7 +4,6 @@ import time
 import pytest
 import torch
 
-import r3dpa.geometry
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
     LidarSensor,
@@ -15,7 +14,6 @@ from r3dpa.geometry import (
     range_image,
     unproject,
 )
-from r3dpa.geometry.range_image import RangeCodec
 
 SMALL = LidarSensor(beams=8, columns=16, inclination_max_deg=20.0, inclination_min_deg=-20.0)
 SENSORS = [LidarSensor(), SMALL, LidarSensor(5, 37, 60.0, -90.0, 0.0, 120.0)]
@@ -48,11 +46,6 @@ def range_image_by_loop(points, projection, values):
             range_m[row, column] = distance
             image[:, row, column] = value
     return range_m, image
-
-
-def test_module_of_the_same_name_does_not_hide_the_function():
-    assert callable(r3dpa.geometry.range_image)
-    assert RangeCodec is r3dpa.geometry.RangeCodec
 
 
 def test_documented_pixel():

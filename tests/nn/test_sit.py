@@ -145,6 +145,19 @@ def test_attention_equals_the_written_out_formula():
     torch.testing.assert_close(attention(tokens), attention.proj(mixed), atol=1e-5, rtol=1e-5)
 
 
+def test_block_equals_the_written_out_formula():
+    block = build().blocks[0].double()
+    tokens, conditioning = 1e-3 * torch.randn(2, 5, 16).double(), torch.randn(2, 16).double()
+    norm = nn.LayerNorm(16, eps=1e-6, elementwise_affine=False)
+    vectors = block.adaLN_modulation[1](conditioning * conditioning.sigmoid())[:, None]
+    shift1, scale1, gate1, shift2, scale2, gate2 = vectors.split(16, dim=-1)
+    expected = tokens + gate1 * block.attn(norm(tokens) * (1 + scale1) + shift1)
+    hidden = block.mlp.fc1(norm(expected) * (1 + scale2) + shift2)
+    hidden = 0.5 * hidden * (1 + torch.tanh((2 / math.pi) ** 0.5 * (hidden + 0.044715 * hidden**3)))
+    expected = expected + gate2 * block.mlp.fc2(hidden)
+    torch.testing.assert_close(block(tokens, conditioning), expected)
+
+
 def test_position_embedding_is_a_buffer_unless_it_is_to_be_learned():
     fixed, learned = SiT(**SMALL), SiT(**SMALL, learn_pos_embed=True)
     assert "pos_embed" not in dict(fixed.named_parameters())

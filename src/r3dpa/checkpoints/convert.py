@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import torch
 
+from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.files import (
-    atomic,
     official_neighbour,
     read_checkpoint,
     refuse_existing,
@@ -99,6 +99,6 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
             files[official_neighbour(out, "latents-stats")] = statistics_of(norm)
     refuse_existing(list(files), overwrite)
     for path, weights in files.items():
-        with atomic(path) as temporary:
+        with atomic_path(path) as temporary:
             torch.save(weights, temporary)
     return list(files)

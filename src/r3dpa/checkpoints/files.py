@@ -6,14 +6,12 @@ import argparse
 import functools
 import hashlib
 import json
-import os
 import pickle
 import re
 import struct
 import subprocess
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,11 +22,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
+from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
 from r3dpa.checkpoints.official import from_official, is_official
 
 __all__ = [
-    "atomic",
     "official_neighbour",
     "read_checkpoint",
     "refuse_existing",
@@ -162,7 +160,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
         "official_args": dict(checkpoint.official_args),
         "left_out": dict(checkpoint.left_out),
     }
-    with atomic(path) as weights_file, atomic(description) as description_file:
+    with atomic_path(path) as weights_file, atomic_path(description) as description_file:
         save_file(_unshared(weights), weights_file)
         about["sha256"] = _sha256(weights_file)
         try:
@@ -331,18 +329,6 @@ def refuse_existing(paths: list[Path], overwrite: bool) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` whose file becomes ``path`` when the block succeeds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _first_line(error: BaseException) -> str:

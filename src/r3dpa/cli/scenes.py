@@ -14,8 +14,9 @@ from tqdm import tqdm
 
 import r3dpa
 from r3dpa import viz
+from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints import Checkpoint, read_checkpoint, source_commit
-from r3dpa.data.scans import atomic_path, write_bin, write_npz, write_ply
+from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.nn import VAE, LatentNorm, SiT

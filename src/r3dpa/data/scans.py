@@ -6,7 +6,6 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from glob import has_magic
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from r3dpa.atomic import atomic_path
 from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, split_scans
 
@@ -141,22 +141,6 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
         limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
         raise ScanError(f"{path}: has no point within the sensor's range {limits}")
     return points
-
-
-@contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
-
-    A reader thus sees the old file or the complete new one; missing parent folders are made.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:

@@ -11,7 +11,7 @@ from r3dpa.geometry.projection import (
     range_image,
     unproject,
 )
-from r3dpa.geometry.range_image import RangeCodec
+from r3dpa.geometry.range_codec import RangeCodec
 from r3dpa.geometry.scan_geometry import ScanGeometry
 from r3dpa.geometry.sensor import LidarSensor
 

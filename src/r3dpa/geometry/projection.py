@@ -17,7 +17,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from r3dpa.geometry.range_image import EMPTY_RANGE_M
+from r3dpa.geometry.range_codec import EMPTY_RANGE_M
 from r3dpa.geometry.rings import match_in_order, mean_per_ring, rings_in_order
 from r3dpa.geometry.sensor import LidarSensor
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from r3dpa.geometry.projection import Projection, RingProjection, SphericalProjection
-from r3dpa.geometry.range_image import RangeCodec
+from r3dpa.geometry.range_codec import RangeCodec
 from r3dpa.geometry.sensor import LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,6 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from r3dpa.atomic import atomic_path
 from r3dpa.simulation.scan import simulate_scan
 from r3dpa.simulation.sensor import HDL64E
 from r3dpa.simulation.street import Street, generator_for
@@ -245,11 +245,5 @@ def _run(task: _Task) -> float:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file so that its name never stands for part of the content."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)

@@ -1,0 +1,30 @@
+"""The one way files are written: under a temporary name, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["atomic_path"]
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
+
+    A reader sees the old file or the complete new one. Missing parent folders are made; after an
+    error the temporary file is removed.
+
+    Args:
+        path: File to write. The temporary name has the same suffix.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
