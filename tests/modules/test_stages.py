@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 import wandb
 import yaml
 
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.nn import LatentNorm, SiT
 
+CONF = Path(__file__).resolve().parents[2] / "conf"
 STAGES = ("vae_alignment", "joint", "flow_matching")
 
 
@@ -80,6 +84,35 @@ def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, tmp_path
         for key in keys:
             torch.testing.assert_close(after[key], before[key])
     torch.testing.assert_close(after["ema.sit.pos_embed"], before["sit.pos_embed"])
+
+
+def test_rgb_weights_keep_the_blocks_and_leave_the_patch_embedding_fresh(
+    smoke_args, tmp_path, capfd
+):
+    """An RGB model with other latents, otherwise the SiT of conf/smoke.yaml."""
+    sit_args = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]
+    rgb_args = sit_args["init_args"] | {"input_size": [8, 8], "in_channels": 3}
+    rgb = SiT(**rgb_args)
+    for parameter in rgb.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    networks = {
+        "sit": NetworkState.of(rgb, rgb_args),
+        "latent_norm": NetworkState.of(LatentNorm(3), {"channels": 3}),
+    }
+    path = tmp_path / "rgb.safetensors"
+    save_checkpoint(Checkpoint(path, "rgb", networks), path)
+    more = ["--model.init_args.rgb_weights", str(path), "--trainer.logger=false"]
+    more += ["--model.init_args.optimizer.lr", "0", "--model.init_args.keep_projector", "false"]
+    main(smoke_args("vae_alignment", tmp_path / "run", *more))
+    trained = load(tmp_path / "run")["state_dict"]
+    for key, value in rgb.state_dict().items():
+        same = trained[f"sit.{key}"].shape == value.shape and torch.equal(
+            trained[f"sit.{key}"], value
+        )
+        fresh = ("x_embedder", "final_layer.linear", "pos_embed", "projector")
+        assert same != key.startswith(fresh), key
+    table = capfd.readouterr().out
+    assert all(word in table for word in ("x_embedder", "fresh", "kept", "latent channels"))
 
 
 def test_resume_is_exact(smoke_args, vae_checkpoint, tmp_path):

@@ -35,7 +35,16 @@ __all__ = [
 ]
 
 _FORMAT = "r3dpa-checkpoint-1"
-_ABOUT = ("stage", "step", "geometry", "version", "commit", "official_args", "left_out")
+_ABOUT = (
+    "stage",
+    "step",
+    "geometry",
+    "interpolant",
+    "version",
+    "commit",
+    "official_args",
+    "left_out",
+)
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
 _LIGHTNING = {
     "vae": ("vae.", "vae"),
@@ -157,6 +166,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
             for name, state in checkpoint.networks.items()
         },
         "geometry": checkpoint.geometry,
+        "interpolant": checkpoint.interpolant,
         "official_args": dict(checkpoint.official_args),
         "left_out": dict(checkpoint.left_out),
     }
@@ -248,6 +258,7 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
         networks=networks,
         step=content.get("global_step"),
         geometry=about.get("geometry"),
+        interpolant=about.get("interpolant", "linear"),
         version=about.get("version"),
         commit=about.get("commit"),
         left_out=dict.fromkeys(sorted(others), "no network that checkpoints exchange"),

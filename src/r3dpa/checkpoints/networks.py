@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -167,6 +167,7 @@ class Checkpoint:
         networks: Networks by name, see :data:`NETWORK_NAMES`.
         step: Optimiser steps taken, None if the file does not tell.
         geometry: Plain values of the ``ScanGeometry`` it was trained for, None if unknown.
+        interpolant: Path between latents and noise that its SiT was trained on.
         version: Version of r3dpa that wrote it, None for official files.
         commit: Commit of r3dpa that wrote it, if known.
         official_args: Options of the official training script, kept for the way back.
@@ -178,6 +179,7 @@ class Checkpoint:
     networks: Mapping[str, NetworkState]
     step: int | None = None
     geometry: Mapping[str, Any] | None = None
+    interpolant: Literal["linear", "cosine"] = "linear"
     version: str | None = None
     commit: str | None = None
     official_args: Mapping[str, Any] = field(default_factory=dict)

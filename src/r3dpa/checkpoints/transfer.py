@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ class TransferRow:
         group: Common beginning of the keys.
         num_tensors: Number of tensors of the group in the receiving network.
         fate: ``kept``, ``fresh`` (initial value of this run) or ``truncated``.
-        source: Shape of the group's first tensor in the RGB checkpoint, ``-`` if absent.
+        source: Shape of the group's largest tensor in the RGB checkpoint, ``-`` if absent.
         target: The same in the receiving network.
         reason: Why.
     """
@@ -51,7 +52,7 @@ class TransferReport:
 
     def table(self) -> str:
         """The report as text, one line per group."""
-        header = ("weights", "tensors", "fate", "first tensor, RGB", "here", "reason")
+        header = ("weights", "tensors", "fate", "largest tensor, RGB", "here", "reason")
         rows = [
             (row.group, str(row.num_tensors), row.fate, row.source, row.target, row.reason)
             for row in self.rows
@@ -107,7 +108,7 @@ def transfer_rgb(
             merged |= {key: value[:1] for key, value in rgb_part.items()}
         else:
             merged |= rgb_part
-        shapes = _first_shape(rgb_part), _first_shape(own_part)
+        shapes = _largest_shape(rgb_part), _largest_shape(own_part)
         rows.append(TransferRow(group, len(own_part), fate, *shapes, reason))
     init_args = rgb.arguments | {"input_size": sit.input_size}
     if any(row.group == "projector" and row.fate == "fresh" for row in rows):
@@ -163,9 +164,10 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _length(groups: Groups, group: str, axis: int) -> int:
-    """Size along an axis of a group's first tensor; 0 if there is no such group."""
-    return next((value.shape[axis] for value in groups.get(group, {}).values()), 0)
+    """Size along an axis of a group's largest tensor; 0 if there is no such group."""
+    largest = max(groups.get(group, {}).values(), key=Tensor.numel, default=None)
+    return 0 if largest is None else largest.shape[axis]
 
 
-def _first_shape(weights: Mapping[str, Tensor]) -> str:
-    return next((str(shape) for shape in _shapes(weights).values()), "-")
+def _largest_shape(weights: Mapping[str, Tensor]) -> str:
+    return str(max(_shapes(weights).values(), key=math.prod, default="-"))

@@ -88,19 +88,30 @@ def sample(
 
 
 def convert(
-    source: Path, out: Path, to: Literal["r3dpa", "official"] = "r3dpa", overwrite: bool = False
+    source: Path,
+    out: Path,
+    to: Literal["r3dpa", "official"] = "r3dpa",
+    overwrite: bool = False,
+    sit_args: dict[str, Any] | None = None,
+    encoding: Literal["linear", "log2"] | None = None,
 ) -> None:
     """Convert official checkpoints into ours, or ours into official ones.
 
     Args:
         source: Official ``.pt``, Lightning ``.ckpt`` or exported ``.safetensors``.
-        out: File to write.
+        out: File to write, ``.safetensors`` for ours and ``.pt`` for the official layout.
         to: Layout of the result.
         overwrite: Replace ``out`` where it exists.
+        sit_args: Official files only: SiT arguments that the file does not tell, such as
+            ``{alignment_depth: 4}``.
+        encoding: Official files only: range encoding, where the file does not tell.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
-    _print(convert_checkpoint(source, out, to, overwrite=overwrite).table())
+    result = convert_checkpoint(
+        source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding
+    )
+    _print(result.table())
 
 
 def report(run: Path) -> None:

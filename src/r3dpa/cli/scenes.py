@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
@@ -31,7 +31,7 @@ def generator_from(
     precision: Literal["fp32", "bf16"] = "fp32",
     device: str = "cpu",
 ) -> SceneGenerator:
-    """Rebuilds the networks of a checkpoint for sampling.
+    """Rebuilds the networks of a checkpoint for sampling, on the path they were trained on.
 
     Raises:
         ValueError: If a network, the latent statistics or the scan geometry is missing.
@@ -51,6 +51,7 @@ def generator_from(
     if not (isinstance(vae, VAE) and isinstance(sit, SiT) and isinstance(norm, LatentNorm)):
         raise ValueError(f"{checkpoint.path} holds other classes than VAE, SiT and LatentNorm")
     geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
+    sampler = replace(sampler, path=checkpoint.interpolant)
     return SceneGenerator(vae, sit, norm, geometry, sampler, precision)
 
 
@@ -103,7 +104,7 @@ def sample(
         "weights": weights,
         "num": num,
         "seed": seed,
-        "sampler": asdict(sampler),
+        "sampler": asdict(generator.sampler),
         "nfe": nfe,
         "precision": precision,
         "device": device,
@@ -139,7 +140,8 @@ def report(run: Path) -> str:
         run: Folder with the ``version_*/metrics.csv`` of a CSVLogger; a resumed run has several.
 
     Returns:
-        A table: quantity, mean of the first and of the last tenth of its values, their ratio.
+        A table: quantity, mean of the first and of the last tenth of its values, their difference
+        and, where both are positive, their ratio.
 
     Raises:
         ValueError: If the folder holds no metrics.
@@ -153,9 +155,10 @@ def report(run: Path) -> str:
             before = curves.get(name, ([], []))
             curves[name] = ([*before[0], *steps], [*before[1], *values])
     viz.save(viz.loss_curves(curves), run / "loss_curves.png")
-    rows = [f"{'quantity':<28}{'first tenth':>14}{'last tenth':>14}{'last/first':>12}"]
+    rows = [f"{'quantity':<26}{'first tenth':>13}{'last tenth':>13}{'change':>13}{'ratio':>8}"]
     for name, (_, values) in curves.items():
         tenth = max(1, len(values) // 10)
         first, last = fmean(values[:tenth]), fmean(values[-tenth:])
-        rows.append(f"{name:<28}{first:>14.5g}{last:>14.5g}{last / first:>12.3f}")
+        ratio = f"{last / first:.3f}" if first > 0 and last > 0 else ""
+        rows.append(f"{name:<26}{first:>13.5g}{last:>13.5g}{last - first:>+13.5g}{ratio:>8}")
     return "\n".join([*rows, f"curves: {run / 'loss_curves.png'}"])

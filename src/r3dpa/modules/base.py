@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from r3dpa import losses
-from r3dpa.checkpoints import load_into, read_checkpoint, transfer_rgb
+from r3dpa import __version__, losses
+from r3dpa.checkpoints import load_into, read_checkpoint, source_commit, transfer_rgb
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant, sample_time
@@ -467,7 +467,13 @@ class GenerativeModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds stage and scan geometry, so that a checkpoint is enough to sample from."""
-        checkpoint["r3dpa"] = {"stage": self.stage, "geometry": self.scan_geometry.to_dict()}
+        checkpoint["r3dpa"] = {
+            "stage": self.stage,
+            "geometry": self.scan_geometry.to_dict(),
+            "interpolant": self.interpolant.path,
+            "version": __version__,
+            "commit": source_commit(),
+        }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage.
