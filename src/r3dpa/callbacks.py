@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -11,12 +12,35 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r3dpa import viz
+from r3dpa.data import write_bin
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import points_of
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
 
-__all__ = ["PictureLogger"]
+__all__ = ["PictureLogger", "ReconstructionWriter"]
+
+
+class ReconstructionWriter(L.Callback):
+    """Writes what ``r3dpa predict`` reconstructs, as ``<run_dir>/reconstructions/<scan>.bin``."""
+
+    def on_predict_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Writes the points of each reconstructed range image, intensity 0."""
+        if not isinstance(pl_module, GenerativeModule):
+            raise TypeError(f"needs a GenerativeModule, got {type(pl_module).__name__}")
+        folder = Path(trainer.default_root_dir) / "reconstructions"
+        for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
+            points = points_of(range_m, pl_module.scan_geometry.projection)
+            write_bin(folder / f"{name}.bin", points)
 
 
 class PictureLogger(L.Callback):

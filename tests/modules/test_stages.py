@@ -14,6 +14,7 @@ import yaml
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.data import read_scan
 from r3dpa.nn import LatentNorm, SiT
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -174,6 +175,18 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_ch
         contents[name] = load(tmp_path / name)["state_dict"]
     for key, value in contents["one"].items():
         torch.testing.assert_close(contents["two"][key], value, atol=1e-5, rtol=1e-5, msg=key)
+
+
+@pytest.mark.parametrize("command", ["validate", "test", "predict"])
+def test_a_checkpoint_is_evaluated(command, smoke_args, vae_checkpoint, tmp_path, capsys):
+    arguments = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint))
+    main([command, *arguments[1:], "--trainer.logger=false"])
+    assert ("range_error_m" in capsys.readouterr().out) == (command != "predict")
+    pictures = list((tmp_path / "pictures").glob(f"{command[:3]}*_reconstruction_*.png"))
+    assert len(pictures) == (command != "predict")
+    written = list((tmp_path / "reconstructions").rglob("*.bin"))
+    assert len(written) == (12 if command == "predict" else 0)
+    assert all(len(read_scan(path)) > 0 for path in written)
 
 
 def test_saved_config_names_what_ran(smoke_args, tmp_path):

@@ -143,13 +143,7 @@ def _help() -> str:
     return "\n".join([*head, *lines, "", "r3dpa COMMAND --help lists the options of a command."])
 
 
-def main(args: list[str] | None = None) -> None:
-    """Runs the command line.
-
-    Args:
-        args: Words after ``r3dpa``; those of the process where None.
-    """
-    args = sys.argv[1:] if args is None else args
+def _run(args: list[str]) -> None:
     if not args or args[0] in ("-h", "--help"):
         _print(_help())
     elif args[0] == "--version":
@@ -172,3 +166,22 @@ def main(args: list[str] | None = None) -> None:
     else:
         _print(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
         sys.exit(2)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Runs the command line.
+
+    Args:
+        args: Words after ``r3dpa``. Where None, those of the process: an error about files or
+            values is then one line on the terminal, not a traceback.
+    """
+    if args is not None:
+        _run(args)
+        return
+    args = sys.argv[1:]
+    try:
+        _run(args)
+    except (ValueError, OSError) as error:
+        if args[0] == "fit":
+            raise  # where training broke is part of the message
+        sys.exit(f"r3dpa {args[0]}: {error}")

@@ -45,6 +45,8 @@ class StageCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Points every logger that has a ``save_dir`` at the run's folder."""
         config = self.config[self.subcommand]
+        if self.subcommand == "predict" and config.return_predictions is None:
+            config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
         Path(config.run_dir).mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
