@@ -19,7 +19,7 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo clean
+.PHONY: help install format lint types test test-all notebooks demo bench clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-12s %s\n", $$1, $$2}'
@@ -64,6 +64,9 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 		--num 16 --steps 64 --batch_size 16 --overwrite true
 	$(BIN)/r3dpa report $(OUT)/vae_alignment
 	$(BIN)/r3dpa report $(OUT)/joint
+
+bench: $(READY) ## one full-size training step of each stage: time and peak memory
+	$(BIN)/r3dpa bench
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

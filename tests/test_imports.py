@@ -22,9 +22,10 @@ ALLOWED = {
     "generation": {"geometry", "nn", "flow"},
     "modules": CORE | {"data", "checkpoints", "generation"},
     "callbacks": {"geometry", "data", "generation", "modules", "nn", "viz"},
+    "bench": {"geometry", "simulation", "nn", "data", "checkpoints", "modules"},
     "__main__": {"cli"},
     "cli": CORE
-    | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz"},
+    | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"},
 }
 
 

@@ -125,8 +125,33 @@ def report(run: Path) -> None:
     _print(draw(run))
 
 
+def bench(
+    conf: Path = Path("conf"),
+    stages: tuple[str, ...] = ("vae_alignment", "joint", "flow_matching"),
+    batch_size: int = 1,
+    steps: int = 2,
+    precision: Literal["32-true", "bf16-mixed"] = "32-true",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    out: Path | None = None,
+) -> None:
+    """Train each stage for a few steps at its real size; print time, memory and parameters.
+
+    Args:
+        conf: Folder of the configurations.
+        stages: Experiments below ``<conf>/experiment``, such as ``[joint]``; one process each.
+        batch_size: Scans per step.
+        steps: Optimiser steps; two are needed for the peak memory of a long run.
+        precision: Precision as the Trainer names it.
+        device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
+        out: JSON file for the same figures.
+    """
+    from r3dpa.bench import StepSettings, training
+
+    _print(training(conf, stages, StepSettings(batch_size, steps, precision, device), out))
+
+
 _COMMANDS: dict[str, Callable[..., None]] = {
-    command.__name__: command for command in (simulate, check, sample, convert, report)
+    command.__name__: command for command in (simulate, check, sample, convert, report, bench)
 }
 
 

@@ -1,0 +1,329 @@
+"""What training costs: real steps of each stage at its real size, with time and peak memory."""
+
+from __future__ import annotations
+
+import json
+import logging
+import platform
+import resource
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal
+
+import lightning as L
+import torch
+import yaml
+from jsonargparse import ArgumentParser
+from torch import Tensor
+from tqdm import tqdm
+
+from r3dpa import __version__
+from r3dpa.atomic import atomic_path
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, source_commit
+from r3dpa.checkpoints.networks import format_table
+from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.geometry import LidarSensor
+from r3dpa.modules import GenerativeModule
+from r3dpa.nn.backbones import GeometricFeatures
+from r3dpa.simulation import simulate
+
+__all__ = ["STAGES", "StageCost", "StepSettings", "training"]
+
+STAGES = ("vae_alignment", "joint", "flow_matching")
+"""Experiments that are measured where none are named."""
+
+_GIB = 2**30
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """How the measured steps are run.
+
+    Args:
+        batch_size: Scans per step.
+        steps: Optimiser steps. The first one pays for warm-up and runs before the optimiser has
+            moments: the peak of a long run takes two.
+        precision: Precision as the Trainer names it.
+        device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
+
+    Raises:
+        ValueError: If a count is below 1.
+    """
+
+    batch_size: int = 1
+    steps: int = 2
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the counts."""
+        if self.batch_size < 1 or self.steps < 1:
+            raise ValueError(
+                f"batch_size and steps must be at least 1, got {self.batch_size} and {self.steps}"
+            )
+
+    @property
+    def accelerator(self) -> str:
+        """``cpu`` or ``cuda``."""
+        if self.device != "auto":
+            return self.device
+        return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What training one stage costs.
+
+    Args:
+        stage: Name of the experiment.
+        num_parameters: Parameters of ``vae``, ``sit`` and ``sit_without_projector`` (both with the
+            position embedding, as published counts have it), ``discriminator`` (0 where the stage
+            has none), and ``trained``, those that the optimiser moves.
+        step_seconds: Wall time of each step: losses, backward, clipping, optimiser and averages,
+            without loading the batch.
+        loss: Weighted loss of the last step.
+        peak_host_bytes: Largest resident memory of the process, everything included.
+        peak_gpu_bytes: Largest memory of tensors on the GPU; None on a CPU.
+    """
+
+    stage: str
+    num_parameters: dict[str, int]
+    step_seconds: list[float]
+    loss: float
+    peak_host_bytes: int
+    peak_gpu_bytes: int | None
+
+    def row(self) -> list[str]:
+        """Cells of the printed table: millions, seconds (first, median of the others), GiB."""
+        first, *others = self.step_seconds
+        return [
+            self.stage,
+            *(f"{count / 1e6:.2f}" for count in self.num_parameters.values()),
+            f"{first:.3g}",
+            f"{median(others):.3g}" if others else "-",
+            f"{self.peak_host_bytes / _GIB:.2f}",
+            "-" if self.peak_gpu_bytes is None else f"{self.peak_gpu_bytes / _GIB:.2f}",
+            f"{self.loss:.4g}",
+        ]
+
+
+def training(
+    conf: Path,
+    stages: tuple[str, ...] = STAGES,
+    settings: StepSettings = StepSettings(),
+    out: Path | None = None,
+) -> str:
+    """Trains each stage for a few steps, as configured, and says what that costs.
+
+    Each stage runs in a fresh process, so that no peak contains what another stage left behind.
+    The scans are simulated, as many as a batch has, with the image and grid size that the networks
+    expect; weights start from random values.
+
+    Args:
+        conf: Folder of the configurations; stage ``joint`` is ``<conf>/experiment/joint.yaml``.
+        stages: Experiments to measure.
+        settings: Size, number, precision and place of the steps.
+        out: JSON file for the same figures, without rounding.
+
+    Returns:
+        A table with a row per stage, and a line each about settings, machine and versions.
+
+    Raises:
+        ValueError: If there is no such experiment.
+        RuntimeError: If the process of a stage was killed, as happens when memory runs out.
+    """
+    for stage in stages:
+        _experiment(conf, stage)
+    costs = []
+    with tempfile.TemporaryDirectory(prefix="r3dpa_bench_") as folder:
+        simulate(Path(folder) / "scans", scans=settings.batch_size)
+        for stage in tqdm(stages, unit="stage", desc="bench"):
+            costs.append(_in_new_process(stage, conf, Path(folder), settings))
+    about = {"settings": asdict(settings), "machine": _machine(settings), "versions": _versions()}
+    if out is not None:
+        content = {**about, "stages": [asdict(cost) for cost in costs]}
+        with atomic_path(out) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n")
+    header = ["stage", "VAE M", "SiT M", "no proj. M", "discr. M", "trained M"]
+    header += ["first s", "next s", "host GiB", "GPU GiB", "loss"]
+    lines = [format_table(header, (cost.row() for cost in costs))]
+    for name, values in about.items():
+        lines.append(f"{name}: " + ", ".join(f"{key} {value}" for key, value in values.items()))
+    return "\n".join(lines)
+
+
+def _in_new_process(stage: str, conf: Path, folder: Path, settings: StepSettings) -> StageCost:
+    # spawn: a forked process would share memory with this one.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(_measure, stage, conf, folder, settings).result()
+        except BrokenProcessPool as error:
+            raise RuntimeError(
+                f"the process that trained stage {stage} was killed, most likely for lack of "
+                f"memory at batch_size {settings.batch_size}, precision {settings.precision}; "
+                "give a smaller batch_size or precision bf16-mixed, or free memory"
+            ) from error
+
+
+def _measure(stage: str, conf: Path, folder: Path, settings: StepSettings) -> StageCost:
+    """Trains one stage in this process."""
+    # Advice on loaders and loggers, and the list of devices: beside the point here.
+    warnings.filterwarnings("ignore", module="lightning")
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    L.seed_everything(0, verbose=False)
+    module = _build(_experiment(conf, stage), folder / f"{stage}.safetensors")
+    timer = _StepTimer()
+    trainer = L.Trainer(
+        accelerator=settings.accelerator,
+        devices=1,
+        precision=settings.precision,
+        max_steps=settings.steps,
+        max_epochs=-1,
+        gradient_clip_val=1.0,
+        limit_val_batches=0,
+        logger=False,
+        callbacks=[timer],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
+    trainer.fit(module, datamodule=_data(module, folder, stage, settings.batch_size))
+    on_gpu = settings.accelerator == "cuda"
+    return StageCost(
+        stage,
+        _num_parameters(module),
+        timer.seconds,
+        float(trainer.callback_metrics["train/loss"]),
+        _peak_host_bytes(),
+        torch.cuda.max_memory_allocated() if on_gpu else None,
+    )
+
+
+def _experiment(conf: Path, stage: str) -> Path:
+    path = conf / "experiment" / f"{stage}.yaml"
+    if not path.is_file():
+        raise ValueError(
+            f"there is no experiment {path}; run in the repository of r3dpa, or give conf its "
+            "folder conf, which an installed package does not contain"
+        )
+    return path
+
+
+def _build(experiment: Path, fresh_vae: Path) -> GenerativeModule:
+    """The module of an experiment, to start from a VAE with random weights.
+
+    Stage flow_matching refuses to start without the VAE of another stage. Random weights cost the
+    same, so all stages are given such a file.
+    """
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(GenerativeModule, "model")
+    parser.add_argument("--trainer", type=dict)  # the length of a whole run: not used
+    config = parser.parse_path(experiment)
+    module = parser.instantiate_classes(config).model
+    # Dumped and read again, the arguments are plain values.
+    vae = yaml.safe_load(parser.dump(config))["model"]["init_args"]["vae"]
+    state = NetworkState(vae["class_path"], vae["init_args"], module.vae.state_dict())
+    save_checkpoint(Checkpoint(fresh_vae, "untrained", {"vae": state}), fresh_vae)
+    module.init_from, module.init_networks = str(fresh_vae), ("vae",)
+    return module
+
+
+def _data(module: GenerativeModule, folder: Path, stage: str, batch_size: int) -> LidarDataModule:
+    """The simulated scans at the size that the networks of a module expect."""
+    beams, columns = (
+        size * stride for size, stride in zip(module.sit.input_size, module.vae.stride, strict=True)
+    )
+    return LidarDataModule(
+        str(folder / "scans"),
+        sensor=LidarSensor(beams=beams, columns=columns),
+        grid_size=module.sit.grid_size,
+        extractor=GeometricFeatures(module.sit.feature_dim),
+        features_dir=str(folder / f"{stage}_features"),
+        batch_size=batch_size,
+        val_every=None,
+    )
+
+
+class _StepTimer(L.Callback):
+    """Wall time of each step, with the batch on its device at the start."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self.start = 0.0
+
+    def on_train_batch_start(self, trainer: L.Trainer, *args: Any) -> None:
+        """Starts the clock."""
+        self.start = self._now(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
+        """Stops the clock, after optimiser and averages."""
+        self.seconds.append(self._now(trainer) - self.start)
+
+    def _now(self, trainer: L.Trainer) -> float:
+        if trainer.strategy.root_device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def _num_parameters(module: GenerativeModule) -> dict[str, int]:
+    sit, discriminator = module.sit, module.discriminator
+    whole = _count({*sit.parameters(), sit.pos_embed})
+    return {
+        "vae": _count(module.vae.parameters()),
+        "sit": whole,
+        "sit_without_projector": whole - _count(sit.projector.parameters()),
+        "discriminator": 0 if discriminator is None else _count(discriminator.parameters()),
+        "trained": _count(
+            p for net in module.trainable().values() for p in net.parameters() if p.requires_grad
+        ),
+    }
+
+
+def _count(tensors: Iterable[Tensor]) -> int:
+    return sum(tensor.numel() for tensor in tensors)
+
+
+def _peak_host_bytes() -> int:
+    """Largest resident memory since this program started.
+
+    Linux hands ``ru_maxrss`` on to child processes: there it is at least the memory of the process
+    that started this one. ``VmHWM`` begins anew with each program.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _machine(settings: StepSettings) -> dict[str, Any]:
+    cpu_info = Path("/proc/cpuinfo")
+    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    on_gpu = settings.accelerator == "cuda"
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if on_gpu else None,
+    }
+
+
+def _versions() -> dict[str, str | None]:
+    return {
+        "r3dpa": __version__,
+        "commit": source_commit(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "lightning": L.__version__,
+    }
