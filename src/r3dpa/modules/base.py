@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -151,7 +152,13 @@ class GenerativeModule(L.LightningModule):
         max_skipped_steps: int = 10,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        with warnings.catch_warnings():
+            # Lightning advises to leave networks out. Kept, they are class paths in a checkpoint of
+            # the CLI, from which the networks are rebuilt.
+            warnings.filterwarnings(
+                "ignore", message="Attribute '.*' is an instance of `nn.Module`"
+            )
+            self.save_hyperparameters()
         if sit.in_channels != vae.latent_channels:
             raise ValueError(
                 f"sit.in_channels is {sit.in_channels}, but the VAE has "
@@ -217,10 +224,27 @@ class GenerativeModule(L.LightningModule):
             )
             self.print(report.table())
         if self.init_from is not None:
+            before = read_checkpoint(self.init_from)
+            if before.geometry is not None:
+                self._check_geometry(dict(before.geometry), self.init_from)
             networks = {name: self.get_submodule(name) for name in self.init_networks}
-            load_into(networks, read_checkpoint(self.init_from), stage=self.stage)
+            load_into(networks, before, stage=self.stage)
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
+
+    def _check_geometry(self, stored: dict[str, Any], source: str) -> None:
+        """Refuses weights that were trained on other range images than this run's."""
+        given = self.scan_geometry.to_dict()
+        different = [
+            f"{part} {stored.get(part)} there, {given[part]} here"
+            for part in ("projection", "codec")
+            if stored.get(part) != given[part]
+        ]
+        if different:
+            raise ValueError(
+                f"{source} was trained on other range images: {'; '.join(different)}. Set sensor, "
+                "projection and codec of the data module to those of the checkpoint"
+            )
 
     def _check_sizes(self, geometry: ScanGeometry, feature_dim: int | None) -> None:
         sensor = geometry.projection.sensor
@@ -476,10 +500,10 @@ class GenerativeModule(L.LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage.
+        """Refuses the checkpoint of another stage or of other range images.
 
         Raises:
-            ValueError: Naming both stages.
+            ValueError: Naming both stages or both geometries.
         """
         found = checkpoint.get("r3dpa", {}).get("stage")
         if found != self.stage:
@@ -487,7 +511,11 @@ class GenerativeModule(L.LightningModule):
                 f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
                 "from another one, give model.init_from instead of ckpt_path"
             )
-        self.geometry = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
+        stored = checkpoint["r3dpa"]["geometry"]
+        if self.geometry is None:
+            self.geometry = ScanGeometry.from_dict(stored)
+        else:
+            self._check_geometry(stored, "the checkpoint")
 
     @property
     def scan_geometry(self) -> ScanGeometry:
