@@ -47,8 +47,8 @@ def networks():
     return vae, sit, norm
 
 
-def generator(sampler=ODE, precision="fp32", geometry=GEOMETRY):
-    return SceneGenerator(*networks(), geometry, sampler, precision)
+def generator(sampler=ODE, precision="fp32", geometry=GEOMETRY, path="linear"):
+    return SceneGenerator(*networks(), geometry, sampler, path, precision)
 
 
 def stand_still(latents, time):
@@ -142,7 +142,7 @@ def test_the_sde_follows_the_path_of_the_sampler():
     """
     states = {"linear": [], "cosine": []}
     for path, seen in states.items():
-        scenes = generator(SamplerConfig("euler_maruyama", steps=3, path=path))
+        scenes = generator(SamplerConfig("euler_maruyama", steps=3), path=path)
         scenes.sit.velocity = lambda latents, time, seen=seen: (
             seen.append(latents) or stand_still(latents, time)
         )

@@ -7,6 +7,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -19,7 +20,20 @@ from r3dpa.geometry import points_of
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
 
-__all__ = ["PictureLogger", "ReconstructionWriter"]
+__all__ = ["PictureLogger", "ReconstructionWriter", "RunCheckpoint"]
+
+
+class RunCheckpoint(ModelCheckpoint):
+    """ModelCheckpoint whose ``last.ckpt`` holds the last step, whatever the saving interval.
+
+    Lightning's own saves at the end of training only if it has never saved before.
+    """
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Saves unless the last step is saved already."""
+        if self._last_global_step_saved != trainer.global_step:
+            self._last_checkpoint_saved = ""
+        super().on_train_end(trainer, pl_module)
 
 
 class ReconstructionWriter(L.Callback):
@@ -85,8 +99,9 @@ class PictureLogger(L.Callback):
         if self.num_scenes and module.ema is not None:
             pictures["samples"] = self._samples(module, module.ema)
         folder = Path(trainer.default_root_dir) / "pictures"
+        step = trainer.global_step or module.loaded_step
         for name, figure in pictures.items():
-            path = viz.save(figure, folder / f"{split}_{name}_{trainer.global_step:07d}.png")
+            path = viz.save(figure, folder / f"{split}_{name}_{step:07d}.png")
             for logger in trainer.loggers:
                 if isinstance(logger, WandbLogger):
                     logger.log_image(f"{split}/{name}", [str(path)])
@@ -106,9 +121,12 @@ class PictureLogger(L.Callback):
     def _samples(self, module: GenerativeModule, average: EMA) -> Figure:
         geometry = module.scan_geometry
         generator = SceneGenerator(
-            module.vae, average.sit, average.latent_norm, geometry, self.sampler
+            module.vae,
+            average.sit,
+            average.latent_norm,
+            geometry,
+            self.sampler,
+            module.interpolant.path,
         )
-        training = module.training
         scenes = generator.generate(range(self.num_scenes), self.seed)
-        module.train(training)
         return viz.scenes_sheet(list(scenes.range_m.cpu()), geometry.projection)

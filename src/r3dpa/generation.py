@@ -36,14 +36,15 @@ class SamplerConfig:
         steps: Solver steps.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
-        path: Interpolant that the SiT was trained with.
+
+    Raises:
+        ValueError: If the solver is unknown.
     """
 
     solver: Literal["euler", "heun", "euler_maruyama"] = "euler_maruyama"
     steps: int = 256
     sde_last_time: float = 0.04
     sde_last: Literal["denoise", "mean"] = "denoise"
-    path: Literal["linear", "cosine"] = "linear"
 
     def __post_init__(self) -> None:
         """Check the solver's name."""
@@ -75,6 +76,7 @@ class SceneGenerator:
         latent_norm: Statistics of the latents the SiT was trained on.
         geometry: Projection and range encoding of the training data.
         sampler: Solver and steps.
+        path: Interpolant that the SiT was trained on.
         precision: ``bf16`` runs the networks under autocast; state and solver stay float32.
 
     Raises:
@@ -88,6 +90,7 @@ class SceneGenerator:
         latent_norm: LatentNorm,
         geometry: ScanGeometry,
         sampler: SamplerConfig = SamplerConfig(),
+        path: Literal["linear", "cosine"] = "linear",
         precision: Literal["fp32", "bf16"] = "fp32",
     ) -> None:
         if not latent_norm.fitted:
@@ -100,6 +103,7 @@ class SceneGenerator:
         self.latent_norm = latent_norm.eval()
         self.geometry = geometry
         self.sampler = sampler
+        self.interpolant = Interpolant(path)
         self.precision = precision
 
     @property
@@ -140,7 +144,7 @@ class SceneGenerator:
                 noise,
                 sde_times(sampler.steps, sampler.sde_last_time),
                 draws,
-                interpolant=Interpolant(sampler.path),
+                interpolant=self.interpolant,
                 last=sampler.sde_last,
             )
         return _ODE_SOLVERS[sampler.solver](velocity, noise, ode_times(sampler.steps))

@@ -88,7 +88,7 @@ def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, tmp_path
 
 
 def test_rgb_weights_keep_the_blocks_and_leave_the_patch_embedding_fresh(
-    smoke_args, tmp_path, capfd
+    smoke_args, tmp_path, caplog
 ):
     """An RGB model with other latents, otherwise the SiT of conf/smoke.yaml."""
     sit_args = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]
@@ -112,8 +112,7 @@ def test_rgb_weights_keep_the_blocks_and_leave_the_patch_embedding_fresh(
         )
         fresh = ("x_embedder", "final_layer.linear", "pos_embed", "projector")
         assert same != key.startswith(fresh), key
-    table = capfd.readouterr().out
-    assert all(word in table for word in ("x_embedder", "fresh", "kept", "latent channels"))
+    assert all(word in caplog.text for word in ("x_embedder", "fresh", "kept", "latent channels"))
 
 
 def test_resume_is_exact(smoke_args, vae_checkpoint, tmp_path):
@@ -195,3 +194,29 @@ def test_saved_config_names_what_ran(smoke_args, tmp_path):
     assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
     assert config["trainer"]["max_steps"] == 3
     json.dumps(config)
+
+
+def test_last_checkpoint_holds_the_last_step(smoke_args, tmp_path):
+    """Five steps, saved every three."""
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.max_steps", "5"]
+    main(smoke_args("joint", tmp_path, *more))
+    assert load(tmp_path)["global_step"] == 5
+
+
+def test_a_second_fit_does_not_mix_with_the_first(smoke_args, tmp_path):
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+    main(smoke_args("joint", tmp_path, *more))
+    before = (tmp_path / "checkpoints" / "last.ckpt").read_bytes()
+    with pytest.raises(ValueError, match=r"holds an earlier run.*--ckpt_path"):
+        main(smoke_args("joint", tmp_path, *more))
+    assert (tmp_path / "checkpoints" / "last.ckpt").read_bytes() == before
+
+
+def test_resume_takes_the_learning_rate_of_the_run(smoke_args, tmp_path):
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+    main(smoke_args("joint", tmp_path, *more))
+    last = str(tmp_path / "checkpoints" / "last.ckpt")
+    resume = ["--trainer.max_steps", "6", "--model.init_args.optimizer.lr", "0.5"]
+    main(smoke_args("joint", tmp_path, *more, *resume, "--ckpt_path", last))
+    groups = load(tmp_path)["optimizer_states"][0]["param_groups"]
+    assert [group["lr"] for group in groups] == [0.5, 0.5, 0.5]

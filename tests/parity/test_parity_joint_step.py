@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import lightning as L
 import pytest
+import torch
 from torch.utils.data import DataLoader
 
 from r3dpa import losses
@@ -147,7 +150,7 @@ def run(recorded):
         ),
         discriminator=PatchDiscriminator(disc["input_nc"], disc["ndf"], disc["n_layers"]),
         weights=LossWeights(
-            reconstruction=vae_loss["reconstruction_weight"],
+            reconstruction=vae_loss["reconstruction_weight"] / math.exp(vae_loss["logvar_init"]),
             reconstruction_norm=vae_loss["reconstruction_loss"],
             kl=float(vae_loss["kl_weight"]),
             adversarial=vae_loss["discriminator_weight"] * vae_loss["discriminator_factor"],
@@ -195,13 +198,14 @@ def values(recorded, run):
     found = {}
     for step, ours_ in enumerate(run):
         parts, out = ours_["parts"], f"out/step{step}"
-        vae = parts["reconstruction"] + parts["kl"] + parts["adversarial"]
+        adversarial = parts.get("adversarial", torch.zeros(()))
+        vae = parts["reconstruction"] + parts["kl"] + adversarial
         found |= {
             f"{out}/vae/generator_total": vae,
             f"{out}/vae/total": vae + parts["vae_alignment"],
             f"{out}/vae/reconstruction_loss": parts["reconstruction"],
             f"{out}/vae/kl_loss": parts["kl"],
-            f"{out}/vae/weighted_gan_loss": parts["adversarial"],
+            f"{out}/vae/weighted_gan_loss": adversarial,
             f"{out}/vae/gan_loss": ours_["generator_loss"][0],
             f"{out}/vae/align_proj_loss": ours_["alignment_loss"][0],
             f"{out}/disc/loss": parts["discriminator"],

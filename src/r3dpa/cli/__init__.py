@@ -59,10 +59,13 @@ def sample(
     seed: int = 0,
     solver: Literal["euler", "heun", "euler_maruyama"] = "euler_maruyama",
     steps: int = 256,
+    sde_last: Literal["denoise", "mean"] = "denoise",
+    sde_last_time: float = 0.04,
     batch_size: int = 8,
     precision: Literal["fp32", "bf16"] = "fp32",
     device: str = "auto",
     weights: Literal["ema", "last"] = "ema",
+    pictures: int = 64,
     overwrite: bool = False,
 ) -> None:
     """Generate scenes from a checkpoint.
@@ -74,17 +77,22 @@ def sample(
         seed: Scene i depends on (seed, i) alone, not on the batch size.
         solver: ODE (euler, heun) or SDE (euler_maruyama) solver.
         steps: Solver steps.
+        sde_last: Last SDE step: ``denoise``, or ``mean`` as in the official sampler.
+        sde_last_time: Time from which the last SDE step starts.
         batch_size: Scenes sampled together.
         precision: Precision of the networks.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         weights: Averaged (``ema``) or last weights of the SiT.
+        pictures: Draw this many scenes; all are written as ``.bin``, ``.ply`` and ``.npz``.
         overwrite: Write into a folder that holds scenes already.
     """
     from r3dpa.cli.scenes import sample as generate
     from r3dpa.generation import SamplerConfig
 
-    sampler = SamplerConfig(solver=solver, steps=steps)
-    generate(ckpt, out, num, seed, sampler, batch_size, precision, device, weights, overwrite)
+    sampler = SamplerConfig(solver, steps, sde_last_time, sde_last)
+    generate(
+        ckpt, out, num, seed, sampler, batch_size, precision, device, weights, pictures, overwrite
+    )
 
 
 def convert(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 import r3dpa
@@ -22,6 +24,9 @@ from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.nn import VAE, LatentNorm, SiT
 
 __all__ = ["generator_from", "report", "sample"]
+
+_ON_SHEET = 16
+_KINDS = ("bin", "ply", "range", "birds_eye", "scene_3d")
 
 
 def generator_from(
@@ -51,8 +56,7 @@ def generator_from(
     if not (isinstance(vae, VAE) and isinstance(sit, SiT) and isinstance(norm, LatentNorm)):
         raise ValueError(f"{checkpoint.path} holds other classes than VAE, SiT and LatentNorm")
     geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
-    sampler = replace(sampler, path=checkpoint.interpolant)
-    return SceneGenerator(vae, sit, norm, geometry, sampler, precision)
+    return SceneGenerator(vae, sit, norm, geometry, sampler, checkpoint.interpolant, precision)
 
 
 def sample(
@@ -65,6 +69,7 @@ def sample(
     precision: Literal["fp32", "bf16"],
     device: str,
     weights: Literal["ema", "last"],
+    pictures: int,
     overwrite: bool,
 ) -> dict[str, Any]:
     """Writes scenes, pictures and metadata below ``out``; see ``r3dpa sample --help``.
@@ -83,20 +88,29 @@ def sample(
         device = "cuda" if torch.cuda.is_available() else "cpu"
     checkpoint = read_checkpoint(ckpt)
     generator = generator_from(checkpoint, sampler, weights, precision, device)
-    range_m, scenes, start, nfe = [], {}, time.perf_counter(), 0
+    for kind in _KINDS:
+        shutil.rmtree(out / kind, ignore_errors=True)  # of an earlier run with more scenes
+    drawn, points, seconds, nfe = [], {}, 0.0, 0
     with tqdm(total=num, unit="scene", desc="sampling") as progress:
         for first in range(0, num, batch_size):
             indices = range(first, min(first + batch_size, num))
+            start = time.perf_counter()
             batch = generator.generate(indices, seed)
-            nfe = batch.nfe
-            for index, scene_m in zip(indices, batch.range_m.cpu(), strict=True):
-                scenes[f"{index:06d}"] = _write_scene(out, index, scene_m, generator.geometry)
-                range_m.append(scene_m)
+            range_m, nfe = batch.range_m.cpu(), batch.nfe  # the copy waits for the GPU
+            seconds += time.perf_counter() - start
+            for index, scene_m in zip(indices, range_m, strict=True):
+                name = f"{index:06d}"
+                points[name] = points_of(scene_m, generator.geometry.projection)
+                write_bin(out / "bin" / f"{name}.bin", points[name])
+                write_ply(out / "ply" / f"{name}.ply", points[name])
+                if index < pictures:
+                    _draw_scene(out, name, scene_m, points[name], generator.geometry)
+                    drawn.append(scene_m)
             progress.update(len(indices))
-    seconds = time.perf_counter() - start
-    write_npz(out / "scenes.npz", scenes)
-    sheet = viz.scenes_sheet(range_m[:16], generator.geometry.projection)
-    viz.save(sheet, out / "scenes.png")
+    write_npz(out / "scenes.npz", points)
+    if drawn:
+        sheet = viz.scenes_sheet(drawn[:_ON_SHEET], generator.geometry.projection)
+        viz.save(sheet, out / "scenes.png")
     metadata = {
         "checkpoint": str(ckpt),
         "stage": checkpoint.stage,
@@ -104,7 +118,8 @@ def sample(
         "weights": weights,
         "num": num,
         "seed": seed,
-        "sampler": asdict(generator.sampler),
+        "sampler": asdict(sampler),
+        "interpolant": checkpoint.interpolant,
         "nfe": nfe,
         "precision": precision,
         "device": device,
@@ -120,17 +135,14 @@ def sample(
     return metadata
 
 
-def _write_scene(out: Path, index: int, range_m: torch.Tensor, geometry: ScanGeometry) -> Any:
-    projection = geometry.projection
-    points, name = points_of(range_m, projection), f"{index:06d}"
-    write_bin(out / "bin" / f"{name}.bin", points)
-    write_ply(out / "ply" / f"{name}.ply", points)
-    scale = max(1, 1024 // projection.sensor.columns)
-    picture = viz.range_image_picture(range_m, projection.sensor, scale)
+def _draw_scene(
+    out: Path, name: str, range_m: Tensor, points: Tensor, geometry: ScanGeometry
+) -> None:
+    sensor = geometry.projection.sensor
+    picture = viz.range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
     viz.save(picture, out / "range" / f"{name}.png")
     viz.save(viz.birds_eye_view(points), out / "birds_eye" / f"{name}.png")
     viz.save(viz.scene_3d(points), out / "scene_3d" / f"{name}.png")
-    return points.numpy()
 
 
 def report(run: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
 
 from r3dpa import __version__, losses
@@ -26,7 +27,9 @@ __all__ = ["GenerativeModule", "LossWeights", "OptimizerConfig", "PathDraws", "f
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the training losses; a loss of weight 0 is not computed.
+    """Weights of the training losses.
+
+    An alignment or adversarial loss of weight 0 is not computed.
 
     Args:
         reconstruction: Weight of the reconstruction error.
@@ -159,11 +162,6 @@ class GenerativeModule(L.LightningModule):
                 "ignore", message="Attribute '.*' is an instance of `nn.Module`"
             )
             self.save_hyperparameters()
-        if sit.in_channels != vae.latent_channels:
-            raise ValueError(
-                f"sit.in_channels is {sit.in_channels}, but the VAE has "
-                f"{vae.latent_channels} latent channels; give both the same number"
-            )
         self.vae = vae
         self.sit = sit
         self.discriminator = discriminator
@@ -182,6 +180,9 @@ class GenerativeModule(L.LightningModule):
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.geometry: ScanGeometry | None = None
+        self.loaded_step = 0
+        self._has_weights = False
+        self._previous_geometry: Mapping[str, Any] | None = None
         self._skipped_in_a_row = 0
 
     # What a stage declares
@@ -197,20 +198,28 @@ class GenerativeModule(L.LightningModule):
     # Starting a stage
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks and, before a fresh fit, loads the stage before."""
+        """Checks data against networks."""
         datamodule = getattr(self.trainer, "datamodule", None)
         if not isinstance(datamodule, LidarDataModule):
             raise ValueError(
                 f"{type(self).__name__} needs a LidarDataModule, got {type(datamodule).__name__}"
             )
         self.geometry = datamodule.geometry
-        has_features = datamodule.features_dir is not None
-        self._check_sizes(self.geometry, datamodule.feature_dim if has_features else None)
-        if stage == "fit" and self.trainer.ckpt_path is None:
+        self._check_sizes(self.geometry)
+        if self.needs_features() and stage != "predict":
+            self._check_features(self.geometry, datamodule)
+
+    def on_fit_start(self) -> None:
+        """Loads the stage before, unless this run goes on from a checkpoint of its own."""
+        if not self._has_weights:
             self.load_previous_stage()
+        if self._previous_geometry is not None:
+            self._check_geometry(self._previous_geometry, str(self.init_from))
 
     def load_previous_stage(self) -> None:
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
+
+        A fit does it by itself; called earlier, it says early what does not fit.
 
         Raises:
             ValueError: Listing everything in the file that does not fit this stage.
@@ -222,23 +231,27 @@ class GenerativeModule(L.LightningModule):
                 self.latent_norm,
                 keep_projector=self.keep_projector,
             )
-            self.print(report.table())
+            rank_zero_info(report.table())
         if self.init_from is not None:
             before = read_checkpoint(self.init_from)
-            if before.geometry is not None:
-                self._check_geometry(dict(before.geometry), self.init_from)
             networks = {name: self.get_submodule(name) for name in self.init_networks}
             load_into(networks, before, stage=self.stage)
+            self._previous_geometry = before.geometry
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
+        self._has_weights = True
 
-    def _check_geometry(self, stored: dict[str, Any], source: str) -> None:
+    def _check_geometry(self, stored: Mapping[str, Any], source: str) -> None:
         """Refuses weights that were trained on other range images than this run's."""
-        given = self.scan_geometry.to_dict()
+        there, here = ScanGeometry.from_dict(dict(stored)), self.scan_geometry
+        parts = {
+            "projection": (there.projection, here.projection),
+            "codec": (there.codec, here.codec),
+        }
         different = [
-            f"{part} {stored.get(part)} there, {given[part]} here"
-            for part in ("projection", "codec")
-            if stored.get(part) != given[part]
+            f"{name} {theirs} there, {ours} here"
+            for name, (theirs, ours) in parts.items()
+            if theirs != ours
         ]
         if different:
             raise ValueError(
@@ -246,7 +259,12 @@ class GenerativeModule(L.LightningModule):
                 "projection and codec of the data module to those of the checkpoint"
             )
 
-    def _check_sizes(self, geometry: ScanGeometry, feature_dim: int | None) -> None:
+    def _check_sizes(self, geometry: ScanGeometry) -> None:
+        if self.sit.in_channels != self.vae.latent_channels:
+            raise ValueError(
+                f"sit.in_channels is {self.sit.in_channels}, but the VAE has "
+                f"{self.vae.latent_channels} latent channels; give both the same number"
+            )
         sensor = geometry.projection.sensor
         image_size = (sensor.beams, sensor.columns)
         latent_size = self.vae.latent_size(image_size)
@@ -255,9 +273,9 @@ class GenerativeModule(L.LightningModule):
                 f"a {image_size} range image gives {latent_size} latents, but sit.input_size is "
                 f"{tuple(self.sit.input_size)}; set sit.input_size to {latent_size}"
             )
-        if not self.needs_features():
-            return
-        if feature_dim is None:
+
+    def _check_features(self, geometry: ScanGeometry, datamodule: LidarDataModule) -> None:
+        if datamodule.features_dir is None:
             raise ValueError(
                 f"stage {self.stage} aligns with 3D features, but the data module has none; give "
                 "it an extractor or features_dir, or set the alignment weights to 0"
@@ -267,9 +285,10 @@ class GenerativeModule(L.LightningModule):
                 f"feature grids are {geometry.grid_size}, but the SiT has "
                 f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
             )
-        if feature_dim != self.sit.feature_dim:
+        if datamodule.feature_dim != self.sit.feature_dim:
             raise ValueError(
-                f"features have width {feature_dim}, but sit.feature_dim is {self.sit.feature_dim}"
+                f"features have width {datamodule.feature_dim}, but sit.feature_dim is "
+                f"{self.sit.feature_dim}; set it to the former"
             )
 
     # Losses of one step
@@ -363,9 +382,18 @@ class GenerativeModule(L.LightningModule):
         return parts
 
     def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
-        """Sums weighted losses and logs each of them, as weighted, under ``train/``."""
+        """Sums weighted losses; logs the sum as ``train/loss``, each loss without its weight.
+
+        Args:
+            parts: Weighted losses under the names of their weights in :class:`LossWeights`.
+        """
         total = torch.stack(list(parts.values())).sum()
-        values = {f"train/{name}": value.detach() for name, value in parts.items()}
+        weights = {name: getattr(self.weights, name) for name in parts}
+        values = {
+            f"train/{name}": value.detach() / weights[name]
+            for name, value in parts.items()
+            if weights[name] != 0
+        }
         self.log_dict({**values, "train/loss": total.detach()})
         return total
 
@@ -403,7 +431,8 @@ class GenerativeModule(L.LightningModule):
         """
         if gradient_clip_algorithm not in (None, "norm"):
             raise ValueError(
-                f"gradients are clipped by norm per network, got {gradient_clip_algorithm!r}"
+                "gradients are clipped by norm per network; leave gradient_clip_algorithm out, got "
+                f"{getattr(gradient_clip_algorithm, 'value', gradient_clip_algorithm)!r}"
             )
         limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
         norms = {
@@ -455,23 +484,33 @@ class GenerativeModule(L.LightningModule):
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
         values = {
-            "reconstruction": losses.reconstruction_loss(reconstruction, image),
+            "reconstruction": losses.reconstruction_loss(
+                reconstruction, image, self.weights.reconstruction_norm
+            ),
             "range_error_m": error_m[mask].mean(),
         }
-        networks = self if self.ema is None else self.ema
-        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
-        velocity, projected = networks.sit(noisy, draws.time)
-        if self.trains_velocity:
-            target = self.interpolant.target(latents, draws.noise, draws.time)
-            values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
-        if self.needs_features():
-            values["alignment"] = self._aligned(projected, batch.get("feature_grid"))
+        if self.trains_velocity or self.needs_features():
+            values |= self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
         self.log_dict(
             {f"{prefix}/{name}": value for name, value in values.items()},
             batch_size=image.shape[0],
             sync_dist=True,
         )
+
+    def _evaluate_flow(
+        self, posterior: Posterior, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        networks = self if self.ema is None else self.ema
+        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
+        velocity, projected = networks.sit(noisy, draws.time)
+        values = {}
+        if self.trains_velocity:
+            target = self.interpolant.target(latents, draws.noise, draws.time)
+            values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
+        if self.needs_features():
+            values["alignment"] = self._aligned(projected, features)
+        return values
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Evaluates a batch of the validation split under ``val/``."""
@@ -505,12 +544,17 @@ class GenerativeModule(L.LightningModule):
         Raises:
             ValueError: Naming both stages or both geometries.
         """
+        self.loaded_step = checkpoint.get("global_step", 0)
+        self._has_weights = True
         found = checkpoint.get("r3dpa", {}).get("stage")
         if found != self.stage:
             raise ValueError(
                 f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
                 "from another one, give model.init_from instead of ckpt_path"
             )
+        for state in checkpoint.get("optimizer_states", []):
+            for group in state["param_groups"]:
+                group.update(asdict(self.optimizer_config))  # those of this run, not the old ones
         stored = checkpoint["r3dpa"]["geometry"]
         if self.geometry is None:
             self.geometry = ScanGeometry.from_dict(stored)

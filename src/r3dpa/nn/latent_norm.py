@@ -8,9 +8,8 @@ from __future__ import annotations
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 
-from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.layers import at_least_float32, sum_over_processes
 
 __all__ = ["LatentNorm"]
 
@@ -126,12 +125,12 @@ class LatentNorm(nn.Module):
         counts = torch.stack([num_broken.new_tensor(positions), num_broken])
         totals = torch.cat([counts, wide.sum(dim=(0, 2, 3))])
         if distributed:
-            totals = all_reduce(totals)
+            totals = sum_over_processes(totals)
         count, num_broken = totals[0].detach(), totals[1].detach()
         mean = totals[2:] / count
         squares = (wide - _per_channel(mean, wide)).square().sum(dim=(0, 2, 3))
         if distributed:
-            squares = all_reduce(squares)
+            squares = sum_over_processes(squares)
         normalised = (wide - _per_channel(mean, wide)) * _per_channel(
             torch.rsqrt(squares / count + self.eps), wide
         )

@@ -5,12 +5,13 @@ Letters: B batch, C channels, H x W image or latent size.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.distributed as dist
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 
 __all__ = [
     "AttentionBlock",
@@ -259,12 +260,36 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
         return (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
 
 
+class _SumOverProcesses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        total = values.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return _SumOverProcesses.apply(gradient.contiguous())
+
+
+def sum_over_processes(values: Tensor) -> Tensor:
+    """Elementwise sum over all processes, with the gradient of every process's share.
+
+    Args:
+        values: Any shape, the same on all processes, each of which must call this.
+
+    Returns:
+        Same shape, equal on all processes.
+    """
+    return _SumOverProcesses.apply(values)
+
+
 def _global_moments(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, biased variance (C,) and number of values per channel over all processes."""
     values = at_least_float32(image)
     count = values.new_tensor([values.numel() / values.shape[1]])
-    sums = all_reduce(torch.cat([values.sum(dim=(0, 2, 3)), count]))
+    sums = sum_over_processes(torch.cat([values.sum(dim=(0, 2, 3)), count]))
     count = sums[-1]
     mean = sums[:-1] / count
     squares = (values - mean.view(-1, 1, 1)).square().sum(dim=(0, 2, 3))
-    return mean, all_reduce(squares) / count, count
+    return mean, sum_over_processes(squares) / count, count

@@ -1,0 +1,403 @@
+"""The ``r3dpa`` command from the outside: what it prints, writes, and refuses."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from r3dpa.checkpoints import read_checkpoint, source_commit
+from r3dpa.cli import main
+from r3dpa.data.feature_grids import stored_feature_dim
+from r3dpa.data.scans import read_npz, read_ply, read_scan
+from r3dpa.geometry import LidarSensor, SphericalProjection, in_range
+
+pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
+
+COMMANDS = {
+    *("fit", "validate", "test", "predict", "features"),
+    *("simulate", "check", "sample", "convert", "report", "bench"),
+}
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
+LEGACY_VAE = ["--model.init_args.vae.init_args.legacy_upsample=true"]
+CSV_LOGGER = json.dumps(
+    [
+        {
+            "class_path": "lightning.pytorch.loggers.CSVLogger",
+            "init_args": {"save_dir": "", "name": ""},
+        }
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def joint_run(smoke_args, tmp_path_factory):
+    """Run of the joint stage whose last and averaged weights have moved apart.
+
+    Its VAE is one that the official layout can hold.
+    """
+    run_dir = tmp_path_factory.mktemp("joint")
+    more = ["--trainer.logger", CSV_LOGGER, "--trainer.limit_val_batches=0"]
+    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
+    more += LEGACY_VAE
+    main(smoke_args("joint", run_dir, *more))
+    return run_dir
+
+
+@pytest.fixture(scope="module")
+def joint_checkpoint(joint_run):
+    return joint_run / "checkpoints" / "last.ckpt"
+
+
+def sample(checkpoint, out, *more):
+    words = ["--ckpt", checkpoint, "--out", out, "--num", 3, "--steps", 3, *more]
+    main(["sample", *map(str, words)])
+    return out
+
+
+@pytest.fixture(scope="module")
+def scenes(joint_checkpoint, tmp_path_factory):
+    return sample(joint_checkpoint, tmp_path_factory.mktemp("scenes") / "new" / "folder")
+
+
+def python(code):
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+class TestHelp:
+    @pytest.mark.parametrize("args", ["['--help']", "['-h']", "[]"])
+    def test_lists_every_command_and_loads_nothing_heavy(self, args):
+        heavy = ["torch", "lightning", "matplotlib", "numpy", "wandb", "jsonargparse"]
+        out = python(
+            f"import sys; from r3dpa.cli import main; main({args}); "
+            f"print('loaded', [name for name in {heavy} if name in sys.modules])"
+        )
+        listed = {line.split()[0] for line in out.splitlines() if line.startswith("  ")}
+        assert listed == COMMANDS
+        assert out.splitlines()[-1] == "loaded []"
+
+    def test_every_line_says_what_the_command_does(self, capsys):
+        main(["--help"])
+        lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+        assert all(len(line.split()) > 3 for line in lines)
+
+    @pytest.mark.parametrize("command", sorted(COMMANDS))
+    def test_every_command_lists_its_options(self, command, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        assert stop.value.code == 0
+        out = capsys.readouterr().out
+        assert f"{command} [" in out
+        assert "--help" in out
+
+    def test_version(self, capsys):
+        main(["--version"])
+        assert capsys.readouterr().out.strip() == "0.1.0"
+
+    def test_module_form_is_the_same_command(self):
+        out = subprocess.run(
+            [sys.executable, "-m", "r3dpa"], capture_output=True, text=True, check=True, timeout=60
+        ).stdout
+        assert out.startswith("usage: r3dpa COMMAND")
+
+
+class TestUsageErrors:
+    def test_unknown_command(self, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["smaple"])
+        assert stop.value.code == 2
+        out = capsys.readouterr().out
+        assert "unknown command 'smaple'" in out
+        assert "sample" in out
+
+    def test_unknown_option(self, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["sample", "--ckpt", "a", "--out", "b", "--stepz", "3"])
+        assert stop.value.code == 2
+        assert "--stepz" in capsys.readouterr().err
+
+    def test_missing_option(self, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["sample", "--ckpt", "a"])
+        assert stop.value.code == 2
+        assert "out" in capsys.readouterr().err
+
+
+class TestErrorsOnTheTerminal:
+    """With the words of the process, not of a caller, an error is one line and exit status 1."""
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["report", "nowhere"], "r3dpa report: nowhere holds no version_"),
+            (["sample", "--ckpt", "no.ckpt", "--out", "x"], "r3dpa sample: no checkpoint file no"),
+            (["convert", "no.pt", "x.pt"], "r3dpa convert: no checkpoint file no.pt"),
+        ],
+    )
+    def test_is_one_line(self, words, message, monkeypatch, tmp_path):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["r3dpa", *words])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert stop.value.code.startswith(message)
+        assert "\n" not in stop.value.code
+
+    def test_of_training_keeps_its_traceback(self, monkeypatch, smoke_args, tmp_path):
+        monkeypatch.setattr(sys, "argv", ["r3dpa", *smoke_args("flow_matching", tmp_path)])
+        with pytest.raises(ValueError, match=r"give model\.init_from a checkpoint"):
+            main()
+
+
+@pytest.fixture
+def simulated(tmp_path):
+    main(["simulate", "--out", str(tmp_path), "--scans", "3", "--drives", "['0000', '0003']"])
+    return tmp_path
+
+
+class TestSimulateAndCheck:
+    def test_simulated_scans_pass_the_check(self, simulated, capsys):
+        scans = list(simulated.rglob("data_3d_raw/*/velodyne_points/data/*.bin"))
+        drives = {path.parents[2].name for path in scans}
+        assert drives == {f"2013_05_28_drive_{number}_sync" for number in ("0000", "0003")}
+        capsys.readouterr()
+        main(["check", str(simulated)])
+        assert "3 scans in 2 drives, all usable" in capsys.readouterr().out
+
+    def test_check_names_every_bad_scan_and_missing_folder(self, simulated, capsys):
+        truncated, *_, infinite = sorted(simulated.rglob("*.bin"))
+        truncated.write_bytes(truncated.read_bytes()[:-3])
+        points = read_scan(infinite)
+        points[1, 2] = np.inf
+        infinite.write_bytes(points.tobytes())
+        with pytest.raises(SystemExit) as stop:
+            main(["check", str(simulated)])
+        assert stop.value.code == 1
+        bad = [line for line in capsys.readouterr().out.splitlines() if line.startswith("bad: ")]
+        assert len(bad) == 2
+        assert str(truncated) in bad[0]
+        assert "not a multiple of 16" in bad[0]
+        assert str(infinite) in bad[1]
+        assert "NaN or infinite" in bad[1]
+
+    def test_check_names_missing_drives(self, tmp_path, capsys):
+        (tmp_path / "data_3d_raw" / "2013_05_28_drive_0000_sync").mkdir(parents=True)
+        with pytest.raises(SystemExit) as stop:
+            main(["check", str(tmp_path)])
+        assert stop.value.code == 1
+        missing = [x for x in capsys.readouterr().out.splitlines() if x.startswith("missing: ")]
+        assert len(missing) == 9
+        assert missing[0].endswith("drive_0000_sync/velodyne_points/data")
+        assert missing[1].endswith("drive_0002_sync")
+
+    def test_check_of_a_folder_that_does_not_exist(self, tmp_path, capsys):
+        with pytest.raises(SystemExit) as stop:
+            main(["check", str(tmp_path / "nowhere")])
+        assert stop.value.code == 1
+        assert f"missing: {tmp_path / 'nowhere'}" in capsys.readouterr().out
+
+
+def values(folder):
+    return read_npz(folder / "scenes.npz")
+
+
+def assert_same_scenes(actual, expected, num=3):
+    """Up to the rounding of another batch size: 1e-5 in the latents, 1e-3 m in the points."""
+    actual, expected = values(actual), values(expected)
+    assert len(actual) == num
+    for name, points in expected.items():
+        np.testing.assert_allclose(actual[name], points, atol=1e-3, rtol=0)
+
+
+class TestSample:
+    def test_writes_every_scene_in_every_form(self, scenes):
+        names = ["000000", "000001", "000002"]
+        clouds = values(scenes)
+        assert list(clouds) == names
+        for folder, suffix in (("bin", "bin"), ("ply", "ply")):
+            assert sorted(p.name for p in (scenes / folder).iterdir()) == [
+                f"{name}.{suffix}" for name in names
+            ]
+        projection = SphericalProjection(SENSOR)
+        for name, points in clouds.items():
+            assert 0 < len(points) <= SENSOR.beams * SENSOR.columns
+            assert in_range(torch.from_numpy(points), SENSOR).all()
+            row, column = projection.pixel_of(torch.from_numpy(points))
+            assert len(torch.unique(row * SENSOR.columns + column)) == len(points)
+            np.testing.assert_array_equal(read_ply(scenes / "ply" / f"{name}.ply"), points)
+            scan = read_scan(scenes / "bin" / f"{name}.bin")
+            np.testing.assert_array_equal(scan[:, :3], points)
+        assert not np.array_equal(clouds["000000"], clouds["000001"])
+
+    def test_draws_every_scene(self, scenes):
+        pictures = [scenes / "scenes.png"]
+        for folder in ("range", "birds_eye", "scene_3d"):
+            pictures += sorted((scenes / folder).iterdir())
+        assert len(pictures) == 1 + 3 * 3
+        for path in pictures:
+            with Image.open(path) as picture:
+                assert min(picture.size) >= 100
+                assert len(picture.convert("RGB").getcolors(1 << 20)) > 10
+
+    def test_metadata_is_enough_to_repeat_the_run(self, scenes, joint_checkpoint):
+        metadata = json.loads((scenes / "metadata.json").read_text())
+        expected = {
+            "checkpoint": str(joint_checkpoint),
+            "stage": "joint",
+            "step": 3,
+            "weights": "ema",
+            "num": 3,
+            "seed": 0,
+            "interpolant": "linear",
+            "nfe": 3,
+            "precision": "fp32",
+            "batch_size": 8,
+            "r3dpa": "0.1.0",
+            "commit": source_commit(),
+            "torch": torch.__version__,
+        }
+        assert {key: metadata[key] for key in expected} == expected
+        assert metadata["sampler"] == {
+            "solver": "euler_maruyama",
+            "steps": 3,
+            "sde_last_time": 0.04,
+            "sde_last": "denoise",
+        }
+        assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
+        assert metadata["seconds_per_scene"] > 0
+
+    def test_options_reach_the_sampler(self, joint_checkpoint, tmp_path):
+        out = sample(joint_checkpoint, tmp_path, "--solver", "heun", "--seed", 5, "--num", 1)
+        metadata = json.loads((out / "metadata.json").read_text())
+        assert metadata["sampler"]["solver"] == "heun"
+        assert (metadata["nfe"], metadata["seed"], metadata["num"]) == (5, 5, 1)
+
+    def test_scenes_depend_on_neither_batch_size_nor_number(
+        self, joint_checkpoint, scenes, tmp_path
+    ):
+        more = sample(joint_checkpoint, tmp_path, "--num", 4, "--batch_size", 1)
+        assert_same_scenes(more, scenes, num=4)
+
+    def test_last_weights_differ_from_the_average(self, joint_checkpoint, scenes, tmp_path):
+        last = values(sample(joint_checkpoint, tmp_path, "--num", 1, "--weights", "last"))
+        points = values(scenes)["000000"]
+        assert last["000000"].shape != points.shape or not np.allclose(
+            last["000000"], points, atol=1e-2
+        )
+
+    def test_existing_scenes_are_kept(self, joint_checkpoint, scenes, tmp_path):
+        out = sample(joint_checkpoint, tmp_path, "--num", 1)
+        before = (out / "scenes.npz").read_bytes()
+        with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
+            sample(joint_checkpoint, out, "--num", 1, "--seed", 1)
+        assert (out / "scenes.npz").read_bytes() == before
+        sample(joint_checkpoint, out, "--num", 1, "--seed", 1, "--overwrite", "true")
+        assert json.loads((out / "metadata.json").read_text())["seed"] == 1
+        assert (out / "scenes.npz").read_bytes() != before
+
+    def test_a_checkpoint_without_velocity_is_refused(self, vae_checkpoint, tmp_path):
+        with pytest.raises(
+            ValueError, match=r"stage vae_alignment.*joint or flow_matching"
+        ) as error:
+            sample(vae_checkpoint, tmp_path / "out")
+        assert str(vae_checkpoint) in str(error.value)
+        assert not (tmp_path / "out").exists()
+
+    def test_missing_checkpoint_is_named(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"nothing\.ckpt"):
+            sample(tmp_path / "nothing.ckpt", tmp_path / "out")
+
+    def test_no_scenes_are_refused(self, joint_checkpoint, tmp_path):
+        with pytest.raises(ValueError, match="num and batch_size must be at least 1, got 0 and 8"):
+            sample(joint_checkpoint, tmp_path, "--num", 0)
+
+
+class TestConvert:
+    def test_exported_checkpoint_gives_the_same_scenes(
+        self, joint_checkpoint, scenes, tmp_path, capsys
+    ):
+        exported = tmp_path / "joint.safetensors"
+        main(["convert", str(joint_checkpoint), str(exported)])
+        out = capsys.readouterr().out
+        for name in ("vae", "discriminator", "sit", "latent_norm", "ema", "ema_latent_norm"):
+            assert f"\n{name} " in out
+        assert_same_scenes(sample(exported, tmp_path / "scenes"), scenes)
+        metadata = json.loads((tmp_path / "scenes" / "metadata.json").read_text())
+        assert (metadata["stage"], metadata["step"]) == ("joint", 3)
+
+    def test_existing_files_are_kept(self, joint_checkpoint, tmp_path):
+        exported = tmp_path / "joint.safetensors"
+        exported.write_bytes(b"precious")
+        with pytest.raises(ValueError, match=r"joint\.safetensors exists already"):
+            main(["convert", str(joint_checkpoint), str(exported)])
+        assert exported.read_bytes() == b"precious"
+        main(["convert", str(joint_checkpoint), str(exported), "--overwrite", "true"])
+        assert read_checkpoint(exported).stage == "joint"
+
+    def test_to_the_official_layout_and_back(self, joint_checkpoint, tmp_path):
+        """The options of official scripts do not tell the sizes of a smoke model: given here."""
+        official, back = tmp_path / "official.pt", tmp_path / "back.safetensors"
+        main(["convert", str(joint_checkpoint), str(official), "--to", "official"])
+        sit_args = "{num_heads: 2, alignment_depth: 2, input_size: [4, 16]}"
+        words = [official, back, "--sit_args", sit_args, "--encoding", "linear"]
+        main(["convert", *map(str, words)])
+        before, after = read_checkpoint(joint_checkpoint), read_checkpoint(back)
+        assert set(after.networks) == set(before.networks)
+        for name, state in before.networks.items():
+            for key, value in state.state_dict.items():
+                assert torch.equal(after.network(name).state_dict[key], value), (name, key)
+
+
+class TestReport:
+    def test_draws_curves_and_prints_a_table(self, joint_run, capsys):
+        main(["report", str(joint_run)])
+        out = capsys.readouterr().out
+        with Image.open(joint_run / "loss_curves.png") as picture:
+            assert min(picture.size) >= 100
+        (metrics,) = joint_run.glob("version_*/metrics.csv")
+        columns = metrics.read_text().splitlines()[0].split(",")
+        for name in (name for name in columns if name.startswith("train/")):
+            (row,) = [line for line in out.splitlines() if line.startswith(f"{name} ")]
+            first, last, change = map(float, row.split()[1:4])
+            assert last - first == pytest.approx(change, abs=1e-3 * max(1, abs(first)))
+        assert str(joint_run / "loss_curves.png") in out
+
+    def test_values_are_means_of_the_ends(self, tmp_path, capsys):
+        """20 values 20, 19, ..., 1 over two runs: first tenth 19.5, last tenth 1.5."""
+        for version, start in ((0, 20), (1, 10)):
+            rows = [f"{20 - value},{value}" for value in range(start, start - 10, -1)]
+            (tmp_path / f"version_{version}").mkdir()
+            text = "\n".join(["step,train/loss", *rows, ""])
+            (tmp_path / f"version_{version}" / "metrics.csv").write_text(text)
+        main(["report", str(tmp_path)])
+        (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("train/loss")]
+        assert row.split()[1:] == ["19.5", "1.5", "-18", "0.077"]
+
+    def test_missing_run_is_an_error(self, tmp_path):
+        with pytest.raises(ValueError, match=r"nowhere holds no version_\*/metrics.csv"):
+            main(["report", str(tmp_path / "nowhere")])
+
+
+class TestFeatures:
+    def test_writes_the_grids_of_a_data_configuration(self, simulated, capsys):
+        words = ["--config", CONF / "data" / "folder.yaml", "--data.init_args.scans", simulated]
+        words += ["--data.init_args.num_workers", 0]
+        main(["features", *map(str, words)])
+        folder = simulated / "feature_grids" / "geometric_8x64"
+        grids = {path.parent.name: np.load(path) for path in folder.rglob("grids.npy")}
+        assert {drive: grid.shape for drive, grid in grids.items()} == {
+            "2013_05_28_drive_0000_sync": (1, 512, 768),
+            "2013_05_28_drive_0003_sync": (2, 512, 768),
+        }
+        assert all(np.abs(grid).sum() > 0 for grid in grids.values())
+        assert stored_feature_dim(folder) == 768
+        times = {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}
+        main(["features", *map(str, words)])
+        assert times == {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}

@@ -1,0 +1,395 @@
+"""Which loss reaches which network, clipping per network, and steps that are dropped."""
+
+from __future__ import annotations
+
+import lightning as L
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from r3dpa.data import LidarDataModule
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.modules import FlowMatching, JointAlignment, LossWeights, VAEAlignment
+from r3dpa.modules.base import frozen
+from r3dpa.nn import VAE, PatchDiscriminator, SiT
+
+pytestmark = [
+    # Only `r3dpa fit` saves plain arguments in place of networks; nothing is saved here.
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+]
+SENSOR = LidarSensor(beams=8, columns=16)
+FEATURE_DIM = 6
+
+
+class TinyData(LidarDataModule):
+    """One random batch per step; where ``bad`` says so with a NaN in its features."""
+
+    def __init__(self, bad=(False,)):
+        L.LightningDataModule.__init__(self)
+        self.features_dir = "random"
+        generator = torch.Generator().manual_seed(0)
+        self.batches = [
+            {
+                "range_image": 2 * torch.rand(2, 1, 8, 16, generator=generator) - 1,
+                "feature_grid": torch.randn(2, 8, FEATURE_DIM, generator=generator),
+            }
+            for _ in bad
+        ]
+        for batch, is_bad in zip(self.batches, bad, strict=True):
+            if is_bad:
+                batch["feature_grid"][0, 0, 0] = torch.nan
+
+    feature_dim = FEATURE_DIM
+    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 4))
+
+    def prepare_data(self):
+        pass
+
+    def setup(self, stage):
+        pass
+
+    def train_dataloader(self):
+        return DataLoader(self.batches, batch_size=None)
+
+    def state_dict(self):
+        return {}
+
+
+class Observed:
+    """Keeps the losses of each step, the gradients around clipping, and the state after it.
+
+    With ``separates_losses`` also the gradient of every single loss, in ``reached``.
+    """
+
+    separates_losses = False
+
+    def on_fit_start(self):
+        self.parts, self.reached, self.grads, self.clipped, self.states = [], [], [], [], []
+
+    def load_previous_stage(self):
+        """Keeps the weights made here."""
+
+    def weigh_and_log(self, parts):
+        self.parts.append({name: part.detach() for name, part in parts.items()})
+        if self.separates_losses:
+            named = [(name, p) for name, p in self.named_parameters() if p.requires_grad]
+            self.reached.append({name: gradients(part, named) for name, part in parts.items()})
+        return super().weigh_and_log(parts)
+
+    def configure_gradient_clipping(self, optimizer, **kwargs):
+        self.grads.append(self.present_gradients())
+        super().configure_gradient_clipping(optimizer, **kwargs)
+        self.clipped.append(self.present_gradients())
+
+    def present_gradients(self):
+        return {n: p.grad.clone() for n, p in self.named_parameters() if p.grad is not None}
+
+    def on_train_batch_end(self, outputs, batch, batch_idx):
+        weights = {k: v.clone() for k, v in self.state_dict().items()}
+        moments = [
+            {k: torch.as_tensor(v).clone() for k, v in state.items()}
+            for state in self.optimizers().state.values()
+        ]
+        self.states.append((weights, moments))
+
+
+def gradients(loss, named):
+    """Gradient of a loss by parameter name, where it is not zero."""
+    parameters = [parameter for _, parameter in named]
+    found = torch.autograd.grad(loss, parameters, allow_unused=True, retain_graph=True)
+    return {
+        name: gradient
+        for (name, _), gradient in zip(named, found, strict=True)
+        if gradient is not None and gradient.count_nonzero()
+    }
+
+
+STAGES = {
+    "vae_alignment": type("ObservedVAEAlignment", (Observed, VAEAlignment), {}),
+    "joint": type("ObservedJoint", (Observed, JointAlignment), {}),
+    "flow_matching": type("ObservedFlowMatching", (Observed, FlowMatching), {}),
+}
+
+
+def stage_module(stage, **kwargs):
+    torch.manual_seed(0)
+    networks = {
+        "vae": VAE(
+            latent_channels=4,
+            channels=32,
+            channel_multipliers=(1, 1),
+            strides=((2, 2),),
+            num_res_blocks=1,
+        ),
+        "sit": SiT(
+            input_size=(4, 8),
+            in_channels=4,
+            hidden_size=8,
+            depth=2,
+            num_heads=2,
+            alignment_depth=1,
+            feature_dim=FEATURE_DIM,
+            projector_dim=8,
+        ),
+    }
+    if stage != "flow_matching":
+        networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)
+    # A fresh SiT has zero gates and output: no gradient would get past them.
+    for parameter in networks["sit"].parameters():
+        nn.init.normal_(parameter, std=0.3)
+    return STAGES[stage](**networks, **kwargs)
+
+
+def train(module, data=None, **kwargs):
+    data = data or TinyData()
+    trainer = L.Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_steps=len(data.batches),
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **kwargs,
+    )
+    trainer.fit(module, datamodule=data)
+    return module
+
+
+ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}
+DISCRIMINATOR = {"discriminator.main"}
+ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
+REST = {"sit.blocks.1", "sit.final_layer"}
+PROJECTOR = {"sit.projector"}
+
+
+def group_of(name):
+    return ".".join(name.split(".")[: 3 if name.startswith("sit.blocks") else 2])
+
+
+REACH = {
+    "vae_alignment": {
+        "reconstruction": ENCODER | DECODER,
+        "kl": ENCODER,
+        "adversarial": ENCODER | DECODER,
+        "vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"},
+        "discriminator": DISCRIMINATOR,
+    },
+    "joint": {
+        "reconstruction": ENCODER | DECODER,
+        "kl": ENCODER,
+        "adversarial": ENCODER | DECODER,
+        "vae_alignment": ENCODER,
+        "discriminator": DISCRIMINATOR,
+        "denoising": ALIGNED | REST,
+        "sit_alignment": ALIGNED | PROJECTOR,
+    },
+    "flow_matching": {
+        "denoising": ALIGNED | REST,
+        "sit_alignment": ALIGNED | PROJECTOR,
+    },
+}
+
+
+def separated(stage, **weights):
+    module = stage_module(stage, weights=LossWeights(**weights))
+    module.separates_losses = True
+    return train(module)
+
+
+@pytest.fixture(scope="module", params=list(REACH))
+def observed(request):
+    return request.param, separated(request.param)
+
+
+class TestReach:
+    def test_every_loss_reaches_exactly_its_networks(self, observed):
+        stage, module = observed
+        found = {
+            part: {group_of(name) for name in reached}
+            for part, reached in module.reached[0].items()
+        }
+        assert found == REACH[stage]
+
+    def test_gradients_of_a_step_are_the_sum_over_the_losses(self, observed):
+        """One backward for all: no network receives more than the table says."""
+        _, module = observed
+        for name, total in module.grads[0].items():
+            parts = [reached[name] for reached in module.reached[0].values() if name in reached]
+            expected = sum(parts, start=torch.zeros_like(total))
+            torch.testing.assert_close(total, expected, atol=1e-6, rtol=1e-4)
+
+    def test_lambda1_scales_what_reaches_the_encoder(self):
+        """Twice lambda1: twice the loss and its gradient; the other losses stay."""
+        once, twice = (separated("joint", vae_alignment=weight) for weight in (1.5, 3.0))
+        for part, value in once.parts[0].items():
+            factor = 2 if part == "vae_alignment" else 1
+            torch.testing.assert_close(twice.parts[0][part], factor * value)
+        for name, gradient in once.reached[0]["vae_alignment"].items():
+            torch.testing.assert_close(twice.reached[0]["vae_alignment"][name], 2 * gradient)
+
+    def test_losses_of_weight_zero_are_not_computed(self):
+        weights = LossWeights(adversarial=0.0, vae_alignment=0.0, sit_alignment=0.0)
+        module = train(stage_module("joint", weights=weights))
+        assert set(module.parts[0]) == {"reconstruction", "kl", "discriminator", "denoising"}
+        assert not any(name.startswith("sit.projector") for name in module.grads[0])
+
+    def test_adversarial_losses_wait_for_their_start(self):
+        """Before its start the discriminator takes part with factor 0, which moves nothing."""
+        module = train(
+            stage_module("joint", weights=LossWeights(adversarial_start=1)), TinyData([False] * 2)
+        )
+        first, second = module.parts
+        assert "adversarial" not in first
+        assert first["discriminator"] == 0
+        assert "adversarial" in second
+        assert second["discriminator"] > 0
+
+
+class TestFrozen:
+    def test_gradients_pass_through_but_do_not_stay(self):
+        layer, inputs = nn.Linear(3, 2), torch.randn(4, 3, requires_grad=True)
+        with frozen(layer):
+            output = layer(inputs)
+        output.sum().backward()
+        assert layer.weight.grad is None
+        torch.testing.assert_close(inputs.grad, layer.weight.detach().sum(0).expand(4, 3))
+
+    def test_both_passes_of_a_network_keep_to_themselves(self):
+        """A pass inside and one outside: the parameters get the gradient of the latter alone."""
+        layer, inputs = nn.Linear(3, 1), torch.ones(1, 3)
+        with frozen(layer):
+            inside = layer(inputs)
+        (5 * inside + layer(2 * inputs)).sum().backward()
+        assert layer.weight.grad.tolist() == [[2.0, 2.0, 2.0]]
+
+    def test_permanently_frozen_parameters_stay_frozen(self):
+        layer = nn.Linear(3, 2)
+        layer.bias.requires_grad_(False)
+        with frozen(layer):
+            assert not layer.weight.requires_grad
+        assert layer.weight.requires_grad
+        assert not layer.bias.requires_grad
+
+    def test_an_exception_restores_the_parameters(self):
+        layers = nn.Linear(3, 2), nn.Linear(2, 1)
+        layers[1].bias.requires_grad_(False)
+        with pytest.raises(RuntimeError, match="in between"), frozen(*layers):
+            raise RuntimeError("in between")
+        assert [p.requires_grad for layer in layers for p in layer.parameters()] == [
+            True,
+            True,
+            True,
+            False,
+        ]
+
+
+def norms_by_network(grads):
+    squares = {}
+    for name, gradient in grads.items():
+        network = name.split(".")[0]
+        squares[network] = squares.get(network, 0.0) + gradient.double().square().sum().item()
+    return {network: square**0.5 for network, square in squares.items()}
+
+
+class TestClipping:
+    def test_each_network_is_clipped_by_its_own_norm(self):
+        """A limit between the norms: what is below it stays bit for bit, the rest has its norm."""
+        module = train(stage_module("joint"))
+        for name, gradient in module.grads[0].items():
+            assert torch.equal(module.clipped[0][name], gradient)  # no limit, no clipping
+        before = norms_by_network(module.grads[0])
+        low, *_, high = sorted(before.values())
+        limit = (low * high) ** 0.5
+        module = train(stage_module("joint"), gradient_clip_val=limit)
+        after = norms_by_network(module.clipped[0])
+        assert set(before) == {"vae", "discriminator", "sit"}
+        for network, norm in before.items():
+            # Clipping divides by norm + 1e-6.
+            assert after[network] == pytest.approx(min(norm, limit), rel=1e-4)
+            assert module.trainer.callback_metrics[f"grad_norm/{network}"] == pytest.approx(norm)
+        for name, gradient in module.clipped[0].items():
+            network = name.split(".")[0]
+            expected = module.grads[0][name]
+            if before[network] <= limit:
+                assert torch.equal(gradient, expected), name
+            else:
+                expected = expected * limit / before[network]
+                torch.testing.assert_close(gradient, expected, atol=1e-7, rtol=1e-4)
+
+    def test_clipping_by_value_is_refused(self):
+        with pytest.raises(ValueError, match=r"by norm per network; .*got 'value'"):
+            train(stage_module("joint"), gradient_clip_val=1.0, gradient_clip_algorithm="value")
+
+
+def trained_keys(weights):
+    """All but the latent statistics, which follow the VAE in every forward pass."""
+    return [
+        key
+        for key in weights
+        if not key.startswith("latent_norm.") and "running_" not in key and "num_batches" not in key
+    ]
+
+
+@pytest.mark.numerics
+class TestNonFiniteGradients:
+    def test_a_clipped_non_finite_gradient_would_break_the_weights(self):
+        """The naive way: inf / inf is NaN in one element, and 0 in all others."""
+        weight = nn.Parameter(torch.ones(3))
+        weight.grad = torch.tensor([1.0, torch.inf, 2.0])
+        nn.utils.clip_grad_norm_([weight], 1.0)
+        assert weight.grad.isnan().tolist() == [False, True, False]
+
+    def test_a_bad_step_changes_neither_weights_nor_moments_nor_averages(self):
+        """Only VAE and SiT see the NaN, yet the discriminator keeps its weights too."""
+        module = train(
+            stage_module("joint", ema_decay=0.5),
+            TinyData([False, True, False]),
+            gradient_clip_val=1.0,
+        )
+        bad = norms_by_network(module.grads[1])
+        assert {network for network, norm in bad.items() if norm != norm} == {"vae", "sit"}
+        (first, first_moments), (second, second_moments), (third, _) = module.states
+        for key in trained_keys(first):
+            assert torch.equal(second[key], first[key]), key
+        for key in ("ema.latent_norm.running_mean", "ema.latent_norm.running_var"):
+            assert torch.equal(second[key], first[key]), key
+        assert len(second_moments) == len(first_moments) > 0
+        for before, after in zip(first_moments, second_moments, strict=True):
+            for key, value in before.items():
+                assert torch.equal(after[key], value), key
+        for prefix in (
+            "vae.encoder",
+            "vae.decoder",
+            "discriminator",
+            "sit.blocks",
+            "ema.sit.blocks",
+        ):
+            weights = [key for key in trained_keys(first) if key.startswith(prefix)]
+            assert not all(torch.equal(third[key], second[key]) for key in weights), prefix
+        assert all(value.isfinite().all() for value in third.values() if value.is_floating_point())
+
+    def test_a_bad_first_step_leaves_no_moments(self):
+        module = train(stage_module("joint"), TinyData([True, False]))
+        (_, first_moments), (weights, second_moments) = module.states
+        assert not first_moments
+        assert {int(state["step"]) for state in second_moments} == {1}
+        assert all(value.isfinite().all() for value in weights.values())
+
+    def test_too_many_in_a_row_stop_the_training(self):
+        """Of max_skipped_steps = 2: bad, good, bad goes on, a second bad one in a row stops."""
+        module = stage_module("joint", max_skipped_steps=2)
+        message = r"2 steps in a row had a non-finite gradient .*vae nan.*learning rate"
+        with pytest.raises(RuntimeError, match=message):
+            train(module, TinyData([True, False, True, True, False]))
+        assert len(module.states) == 3
+        assert all(value.isfinite().all() for value in module.state_dict().values())
+
+    def test_bad_steps_with_good_ones_between_do_not_add_up(self):
+        module = stage_module("joint", max_skipped_steps=2)
+        train(module, TinyData([True, False] * 3))
+        assert len(module.states) == 6
