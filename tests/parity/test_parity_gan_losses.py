@@ -42,12 +42,19 @@ def logits(case):
     return outputs | statistics(case, trained, "out/after_train_forward/")
 
 
+def started_factor(case):
+    """Factor of both adversarial losses: 0 before the discriminator's first step."""
+    weights = case.config["loss_config"]["losses"]
+    started = case.config["global_step"] >= weights["discriminator_start"]
+    return weights["discriminator_factor"] if started else 0.0
+
+
 def generator_terms(case, network, fake):
     weights = case.config["loss_config"]["losses"]
     error = reconstruction_loss(fake, case["in/real"], weights["reconstruction_loss"])
     posterior = Posterior(case["in/posterior_parameters"])
     adversarial = generator_loss(network(fake))
-    factor, d_weight = weights["discriminator_factor"], weights["discriminator_weight"]
+    factor, d_weight = started_factor(case), weights["discriminator_weight"]
     return {
         "reconstruction_loss": weights["reconstruction_weight"]
         * error
@@ -57,8 +64,7 @@ def generator_terms(case, network, fake):
         "weighted_gan_loss": d_weight * factor * adversarial,
         "discriminator_factor": factor,
         "d_weight": d_weight,
-        # Terms whose weight is 0 are not computed here.
-        "perceptual_loss": weights["perceptual_weight"],
+        "perceptual_loss": 0.0,  # the official configuration turns it off: not computed here
     }
 
 
@@ -72,16 +78,15 @@ def training_step(case, mode):
     terms |= {"loss": total, "total_loss": total, "grad_fake": grad_fake}
     outputs = {f"out/{mode}/generator/{name}": value for name, value in terms.items()}
 
-    weights = case.config["loss_config"]["losses"]
     real_logits, fake_logits = network(case["in/real"]), network(case["in/fake"])
-    loss = weights["discriminator_factor"] * discriminator_loss(real_logits, fake_logits)
+    loss = started_factor(case) * discriminator_loss(real_logits, fake_logits)
     loss.backward()
     terms = {
         "loss": loss,
         "discriminator_loss": loss,
         "logits_real": real_logits.mean(),
         "logits_fake": fake_logits.mean(),
-        "lecam_loss": weights["lecam_regularization_weight"],
+        "lecam_loss": 0.0,  # turned off likewise
     }
     prefix = f"out/{mode}/discriminator/"
     outputs |= {prefix + name: value for name, value in terms.items()}

@@ -146,23 +146,13 @@ def test_sit_every_recorded_output_is_compared(case):
     assert set().union(*(group(case) for group in GROUPS)) == set(case.keys("out/"))
 
 
-def test_sit_guided_velocity_is_the_recorded_sum(case, close):
-    outputs = feature_guidance(case)
-    for name in ("nomask", "mask"):
-        prefix = f"out/cond_feats_{name}/"
-        assert outputs[prefix + "v_feat"].abs().max() > 1e-2
-        close(
-            outputs[prefix + "v"] + outputs[prefix + "v_feat"],
-            case[prefix + "v"] + case[prefix + "v_feat"],
-        )
-
-
 def test_sit_train_statistics_need_the_unbiased_variance(case):
     norm = build_norm(case)
     norm.update(case["in/x"])
     biased = case["in/x"].var(dim=(0, 2, 3), correction=0)
     naive = torch.lerp(build_norm(case).running_var, biased, norm.momentum)
-    assert (naive - case["out/train/bn.running_var"]).abs().max() > 1e-4
+    recorded = case["out/train/bn.running_var"]
+    assert (naive - recorded).abs().max() > 10 * (norm.running_var - recorded).abs().max()
 
 
 LAYOUTS = [
