@@ -1,7 +1,7 @@
 # `make help` lists the targets. Every target sets up what it needs.
 
 PYTHON ?= python3
-# The CPU build of the tests; on a GPU machine: make install TORCH="torch"
+# The release that the tests run on. Another build, say for your CUDA: make install TORCH="torch==..."
 TORCH ?= torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin

@@ -1,8 +1,9 @@
 """Training stages as LightningModules."""
 
-from r3dpa.modules.base import GenerativeModule, LossWeights, OptimizerConfig
+from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.joint_alignment import JointAlignment
+from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.modules.vae_alignment import VAEAlignment
 
 __all__ = [

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.modules.base import GenerativeModule, LossWeights
+from r3dpa.modules.base import GenerativeModule
+from r3dpa.modules.settings import LossWeights
 from r3dpa.nn import VAE, SiT
 
 __all__ = ["FlowMatching"]
