@@ -21,7 +21,18 @@ def pytest_addoption(parser):
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
-REAL_SCANS = REPOSITORY.parent / "shared" / "data" / "real_scans"
+
+
+@pytest.fixture(scope="session")
+def real_scans_dir(pytestconfig) -> Path:
+    """Folder of the real scans, beside the repository or beside the ``--parity-dir``."""
+    given = pytestconfig.getoption("--parity-dir")
+    shared = [REPOSITORY.parent / "shared"] + ([] if given is None else [given.resolve().parent])
+    folders = [folder / "data" / "real_scans" for folder in shared]
+    for folder in folders:
+        if any(folder.rglob("*.bin")):
+            return folder
+    pytest.skip(f"no real scan in {' or '.join(map(str, folders))} (KITTI, not redistributed)")
 
 
 @pytest.fixture(scope="session")

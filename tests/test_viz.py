@@ -10,13 +10,17 @@ from PIL import Image
 from r3dpa import viz
 from r3dpa.geometry.projection import SphericalProjection
 from r3dpa.geometry.sensor import LidarSensor
+from r3dpa.viz.features import DARKEST_FEATURE
+from r3dpa.viz.figures import ERROR_MAP, ONLY_INPUT, ONLY_RECONSTRUCTION
+from r3dpa.viz.pixels import BACKGROUND
+from r3dpa.viz.scans import CAMERA_EYE_M, CAMERA_TARGET_M
 
 SENSOR = LidarSensor(beams=8, columns=32)
 BLUE, RED, GREEN = np.eye(3)[[2, 0, 1]]
 
 
 def is_background(pixels):
-    return (pixels == np.array(viz.BACKGROUND)).all(axis=-1)
+    return (pixels == np.array(BACKGROUND)).all(axis=-1)
 
 
 def centre_of(picture, colour):
@@ -126,13 +130,13 @@ def test_scene_3d_left_is_left_up_is_up_and_forward_is_farther_up():
 
 
 def test_scene_3d_target_of_the_camera_is_in_the_middle():
-    picture = viz.scene_3d(np.array([viz.CAMERA_TARGET_M]), RED[None], size=(200, 300))
+    picture = viz.scene_3d(np.array([CAMERA_TARGET_M]), RED[None], size=(200, 300))
     assert picture.shape == (200, 300, 3)
     assert centre_of(picture, RED) == pytest.approx([99.5, 149.5], abs=1.0)
 
 
 def test_scene_3d_near_hides_far_on_the_same_ray_in_any_order():
-    eye, target = np.array(viz.CAMERA_EYE_M), np.array(viz.CAMERA_TARGET_M)
+    eye, target = np.array(CAMERA_EYE_M), np.array(CAMERA_TARGET_M)
     points = np.stack([eye + (target - eye) * 0.5, target])
     for order in ([0, 1], [1, 0]):
         picture = viz.scene_3d(points[order], np.stack([RED, BLUE])[order])
@@ -141,7 +145,7 @@ def test_scene_3d_near_hides_far_on_the_same_ray_in_any_order():
 
 
 def test_scene_3d_nothing_behind_the_camera_is_drawn():
-    behind = 2 * np.array(viz.CAMERA_EYE_M) - np.array(viz.CAMERA_TARGET_M)
+    behind = 2 * np.array(CAMERA_EYE_M) - np.array(CAMERA_TARGET_M)
     assert is_background(viz.scene_3d(behind[None])).all()
     assert is_background(viz.scene_3d(torch.empty(0, 3))).all()
 
@@ -183,11 +187,11 @@ def test_reconstruction_figure_tells_errors_from_wrong_returns():
     figure = viz.reconstruction_figure(before, after, SENSOR, 2.5, 0.6)
     shown = np.asarray(figure.axes[2].images[0].get_array())[0] / 255
     expected = [
-        viz.ERROR_MAP(0.0)[:3],
-        viz.ONLY_INPUT,
-        viz.ONLY_RECONSTRUCTION,
-        np.array(viz.BACKGROUND) / 255,
-        viz.ERROR_MAP(1.0)[:3],  # 5 m is beyond the scale
+        ERROR_MAP(0.0)[:3],
+        ONLY_INPUT,
+        ONLY_RECONSTRUCTION,
+        np.array(BACKGROUND) / 255,
+        ERROR_MAP(1.0)[:3],  # 5 m is beyond the scale
     ]
     assert shown == pytest.approx(np.array(expected), abs=1 / 255)
     assert "0.6" not in figure.get_suptitle()
@@ -287,7 +291,7 @@ def test_pca_colours_of_axis_aligned_features_follow_the_variances():
     for component in range(3):  # the sign is that of the feature: brighter means more of it
         correlation = np.corrcoef(colours[:, component], spread[:, component])[0, 1]
         assert correlation > 0.99
-    assert colours.min() == viz.DARKEST_FEATURE
+    assert colours.min() == DARKEST_FEATURE
     assert colours.max() == 1.0
 
 
@@ -309,7 +313,7 @@ def test_pca_colours_do_not_change_with_the_order_of_rows():
 
 def test_pca_colours_of_constant_empty_and_narrow_features():
     constant = viz.pca_colours(torch.full((20, 8), 0.1))
-    assert constant == pytest.approx(np.full((20, 3), (1 + viz.DARKEST_FEATURE) / 2))
+    assert constant == pytest.approx(np.full((20, 3), (1 + DARKEST_FEATURE) / 2))
     assert (viz.pca_colours(torch.zeros(4, 8)) == 0).all()
     narrow = viz.pca_colours(torch.tensor([[1.0], [2.0], [3.0]]))
     assert narrow[:, 0].tolist() == sorted(narrow[:, 0])

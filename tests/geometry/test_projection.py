@@ -1,5 +1,4 @@
 import math
-import time
 
 import pytest
 import torch
@@ -250,17 +249,6 @@ def test_wrong_shapes_are_refused():
         pool_cells(torch.zeros(5, 3), torch.zeros(5, 1), projection, (3, 4))
     with pytest.raises(ValueError, match=r"\(4, 1\)"):
         pool_cells(torch.zeros(5, 3), torch.zeros(4, 1), projection, (2, 4))
-
-
-def test_a_full_scan_is_fast():
-    points = random_points(120_000)
-    projection = SphericalProjection(LidarSensor())
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        range_image(points, projection)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 0.1  # 0.01 s alone on one core; the bound leaves room for a busy machine
 
 
 @pytest.mark.gpu

@@ -1,5 +1,4 @@
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from r3dpa.geometry import (
     range_image,
     unproject,
 )
-
-REAL_SCANS = Path(__file__).resolve().parents[3] / "shared" / "data" / "real_scans"
 
 SENSOR = LidarSensor(beams=8, columns=90, inclination_max_deg=5.0, inclination_min_deg=-25.0)
 # Uneven pitch on purpose: two neighbouring lasers fall into one row of equal pitch.
@@ -121,9 +118,18 @@ def test_round_trip():
     cosine = (rays * torch.nn.functional.normalize(points, dim=-1)).sum(dim=-1)
     # Half a column of 4 degrees aside, and 5 sd of the inclination noise.
     assert cosine.clamp(max=1).arccos().rad2deg().max() < 2.0 + 0.3
-    torch.testing.assert_close(cloud.norm(dim=-1), range_m[range_m > 0])
+    torch.testing.assert_close(cloud.norm(dim=-1), range_m[:, RING.column_order()].flatten())
     inclination = torch.atan2(cloud[:, 2], cloud[:, :2].norm(dim=-1)).rad2deg().reshape(8, 90)
     torch.testing.assert_close(inclination, torch.tensor(INCLINATIONS).unsqueeze(1).expand(8, 90))
+
+
+@pytest.mark.parametrize("empty_rows", [[], [0], [0, 1, 2, 5]])
+def test_points_of_an_image_are_read_back_as_that_image(empty_rows):
+    range_m, _ = range_image(scan_of()[0], RING)
+    range_m[empty_rows] = EMPTY_RANGE_M
+    range_m[3, 10:40] = EMPTY_RANGE_M
+    read_back, _ = range_image(points_of(range_m, RING), RING)
+    torch.testing.assert_close(read_back, range_m, atol=1e-4, rtol=0)
 
 
 def test_corner_moves_columns_only():
@@ -170,6 +176,45 @@ def test_other_orders_are_refused(order):
         range_image(points[index], RING)
 
 
+def in_ring_order(order, points, ring):
+    """Points of a whole scan, stored ring after ring but not as KITTI stores them."""
+    if order == "lowest_first":
+        return torch.cat([points[ring == beam] for beam in ring.unique().flip(0)])
+    if order == "clockwise":
+        return torch.cat([points[ring == beam].flip(0) for beam in ring.unique()])
+    return points.flip(0)  # both
+
+
+RING_ORDERS = ["lowest_first", "clockwise", "reversed"]
+
+
+@pytest.mark.parametrize("missing", [[], [3]], ids=["whole", "a ring missing"])
+@pytest.mark.parametrize("order", RING_ORDERS)
+def test_other_orders_of_rings_are_refused(order, missing):
+    points, ring = scan_of()
+    kept = ~torch.isin(ring, torch.tensor(missing))
+    wrong = in_ring_order(order, points[kept], ring[kept])
+    with pytest.raises(ValueError, match="not stored ring after ring"):
+        RING.pixel_of(wrong)
+    if not missing:
+        with pytest.raises(ValueError, match="not stored ring after ring"):
+            RingProjection.fit([wrong], SENSOR)
+
+
+def test_rings_that_start_elsewhere_are_refused():
+    points, _ = scan_of()
+    with pytest.raises(ValueError, match="9 rings but the sensor has 8 beams"):
+        RING.pixel_of(points * torch.tensor([-1.0, -1.0, 1.0]))  # they start behind the sensor
+
+
+def test_near_walls_all_around_do_not_look_like_another_order():
+    """Lasers 0.2 m above the frame origin see a wall at 4 m 2.9 degrees above their beam."""
+    points, ring = scan_of()
+    unit = torch.nn.functional.normalize(points, dim=-1)
+    near = unit * 4 / unit[:, :2].norm(dim=-1, keepdim=True) + torch.tensor([0.0, 0.0, 0.2])
+    assert torch.equal(RING.pixel_of(near)[0], ring)
+
+
 def test_too_many_rings_are_refused():
     points, _ = scan_of((*INCLINATIONS, -24.8))
     with pytest.raises(ValueError, match="9 rings but the sensor has 8 beams"):
@@ -188,10 +233,8 @@ def test_wrong_settings_are_refused():
 
 
 @pytest.fixture(scope="module")
-def real_scans():
-    paths = sorted(REAL_SCANS.glob("**/*.bin"))
-    if not paths:
-        pytest.skip(f"no real scan in {REAL_SCANS} (KITTI, not redistributed)")
+def real_scans(real_scans_dir):
+    paths = sorted(real_scans_dir.glob("**/*.bin"))
     return [torch.from_numpy(np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]) for path in paths]
 
 
@@ -218,3 +261,13 @@ def test_real_scans_fill_the_image_by_ring(real_scans):
         unit = torch.nn.functional.normalize(points[kept].double(), dim=-1)
         residual = (rays * unit).sum(dim=-1).clamp(max=1).arccos().rad2deg()
         assert residual.median() < 0.7
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("order", RING_ORDERS)
+def test_real_scans_in_other_orders_are_refused(real_scans, order):
+    ring = RingProjection.fit(real_scans, LidarSensor())
+    for points in real_scans:
+        wrong = in_ring_order(order, points, ring.pixel_of(points)[0])
+        with pytest.raises(ValueError, match="not stored ring after ring"):
+            ring.pixel_of(wrong)

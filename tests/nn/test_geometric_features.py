@@ -108,6 +108,12 @@ def test_own_values(extractor):
     assert extractor(points[:0]).shape == (0, 96)
 
 
+def test_shape_needs_two_neighbours(extractor):
+    row = scan(rays(torch.tensor([-2.0]), torch.tensor([0.1, 0.46, 0.82])) * 10)
+    assert (extractor.descriptors(row[:2])[:, :6] == 0).all()
+    assert (extractor.descriptors(row)[1, LINEARITY] - 1).abs() < 0.01
+
+
 def test_rotating_the_scan_about_z_keeps_the_features(extractor):
     turn = 2 * math.pi * 129 / 1024  # whole columns, so that the pixels move as one
     rotation = torch.tensor(

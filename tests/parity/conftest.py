@@ -12,7 +12,6 @@ import torch
 REPOSITORY = Path(__file__).resolve().parents[2]
 SYNTHETIC = REPOSITORY / "tests" / "parity" / "data"
 SHARED = REPOSITORY.parent / "shared" / "parity"
-REAL_SCANS = REPOSITORY.parent / "shared" / "data" / "real_scans"
 
 
 class Case:
@@ -49,11 +48,14 @@ def parity_dir(pytestconfig) -> Path:
 
 
 @pytest.fixture(scope="session")
-def load_case(parity_dir):
+def load_case(parity_dir, pytestconfig):
     """``load_case(name)``; a case without its file is skipped only outside ``--parity-dir``."""
+    must_exist = pytestconfig.getoption("--parity-dir") is not None
 
     def load(name: str) -> Case:
         if not (parity_dir / f"{name}.npz").is_file():
+            if must_exist:
+                pytest.fail(f"{name}.npz is not in the given --parity-dir {parity_dir}")
             pytest.skip(f"{name}.npz is not in {parity_dir} (KITTI-derived, not redistributed)")
         return Case(parity_dir, name)
 

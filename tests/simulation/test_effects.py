@@ -29,7 +29,7 @@ def power_of_wall(distance_m, tilt_deg=0.0):
     wall = Primitive(Shape.BOX, centre, (0.5, 40, 4), Semantic.WALL, 0.6, np.radians(tilt_deg))
     returns = cast(Scene((wall,), Pose(z_m=2.0)), ahead())
     assert returns.range_m[0, 0] == pytest.approx(distance_m, rel=1e-5)
-    return LambertianReflection()(returns, generator_for(0)).power[0, 0]
+    return LambertianReflection()(returns, Scene(), generator_for(0)).power[0, 0]
 
 
 def test_power_of_a_wall():
@@ -39,7 +39,7 @@ def test_power_of_a_wall():
 
 
 def test_no_surface_gives_no_power():
-    returns = LambertianReflection()(cast(Scene(), ahead()), generator_for(0))
+    returns = LambertianReflection()(cast(Scene(), ahead()), Scene(), generator_for(0))
     assert (returns.power == 0).all()
 
 
@@ -52,9 +52,10 @@ def test_last_ground_return(height_m):
     # Beams by shots: a column of beams, seen by 8 equal shots (ground has no windows).
     direction = np.repeat(direction[:, :, None], 8, axis=2).astype(np.float32)
     rays = Rays(np.zeros_like(direction), direction)
-    returns = cast(Scene(pose=Pose(z_m=height_m), ground_reflectivity=0.1), rays)
+    scene = Scene(pose=Pose(z_m=height_m), ground_reflectivity=0.1)
+    returns = cast(scene, rays)
     for effect in (LambertianReflection(), DetectionLimit()):
-        returns = effect(returns, generator_for(0))
+        returns = effect(returns, scene, generator_for(0))
     farthest = returns.range_m[np.isfinite(returns.range_m)].max()
     # The beams are 3 cm apart on the ground.
     assert farthest == pytest.approx((0.1 * height_m / MIN_POWER) ** (1 / 3), abs=0.05)
@@ -66,12 +67,12 @@ def test_range_limits_and_untouched_argument():
     wall = Primitive(Shape.BOX, (0.9, 0, 2), (0.5, 0.2, 1), Semantic.WALL, 0.6)
     before = cast(Scene((wall,), Pose(z_m=2.0)), ahead())
     assert before.range_m[0, 0] == pytest.approx(0.4)
-    after = DetectionLimit()(before, generator_for(0))
+    after = DetectionLimit()(before, Scene(), generator_for(0))
     assert np.isinf(after.range_m[0, 0])
     assert before.range_m[0, 0] == pytest.approx(0.4)
-    near = DetectionLimit(min_range_m=0.1)(before, generator_for(0))
+    near = DetectionLimit(min_range_m=0.1)(before, Scene(), generator_for(0))
     assert near.range_m[0, 0] == pytest.approx(0.4)
-    far = DetectionLimit(min_range_m=0.1, max_range_m=0.3)(before, generator_for(0))
+    far = DetectionLimit(min_range_m=0.1, max_range_m=0.3)(before, Scene(), generator_for(0))
     assert np.isinf(far.range_m).all()
 
 

@@ -14,7 +14,6 @@ from r3dpa.simulation import (
     Shape,
     Street,
     cast,
-    generator_for,
     simulate_scan,
 )
 
@@ -23,7 +22,7 @@ DRY = (LambertianReflection(), DetectionLimit())
 
 @pytest.fixture(scope="module")
 def scan():
-    return simulate_scan(Street(0, 3).scene(60), HDL64E(), generator_for(0))
+    return simulate_scan(Street(0, 3).scene(60), HDL64E(), (0,))
 
 
 def rings_of(points):
@@ -60,9 +59,7 @@ def test_parallax_changes_the_inclination_of_the_highest_beam_with_range():
     """A wall at 5 m is seen 2.4 degrees above the beam, one at 25 m by 0.5."""
     for distance_m, shift_deg in ((5, np.degrees(np.arctan(0.217 / 5))), (25, 0.497)):
         wall = Primitive(Shape.BOX, (distance_m + 1, 0, 2), (1, 30, 4), Semantic.WALL, 0.5)
-        points = simulate_scan(
-            Scene((wall,), Pose(), DRY), HDL64E(shots=720), generator_for(0)
-        ).points
+        points = simulate_scan(Scene((wall,), Pose(), DRY), HDL64E(shots=720), (0,)).points
         straight = points[(rings_of(points) == 0) & (np.abs(points[:, 1]) < 0.1)]
         inclination = np.degrees(np.arctan2(straight[:, 2], straight[:, 0]))
         np.testing.assert_allclose(inclination - 1.96, shift_deg, atol=0.02)
@@ -71,7 +68,7 @@ def test_parallax_changes_the_inclination_of_the_highest_beam_with_range():
 def test_points_lie_on_the_surface_whatever_the_pose():
     """Points on the ground, brought to the world by the pose, have height 0."""
     pose = Pose(3.0, -2.0, 1.73, 0.7, 0.03, -0.02)
-    points = simulate_scan(Scene((), pose, DRY), HDL64E(shots=90), generator_for(0)).points
+    points = simulate_scan(Scene((), pose, DRY), HDL64E(shots=90), (0,)).points
     x, y, z = points[:, :3].astype(float).T
     y, z = (
         np.cos(pose.roll_rad) * y - np.sin(pose.roll_rad) * z,
@@ -83,7 +80,7 @@ def test_points_lie_on_the_surface_whatever_the_pose():
 
 def test_intensity_of_a_wall_is_the_root_of_its_reflectivity():
     wall = Primitive(Shape.BOX, (11, 0, 2), (1, 30, 4), Semantic.WALL, 0.49)
-    scan = simulate_scan(Scene((wall,), Pose(), DRY), HDL64E(shots=720), generator_for(0))
+    scan = simulate_scan(Scene((wall,), Pose(), DRY), HDL64E(shots=720), (0,))
     straight = (np.abs(scan.points[:, 1]) < 0.1) & (np.abs(scan.points[:, 2]) < 0.1)
     straight &= scan.points[:, 0] > 0
     assert straight.any()
@@ -92,7 +89,7 @@ def test_intensity_of_a_wall_is_the_root_of_its_reflectivity():
 
 def test_labels_name_the_object():
     car = Primitive(Shape.BOX, (8, 0, 1), (2, 1, 0.8), Semantic.CAR, 0.5, 0.0, 1234)
-    scan = simulate_scan(Scene((car,), Pose(), DRY), HDL64E(shots=360), generator_for(0))
+    scan = simulate_scan(Scene((car,), Pose(), DRY), HDL64E(shots=360), (0,))
     on_car = (scan.points[:, 0] > 5) & (scan.points[:, 0] < 11) & (scan.points[:, 2] > -1.6)
     on_car &= np.abs(scan.points[:, 1]) < 2
     assert on_car.sum() > 50
@@ -100,28 +97,64 @@ def test_labels_name_the_object():
     assert (scan.labels[~on_car] == Semantic.ROAD).all()
 
 
-def test_effects_are_applied_in_turn_with_the_generator():
-    class Weaken:
-        stage = 6
+class Weaken:
+    stage = 6
 
-        def __call__(self, returns, generator):
-            keep = generator.random(returns.power.shape) < 0.5
-            return replace(returns, power=returns.power * keep)
+    def __call__(self, returns, scene, generator):
+        keep = generator.random(returns.power.shape) < 0.5
+        return replace(returns, power=returns.power * keep)
 
-    scene = Scene((), Pose(), (DRY[0], Weaken(), DRY[1]))
-    sensor = HDL64E(shots=360)
-    full = simulate_scan(Scene((), Pose(), DRY), sensor, generator_for(1)).points
-    half = simulate_scan(scene, sensor, generator_for(1)).points
-    again = simulate_scan(scene, sensor, generator_for(1)).points
-    assert len(half) / len(full) == pytest.approx(0.5, abs=0.02)
-    np.testing.assert_array_equal(half, again)
+
+class WeakenAgain(Weaken):
+    pass
+
+
+class Draw:
+    """Draws, and changes nothing."""
+
+    stage = 6
+
+    def __call__(self, returns, scene, generator):
+        generator.random(7)
+        return returns
+
+
+def points_after(*effects, key=(1,)):
+    scene = Scene((), Pose(), (DRY[0], *effects, DRY[1]))
+    return simulate_scan(scene, HDL64E(shots=360), key).points
+
+
+def test_effects_are_applied_in_turn_each_with_its_own_draws():
+    half = points_after(Weaken())
+    assert len(half) / len(points_after()) == pytest.approx(0.5, abs=0.02)
+    np.testing.assert_array_equal(half, points_after(Weaken()))
+    np.testing.assert_array_equal(half, points_after(Draw(), Weaken()))
+    assert not np.array_equal(half, points_after(Weaken(), key=(2,)))
+    quarter = points_after(Weaken(), WeakenAgain())
+    assert len(quarter) / len(points_after()) == pytest.approx(0.25, abs=0.02)
+
+
+def test_an_effect_sees_the_scene_and_may_turn_the_rays():
+    class Rise:
+        """Moves the origin of every shot up to the height of the sensor above the road."""
+
+        stage = 8
+
+        def __call__(self, returns, scene, generator):
+            up = np.float32([[[0.0]], [[0.0]], [[scene.pose.z_m]]])
+            return replace(returns, rays=returns.rays._replace(origin=returns.rays.origin + up))
+
+    pose = Pose(z_m=2.0)
+    points = simulate_scan(Scene((), pose, (*DRY, Rise())), HDL64E(shots=90), (0,)).points
+    assert len(points) > 1000
+    np.testing.assert_allclose(points[:, 2], 0, atol=1e-4)
 
 
 def test_scans_look_like_those_of_a_real_hdl64():
-    """Figures of 30 real scans (design/effects.md, section 0), with room for a scene's luck."""
+    """Figures of 30 real scans (KITTI, 64 beams), with room for a scene's luck."""
     valid, ground, rows, sizes = [], [], [], []
     for drive in (0, 2, 3, 5, 7, 9):
-        points = simulate_scan(Street(0, drive).scene(40), HDL64E(), generator_for(0)).points
+        points = simulate_scan(Street(0, drive).scene(40), HDL64E(), (0,)).points
         ranges = np.linalg.norm(points[:, :3], axis=1)
         near = (ranges > 1) & (ranges < 56)
         inclination = np.degrees(np.arcsin(points[near, 2] / ranges[near]))
@@ -143,5 +176,5 @@ def test_scans_look_like_those_of_a_real_hdl64():
 def test_cast_alone_keeps_everything_the_limit_drops():
     scene = Scene()
     bare = np.isfinite(cast(scene, HDL64E(shots=90).rays).range_m).sum()
-    kept = len(simulate_scan(Scene(effects=DRY), HDL64E(shots=90), generator_for(0)).points)
+    kept = len(simulate_scan(Scene(effects=DRY), HDL64E(shots=90), (0,)).points)
     assert 0 < kept < bare

@@ -1,9 +1,18 @@
 import json
+import os
 
 import numpy as np
 import pytest
 
-from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drives, simulate, split_scans
+from r3dpa.simulation import (
+    TRAIN_DRIVES,
+    VAL_DRIVES,
+    drive_name,
+    drives,
+    expected_scans,
+    simulate,
+    split_scans,
+)
 
 SMALL = {"shots": 32}
 
@@ -13,7 +22,7 @@ def files_of(root):
 
 
 def points_folder(root, drive):
-    return root / "data_3d_raw" / f"2013_05_28_drive_{drive}_sync" / "velodyne_points"
+    return root / "data_3d_raw" / drive_name(drive) / "velodyne_points"
 
 
 def test_layout_and_contents(tmp_path):
@@ -97,7 +106,7 @@ def test_foreign_data_are_left_alone(tmp_path):
         simulate(file, 2, **SMALL)
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "simulation.json").write_text("{")
-    with pytest.raises(ValueError, match="not valid JSON"):
+    with pytest.raises(ValueError, match=r"simulation.json is damaged"):
         simulate(tmp_path / "broken", 2, **SMALL)
 
 
@@ -117,9 +126,64 @@ def test_a_failed_write_leaves_no_part_of_a_file(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="No space left"):
             simulate(tmp_path, 2, drives=["0003"], **SMALL)
     assert sorted(p.name for p in (folder / "data").iterdir()) == ["0000000000.bin"]
-    assert not list(tmp_path.rglob("*.part"))
+    assert not list(tmp_path.rglob(".*.partial*"))
     simulate(tmp_path, 2, drives=["0003"], **SMALL)
     assert scan.read_bytes() == content
+
+
+def test_files_of_a_killed_run_are_deleted_and_those_of_a_running_one_are_not(tmp_path):
+    simulate(tmp_path, 2, drives=["0003"], **SMALL)
+    before = files_of(tmp_path)
+    old = points_folder(tmp_path, "0003") / "data" / ".0000000001.1a2b3c4d.partial.bin"
+    new = tmp_path / ".simulation.1a2b3c4d.partial.json"
+    for path in (old, new):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    simulate(tmp_path, 2, drives=["0003"], **SMALL)
+    assert files_of(tmp_path) == before | {new.relative_to(tmp_path): b"half"}
+
+
+def test_after_a_failure_waiting_tasks_do_not_run(tmp_path, monkeypatch):
+    """The first of 60 tasks finds a folder in the place of its file."""
+    request = {"out": tmp_path, "scans": 480, "drives": ["0003"], "shots": 8}
+    folder = points_folder(tmp_path, "0003")
+    with monkeypatch.context() as patch:
+        patch.delattr(drives, "_run")
+        with pytest.raises(NameError):  # only the folders are made
+            simulate(**request)
+    (folder / "labels" / "0000000000.label").mkdir()
+    with pytest.raises(IsADirectoryError):
+        simulate(**request, workers=2)
+    assert len(list((folder / "data").iterdir())) < 400
+
+
+def test_expected_scans_are_those_of_a_complete_data_set(tmp_path):
+    assert expected_scans(tmp_path) is None
+    simulate(tmp_path, 5, drives=["0000", "0004"], **SMALL)
+    expected = expected_scans(tmp_path)
+    assert expected == {drive_name("0000"): 1, drive_name("0004"): 4}
+    assert list(expected) == sorted(expected)
+    for drive, count in expected.items():
+        data = tmp_path / "data_3d_raw" / drive / "velodyne_points" / "data"
+        assert len(list(data.iterdir())) == count
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        "{}",
+        '{"scans": "ten", "drives": ["0003"]}',
+        '{"scans": 0, "drives": ["0003"]}',
+        '{"scans": 5, "drives": ["0001"]}',
+        '{"scans": 5, "drives": null}',
+    ],
+)
+def test_a_damaged_manifest_is_named(tmp_path, text):
+    (tmp_path / "simulation.json").write_text(text)
+    with pytest.raises(ValueError, match=r"simulation.json .*simulate the data set again"):
+        expected_scans(tmp_path)
 
 
 @pytest.mark.parametrize("scans", [1, 2, 3, 10, 100, 1001])

@@ -12,7 +12,7 @@ from r3dpa.geometry.projection import (
     unproject,
 )
 from r3dpa.geometry.range_codec import RangeCodec
-from r3dpa.geometry.scan_geometry import ScanGeometry
+from r3dpa.geometry.scan_geometry import ScanGeometry, projection_to_dict
 from r3dpa.geometry.sensor import LidarSensor
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "in_range",
     "points_of",
     "pool_cells",
+    "projection_to_dict",
     "range_image",
     "unproject",
 ]

@@ -1,16 +1,180 @@
-"""Laser rings of scans that are stored ring after ring, from the azimuth of the returns."""
+"""One row per laser ring, for scans that are stored ring after ring.
+
+Letters: B batch, P points, H beams, W columns, R rings found.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
+from r3dpa.geometry.rays import (
+    PixelRays,
+    angles_of,
+    check_points,
+    column_azimuths,
+    column_of,
+    range_of,
+)
 from r3dpa.geometry.sensor import LidarSensor
 
 _BACKWARD_RAD = 1.0  # a smaller step back is jitter, a larger one starts the next ring
+_OUT_OF_PLACE_SHARE = 1 / 8  # of the field of view; 1/2 where the lowest ring comes first
 _STRAY_SHARE = 0.01  # a ring with fewer returns than this share of the median ring is no ring
+
+
+@dataclass(frozen=True)
+class RingProjection(PixelRays):
+    """One row per laser ring ("scan unfolding") for scans stored ring after ring.
+
+    The lasers of a real sensor neither start at one point nor have one pitch, so that rows of
+    equal pitch leave many pixels empty; one row per laser fills them. The ring of a point
+    follows from its place in the file: the highest ring comes first, azimuth grows and each
+    ring starts at azimuth 0, as in KITTI. Columns are those of :class:`SphericalProjection`. A
+    point clipped off the vertical field of view cannot exist here; the inclination limits of
+    the sensor only tell scans in ring order from others.
+
+    Source: Triess et al., "Scan-based Semantic Segmentation of LiDAR Point Clouds" (IV 2020).
+
+    Args:
+        sensor: Image size and range limits.
+        ring_inclinations_deg: H inclinations, first row first, degrees above the horizon; see
+            :meth:`fit`.
+
+    Raises:
+        ValueError: If there are not H inclinations, or one is outside [-90, 90].
+    """
+
+    sensor: LidarSensor
+    ring_inclinations_deg: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check the inclinations; a list, as YAML gives it, would not be hashable."""
+        object.__setattr__(self, "ring_inclinations_deg", tuple(self.ring_inclinations_deg))
+        if len(self.ring_inclinations_deg) != self.sensor.beams:
+            raise ValueError(
+                f"a sensor of {self.sensor.beams} beams needs as many ring inclinations, "
+                f"got {len(self.ring_inclinations_deg)}"
+            )
+        if not all(-90.0 <= angle <= 90.0 for angle in self.ring_inclinations_deg):
+            raise ValueError(
+                f"ring inclinations must lie in [-90, 90] degrees, got {self.ring_inclinations_deg}"
+            )
+
+    @classmethod
+    def fit(cls, scans: Iterable[Tensor], sensor: LidarSensor) -> Self:
+        """Projection whose ring inclinations are the medians measured in real scans.
+
+        Scans in which another number of rings than H is seen (a laser without any return) do
+        not tell which laser is which, and are left out.
+
+        Args:
+            scans: Each ``(P, 3)`` metres, points in the order of the file.
+            sensor: Image size, range limits and field of view.
+
+        Returns:
+            The fitted projection.
+
+        Raises:
+            ValueError: If a scan is not stored as above, or none shows H rings.
+        """
+        measured: list[list[Tensor]] = [[] for _ in range(sensor.beams)]
+        counts_seen = []
+        for scan in scans:
+            returns = scan[_is_return(scan, sensor)]
+            inclination, azimuth = angles_of(returns)
+            ring, num_rings = rings_in_order(inclination, azimuth, sensor)
+            counts_seen.append(num_rings)
+            if num_rings == sensor.beams:
+                for index, values in enumerate(measured):
+                    values.append(inclination[ring == index])
+        if not measured[0]:
+            raise ValueError(
+                f"no scan shows the {sensor.beams} rings of the sensor; rings found per scan: "
+                f"{counts_seen}. Give more scans, or a sensor with another number of beams"
+            )
+        medians = torch.stack([torch.cat(values).median() for values in measured])
+        if (medians.diff() >= 0).any():
+            raise _not_in_ring_order("the inclination does not fall from ring to ring", sensor)
+        return cls(sensor, tuple(medians.rad2deg().tolist()))
+
+    def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Row and column of the range-image pixel that each point of whole scans falls into.
+
+        Where fewer than H rings are found they are matched in order to the known inclinations;
+        fewer than H returns go to the nearest inclinations one by one.
+
+        Args:
+            points: ``(P, 3)`` or ``(B, P, 3)`` metres, each scan whole and in the order of the
+                file. Points that are not finite (padding) or not beyond the shortest range take
+                no part in the search for rings and get pixel (0, 0).
+
+        Returns:
+            ``(row, column)``, each ``(P,)`` or ``(B, P)`` int64, in ``[0, H)`` and ``[0, W)``.
+
+        Raises:
+            ValueError: If a scan is not stored as above, shows more than H rings, or if
+                ``points`` has another shape.
+        """
+        if points.ndim == 3:
+            pixels = [self.pixel_of(scan) for scan in points]
+            if not pixels:
+                empty = torch.zeros(points.shape[:2], dtype=torch.int64, device=points.device)
+                return empty, empty
+            rows, columns = zip(*pixels, strict=True)
+            return torch.stack(rows), torch.stack(columns)
+        if points.ndim != 2:
+            raise ValueError(
+                f"points must be (P, 3) or (B, P, 3) whole scans, got shape {tuple(points.shape)}"
+            )
+        is_return = _is_return(points, self.sensor)
+        inclination, azimuth = angles_of(points[is_return])
+        row = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        column = torch.zeros_like(row)
+        column[is_return] = column_of(azimuth, self.sensor.columns)
+        row[is_return] = self._beam_of(inclination, azimuth)
+        return row, column
+
+    def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
+        """Inclination of each row and azimuth of each column.
+
+        Args:
+            corner: Take the left border of the column, not its centre. A ring has no corner.
+
+        Returns:
+            ``(H,)`` and ``(W,)`` radians, float64.
+        """
+        return self._inclinations(), column_azimuths(self.sensor.columns, corner)
+
+    def column_order(self) -> Tensor:
+        """Columns ``(W,)`` int64 in the order in which a scan lists the points of a ring."""
+        return (column_azimuths(self.sensor.columns, corner=False) % (2 * math.pi)).argsort()
+
+    def _beam_of(self, inclination: Tensor, azimuth: Tensor) -> Tensor:
+        beams, known = self.sensor.beams, self._inclinations()
+        if len(inclination) < beams:  # too few for turns of the azimuth to show
+            return (inclination.unsqueeze(-1) - known.to(inclination.device)).abs().argmin(dim=-1)
+        ring, num_rings = rings_in_order(inclination, azimuth, self.sensor)
+        if num_rings > beams:
+            raise ValueError(
+                f"the scan shows {num_rings} rings but the sensor has {beams} beams; "
+                "check that the scan is complete and the sensor is the right one"
+            )
+        measured = mean_per_ring(inclination, ring, num_rings).cpu()
+        beam = match_in_order(measured, known)
+        out_of_place = (measured - known[beam]).abs().median()
+        if out_of_place > _OUT_OF_PLACE_SHARE * _field_of_view_rad(self.sensor):
+            found = f"rings lie {out_of_place.rad2deg():.1f} degrees from the beam of their place"
+            raise _not_in_ring_order(found, self.sensor)
+        return beam.to(ring.device)[ring]
+
+    def _inclinations(self) -> Tensor:
+        return torch.tensor(self.ring_inclinations_deg, dtype=torch.float64).deg2rad()
 
 
 def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) -> tuple[Tensor, int]:
@@ -32,6 +196,8 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
     step = (azimuth % (2 * math.pi)).diff(prepend=azimuth[:1] % (2 * math.pi))
     # Jitter may step back over the seam, which looks like a step ahead of almost a turn.
     turn = (step < -_BACKWARD_RAD).long() - (step > 2 * math.pi - _BACKWARD_RAD).long()
+    if turn.sum() < 0:
+        raise _not_in_ring_order("the azimuth falls", sensor)
     if (num_wraps := int((turn > 0).sum())) > 2 * sensor.beams:
         raise _not_in_ring_order(f"the azimuth wraps {num_wraps} times", sensor)
     ring = turn.cumsum(0)
@@ -44,7 +210,7 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
     mean = mean_per_ring(inclination, ring, num_rings)
     spread = mean_per_ring((inclination - mean[ring]).square(), ring, num_rings).sqrt().median()
     # Inclinations spread evenly over the field of view have a deviation of 0.29 times it.
-    if spread > (sensor.inclination_max_rad - sensor.inclination_min_rad) / 6:
+    if spread > _field_of_view_rad(sensor) / 6:
         found = f"inclinations within one turn have a deviation of {spread.rad2deg():.1f} degrees"
         raise _not_in_ring_order(found, sensor)
     return ring, num_rings
@@ -60,7 +226,7 @@ def match_in_order(measured: Tensor, known: Tensor) -> Tensor:
     Returns:
         ``(R,)`` int64, strictly increasing.
     """
-    costs = (measured.cpu().unsqueeze(1) - known.unsqueeze(0)).abs()
+    costs = (measured.unsqueeze(1) - known.unsqueeze(0)).abs()
     total, choices = costs[0], []
     for cost in costs[1:]:
         best_before, choice = torch.cummin(total[:-1], dim=0)
@@ -87,8 +253,20 @@ def mean_per_ring(values: Tensor, ring: Tensor, num_rings: int) -> Tensor:
     return sums / torch.bincount(ring, minlength=num_rings)
 
 
+def _is_return(points: Tensor, sensor: LidarSensor) -> Tensor:
+    """Points that may show a ring: files hold dummies at the origin, and padding is NaN."""
+    check_points(points)
+    distance = range_of(points)
+    return distance.isfinite() & (distance > sensor.range_min_m)
+
+
+def _field_of_view_rad(sensor: LidarSensor) -> float:
+    return sensor.inclination_max_rad - sensor.inclination_min_rad
+
+
 def _not_in_ring_order(found: str, sensor: LidarSensor) -> ValueError:
     return ValueError(
-        f"the scan is not stored ring after ring: {found}, for a sensor of {sensor.beams} beams; "
-        "keep the order of the original file, or use SphericalProjection, which needs no order"
+        f"the scan is not stored ring after ring (highest first, each by growing azimuth from 0): "
+        f"{found}, for a sensor of {sensor.beams} beams; keep the order of the original file, or "
+        "use SphericalProjection, which needs no order"
     )

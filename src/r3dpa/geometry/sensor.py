@@ -50,6 +50,23 @@ class LidarSensor:
                 f"range_min_m={self.range_min_m}, range_max_m={self.range_max_m}"
             )
 
+    def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of the range image in one cell of a grid that is laid over it.
+
+        Args:
+            grid_size: Rows and columns of the grid.
+
+        Raises:
+            ValueError: If the grid does not divide the range image.
+        """
+        rows, columns = grid_size
+        if rows < 1 or columns < 1 or self.beams % rows or self.columns % columns:
+            raise ValueError(
+                f"a grid of {rows} x {columns} cells does not divide the "
+                f"{self.beams} x {self.columns} range image"
+            )
+        return self.beams // rows, self.columns // columns
+
     @property
     def inclination_max_rad(self) -> float:
         """Upper border of the first row, radians."""

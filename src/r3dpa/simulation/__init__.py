@@ -4,6 +4,8 @@ from r3dpa.simulation.drives import (
     TRAIN_DRIVES,
     VAL_DRIVES,
     SimulationReport,
+    drive_name,
+    expected_scans,
     simulate,
     split_scans,
 )
@@ -31,6 +33,8 @@ __all__ = [
     "SimulationReport",
     "Street",
     "cast",
+    "drive_name",
+    "expected_scans",
     "generator_for",
     "simulate",
     "simulate_scan",

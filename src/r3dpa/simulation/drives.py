@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from multiprocessing import get_context
@@ -24,7 +25,7 @@ from typing import Any, NamedTuple
 from r3dpa.atomic import atomic_path
 from r3dpa.simulation.scan import simulate_scan
 from r3dpa.simulation.sensor import HDL64E
-from r3dpa.simulation.street import Street, generator_for
+from r3dpa.simulation.street import Street
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
 VAL_DRIVES = ("0000", "0002")
@@ -37,6 +38,9 @@ _SIMULATOR_VERSION = 1
 _SCANS_PER_TASK = 8
 _FIRST_SCAN = datetime(2013, 5, 28, 8, 46, 2)
 _SCAN_PERIOD = timedelta(seconds=0.1)
+# A scan takes well under a second: an older temporary file was left by a run that was killed, a
+# newer one may belong to another process.
+_ABANDONED_S = 60
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ def simulate(
 
     Each scan follows from (seed, drive, number) alone: the files are the same bytes for any number
     of workers. A file appears under its name only when it is whole, so an interrupted call is
-    completed by the same call; a complete data set is left as it is.
+    completed by the same call, which also deletes temporary files of killed runs; a complete data
+    set is left as it is.
 
     Args:
         out: Root folder of the data set; made if missing.
@@ -86,8 +91,6 @@ def simulate(
         ValueError: If a value is out of range, a drive is unknown or named twice, or ``out`` holds
             other data or the data set of another request.
     """
-    if scans < 1:
-        raise ValueError(f"scans must be 1 or greater, got {scans}")
     if workers < 1:
         raise ValueError(f"workers must be 1 or greater, got {workers}")
     if seed < 0:
@@ -103,6 +106,7 @@ def simulate(
         "sensor": asdict(sensor),
     }
     _claim(out, request)
+    _delete_abandoned(out)
     for drive, count in counts.items():
         _make_drive(_points_folder(out, drive), count)
     tasks = [
@@ -134,8 +138,11 @@ def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
         Count by drive, training drives first; drives that get none are left out.
 
     Raises:
-        ValueError: If a drive is not an official one, is named twice, or there is none.
+        ValueError: If there is no scan, or a drive is not an official one, is named twice, or
+            there is none.
     """
+    if scans < 1:
+        raise ValueError(f"scans must be 1 or greater, got {scans}")
     unknown = sorted(set(drives) - {*TRAIN_DRIVES, *VAL_DRIVES})
     if unknown or not drives or len(set(drives)) < len(drives):
         raise ValueError(
@@ -151,6 +158,37 @@ def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
     else:
         num_val = max(1, round(VAL_SHARE * scans))
     return _share(scans - num_val, train) | _share(num_val, val)
+
+
+def drive_name(number: str) -> str:
+    """Folder of a drive in the KITTI-360 layout, of its four-digit number."""
+    return f"2013_05_28_drive_{number}_sync"
+
+
+def expected_scans(root: Path) -> dict[str, int] | None:
+    """Scans that a simulated data set holds when it is complete.
+
+    Args:
+        root: Root folder of a data set.
+
+    Returns:
+        Number of scans by drive folder, sorted; None where ``root`` holds no simulated data set.
+
+    Raises:
+        ValueError: If the manifest of the data set is damaged.
+    """
+    manifest = root / _MANIFEST
+    if not manifest.is_file():
+        return None
+    request = _read_manifest(manifest)
+    try:
+        counts = split_scans(request["scans"], request["drives"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{manifest} does not say which scans were simulated ({error!r}); simulate the data "
+            f"set again into an empty folder"
+        ) from error
+    return {drive_name(drive): count for drive, count in sorted(counts.items())}
 
 
 def _share(scans: int, drives: list[str]) -> dict[str, int]:
@@ -172,11 +210,7 @@ class _Task(NamedTuple):
 
 
 def _points_folder(out: Path, drive: str) -> Path:
-    return out / "data_3d_raw" / f"2013_05_28_drive_{drive}_sync" / "velodyne_points"
-
-
-def _scan_files(folder: Path, number: int) -> tuple[Path, Path]:
-    return folder / "data" / f"{number:010d}.bin", folder / "labels" / f"{number:010d}.label"
+    return out / "data_3d_raw" / drive_name(drive) / "velodyne_points"
 
 
 def _claim(out: Path, request: dict[str, Any]) -> None:
@@ -193,10 +227,7 @@ def _claim(out: Path, request: dict[str, Any]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         _write(manifest, (json.dumps(request, indent=2) + "\n").encode())
         return
-    try:
-        stored = json.loads(manifest.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{manifest} is not valid JSON ({error}); give another folder") from error
+    stored = _read_manifest(manifest)
     different = [key for key in request if stored.get(key) != request[key]]
     if different:
         listed = "; ".join(
@@ -206,6 +237,25 @@ def _claim(out: Path, request: dict[str, Any]) -> None:
             f"{out} holds a data set of another request ({listed}); give another folder, "
             f"or delete it"
         )
+
+
+def _read_manifest(manifest: Path) -> dict[str, Any]:
+    try:
+        request = json.loads(manifest.read_text())
+        if not isinstance(request, dict):
+            raise ValueError(f"it holds {type(request).__name__}, not an object")
+    except ValueError as error:
+        raise ValueError(
+            f"{manifest} is damaged ({error}); simulate the data set again into an empty folder"
+        ) from error
+    return request
+
+
+def _delete_abandoned(out: Path) -> None:
+    for path in out.rglob(".*.partial.*"):
+        with suppress(FileNotFoundError):  # another process has just finished its file
+            if path.stat().st_mtime < time.time() - _ABANDONED_S:
+                path.unlink()
 
 
 def _make_drive(folder: Path, count: int) -> None:
@@ -220,11 +270,15 @@ def _make_drive(folder: Path, count: int) -> None:
 
 def _missing(out: Path, drive: str, count: int, seed: int, sensor: HDL64E) -> Iterator[_Task]:
     folder = _points_folder(out, drive)
+    data, labels = (
+        {path.stem for path in (folder / name).iterdir()} for name in ("data", "labels")
+    )
+    complete = data & labels
     for first in range(0, count, _SCANS_PER_TASK):
         numbers = tuple(
             number
             for number in range(first, min(first + _SCANS_PER_TASK, count))
-            if not all(file.exists() for file in _scan_files(folder, number))
+            if f"{number:010d}" not in complete
         )
         if numbers:
             yield _Task(folder, drive, numbers, seed, sensor)
@@ -236,11 +290,10 @@ def _run(task: _Task) -> float:
     start = time.perf_counter()
     for number in task.numbers:
         scene = street.scene(number, task.sensor.mount_height_m)
-        generator = generator_for(task.seed, "effects", street.drive, number)
-        scan = simulate_scan(scene, task.sensor, generator)
-        points_file, labels_file = _scan_files(task.folder, number)
-        _write(labels_file, scan.labels.astype("<u4").tobytes())
-        _write(points_file, scan.points.astype("<f4").tobytes())
+        scan = simulate_scan(scene, task.sensor, (task.seed, "effects", street.drive, number))
+        name = f"{number:010d}"
+        _write(task.folder / "labels" / f"{name}.label", scan.labels.astype("<u4").tobytes())
+        _write(task.folder / "data" / f"{name}.bin", scan.points.astype("<f4").tobytes())
     return time.perf_counter() - start
 
 

@@ -1,7 +1,7 @@
 """What happens to the returns between the ray cast and the stored scan.
 
-Each effect is a frozen dataclass: a function ``(returns, generator) -> returns`` with a ``stage``.
-A scene lists the effects it calls for, ordered by stage; see ``design/effects.md``.
+Each effect is a frozen dataclass: a function ``(returns, scene, generator) -> returns`` with a
+``stage``. A scene lists the effects it calls for, ordered by stage.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from r3dpa.simulation.raycast import MAX_RANGE_M, Returns
+from r3dpa.simulation.scene import Scene
 
 SURFACE_RADIOMETRY_STAGE = 5
 DETECTION_STAGE = 7
@@ -26,8 +27,8 @@ class Effect(Protocol):
     def stage(self) -> int:
         """Place in the order: 4 optical path, 5 surface, 6 medium, 7 detection, 8 measurement."""
 
-    def __call__(self, returns: Returns, generator: np.random.Generator) -> Returns:
-        """Returns after the effect; the argument is left as it was."""
+    def __call__(self, returns: Returns, scene: Scene, generator: np.random.Generator) -> Returns:
+        """Returns after the effect; the arguments are left as they were."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,13 @@ class LambertianReflection:
 
         power = power * reflectivity * cos(incidence) / range^2
 
-    Source: lidar range equation; design/effects.md, section 4.
+    Source: lidar range equation for a target that fills the beam, with its constants (aperture,
+    transmission) left out, so that power is counted in m^-2.
     """
 
     stage: ClassVar[int] = SURFACE_RADIOMETRY_STAGE
 
-    def __call__(self, returns: Returns, generator: np.random.Generator) -> Returns:
+    def __call__(self, returns: Returns, scene: Scene, generator: np.random.Generator) -> Returns:
         """Returns with the power in m^-2; 0 where there is no surface."""
         gain = returns.reflectivity * returns.cos_incidence / returns.range_m**2
         return replace(returns, power=returns.power * gain)
@@ -80,7 +82,7 @@ class DetectionLimit:
                 f"got {self.min_range_m} and {self.max_range_m}"
             )
 
-    def __call__(self, returns: Returns, generator: np.random.Generator) -> Returns:
+    def __call__(self, returns: Returns, scene: Scene, generator: np.random.Generator) -> Returns:
         """Returns with an infinite range where the instrument sees nothing."""
         range_m = returns.range_m
         seen = (

@@ -23,9 +23,10 @@ _WINDOW_SLACK_RAD = 2e-3
 
 @dataclass(frozen=True)
 class Returns:
-    """What comes back for each shot; every array is ``(H, W)``, beams by shots.
+    """What comes back for each shot; every array but the rays is ``(H, W)``, beams by shots.
 
     Args:
+        rays: The shots, in the sensor frame; a point is ``origin + range_m * direction``.
         range_m: Distance along the ray, float32; infinity where nothing comes back.
         surface: Index of the primitive that was hit, ``GROUND`` or ``NO_SURFACE``; int32.
         cos_incidence: Cosine between the ray and the surface normal, float32 in [0, 1].
@@ -35,6 +36,7 @@ class Returns:
         power: Received over emitted power, m^-2, float32; 1 before any effect has been applied.
     """
 
+    rays: Rays
     range_m: Floats
     surface: NDArray[np.int32]
     cos_incidence: Floats
@@ -76,6 +78,7 @@ def cast(scene: Scene, rays: Rays) -> Returns:
         return np.array([*values, 0, ground], dtype=dtype)[surface]
 
     return Returns(
+        rays=rays,
         range_m=np.where(surface == NO_SURFACE, np.float32(np.inf), nearest),
         surface=surface,
         cos_incidence=cos_incidence,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from r3dpa.simulation.raycast import cast
 from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import HDL64E
+from r3dpa.simulation.street import generator_for
 
 
 @dataclass(frozen=True)
@@ -27,22 +28,23 @@ class SimulatedScan:
     labels: NDArray[np.uint32]
 
 
-def simulate_scan(scene: Scene, sensor: HDL64E, generator: np.random.Generator) -> SimulatedScan:
+def simulate_scan(scene: Scene, sensor: HDL64E, key: tuple[int | str, ...]) -> SimulatedScan:
     """Scan a scene.
 
     Args:
         scene: Solids, pose and effects.
         sensor: Instrument; its mount height is not used, the pose holds the height.
-        generator: Source of the effects' random draws.
+        key: Seed of the effects' random draws, see ``generator_for``. The name of its class is
+            added for each effect, so that no effect moves the draws of another.
 
     Returns:
         The points that came back.
     """
     returns = cast(scene, sensor.rays)
     for effect in scene.effects:
-        returns = effect(returns, generator)
+        returns = effect(returns, scene, generator_for(*key, type(effect).__name__))
     seen = np.isfinite(returns.range_m)
-    origin, direction = (array[:, seen] for array in sensor.rays)
+    origin, direction = (array[:, seen] for array in returns.rays)
     points = np.empty((origin.shape[1], 4), dtype=np.float32)
     points[:, :3] = (origin + returns.range_m[seen] * direction).T
     points[:, 3] = calibrated_intensity(returns.power[seen], returns.range_m[seen])

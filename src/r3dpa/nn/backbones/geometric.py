@@ -13,7 +13,8 @@ from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
 # Neighbourhood in pixels: wider than high, as a spinning sensor samples more densely in azimuth.
 _ROW_OFFSETS = (-2, -1, 0, 1, 2)
 _COLUMN_OFFSETS = (-6, -3, -1, 0, 1, 3, 6)
-# One image for all sensors: 0.42 deg per row, finer than the beams of a 64-beam sensor.
+# One image for all sensors: 0.42 deg per row, between the beam spacings of the two blocks of an
+# HDL-64E (0.34 and 0.51 deg).
 _IMAGE = LidarSensor(
     beams=96,
     columns=1024,
@@ -119,7 +120,7 @@ class GeometricFeatures(nn.Module):
             points: ``(P, 4)`` x, y, z in metres, intensity.
 
         Returns:
-            ``(P, 9)`` float32. A point with fewer than three neighbours has shape and normal 0.
+            ``(P, 9)`` float32. A point with fewer than two neighbours has shape and normal 0.
         """
         xyz = points[:, :3].float()
         radius = torch.linalg.vector_norm(xyz, dim=1)
@@ -140,7 +141,8 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Linearity, planarity, sphericity ``(P, 3)`` and normal ``(P, 3)`` of each point's pixel.
 
     The neighbours of a pixel are the nearest returns of the pixels around it, columns wrapping,
-    whose range is close to its own.
+    whose range is close to its own. The statistics are those of the neighbours and the pixel
+    itself; with fewer than three in all, every value is 0.
     """
     rows, columns = _IMAGE.beams, _IMAGE.columns
     range_m, nearest = range_image(xyz, _PROJECTION, xyz)

@@ -1,0 +1,30 @@
+"""Pictures of scans, scenes, reconstructions, features and losses.
+
+Every function takes arrays or tensors and returns a matplotlib ``Figure`` or the pixels of a
+picture, ``(rows, columns, 3)`` uint8 RGB; only :func:`save` and :func:`read_metrics` touch files.
+Colours are perceptually uniform and safe for colour-blind readers, on scales fixed in metres, so
+pictures of different scenes can be compared. Dark means that there is no return.
+"""
+
+from r3dpa.viz.curves import Series, loss_curves, read_metrics
+from r3dpa.viz.features import feature_grid_picture, latents_picture, pca_colours
+from r3dpa.viz.figures import birds_eye_view, reconstruction_figure, scenes_sheet
+from r3dpa.viz.pixels import save
+from r3dpa.viz.scans import birds_eye_picture, encoded_picture, range_image_picture, scene_3d
+
+__all__ = [
+    "Series",
+    "birds_eye_picture",
+    "birds_eye_view",
+    "encoded_picture",
+    "feature_grid_picture",
+    "latents_picture",
+    "loss_curves",
+    "pca_colours",
+    "range_image_picture",
+    "read_metrics",
+    "reconstruction_figure",
+    "save",
+    "scene_3d",
+    "scenes_sheet",
+]

@@ -1,0 +1,180 @@
+"""Range images and points as pixels.
+
+Letters: H beams, W columns, P points.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from matplotlib.colors import Normalize, PowerNorm
+from numpy.typing import NDArray
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.viz.pixels import (
+    BACKGROUND,
+    Array,
+    Pixels,
+    as_bytes,
+    as_numpy,
+    bright_part,
+    enlarge,
+    paint,
+)
+
+HEIGHT_LIMITS_M = (-2.0, 3.0)  # relative to the sensor, which stands about 1.7 m above the road
+CAMERA_EYE_M = (-20.0, 0.0, 10.5)
+CAMERA_TARGET_M = (12.0, 0.0, -1.0)
+CAMERA_WIDTH_DEG = 58.0
+POINT_WIDTH_M = 0.11  # drawn width of a point in the 3D picture
+MAX_POINT_PIXELS = 6  # before the averaging over 2 x 2
+RANGE_MAP = bright_part("plasma", 0.0).reversed()  # near is bright
+HEIGHT_MAP = bright_part("viridis", 0.3)
+
+
+def range_image_picture(range_m: Array, sensor: LidarSensor, scale: int = 1) -> Pixels:
+    """Colours of a range image, pixel for pixel.
+
+    The colour follows the square root of the range from ``range_min_m`` (bright) to
+    ``range_max_m``, because most returns are near; ranges beyond the limits take the end colours.
+
+    Args:
+        range_m: ``(H, W)`` range in metres; not above 0 where there is no return.
+        sensor: Gives the limits of the colour scale.
+        scale: Side of the square drawn for one pixel, at least 1.
+
+    Returns:
+        ``(H * scale, W * scale, 3)`` uint8; pixels without a return have the dark background.
+
+    Raises:
+        ValueError: If ``range_m`` has other than two axes or ``scale`` is below 1.
+    """
+    ranges = as_numpy(range_m, ("H", "W"))
+    picture = paint(ranges, RANGE_MAP, range_scale(sensor))
+    picture[~(ranges > 0)] = BACKGROUND
+    return enlarge(picture, scale)
+
+
+def encoded_picture(image: Array) -> Pixels:
+    """Gray values of an encoded range image: [-1, 1] becomes 0 to 255, rounded down.
+
+    Source: the PNG that ``generate.py`` of valeoai/R3DPA writes; same bytes.
+
+    Args:
+        image: ``(H, W)`` encoded range; values outside [-1, 1] are clipped.
+
+    Returns:
+        ``(H, W)`` uint8.
+
+    Raises:
+        ValueError: If ``image`` has other than two axes.
+    """
+    values = as_numpy(image, ("H", "W")).astype(np.float32)  # its rounding decides the last bit
+    return np.clip((values + 1) / 2 * 255, 0, 255).astype(np.uint8)
+
+
+def birds_eye_picture(
+    points: Array, extent_m: float = 50.0, pixels: int = 500, colours: Array | None = None
+) -> Pixels:
+    """Points seen from above, forward up and left to the left; the highest point of a pixel shows.
+
+    Args:
+        points: ``(P, 3+)`` x forward, y left, z up, metres; further columns are not used.
+        extent_m: Half side of the square around the sensor that is shown.
+        pixels: Side of the picture.
+        colours: ``(P, 3)`` RGB in [0, 1] of the points, by default from their height.
+
+    Returns:
+        ``(pixels, pixels, 3)`` uint8.
+
+    Raises:
+        ValueError: If the shapes of ``points`` and ``colours`` are not as above.
+    """
+    xyz, rgb = _coloured_points(points, colours)
+    row = np.floor((extent_m - xyz[:, 0]) / (2 * extent_m) * pixels)
+    column = np.floor((extent_m - xyz[:, 1]) / (2 * extent_m) * pixels)
+    inside = (row >= 0) & (row < pixels) & (column >= 0) & (column < pixels)
+    order = np.flatnonzero(inside)[np.argsort(xyz[inside, 2], kind="stable")]
+    picture = np.full((pixels, pixels, 3), BACKGROUND, dtype=np.uint8)
+    picture[row[order].astype(int), column[order].astype(int)] = rgb[order]
+    return picture
+
+
+def scene_3d(
+    points: Array, colours: Array | None = None, size: tuple[int, int] = (540, 960)
+) -> Pixels:
+    """Points seen by a pinhole camera behind and above the ego vehicle, looking forward.
+
+    Near points hide far ones and are drawn larger; colours fade with distance.
+
+    Args:
+        points: ``(P, 3+)`` x forward, y left, z up, metres.
+        colours: ``(P, 3)`` RGB in [0, 1] of the points, by default from their height.
+        size: Rows and columns of the picture.
+
+    Returns:
+        ``(*size, 3)`` uint8 on a dark background.
+
+    Raises:
+        ValueError: If the shapes of ``points`` and ``colours`` are not as above.
+    """
+    xyz, rgb = _coloured_points(points, colours)
+    height, width = 2 * size[0], 2 * size[1]  # averaged over 2 x 2 at the end, against jagged edges
+    focal = 0.5 * width / math.tan(math.radians(CAMERA_WIDTH_DEG) / 2)
+    from_eye = (xyz - np.array(CAMERA_EYE_M)) @ _camera_axes()
+    order = np.argsort(-from_eye[:, 2])  # far to near: the rank of a point tells what hides what
+    order = order[from_eye[order, 2] > 1.0]
+    right, up, depth = from_eye[order].T
+    side = np.clip(np.rint(POINT_WIDTH_M * focal / depth), 1, MAX_POINT_PIXELS).astype(int)
+    row = np.floor(height / 2 - focal * up / depth).astype(int) - side // 2
+    column = np.floor(width / 2 + focal * right / depth).astype(int) - side // 2
+
+    nearest = np.full(height * width, -1)
+    for down, across in itertools.product(range(MAX_POINT_PIXELS), repeat=2):
+        drawn = (side > max(down, across)) & (row + down >= 0) & (row + down < height)
+        drawn &= (column + across >= 0) & (column + across < width)
+        layer = np.full(height * width, -1)
+        ranks = np.flatnonzero(drawn)
+        layer[(row[ranks] + down) * width + column[ranks] + across] = ranks
+        np.maximum(nearest, layer, out=nearest)
+
+    background = np.array([BACKGROUND], dtype=np.float64)
+    haze = np.clip((depth[:, None] - 25.0) / 90.0, 0.0, 0.75)
+    shaded = (1 - haze) * rgb[order] + haze * background
+    picture = np.concatenate([shaded, background])[nearest]  # index -1 is the background
+    picture = picture.reshape(size[0], 2, size[1], 2, 3).mean(axis=(1, 3))
+    return np.rint(picture).astype(np.uint8)
+
+
+def range_scale(sensor: LidarSensor) -> Normalize:
+    """Square-root scale between the range limits of a sensor."""
+    return PowerNorm(0.5, sensor.range_min_m, sensor.range_max_m)
+
+
+def _coloured_points(
+    points: Array, colours: Array | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Finite points ``(P, 3)`` and their RGB ``(P, 3)`` from 0 to 255, by default from height."""
+    given = as_numpy(points, ("P", "3+"))
+    if given.shape[1] < 3:
+        raise ValueError(f"points need columns x, y, z, got shape {given.shape}")
+    xyz = given[:, :3]
+    if colours is None:
+        rgb = paint(xyz[:, 2], HEIGHT_MAP, Normalize(*HEIGHT_LIMITS_M))
+    else:
+        rgb = as_bytes(as_numpy(colours, ("P", "3")))
+    if rgb.shape != xyz.shape:
+        raise ValueError(f"colours are {rgb.shape} but points {xyz.shape}; give one RGB per point")
+    finite = np.isfinite(xyz).all(axis=1)
+    return xyz[finite], rgb[finite].astype(np.float64)
+
+
+def _camera_axes() -> NDArray[np.float64]:
+    """Right, up and forward of the 3D camera as columns, in the sensor frame."""
+    forward = np.subtract(CAMERA_TARGET_M, CAMERA_EYE_M)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, forward), forward], axis=1)

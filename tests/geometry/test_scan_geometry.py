@@ -1,0 +1,78 @@
+import json
+import math
+
+import pytest
+
+from r3dpa.geometry import (
+    LidarSensor,
+    RangeCodec,
+    RingProjection,
+    ScanGeometry,
+    SphericalProjection,
+)
+
+SENSOR = LidarSensor(beams=4, columns=32)
+FAR = LidarSensor(beams=4, columns=32, range_max_m=80.0)
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [
+        SphericalProjection(SENSOR, legacy_seam=True),
+        RingProjection(SENSOR, (2.0, -1.0, -8.5, -20.0)),
+    ],
+    ids=["spherical", "rings"],
+)
+def test_to_plain_values_and_back(projection):
+    geometry = ScanGeometry(projection, RangeCodec("log2", 6.0), (2, 8))
+    stored = json.loads(json.dumps(geometry.to_dict()))
+    assert stored == geometry.to_dict()  # nothing that JSON would change, such as a tuple
+    restored = ScanGeometry.from_dict(stored)
+    assert restored == geometry
+    assert hash(restored.projection) == hash(projection)
+
+
+def test_damaged_values_are_refused():
+    whole = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8)).to_dict()
+    for damaged in (
+        {},
+        {key: whole[key] for key in ("projection", "codec")},
+        whole | {"projection": {**whole["projection"], "kind": "cubic"}},
+        whole | {"projection": {**whole["projection"], "tilt": 1.0}},
+        whole | {"codec": {"encoding": "linear", "base": 2}},
+        whole | {"grid_size": [2]},
+    ):
+        with pytest.raises(ValueError, match="not a scan geometry"):
+            ScanGeometry.from_dict(damaged)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "codec"),
+    [
+        (SENSOR, RangeCodec()),
+        (SENSOR, RangeCodec("log2")),  # 2^5.84 - 1 = 56.3
+        (FAR, RangeCodec("linear", 80.0)),
+        (FAR, RangeCodec("log2", math.log2(81))),
+    ],
+)
+def test_a_codec_that_reaches_the_farthest_range_is_accepted(sensor, codec):
+    ScanGeometry(SphericalProjection(sensor), codec, (2, 8))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "codec", "message"),
+    [
+        (FAR, RangeCodec(), "ends at 56.00 m, but the sensor reports up to 80 m"),
+        (FAR, RangeCodec("log2"), "ends at 56.28 m"),
+        (SENSOR, RangeCodec("linear", 55.9), "ends at 55.90 m"),
+    ],
+)
+def test_a_codec_that_would_show_far_points_as_a_wall_is_refused(sensor, codec, message):
+    with pytest.raises(ValueError, match=message):
+        ScanGeometry(SphericalProjection(sensor), codec, (2, 8))
+
+
+@pytest.mark.parametrize("grid_size", [(3, 8), (2, 5), (0, 8), (2, -8)])
+def test_a_grid_that_does_not_divide_the_image_is_refused(grid_size):
+    with pytest.raises(ValueError, match=r"does not divide the 4 x 32 range image"):
+        ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), grid_size)
