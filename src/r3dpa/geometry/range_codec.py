@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
@@ -50,12 +50,14 @@ class RangeCodec:
         """Check the encoding and its scale."""
         if self.encoding not in _DEFAULT_SCALES:
             raise ValueError(f"range encoding must be 'linear' or 'log2', got {self.encoding!r}")
+        if self.scale is None:  # so that a codec equals the same one written out
+            object.__setattr__(self, "scale", _DEFAULT_SCALES[self.encoding])
         if not 0.0 < self._divisor < math.inf:
             raise ValueError(f"range scale must be positive and finite, got {self.scale}")
 
     @property
     def _divisor(self) -> float:
-        return _DEFAULT_SCALES[self.encoding] if self.scale is None else self.scale
+        return cast(float, self.scale)
 
     @property
     def threshold(self) -> float:
