@@ -48,16 +48,27 @@ def parity_dir(pytestconfig) -> Path:
 
 
 @pytest.fixture(scope="session")
-def load_case(parity_dir, pytestconfig):
-    """``load_case(name)``; a case without its file is skipped only outside ``--parity-dir``."""
-    must_exist = pytestconfig.getoption("--parity-dir") is not None
+def load_case(parity_dir):
+    """``load_case(name)``; skips a case that ``cases.json`` does not list, and no other."""
+    listed = json.loads((parity_dir / "cases.json").read_text())
 
     def load(name: str) -> Case:
+        if name not in listed:
+            pytest.skip(f"{name} is no case of {parity_dir} (KITTI-derived: not redistributed)")
         if not (parity_dir / f"{name}.npz").is_file():
-            if must_exist:
-                pytest.fail(f"{name}.npz is not in the given --parity-dir {parity_dir}")
-            pytest.skip(f"{name}.npz is not in {parity_dir} (KITTI-derived, not redistributed)")
+            pytest.fail(f"{parity_dir} lists {name} in cases.json, but holds no {name}.npz")
         return Case(parity_dir, name)
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def official_listing(parity_dir):
+    """``official_listing(name)``: a recorded state-dict listing, which no seed or size changes."""
+
+    def load(name: str):
+        folder = parity_dir if (parity_dir / f"{name}.json").is_file() else SYNTHETIC
+        return json.loads((folder / f"{name}.json").read_text())
 
     return load
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import pytest
@@ -14,10 +13,6 @@ from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 
 PATH = Path("official.pt")
-
-
-def listing(parity_dir, name):
-    return json.loads((parity_dir / f"{name}.json").read_text())
 
 
 def weights_of(shapes, first=0):
@@ -58,8 +53,8 @@ def through_our_networks(checkpoint):
     return type(checkpoint)(**{**vars(checkpoint), "networks": networks})
 
 
-def test_every_sit_state_dict(parity_dir):
-    sits = listing(parity_dir, "sit_state_dicts")
+def test_every_sit_state_dict(official_listing):
+    sits = official_listing("sit_state_dicts")
     for name, sit in sits.items():
         config, kitti = sit["config"], not isinstance(sit["config"]["input_size"], int)
         args = args_of(sit)
@@ -89,8 +84,8 @@ def test_every_sit_state_dict(parity_dir):
         assert (back["steps"], back["args"]) == (12, args)
 
 
-def test_every_vae_state_dict(parity_dir):
-    for name, vae in listing(parity_dir, "vae_state_dicts").items():
+def test_every_vae_state_dict(official_listing):
+    for name, vae in official_listing("vae_state_dicts").items():
         official = {"model": {}, "vae": weights_of(vae["state_dict"])}
         checkpoint = from_official({"vae": official["vae"]}, PATH)
         with torch.device("meta"):
@@ -104,23 +99,23 @@ def test_every_vae_state_dict(parity_dir):
         assert vars(back["args"])["vae"] == name
 
 
-def test_discriminator_state_dict(parity_dir):
-    official = weights_of(listing(parity_dir, "discriminator_state_dict")["state_dict"])
+def test_discriminator_state_dict(official_listing):
+    official = weights_of(official_listing("discriminator_state_dict")["state_dict"])
     checkpoint = from_official(official, PATH)
     assert_same(to_official(through_our_networks(checkpoint))["discriminator"], official)
 
 
-def test_checkpoint_layout_through_our_file(parity_dir, tmp_path):
+def test_checkpoint_layout_through_our_file(official_listing, tmp_path):
     """A whole training checkpoint: official .pt -> our .safetensors -> official .pt."""
-    layout = listing(parity_dir, "checkpoint_layout")
-    sits = listing(parity_dir, "sit_state_dicts")
+    layout = official_listing("checkpoint_layout")
+    sits = official_listing("sit_state_dicts")
     name, sit = next(
         (name, sit)
         for name, sit in sits.items()
         if not isinstance(sit["config"]["input_size"], int)
     )
-    vae = listing(parity_dir, "vae_state_dicts")[name.rpartition("_")[2]]
-    discriminator = listing(parity_dir, "discriminator_state_dict")
+    vae = official_listing("vae_state_dicts")[name.rpartition("_")[2]]
+    discriminator = official_listing("discriminator_state_dict")
     args = args_of(sit)
     args.dataset_config = "configs/kitti.yaml"
     parts = {
@@ -185,9 +180,9 @@ def test_joint_step_through_our_files(load_case, tmp_path):
     assert torch.equal(norm.running_var, official["ema"]["bn.running_var"])
 
 
-def test_rgb_transfer_of_the_imagenet_variants(parity_dir):
-    sits = listing(parity_dir, "sit_state_dicts")
-    rules = listing(parity_dir, "checkpoint_layout")["rgb_transfer_in_tuning_stage"]
+def test_rgb_transfer_of_the_imagenet_variants(official_listing):
+    sits = official_listing("sit_state_dicts")
+    rules = official_listing("checkpoint_layout")["rgb_transfer_in_tuning_stage"]
     kitti = next(s for n, s in sits.items() if "kitti" in n and s["constructor"] == "SiT-B/2")
     config = kitti["config"]
     for name, rgb in sits.items():
@@ -239,8 +234,8 @@ def test_rgb_transfer_of_the_imagenet_variants(parity_dir):
 
 
 @pytest.mark.parametrize("change", ["missing", "unknown", "shape"])
-def test_a_listing_that_differs_by_one_key_is_refused(parity_dir, change):
-    sit = next(iter(listing(parity_dir, "sit_state_dicts").values()))
+def test_a_listing_that_differs_by_one_key_is_refused(official_listing, change):
+    sit = next(iter(official_listing("sit_state_dicts").values()))
     shapes = dict(sit["state_dict"])
     if change == "missing":
         del shapes["blocks.3.attn.proj.bias"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import pytest
@@ -127,8 +126,8 @@ def test_gan_losses_every_recorded_output_is_compared(case):
     assert compared == set(case.keys("out/"))
 
 
-def test_gan_losses_official_discriminator_has_our_keys_and_shapes(parity_dir):
-    official = json.loads((parity_dir / "discriminator_state_dict.json").read_text())
+def test_gan_losses_official_discriminator_has_our_keys_and_shapes(official_listing):
+    official = official_listing("discriminator_state_dict")
     with torch.device("meta"):
         network = PatchDiscriminator()
     ours = {key: list(value.shape) for key, value in network.state_dict().items()}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 import torch
 from official_sit import build_norm, build_sit, our_name
@@ -169,8 +167,8 @@ WIDTHS = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS, ids=lambda name: f"sit-{name}")
-def test_sit_official_layouts_have_our_keys_and_shapes(parity_dir, name):
-    official = json.loads((parity_dir / "sit_state_dicts.json").read_text())[name]
+def test_sit_official_layouts_have_our_keys_and_shapes(official_listing, name):
+    official = official_listing("sit_state_dicts")[name]
     config = official["config"]
     size = config["input_size"]
     with torch.device("meta"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 import torch
 
@@ -153,8 +151,8 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS, ids=lambda name: f"vae-{name}")
-def test_vae_official_layouts_have_our_keys_and_shapes(parity_dir, name):
-    official = json.loads((parity_dir / "vae_state_dicts.json").read_text())[name]
+def test_vae_official_layouts_have_our_keys_and_shapes(official_listing, name):
+    official = official_listing("vae_state_dicts")[name]
     with torch.device("meta"):
         vae = VAE(**LAYOUTS[name])
     ours = {key: list(value.shape) for key, value in vae.state_dict().items()}
