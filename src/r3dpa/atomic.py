@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from uuid import uuid4
 
 __all__ = ["atomic_path"]
 
@@ -18,11 +18,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     error the temporary file is removed.
 
     Args:
-        path: File to write. The temporary name has the same suffix.
+        path: File to write. The temporary name is hidden, starts with a dot, and has the same
+            suffix; no other writer has it, on this machine or on another one of a shared disk.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{uuid4().hex[:8]}.partial{path.suffix}")
     try:
         yield temporary
         temporary.replace(path)

@@ -11,8 +11,10 @@ from r3dpa.data import (
     LidarDataModule,
     SimulatedDataModule,
     check,
+    write_bin,
 )
 from r3dpa.data.scans import KITTI360_DRIVES
+from r3dpa.geometry import LidarSensor
 
 
 class Recorder(LightningModule):
@@ -200,16 +202,99 @@ def test_official_split(tmp_path, make_scans, sensor):
     assert (len(train), len(val)) == (14, 4)
 
 
-def test_other_rings_than_those_of_the_checkpoint_are_refused(data):
-    rings = [2.0 - 3 * row for row in range(8)]
-    module = data(projection="rings", ring_inclinations_deg=rings)
-    module.setup("predict")
-    state = module.state_dict()
-    module.load_state_dict(state)
-    other = data(projection="rings", ring_inclinations_deg=[r - 0.5 for r in rings])
-    other.setup("predict")
-    with pytest.raises(ValueError, match="ring_inclinations_deg"):
-        other.load_state_dict(state)
+def write_rings(folder, heights_deg):
+    """One scan for each row, with rings at these inclinations, stored ring after ring."""
+    folder.mkdir(parents=True)
+    azimuth = torch.linspace(0.05, 6.2, 64)
+    for frame, rows in enumerate(heights_deg):
+        rings = [
+            torch.stack([azimuth.cos(), azimuth.sin(), tan.expand(64)], 1) * 10
+            for tan in torch.tensor(rows).deg2rad().tan()
+        ]
+        write_bin(folder / f"{frame:06d}.bin", torch.cat(rings)[:, :3])
+
+
+def test_rings_do_not_depend_on_the_limit(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    tilt = torch.randn(12, 1, generator=generator) / 4
+    write_rings(tmp_path / "s", (torch.tensor([2.0, -4, -10, -16]) + tilt).tolist())
+    options = {"sensor": LidarSensor(beams=4, columns=64), "projection": "rings"}
+    fitted = []
+    for limit in (None, 1, 3):
+        data = LidarDataModule(str(tmp_path / "s"), limit=limit, val_every=4, **options)
+        data.setup("predict")
+        fitted.append(data.projection.ring_inclinations_deg)
+    assert fitted[0] == fitted[1] == fitted[2]
+    held_out = LidarDataModule(
+        str(tmp_path / "s"), val_every=None, val_drives=["s"], limit=1, **options
+    )
+    held_out.setup("predict")  # no scan to train on: measured in the others
+    assert held_out.projection.ring_inclinations_deg == pytest.approx(fitted[0], abs=1)
+
+
+@pytest.mark.parametrize("part", ["train", "val"])
+def test_one_split_alone(tmp_path, make_scans, sensor, part):
+    """KITTI-360 with drives of one split: usable but for the stage that needs the other one."""
+    drive = KITTI360_DRIVES[part][0]
+    make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 4)
+    data = KITTI360DataModule(str(tmp_path), sensor=sensor, batch_size=2)
+    data.setup("predict")
+    assert sum(len(batch["name"]) for batch in data.predict_dataloader()) == 4
+    if part == "train":
+        assert len(record(tmp_path, data, 2)[0].seen) == 2
+        with pytest.raises(ValueError, match=r"No held-out scan in .*missing drives"):
+            trainer(tmp_path, 1).validate(Recorder(), data, verbose=False)
+    else:
+        trainer(tmp_path, 1).validate(Recorder(), data, verbose=False)
+        with pytest.raises(ValueError, match=r"No scan to train on in .*missing drives"):
+            record(tmp_path, data, 1)
+
+
+def test_prediction_makes_no_grids(tmp_path, data, scaled_points):
+    class Predicting(Recorder):
+        def predict_step(self, batch, batch_idx):
+            assert "feature_grid" not in batch
+            return len(batch["name"])
+
+    extractor = scaled_points()
+    module = data(extractor=extractor)
+    assert sum(trainer(tmp_path, 1).predict(Predicting(), module)) == 11
+    assert extractor.calls == 0
+    assert not module.features_dir.exists()
+
+
+@pytest.mark.parametrize("per_node", [False, True])
+def test_which_processes_prepare_the_data(data, per_node):
+    assert data().prepare_data_per_node is False
+    assert data(prepare_data_per_node=per_node).prepare_data_per_node is per_node
+
+
+def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_points):
+    data()
+    file = str(tmp_path / "scans/0000000000.bin")
+    with pytest.raises(ValueError, match="features_dir is needed"):
+        LidarDataModule(file, sensor=sensor, extractor=scaled_points())
+    module = LidarDataModule(
+        file,
+        sensor,
+        val_every=None,
+        extractor=scaled_points(),
+        features_dir=str(tmp_path / "g"),
+        grid_size=(2, 4),
+    )
+    module.prepare_data()
+    module.setup("fit")
+    assert module.train_set[0]["feature_grid"].shape == (8, 4)
+
+
+def test_replaced_scan_is_named_in_training(tmp_path, data, scaled_points):
+    module = data(extractor=scaled_points())
+    module.prepare_data()
+    module.setup("fit")
+    path = tmp_path / "scans/0000000004.bin"
+    path.write_bytes(path.read_bytes()[:-16])
+    with pytest.raises(FeatureGridError, match=r"0000000004\.bin has 4784 bytes.*replaced"):
+        [module.all_set[index] for index in range(11)]
 
 
 @pytest.mark.parametrize(
@@ -224,6 +309,11 @@ def test_other_rings_than_those_of_the_checkpoint_are_refused(data):
 def test_bad_arguments(data, options, message):
     with pytest.raises(ValueError, match=message):
         data(**options)
+
+
+def test_one_simulated_scan_cannot_be_split(tmp_path):
+    with pytest.raises(ValueError, match=r"num_scans must be at least 2, .* got 1"):
+        SimulatedDataModule(str(tmp_path), num_scans=1)
 
 
 def test_a_batch_larger_than_the_data_is_refused(data):

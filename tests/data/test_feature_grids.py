@@ -1,6 +1,9 @@
 import json
 import pickle
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import numpy as np
 import pytest
@@ -11,6 +14,11 @@ from r3dpa.data.scans import ScanError, find_scans, read_scan
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
 GRID = (2, 4)
+FILES = ("a/grids.npy", "a/index.json", "town/b/grids.npy", "town/b/index.json")
+
+
+def read(grids, scan):
+    return grids.read(scan, scan.path.stat().st_size)
 
 
 @pytest.fixture
@@ -39,7 +47,7 @@ def test_grid_is_the_cell_mean_in_half_precision(made, projection, scaled_points
     for scan in scans:
         points = torch.from_numpy(read_scan(scan.path))
         expected, counts = pool_cells(points[:, :3], points, projection, GRID)
-        grid = grids.read(scan)
+        grid = read(grids, scan)
         assert grid.dtype == torch.float32
         assert torch.equal(grid, expected.half().float())
         assert counts.sum() == len(points)
@@ -61,7 +69,7 @@ def test_workers_give_the_same_files(tmp_path, made, projection, scaled_points, 
     )
     assert count == 5
     assert calls == [(i, 5) for i in range(1, 6)]
-    for name in ("a/grids.npy", "a/index.json", "town/b/grids.npy", "town/b/index.json"):
+    for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (root / name).read_bytes()
 
 
@@ -100,7 +108,7 @@ def test_other_sensor_is_refused(made, scaled_points):
 
 def test_other_projection_is_refused(made, sensor, scaled_points):
     rings = RingProjection(sensor, tuple(float(-row) for row in range(8)))
-    refused(made, rings, GRID, scaled_points(), ["SphericalProjection", "RingProjection"])
+    refused(made, rings, GRID, scaled_points(), ["'spherical'", "'rings'"])
 
 
 def test_other_grid_size_is_refused(made, projection, scaled_points):
@@ -142,32 +150,114 @@ def test_new_scans_are_added_and_old_grids_kept(
     points = torch.from_numpy(read_scan(scan.path))
     expected, _ = pool_cells(points[:, :3], points, projection, GRID)
     grids = FeatureGrids(root, find_scans(folder), projection, GRID)
-    assert torch.equal(grids.read(scan), expected.half().float())
+    assert torch.equal(read(grids, scan), expected.half().float())
 
 
 def test_replaced_scan_is_noticed(made, projection, scaled_points):
     scans, root = made
-    data = scans[0].path.read_bytes()
-    scans[0].path.write_bytes(data[:-16])
-    with pytest.raises(FeatureGridError, match=re.escape(str(scans[0].path)) + ".*replaced"):
-        FeatureGrids(root, scans, projection, GRID)
+    before = [read(FeatureGrids(root, scans, projection, GRID), scan) for scan in scans]
+    scans[1].path.write_bytes(scans[3].path.read_bytes()[:-16])
+    with pytest.raises(FeatureGridError, match=re.escape(str(scans[1].path)) + ".*replaced"):
+        read(FeatureGrids(root, scans, projection, GRID), scans[1])
     assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
-    FeatureGrids(root, scans, projection, GRID)
+    grids = FeatureGrids(root, scans, projection, GRID)
+    same = [torch.equal(read(grids, scan), old) for scan, old in zip(scans, before, strict=True)]
+    assert same == [True, False, True, True, True]
 
 
-def test_interrupted_drive_is_not_readable_and_is_done_again(
-    tmp_path, folder, projection, scaled_points
-):
-    scans, root = find_scans(folder), tmp_path / "grids"
-    with pytest.raises(RuntimeError, match="interrupted"):
-        write_feature_grids(scans, scaled_points(fail_after=4), projection, GRID, root)
-    FeatureGrids(root, scans[:3], projection, GRID)  # drive a was complete
+@pytest.mark.parametrize(("workers", "error"), [(0, RuntimeError), (0, ScanError), (2, ScanError)])
+def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points, workers, error):
+    """At the last of five scans, an interruption or a damaged file."""
+    (scans, complete), root = made, tmp_path / "again"
+    extractor, data = scaled_points(), scans[4].path.read_bytes()
+    if error is RuntimeError:
+        extractor.fail_after = 4
+    else:
+        scans[4].path.write_bytes(data[:-3])
+    with pytest.raises(error):
+        write_feature_grids(scans, extractor, projection, GRID, root, workers=workers)
+    FeatureGrids(root, scans[:4], projection, GRID)
     with pytest.raises(FeatureGridError, match="No feature grid"):
         FeatureGrids(root, scans, projection, GRID)
-    extractor = scaled_points()
-    assert write_feature_grids(scans, extractor, projection, GRID, root) == 2
+    scans[4].path.write_bytes(data)
+    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
+    for name in FILES:
+        assert (root / name).read_bytes() == (complete / name).read_bytes()
+
+
+def test_a_killed_writer_leaves_nothing_that_counts(folder, made, projection, scaled_points):
+    """Killed with a row half written: rows that the index does not name are made again."""
+    scans, root = made
+    whole = (root / "a/grids.npy").read_bytes()
+    index = json.loads((root / "a/index.json").read_text())
+    del index["scans"]["0000000002"]
+    (root / "a/index.json").write_text(json.dumps(index))
+    (root / "a/grids.npy").write_bytes(whole[:-30])
+    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
+    assert (root / "a/grids.npy").read_bytes() == whole
+
+
+def test_two_writers_at_once_make_each_grid_once(tmp_path, made, projection, scaled_points):
+    (scans, complete), root = made, tmp_path / "again"
+    started = Event()
+
+    class Slow(scaled_points):
+        def forward(self, points):
+            started.set()
+            time.sleep(0.05)
+            return super().forward(points)
+
+    def write(extractor):
+        return write_feature_grids(scans, extractor, projection, GRID, root)
+
+    with ThreadPoolExecutor() as pool:
+        first = pool.submit(write, Slow())
+        started.wait()
+        second = pool.submit(write, scaled_points())
+        assert (first.result(), second.result()) == (5, 0)
+    for name in FILES:
+        assert (root / name).read_bytes() == (complete / name).read_bytes()
+
+
+def test_drives_within_drives(tmp_path, make_scans, projection, scaled_points):
+    make_scans(tmp_path / "s/seq", 2)
+    make_scans(tmp_path / "s/seq/extra", 2, seed=1)
+    scans = find_scans(tmp_path / "s")
+    assert [scan.drive for scan in scans] == ["seq", "seq", "seq/extra", "seq/extra"]
+    root = tmp_path / "grids"
+    assert write_feature_grids(scans[2:], scaled_points(), projection, GRID, root) == 2
+    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 2
     FeatureGrids(root, scans, projection, GRID)
-    assert sorted(p.name for p in (root / "town").iterdir()) == ["b"]
+
+
+def test_a_disk_without_space_is_refused_before_the_first_grid(
+    tmp_path, made, projection, scaled_points, monkeypatch
+):
+    scans, _ = made
+    extractor = scaled_points()
+    extractor.dim = 10**14
+    # 5 grids of 2 x 4 cells, 1e14 wide, 2 bytes each.
+    with pytest.raises(FeatureGridError, match=r"5 feature grids need 8000000\.0 GB, but .* free"):
+        write_feature_grids(scans, extractor, projection, GRID, tmp_path / "again")
+    assert extractor.calls == 0
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path, made, projection, scaled_points):
+    scans, complete = made
+    (tmp_path / "file").touch()
+    with pytest.raises(FeatureGridError, match=r"file/grids .*give a features_dir"):
+        write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "file/grids")
+    (complete / ".lock").unlink()
+    assert write_feature_grids(scans, scaled_points(), projection, GRID, complete) == 0
+    assert not (complete / ".lock").exists()  # complete grids may lie on a read-only disk
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"settings": 3, "scans": {}}'])
+def test_a_damaged_index_is_named(made, projection, scaled_points, text):
+    scans, root = made
+    (root / "a/index.json").write_text(text)
+    with pytest.raises(FeatureGridError, match=r"a/index\.json is damaged"):
+        FeatureGrids(root, scans, projection, GRID)
 
 
 def test_bad_scan_and_bad_features_name_the_file(tmp_path, folder, projection, scaled_points):
@@ -176,6 +266,7 @@ def test_bad_scan_and_bad_features_name_the_file(tmp_path, folder, projection, s
         write_feature_grids(
             scans, scaled_points(gain=float("nan")), projection, GRID, tmp_path / "nan"
         )
+    assert write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "nan") == 5
     scans[1].path.write_bytes(b"123")
     with pytest.raises(ScanError, match=r"a/0000000001\.bin"):
         write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "g", workers=1)
@@ -185,22 +276,22 @@ def test_large_features_stay_finite(tmp_path, folder, projection, scaled_points)
     scans = find_scans(folder)
     write_feature_grids(scans, scaled_points(gain=1e6), projection, GRID, tmp_path / "g")
     grids = FeatureGrids(tmp_path / "g", scans, projection, GRID)
-    assert all(torch.isfinite(grids.read(scan)).all() for scan in scans)
+    assert all(torch.isfinite(read(grids, scan)).all() for scan in scans)
 
 
 def test_grids_travel_to_other_processes_without_their_maps(made, projection):
     scans, root = made
     grids = FeatureGrids(root, scans, projection, GRID)
-    expected = grids.read(scans[0])
+    expected = read(grids, scans[0])
     data = pickle.dumps(grids)
     assert len(data) < 10_000
     copy = pickle.loads(data)  # noqa: S301 - made two lines above
-    assert torch.equal(copy.read(scans[0]), expected)
+    assert torch.equal(read(copy, scans[0]), expected)
     assert json.loads((root / "a/index.json").read_text())["scans"]["0000000000"] == 4800
 
 
 def test_each_grid_belongs_to_its_scan(made, projection):
     scans, root = made
     grids = FeatureGrids(root, scans[::-1], projection, GRID)
-    sums = {scan.name: grids.read(scan).sum().item() for scan in scans}
+    sums = {scan.name: read(grids, scan).sum().item() for scan in scans}
     assert len(set(sums.values())) == 5

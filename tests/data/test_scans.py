@@ -1,6 +1,5 @@
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,6 +98,15 @@ def test_ply_of_other_programs(tmp_path):
     (tmp_path / "b.ply").write_bytes(header.encode() + b"12")
     with pytest.raises(ScanError, match=r"b\.ply: holds 2 bytes for 1 points of 25"):
         read_ply(tmp_path / "b.ply")
+    (tmp_path / "i.ply").write_bytes(
+        header.replace("uchar red", "int label").encode() + struct.pack("<3di", 1, 2, 3, -7)
+    )
+    assert read_ply(tmp_path / "i.ply").tolist() == [[1, 2, 3]]
+    (tmp_path / "l.ply").write_text(header.replace("uchar red", "list uchar int rest"))
+    with pytest.raises(ScanError, match=r"l\.ply: has property list uchar int rest"):
+        read_ply(tmp_path / "l.ply")
+    with pytest.raises(ScanError, match=r"gone\.ply: cannot be read"):
+        read_ply(tmp_path / "gone.ply")
     (tmp_path / "c.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(ScanError, match=r"c\.ply: is not a binary little-endian"):
         read_ply(tmp_path / "c.ply")
@@ -117,6 +125,32 @@ def test_interrupted_write_leaves_the_old_file(tmp_path):
         interrupted_write()
     assert np.array_equal(read_scan(file), POINTS)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_killed_writer_leaves_no_scan(tmp_path, make_scans):
+    """A kill leaves the temporary file, which no search takes for a scan."""
+    raw = tmp_path / "data_3d_raw" / KITTI360_DRIVES["train"][0] / "velodyne_points/data"
+    for folder in (tmp_path / "plain", raw):
+        make_scans(folder, 1)
+        with atomic_path(folder / "0000000001.bin") as temporary:
+            temporary.write_bytes(POINTS.tobytes())
+        temporary.write_bytes(b"half")
+        assert len(list(folder.iterdir())) == 3
+        assert [scan.frame for scan in find_scans(folder)] == ["0000000000", "0000000001"]
+        assert check(folder).ok
+    assert [scan.frame for scan in find_scans(f"{tmp_path}/plain/*")] == [
+        "0000000000",
+        "0000000001",
+    ]
+    assert len(kitti360_scans(tmp_path, "train")) == 2
+
+
+def test_two_writers_of_a_file_have_their_own_temporary_files(tmp_path):
+    with atomic_path(tmp_path / "a.bin") as one, atomic_path(tmp_path / "a.bin") as two:
+        assert one != two
+        one.write_bytes(b"1")
+        two.write_bytes(b"2")
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"1"]
 
 
 def test_writers_refuse_what_no_reader_would_take(tmp_path):
@@ -160,6 +194,34 @@ def test_official_layout(tmp_path, make_scans):
     assert check(tmp_path).num_scans == dict.fromkeys(sorted(drives), 2)
 
 
+def test_other_sensors_of_the_official_tree_are_left_alone(tmp_path, make_scans):
+    drives = KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]
+    make_kitti360(tmp_path, make_scans, drives)
+    for drive in drives:
+        make_scans(tmp_path / "data_3d_raw" / drive / "sick_points/data", 1)
+    make_scans(tmp_path / "data_2d_raw", 1)
+    assert len(find_scans(tmp_path)) == 18
+    assert check(tmp_path).ok
+
+
+def test_links_to_folders_are_followed_once(tmp_path, make_scans):
+    drives = KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]
+    make_kitti360(tmp_path / "disk", make_scans, drives)
+    for drive in drives:
+        (tmp_path / "kitti/data_3d_raw").mkdir(parents=True, exist_ok=True)
+        link = tmp_path / "kitti/data_3d_raw" / drive
+        link.symlink_to(tmp_path / "disk/data_3d_raw" / drive)
+    assert check(tmp_path / "kitti").ok
+    assert len(kitti360_scans(tmp_path / "kitti", "val")) == 4
+    make_scans(tmp_path / "elsewhere", 2)
+    make_scans(tmp_path / "plain/b", 1)
+    (tmp_path / "plain/a").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "plain/b/loop").symlink_to(tmp_path / "plain")
+    (tmp_path / "plain/c").symlink_to(tmp_path / "plain/b")
+    names = ["a/0000000000", "a/0000000001", "b/0000000000"]
+    assert [scan.name for scan in find_scans(tmp_path / "plain")] == names
+
+
 def test_missing_folders_are_named(tmp_path, make_scans):
     assert [str(f) for f in check(tmp_path / "none").missing] == [str(tmp_path / "none")]
     assert check(tmp_path).missing == (tmp_path / "data_3d_raw",)
@@ -174,6 +236,12 @@ def test_missing_folders_are_named(tmp_path, make_scans):
     assert all(str(folder) in str(check(tmp_path)) for folder in missing)
     with pytest.raises(ValueError, match="r3dpa check"):
         kitti360_scans(tmp_path / "none", "train")
+
+
+def test_one_split_may_be_absent(tmp_path, make_scans):
+    make_kitti360(tmp_path, make_scans, KITTI360_DRIVES["val"][:1])
+    assert len(kitti360_scans(tmp_path, "val")) == 2
+    assert kitti360_scans(tmp_path, "train") == []
 
 
 def test_simulated_set_is_held_against_its_manifest(tmp_path, make_scans):
@@ -196,6 +264,7 @@ def test_simulated_set_is_held_against_its_manifest(tmp_path, make_scans):
 
 def test_plain_folder_needs_no_layout(tmp_path, make_scans):
     make_scans(tmp_path / "a", 3)
+    (tmp_path / "calibration").mkdir()
     report = check(tmp_path)
     assert report.ok
     assert report.num_scans == {"a": 3}
@@ -203,11 +272,8 @@ def test_plain_folder_needs_no_layout(tmp_path, make_scans):
 
 
 @pytest.mark.data
-def test_real_scans():
-    folder = Path("/work/shared/data/real_scans")
-    if not folder.is_dir():
-        pytest.skip("the real scans are not on this machine")
-    report = check(folder)
+def test_real_scans(real_scans_dir):
+    report = check(real_scans_dir)
     assert report.ok
     assert report.num_scans == {
         "kitti_object_vis/velodyne": 3,

@@ -31,7 +31,7 @@ def simulate(
         scans: Number of scans over all drives.
         seed: Seed of streets and instrument.
         workers: Processes; the bytes written do not depend on it.
-        drives: Four-digit drives to fill; all official ones where not given.
+        drives: Four-digit drives to fill, such as '["0003"]'; all official ones where not given.
     """
     from r3dpa.simulation import simulate as write
 

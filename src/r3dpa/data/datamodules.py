@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from glob import has_magic
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -19,11 +18,12 @@ from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
     default_features_dir,
+    grid_bytes,
     stored_feature_dim,
     write_feature_grids,
 )
 from r3dpa.data.loaders import training_loader
-from r3dpa.data.scans import KITTI360_DRIVES, Scan, find_scans, kitti360_scans, read_scan
+from r3dpa.data.scans import Scan, find_scans, kitti360_scans, read_scan
 from r3dpa.geometry import (
     LidarSensor,
     Projection,
@@ -38,6 +38,10 @@ _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
 _SCALR_DIM = 768  # width of the published feature grids
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
+_EMPTY_SPLIT = (
+    "all scans are of the other split. Look at val_every and val_drives, or, in the KITTI-360 "
+    "layout, for missing drives with `r3dpa check`."
+)
 
 
 class LidarDataModule(LightningDataModule):
@@ -45,8 +49,7 @@ class LidarDataModule(LightningDataModule):
 
     Validation and test use the held-out scans, prediction all scans in order. No augmentation.
     The order of training scans depends on ``seed`` and the epoch alone; a resumed run goes on
-    with the very next batch. On several nodes that share a disk, set ``prepare_data_per_node`` to
-    False, so that one process prepares the data.
+    with the very next batch.
 
     Args:
         scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
@@ -54,7 +57,7 @@ class LidarDataModule(LightningDataModule):
         projection: ``"spherical"``: rows of equal pitch; ``"rings"``: one row per laser, for scans
             stored ring after ring.
         ring_inclinations_deg: Inclination of each row for ``"rings"``, degrees above the horizon;
-            measured in the first training scans if None.
+            measured in the first training scans if None, whatever ``limit``.
         codec: Metres to [-1, 1].
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
@@ -69,6 +72,8 @@ class LidarDataModule(LightningDataModule):
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
         limit: Use this many scans of each split at most, spread evenly over it.
+        prepare_data_per_node: Whether one process of each node prepares the data, as node-local
+            disks need; by default one process of all does, for a disk that the nodes share.
 
     Attributes:
         feature_dim: Width D of the feature grids; 768, that of ScaLR, where none are used.
@@ -94,8 +99,10 @@ class LidarDataModule(LightningDataModule):
         val_every: int | None = 10,
         val_drives: list[str] | None = None,
         limit: int | None = None,
+        prepare_data_per_node: bool = False,
     ) -> None:
         super().__init__()
+        self.prepare_data_per_node = prepare_data_per_node
         if projection not in ("spherical", "rings"):
             raise ValueError(f"projection must be 'spherical' or 'rings', got {projection!r}.")
         for name, value, least in (
@@ -142,7 +149,7 @@ class LidarDataModule(LightningDataModule):
         return ScanGeometry(self.projection, self.codec, self.grid_size)
 
     def split(self) -> tuple[list[Scan], list[Scan]]:
-        """Training scans and held-out scans, each sorted, before ``limit`` is applied.
+        """Training scans and held-out scans, each sorted, before ``limit``; not both empty.
 
         Raises:
             ValueError: If there are no scans, or a name in ``val_drives`` is none of theirs.
@@ -160,21 +167,30 @@ class LidarDataModule(LightningDataModule):
         return [scan for scan in scans if scan not in held_out], sorted(held_out)
 
     def prepare_data(self) -> None:
-        """Make the feature grids that are missing, if there is an extractor."""
-        if self.extractor is None or self.features_dir is None:
+        """Make the feature grids that are missing, if there is an extractor; none to predict."""
+        predicting = self.trainer is not None and self.trainer.predicting
+        if self.extractor is None or self.features_dir is None or predicting:
             return
-        train, val = self._limited_split()
-        tensors = (*self.extractor.parameters(), *self.extractor.buffers())
-        on_gpu = any(tensor.is_cuda for tensor in tensors)
-        write_feature_grids(
+        train, val, projection = self._scans_and_projection()
+        extractor = cast(Extractor, self.extractor.eval())
+        gigabytes = grid_bytes(self.grid_size, extractor.dim) / 1e9
+
+        def log(done: int, total: int) -> None:
+            if done == 1 or done * 20 // total > (done - 1) * 20 // total:
+                size = f"{done * gigabytes:.3g} of {total * gigabytes:.3g} GB"
+                rank_zero_info(f"feature grids: {done} of {total}, {size}")
+
+        num_made = write_feature_grids(
             train + val,
-            cast(Extractor, self.extractor.eval()),
-            self._make_projection(train),
+            extractor,
+            projection,
             self.grid_size,
             self.features_dir,
-            workers=0 if on_gpu else self.num_workers,
-            progress=_log_progress,
+            workers=self.num_workers,
+            progress=log,
         )
+        num_kept = len(train) + len(val) - num_made
+        rank_zero_info(f"feature grids: {num_made} made, {num_kept} kept, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
         """Index the scans and open the feature grids.
@@ -182,8 +198,7 @@ class LidarDataModule(LightningDataModule):
         Args:
             stage: ``"fit"``, ``"validate"``, ``"test"``, or ``"predict"``, which needs no grids.
         """
-        train, val = self._limited_split()
-        self.projection: Projection = self._make_projection(train)
+        train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
             extractor = cast(Extractor | None, self.extractor)
@@ -197,6 +212,8 @@ class LidarDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
         dataset = _ready(self.train_set)
+        if not len(dataset):
+            raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self._ordered_loader(dataset)
         num_replicas, rank = self._place()
@@ -212,9 +229,13 @@ class LidarDataModule(LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
-        """Held-out scans in order, none twice; no loader where nothing is held out."""
+        """Held-out scans in order, none twice; no loader in a fit where nothing is held out."""
         dataset = _ready(self.val_set)
-        return self._ordered_loader(dataset) if len(dataset) else []
+        if len(dataset):
+            return self._ordered_loader(dataset)
+        if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
+            raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
+        return []
 
     def test_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """The same as for validation."""
@@ -224,51 +245,35 @@ class LidarDataModule(LightningDataModule):
         """All scans in order, none twice."""
         return self._ordered_loader(_ready(self.all_set))
 
-    def state_dict(self) -> dict[str, Any]:
-        """Projection of the images, without which they cannot be turned into points."""
-        rings = getattr(self.projection, "ring_inclinations_deg", None)
-        return {"projection": self.projection_kind, "ring_inclinations_deg": rings}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Check that the rows of the images are those of the checkpoint.
-
-        Raises:
-            ValueError: If the projection or its ring inclinations are others.
-        """
-        if state_dict != self.state_dict():
-            raise ValueError(
-                f"The checkpoint was trained with {state_dict}, this run has {self.state_dict()}: "
-                "set projection and ring_inclinations_deg to those of the checkpoint."
-            )
-
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
         if features_dir is not None:
             return Path(features_dir)
         if self.extractor is None:
             return None
-        if not isinstance(self.scans, str) or has_magic(self.scans):
+        scans = self.scans
+        if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
             raise ValueError(
                 f"features_dir is needed for scans given as {self.scans!r}: only a single folder "
                 "has a default place for its feature grids."
             )
-        return default_features_dir(
-            self.scans, cast(Extractor, self.extractor).name, self.grid_size
-        )
+        return default_features_dir(scans, cast(Extractor, self.extractor).name, self.grid_size)
 
-    def _limited_split(self) -> tuple[list[Scan], list[Scan]]:
+    def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
+        """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
-        return _spread(train, self.limit), _spread(val, self.limit)
+        projection = self._make_projection(train or val)
+        return _spread(train, self.limit), _spread(val, self.limit), projection
 
-    def _make_projection(self, train: Sequence[Scan]) -> Projection:
+    def _make_projection(self, scans: list[Scan]) -> Projection:
         if self.projection_kind == "spherical":
             return SphericalProjection(self.sensor)
         if self.ring_inclinations_deg is not None:
             return RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
-        scans = (
+        points = (
             torch.from_numpy(read_scan(scan.path, self.sensor)[:, :3])
-            for scan in train[:_SCANS_TO_FIT]
+            for scan in scans[:_SCANS_TO_FIT]
         )
-        return RingProjection.fit(scans, self.sensor)
+        return RingProjection.fit(points, self.sensor)
 
     def _place(self) -> tuple[int, int]:
         """Number of processes and which of them this is."""
@@ -306,9 +311,8 @@ class KITTI360DataModule(LidarDataModule):
     """
 
     def __init__(self, root: str, **kwargs: Any) -> None:
-        super().__init__(
-            scans=root, val_every=None, val_drives=list(KITTI360_DRIVES["val"]), **kwargs
-        )
+        # Given here, they are no options of the YAML: the split is fixed.
+        super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
         self.root = root
 
     def split(self) -> tuple[list[Scan], list[Scan]]:
@@ -321,15 +325,20 @@ class SimulatedDataModule(KITTI360DataModule):
 
     Args:
         root: Folder of the data set; filled where it is not complete.
-        num_scans: Scans to simulate, over all drives.
+        num_scans: Scans to simulate, over all drives; 2 or more, a fifth of them held out.
         simulation_seed: Seed of the streets.
         kwargs: Arguments of :class:`LidarDataModule`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
     """
 
     def __init__(
         self, root: str, num_scans: int = 1000, simulation_seed: int = 0, **kwargs: Any
     ) -> None:
         super().__init__(root, **kwargs)
+        if num_scans < 2:
+            raise ValueError(f"num_scans must be at least 2, one of them held out, got {num_scans}")
         self.num_scans = num_scans
         self.simulation_seed = simulation_seed
 
@@ -354,8 +363,3 @@ def _spread(scans: list[Scan], limit: int | None) -> list[Scan]:
     if limit is None or limit >= len(scans):
         return scans
     return [scans[i * len(scans) // limit] for i in range(limit)]
-
-
-def _log_progress(done: int, total: int) -> None:
-    if done == 1 or done == total or done * 100 // total > (done - 1) * 100 // total:
-        rank_zero_info(f"feature grids: {done} of {total}")

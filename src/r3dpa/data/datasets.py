@@ -86,5 +86,5 @@ class LidarDataset(Dataset[LidarSample]):
             name=scan.name,
         )
         if self.grids is not None:
-            sample["feature_grid"] = self.grids.read(scan)
+            sample["feature_grid"] = self.grids.read(scan, points.nbytes)
         return sample

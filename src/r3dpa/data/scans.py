@@ -2,41 +2,49 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from r3dpa.atomic import atomic_path
 from r3dpa.geometry import LidarSensor, in_range
-from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, split_scans
+from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 
 Split = Literal["train", "val"]
 #: Drives of KITTI-360 by split, as in R2DM and RangeLDM (LiDAR-Diffusion validates on drive 3).
 KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
-    "train": tuple(f"2013_05_28_drive_{number}_sync" for number in TRAIN_DRIVES),
-    "val": tuple(f"2013_05_28_drive_{number}_sync" for number in VAL_DRIVES),
+    "train": tuple(drive_name(number) for number in TRAIN_DRIVES),
+    "val": tuple(drive_name(number) for number in VAL_DRIVES),
 }
-_MANIFEST = "simulation.json"  # in the root of a simulated data set
 _RAW = "data_3d_raw"
 _VELODYNE = Path("velodyne_points") / "data"
-_KITTI360_FOLDERS = (_RAW, "data_2d_raw", "data_poses", "calibration", _MANIFEST)
 _BYTES_PER_POINT = 16
-_PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1"}
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
 
 
 class ScanError(ValueError):
     """A scan file that cannot be used; the message names the file and the reason."""
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Scan:
     """One sensor sweep in a file.
 
@@ -59,6 +67,8 @@ class Scan:
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
+    Of a data set in the KITTI-360 layout (a folder that holds ``data_3d_raw``), the Velodyne scans
+    alone. Links to folders are followed; hidden files, among them unfinished ones, are left out.
     The drive of a scan is its folder relative to the root: the given folder itself, or the
     common parent of the files where a glob or a list is given. The fixed folders of the
     KITTI-360 layout are left out of the name.
@@ -92,20 +102,20 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
         split: ``"train"`` or ``"val"``, see :data:`KITTI360_DRIVES`.
 
     Raises:
-        ValueError: If no scan of the split exists.
+        ValueError: If there is no scan of the split, and none of the other one either.
     """
-    scans = [
-        Scan(drive, file.stem, file)
-        for drive in KITTI360_DRIVES[split]
-        for file in sorted((Path(root).absolute() / _RAW / drive / _VELODYNE).glob("*.bin"))
-    ]
-    if not scans:
+    raw = Path(root).absolute() / _RAW
+    scans = {
+        part: [Scan(name, file.stem, file) for name in drives for file in _drive_files(raw / name)]
+        for part, drives in KITTI360_DRIVES.items()
+    }
+    if not any(scans.values()):
         raise ValueError(
-            f"No scan of the {split} split in {root}: expected {_RAW}/<drive>/{_VELODYNE}/*.bin "
-            f"for a drive of {', '.join(KITTI360_DRIVES[split])}. `r3dpa check {root}` names what "
-            "is missing; use LidarDataModule for scans in other folders."
+            f"No scan of the {split} split in {root}, nor of the other one: expected {_RAW}/<drive>"
+            f"/{_VELODYNE}/*.bin for a drive of {', '.join(KITTI360_DRIVES[split])}. `r3dpa check "
+            f"{root}` names what is missing; use LidarDataModule for scans in other folders."
         )
-    return sorted(scans)
+    return sorted(scans[split])
 
 
 def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray:
@@ -123,10 +133,7 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
             infinite values, or has no point in range; the message names the file.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ScanError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = _read_bytes(path)
     if not data:
         raise ScanError(f"{path}: is empty")
     if len(data) % _BYTES_PER_POINT:
@@ -185,10 +192,11 @@ def read_ply(path: str | Path) -> np.ndarray:
         ``(P, 3)`` float32 x, y, z in metres, or ``(P, 4)`` where the file has an intensity.
 
     Raises:
-        ScanError: If the file has another format or lacks x, y or z.
+        ScanError: If the file is unreadable, has another format, or lacks x, y or z; the message
+            names the file.
     """
     path = Path(path)
-    head, separator, body = path.read_bytes().partition(b"end_header\n")
+    head, separator, body = _read_bytes(path).partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").split("\n")
     if not separator or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise ScanError(f"{path}: is not a binary little-endian .ply file")
@@ -198,9 +206,11 @@ def read_ply(path: str | Path) -> np.ndarray:
     if len(elements) != 1 or elements[0][1] != "vertex":
         raise ScanError(f"{path}: holds other elements than vertex; export the points alone")
     unknown = [" ".join(word) for word in properties if word[1] not in _PLY_TYPES]
-    names = [word[2] for word in properties if word[1] in _PLY_TYPES]
-    if unknown or not {"x", "y", "z"} <= set(names):
-        raise ScanError(f"{path}: needs float properties x, y, z; found {names + unknown}")
+    if unknown:
+        raise ScanError(f"{path}: has {', '.join(unknown)}, but only single numbers can be read")
+    names = [word[2] for word in properties]
+    if not {"x", "y", "z"} <= set(names):
+        raise ScanError(f"{path}: needs properties x, y and z; found {', '.join(names)}")
     layout = np.dtype([(word[2], _PLY_TYPES[word[1]]) for word in properties])
     count = int(elements[0][2])
     if len(body) != count * layout.itemsize:
@@ -265,15 +275,17 @@ class CheckReport:
         return "\n".join([*lines, summary + problems])
 
 
-def check(path: str | Path, sensor: LidarSensor | None = None) -> CheckReport:
+def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
     """Read every scan of a data set or folder and report all that is wrong with it.
 
-    A folder with a KITTI-360 sub-folder, or without any scan, is held against the KITTI-360
-    layout with its nine LiDAR drives; a simulated one against the scans that its manifest asks for.
+    A folder with ``data_3d_raw``, or without any scan, is held against the KITTI-360 layout with
+    its nine LiDAR drives; a simulated one against the scans that its manifest asks for. A terminal
+    shows the progress.
 
     Args:
         path: Root of a data set, or any folder or file of scans.
         sensor: Every scan must have a point within its range limits; default sensor if None.
+        workers: Threads that read.
 
     Raises:
         ValueError: If the manifest of a simulated data set cannot be understood.
@@ -282,17 +294,18 @@ def check(path: str | Path, sensor: LidarSensor | None = None) -> CheckReport:
     sensor = sensor or LidarSensor()
     scans = find_scans(root) if any(_files(root)) else []
     counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
-    bad: list[tuple[Path, str]] = []
-    missing: list[Path] = []
-    if not root.exists():
-        missing.append(root)
-    elif not scans or any((root / name).exists() for name in _KITTI360_FOLDERS):
-        missing, bad = _compare_layout(root, counts)
-    for scan in scans:
+    missing, bad = _compare_layout(root, counts)
+
+    def reason(scan: Scan) -> str | None:
         try:
             read_scan(scan.path, sensor)
         except ScanError as error:
-            bad.append((scan.path, str(error).removeprefix(f"{scan.path}: ")))
+            return str(error).removeprefix(f"{scan.path}: ")
+        return None
+
+    with ThreadPool(workers) as pool:
+        reasons = tqdm(pool.imap(reason, scans), total=len(scans), unit="scan", disable=None)
+        bad += [(s.path, why) for s, why in zip(scans, reasons, strict=True) if why is not None]
     return CheckReport(root, counts, tuple(bad), tuple(missing))
 
 
@@ -300,47 +313,62 @@ def _compare_layout(
     root: Path, counts: dict[str, int]
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Folders that a data set lacks, and drives that lack scans, with the reason."""
-    if not (root / _RAW).is_dir():
-        return [root / _RAW], []
+    raw, simulated = root / _RAW, expected_scans(root)
+    if not root.exists():
+        return [root], []
+    if not raw.is_dir():
+        return ([] if counts and simulated is None else [raw]), []
     missing, incomplete = [], []
-    for drive, expected in _expected_counts(root).items():
-        folder = root / _RAW / drive
+    official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
+    for drive, expected in sorted((simulated or official).items()):
+        folder, count = raw / drive, counts.get(drive, 0)
         if not folder.is_dir():
             missing.append(folder)
-        elif drive not in counts:
+        elif not count:
             missing.append(folder / _VELODYNE)
-        elif expected is not None and counts[drive] < expected:
-            reason = f"holds {counts[drive]} of {expected} scans; simulate again to complete it"
+        elif count < expected:
+            reason = f"holds {count} of {expected} scans; simulate again to complete it"
             incomplete.append((folder, reason))
     return missing, incomplete
 
 
-def _expected_counts(root: Path) -> dict[str, int | None]:
-    """Drives that a data set must have, with their number of scans where it is known."""
-    manifest = root / _MANIFEST
-    if not manifest.is_file():
-        return dict.fromkeys(sorted(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"]))
-    try:
-        request = json.loads(manifest.read_text())
-        counts = split_scans(request["scans"], request["drives"])
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{manifest} does not say which scans were simulated ({error!r}); simulate the data "
-            "set again into an empty folder."
-        ) from error
-    return {f"2013_05_28_drive_{number}_sync": count for number, count in sorted(counts.items())}
-
-
 def _files(entry: str | Path) -> Iterator[Path]:
     path = Path(entry)
-    if path.is_dir():
-        yield from path.rglob("*.bin")
+    if (path / _RAW).is_dir():
+        for drive in (path / _RAW).iterdir():
+            yield from _drive_files(drive)
+    elif path.is_dir():
+        seen = set()
+        for folder, below, names in os.walk(path, followlinks=True):
+            real = os.path.realpath(folder)
+            if real in seen:
+                below.clear()
+            else:
+                below.sort()  # of a folder and a link to it, the same one on every machine
+                seen.add(real)
+                yield from filter(_is_scan, (Path(folder, name) for name in names))
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):
         root = Path(path.absolute().anchor)
-        found = root.glob(str(path.absolute().relative_to(root)))
-        yield from (file for file in found if file.suffix == ".bin")
+        yield from filter(_is_scan, root.glob(str(path.absolute().relative_to(root))))
+
+
+def _drive_files(drive: Path) -> Iterator[Path]:
+    """Scans of a drive in the KITTI-360 layout."""
+    return filter(_is_scan, (drive / _VELODYNE).glob("*"))
+
+
+def _is_scan(file: Path) -> bool:
+    """Whether a file is a scan; the hidden ones are of writers that have not finished."""
+    return file.suffix == ".bin" and not file.name.startswith(".")
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ScanError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def _common_parent(files: list[Path]) -> Path:

@@ -58,6 +58,14 @@ class SimulationReport:
     num_written: int
     ms_per_scan: float
 
+    def __str__(self) -> str:
+        """One line per drive and one with the totals."""
+        lines = [f"drive {drive}: {count} scans" for drive, count in self.scans_per_drive.items()]
+        written = f"{self.num_written} written"
+        if self.num_written:
+            written += f", {self.ms_per_scan:.0f} ms each"
+        return "\n".join([*lines, f"{sum(self.scans_per_drive.values())} scans, {written}"])
+
 
 def simulate(
     out: Path,
