@@ -160,7 +160,9 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_ch
     A sum in another order changes a float32 gradient by about 1e-7 of its terms. AdamW divides by
     the gradient's own size, so where the true gradient is zero (biases in front of a group norm of
     one channel) it would turn that rounding into a full step; eps = 1e-3 keeps such steps at
-    lr * 1e-7 / 1e-3. With lr = 1e-2, three steps of about 1e-2 must then agree to 1e-5.
+    lr * 1e-7 / 1e-3. The leaky ReLUs of the discriminator have kinks: where rounding moves a value
+    over one, a gradient moves by more (1.2e-5 of weight seen). Steps of about lr = 1e-2 must thus
+    agree to 1e-4; batch norm over the own process alone would differ by more than 1e-3.
     """
     runs = {"one": (1, "2", "auto"), "two": (2, "1", "ddp")}
     contents = {}
@@ -173,7 +175,7 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_ch
         subprocess.run(command, check=True, timeout=300, capture_output=True)
         contents[name] = load(tmp_path / name)["state_dict"]
     for key, value in contents["one"].items():
-        torch.testing.assert_close(contents["two"][key], value, atol=1e-5, rtol=1e-5, msg=key)
+        torch.testing.assert_close(contents["two"][key], value, atol=1e-4, rtol=1e-5, msg=key)
 
 
 @pytest.mark.parametrize("command", ["validate", "test", "predict"])
