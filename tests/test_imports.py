@@ -44,7 +44,9 @@ def violations(source: str, area: str) -> set[str]:
     return found - ALLOWED[area] - {area, "atomic", "__version__"}
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=str)
+@pytest.mark.parametrize(
+    "path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE))
+)
 def test_area_imports_only_what_it_may(path):
     area = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     if area != "__init__":

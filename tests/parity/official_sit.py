@@ -10,10 +10,10 @@ def our_name(official: str) -> str:
     return official.replace("projectors.0.", "projector.")
 
 
-def build_sit(case, **options):
-    config = case.config
+def sit_of(config, **options):
+    """Our network of the size that ``cases.json`` gives."""
     (feature_dim,) = config["z_dims"]
-    sit = SiT(
+    return SiT(
         input_size=tuple(config["input_size"]),
         in_channels=config["in_channels"],
         patch_size=config["patch_size"],
@@ -28,6 +28,10 @@ def build_sit(case, **options):
         qk_norm=config["qk_norm"],
         **options,
     )
+
+
+def build_sit(case, **options):
+    sit = sit_of(case.config, **options)
     weights = case.weights().items()
     sit.load_state_dict({our_name(k): v for k, v in weights if not k.startswith("bn.")})
     return sit

@@ -7,6 +7,7 @@ import math
 import lightning as L
 import pytest
 import torch
+from official_sit import our_name, sit_of
 from torch.utils.data import DataLoader
 
 from r3dpa import losses
@@ -14,7 +15,7 @@ from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import JointAlignment, LossWeights, OptimizerConfig
 from r3dpa.modules.base import PathDraws
-from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator
 
 
 class RecordedData(LidarDataModule):
@@ -96,7 +97,7 @@ def ours(official: str) -> str:
     network, _, key = official.partition(".")
     prefix = "ema." if network == "ema" else ""
     if network in ("sit", "ema"):
-        key = key.replace("projectors.0.", "projector.")
+        key = our_name(key)
         if key.startswith("bn."):
             return f"{prefix}latent_norm.{key.removeprefix('bn.')}"
         return f"{prefix}sit.{key}"
@@ -133,21 +134,7 @@ def run(recorded):
             attention_levels=tuple(vae["attn_levels"]),
             legacy_upsample=True,
         ),
-        sit=SiT(
-            input_size=tuple(sit["input_size"]),
-            in_channels=sit["in_channels"],
-            patch_size=sit["patch_size"],
-            hidden_size=sit["hidden_size"],
-            depth=sit["depth"],
-            num_heads=sit["num_heads"],
-            alignment_depth=sit["encoder_depth"],
-            feature_dim=sit["z_dims"][0],
-            projector_dim=sit["projector_dim"],
-            num_classes=sit["num_classes"],
-            class_dropout=sit["class_dropout_prob"] > 0,
-            qk_norm=sit["qk_norm"],
-            learn_pos_embed=True,
-        ),
+        sit=sit_of(sit, learn_pos_embed=True),
         discriminator=PatchDiscriminator(disc["input_nc"], disc["ndf"], disc["n_layers"]),
         weights=LossWeights(
             reconstruction=vae_loss["reconstruction_weight"] / math.exp(vae_loss["logvar_init"]),
