@@ -1,0 +1,43 @@
+"""Every shipped YAML is accepted by the real parser, in the order that README gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from r3dpa.cli import main
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+STAGES = ("vae_alignment", "joint", "flow_matching")
+
+
+def parsed(capsys, *configs):
+    words = [word for config in configs for word in ("--config", str(CONF / f"{config}.yaml"))]
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", *words, "--print_config"])
+    assert ended.value.code == 0
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("data", sorted(path.stem for path in (CONF / "data").iterdir()))
+def test_data_config(data, capsys):
+    config = parsed(capsys, "trainer", f"data/{data}", "experiment/joint")
+    assert config["data"]["init_args"]["extractor"]["class_path"].endswith("GeometricFeatures")
+    assert config["trainer"]["max_steps"] == 1000000
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_demo_of_a_stage(stage, capsys):
+    experiments = (f"experiment/{stage}", f"experiment/{stage}_demo")
+    config = parsed(capsys, "trainer", "trainer_demo", "data/demo", *experiments)
+    sit = config["model"]["init_args"]["sit"]["init_args"]
+    grid = [size // sit["patch_size"] for size in sit["input_size"]]
+    assert config["data"]["init_args"]["grid_size"] == grid
+    assert config["trainer"]["max_steps"] == 400
+
+
+def test_no_experiment_is_left_out():
+    names = {path.stem for path in (CONF / "experiment").iterdir()}
+    assert names == {*STAGES, *(f"{stage}_demo" for stage in STAGES)}
