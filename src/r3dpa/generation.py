@@ -125,12 +125,13 @@ class SceneGenerator:
         generators = [_scene_random(seed, index) for index in indices]
         shape = (self.sit.in_channels, *self.sit.input_size)
 
-        def draw() -> Tensor:
-            noise = [torch.randn(shape, generator=generator) for generator in generators]
-            return torch.stack(noise).to(self.device)
+        def draws() -> Iterator[Tensor]:
+            while True:
+                noise = [torch.randn(shape, generator=generator) for generator in generators]
+                yield torch.stack(noise).to(self.device)
 
-        velocity = CountingVelocity(self._velocity)
-        latents = self._solve(velocity, draw(), iter(draw, None))
+        velocity, noise = CountingVelocity(self._velocity), draws()
+        latents = self._solve(velocity, next(noise), noise)
         with self._autocast():
             image = self.vae.decode(self.latent_norm.denormalise(latents))
         range_m = self.geometry.codec.decode(image[:, 0].float(), self.geometry.projection.sensor)

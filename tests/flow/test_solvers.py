@@ -16,6 +16,14 @@ from r3dpa.flow.solvers import (
 )
 
 
+def still(x, time):
+    return torch.zeros_like(x)
+
+
+def steady(x, time):
+    return torch.ones_like(x)
+
+
 def parabola(x, time):
     return 3 * time.square()[:, None].expand_as(x)
 
@@ -134,14 +142,11 @@ def test_solvers_keep_no_graph():
 
 
 def test_heun_takes_its_second_slope_from_the_corrector():
-    ones = lambda x, time: torch.ones_like(x)  # noqa: E731
-    nothing = lambda x, time: torch.zeros_like(x)  # noqa: E731
-    result = heun(ones, torch.zeros(1, 1), ode_times(2), corrector_velocity=nothing)
+    result = heun(steady, torch.zeros(1, 1), ode_times(2), corrector_velocity=still)
     assert result.item() == -0.5 * 0.5 - 0.5
 
 
 def test_sde_without_noise_follows_its_drift():
-    still = lambda x, time: torch.zeros_like(x)  # noqa: E731
     times = torch.tensor([1.0, 0.6, 0.2, 0.0]).double()
     silence = torch.zeros(2, 1, 1).double()
     start = torch.ones(1, 1).double()
@@ -173,7 +178,6 @@ def test_sde_drift_is_changed_in_every_step_but_the_last():
         seen.append(time.item())
         return drift + 10
 
-    still = lambda x, time: torch.zeros_like(x)  # noqa: E731
     times = torch.tensor([1.0, 0.5, 0.25, 0.0])
     draws = torch.zeros(2, 1, 1)
     result = euler_maruyama(still, torch.zeros(1, 1), times, draws, change_drift=change)

@@ -66,7 +66,6 @@ def transfer_rgb(
     latent_norm: LatentNorm,
     *,
     keep_projector: bool,
-    source: Literal["sit", "ema"] = "sit",
 ) -> TransferReport:
     """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
 
@@ -83,7 +82,6 @@ def transfer_rgb(
         sit: Receives the weights, in place.
         latent_norm: Receives the statistics, in place.
         keep_projector: Also take the projector, as VAE alignment does.
-        source: Network of the checkpoint to take: ``sit``, or ``ema`` for its average.
 
     Returns:
         The fate of every group of weights; fresh ones keep the values they have in ``sit``.
@@ -91,9 +89,7 @@ def transfer_rgb(
     Raises:
         ValueError: If anything beside those groups does not fit; nothing is changed then.
     """
-    rgb = checkpoint.network(source)
-    averaged = source == "ema" and "ema_latent_norm" in checkpoint.networks
-    statistics = checkpoint.network("ema_latent_norm" if averaged else "latent_norm")
+    rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
     theirs = _grouped({**rgb.state_dict, **_prefixed(statistics.state_dict)})
     ours = _grouped({**sit.state_dict(), **_prefixed(latent_norm.state_dict())})
     same_grid = tuple(rgb.arguments["input_size"]) == tuple(sit.input_size)
