@@ -17,6 +17,7 @@ ALLOWED = {
     "simulation": {"geometry"},
     "nn": {"geometry"},
     "viz": {"geometry"},
+    "metrics": {"geometry"},
     "data": {"geometry", "simulation"},
     "checkpoints": {"nn"},
     "generation": {"geometry", "nn", "flow"},
@@ -25,7 +26,8 @@ ALLOWED = {
     "bench": {"geometry", "simulation", "nn", "data", "checkpoints", "modules"},
     "__main__": {"cli"},
     "cli": CORE
-    | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"},
+    | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
+    | {"metrics"},
 }
 
 

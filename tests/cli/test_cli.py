@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +164,109 @@ def simulated(tmp_path):
     return tmp_path
 
 
+class TestSimulate:
+    """One small scan each; what is asked for is recorded in the manifest."""
+
+    CALIBRATION = "lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]"
+
+    @pytest.fixture
+    def simulate(self, tmp_path):
+        """``simulate(*words)``: manifest of a data set of one scan."""
+        calibration = tmp_path / "lasers.yaml"
+        calibration.write_text(self.CALIBRATION)
+        out = tmp_path / "out"
+
+        def run(*words):
+            fixed = ["--out", out, "--scans", 1, "--sensor", calibration]
+            main(["simulate", *map(str, [*fixed, *words])])
+            return json.loads((out / "simulation.json").read_text())
+
+        return run
+
+    def test_prints_what_each_effect_did_and_cost(self, simulate, capsys):
+        simulate("--effects.range_noise", "off")
+        lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+        assert lines["range_noise"].split()[1:4] == ["0", "0", "1"]
+        assert lines["range_noise"].endswith("switched off")
+        assert lines["detection_limit"].split()[1:4] == ["1", "0", "0"]
+        assert lines["dual_return"].split()[1:4] == ["0", "1", "0"]
+        assert lines["total"].endswith("100.0%")
+
+    def test_sensor_and_return_mode(self, simulate):
+        sensor = simulate("--return_mode", "dual")["sensor"]
+        assert sensor["return_mode"] == "dual"
+        assert sensor["lasers"]["inclination_rad"] == [0.02, -0.1]
+
+    def test_weather_by_its_fields(self, simulate):
+        weather = simulate("--weather.visibility_m", 50, "--weather.clear_sky", "false")["weather"]
+        assert (weather["visibility_m"], weather["clear_sky"]) == (50, False)
+        assert weather["rain_mm_h"] == 0
+
+    @pytest.mark.parametrize(
+        "words",
+        [
+            ["--effects.range_noise", "off", "--effects.soft_raydrop=on"],
+            ["--effects", "{range_noise: off, soft_raydrop: on}"],
+        ],
+    )
+    def test_switches_on_the_command_line(self, simulate, words):
+        assert simulate(*words)["effects"] == {"range_noise": "off", "soft_raydrop": "on"}
+
+    def test_switches_in_yaml_and_one_more_on_the_command_line(self, simulate, tmp_path):
+        config = tmp_path / "request.yaml"
+        config.write_text(
+            "seed: 3\ndrives: ['0003']\nweather: {rain_mm_h: 2}\n"
+            "effects: {range_noise: off, soft_raydrop: on, rolling_shutter: auto}\n"
+        )
+        manifest = simulate("--config", config, "--effects.ego_occlusion", "off")
+        assert manifest["effects"] == {
+            **{"ego_occlusion": "off", "range_noise": "off", "soft_raydrop": "on"}
+        }
+        assert (manifest["seed"], manifest["drives"]) == (3, ["0003"])
+        assert manifest["weather"]["rain_mm_h"] == 2
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--effects.fogg", "off"], "there is no effect 'fogg'; there are dual_return, "),
+            (["--effects.range_noise", "of"], "range_noise must be auto, on or off, got 'of'"),
+            (["--sensor", "hdl65e"], "there is no sensor 'hdl65e': give hdl64e, "),
+        ],
+    )
+    def test_wrong_words_are_named(self, simulate, words, message, tmp_path):
+        with pytest.raises(ValueError, match=message):
+            simulate(*words)
+        assert not (tmp_path / "out").exists()
+
+    def test_a_data_module_asks_for_the_same(self, simulate, tmp_path, capsys):
+        config = tmp_path / "data.yaml"
+        config.write_text(
+            "data: {class_path: r3dpa.data.SimulatedDataModule, init_args: {"
+            f"root: {tmp_path / 'data'}, num_scans: 2, simulation_sensor: "
+            f"{tmp_path / 'lasers.yaml'}, effects: {{range_noise: off}}, "
+            "weather: {rain_mm_h: 2}, extractor: r3dpa.nn.backbones.GeometricFeatures}}\n"
+        )
+        words = ["--scans", 2, "--effects.range_noise", "off", "--weather.rain_mm_h", 2]
+        manifest = simulate(*words)
+        main(["features", "--config", str(config)])
+        assert json.loads((tmp_path / "data" / "simulation.json").read_text()) == manifest
+
+    def test_an_interrupt_stops_it_in_one_line_and_the_same_command_goes_on(self, tmp_path):
+        command = [sys.executable, "-m", "r3dpa", "simulate", "--out", tmp_path / "out"]
+        command += ["--scans", "300", "--workers", "2", "--sensor", tmp_path / "lasers.yaml"]
+        (tmp_path / "lasers.yaml").write_text(self.CALIBRATION)
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        while not list(tmp_path.rglob("data/*.bin")) and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+        assert process.returncode == 130
+        out = tmp_path / "out"
+        assert stderr == f"r3dpa simulate: stopped; the same command goes on in {out}\n"
+        assert not list(tmp_path.rglob(".*.partial.*"))
+        assert 0 < len(list(tmp_path.rglob("data/*.bin"))) < 300
+
+
 class TestSimulateAndCheck:
     def test_simulated_scans_pass_the_check(self, simulated, capsys):
         scans = list(simulated.rglob("data_3d_raw/*/velodyne_points/data/*.bin"))
@@ -172,7 +277,7 @@ class TestSimulateAndCheck:
         assert "3 scans in 2 drives, all usable" in capsys.readouterr().out
 
     def test_check_names_every_bad_scan_and_missing_folder(self, simulated, capsys):
-        truncated, *_, infinite = sorted(simulated.rglob("*.bin"))
+        truncated, *_, infinite = sorted(simulated.rglob("data/*.bin"))
         truncated.write_bytes(truncated.read_bytes()[:-3])
         points = read_scan(infinite)
         points[1, 2] = np.inf

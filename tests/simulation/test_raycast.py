@@ -1,9 +1,22 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from r3dpa.simulation import HDL64E, Pose, Primitive, Scene, Semantic, Shape, Street, cast, raycast
-from r3dpa.simulation.raycast import GROUND, MAX_RANGE_M, NO_SURFACE
+from r3dpa.simulation import Pose, Primitive, Scene, Semantic, Shape, Weather, hdl64e, raycast
+from r3dpa.simulation.raycast import (
+    GROUND,
+    NO_SURFACE,
+    cast,
+    cast_single,
+    level,
+    normals,
+    scene_solids,
+    surface_distance,
+)
 from r3dpa.simulation.sensor import Rays
+
+REACH_M = 120.0
 
 
 def rays_towards(*directions, origin=(0.0, 0.0, 0.0)):
@@ -24,22 +37,36 @@ def solid(shape, centre, half_size, yaw_rad=0.0):
     return Primitive(shape, centre, half_size, Semantic.CAR, 0.4, yaw_rad, 7)
 
 
+class Hits:
+    """Ranges, surfaces and incidence of a scene under some rays, each (beams, shots)."""
+
+    def __init__(self, scene, rays, **motion):
+        self.solids = scene_solids(scene)
+        origin, direction = (level(array, scene.pose) for array in rays)
+        self.range_m, self.surface = cast(self.solids, origin, direction, REACH_M, **motion)
+        hit = np.isfinite(self.range_m)
+        position = origin[:, hit] + self.range_m[hit] * direction[:, hit]
+        time_s = motion["actor_time_s"][hit] if "actor_time_s" in motion else None
+        self.normal = np.full(direction.shape, np.nan)
+        self.normal[:, hit] = normals(self.solids, self.surface[hit], position, time_s)
+        self.cos_incidence = np.abs((self.normal * direction).sum(axis=0))
+
+
 def test_ground_range_and_incidence():
-    returns = cast(Scene(pose=Pose(z_m=2.0)), compass(-0.2))
+    hits = Hits(Scene(pose=Pose(z_m=2.0)), compass(-0.2))
     # A ray that falls 0.2 per metre reaches the ground 10 m away; its length is 10 sqrt(1.04).
-    np.testing.assert_allclose(returns.range_m, 10 * np.sqrt(1.04), rtol=1e-6)
-    np.testing.assert_allclose(returns.cos_incidence, 0.2 / np.sqrt(1.04), rtol=1e-6)
-    assert (returns.surface == GROUND).all()
-    assert (returns.semantic == Semantic.ROAD).all()
+    np.testing.assert_allclose(hits.range_m, 10 * np.sqrt(1.04), rtol=1e-6)
+    np.testing.assert_allclose(hits.cos_incidence, 0.2 / np.sqrt(1.04), rtol=1e-6)
+    assert (hits.surface == GROUND).all()
+    lower = Hits(Scene(pose=Pose(z_m=2.0), ground_m=-1.0), compass(-0.2))
+    np.testing.assert_allclose(lower.range_m, 15 * np.sqrt(1.04), rtol=1e-6)
 
 
 def test_rays_to_the_sky_and_beyond_reach_come_back_without_a_surface():
     for z in (0.1, -0.01):  # 2 m above ground: the second would hit at 200 m
-        returns = cast(Scene(pose=Pose(z_m=2.0)), compass(z))
-        assert (returns.surface == NO_SURFACE).all()
-        assert np.isinf(returns.range_m).all()
-        assert (returns.semantic == 0).all()
-    assert MAX_RANGE_M == 120
+        hits = Hits(Scene(pose=Pose(z_m=2.0)), compass(z))
+        assert (hits.surface == NO_SURFACE).all()
+        assert np.isinf(hits.range_m).all()
 
 
 def test_box_cylinder_and_ellipsoid_on_the_axes():
@@ -49,41 +76,80 @@ def test_box_cylinder_and_ellipsoid_on_the_axes():
         solid(Shape.ELLIPSOID, (-10, 0, 2), (2, 1, 1)),
         solid(Shape.BOX, (0, -10, 2), (1, 4, 1), np.pi / 2),
     )
-    returns = cast(Scene(primitives, Pose(z_m=2.0)), compass(0.0))
-    np.testing.assert_allclose(returns.range_m[0, ::2], [9, 9.5, 8, 9], rtol=1e-6)
-    np.testing.assert_array_equal(returns.surface[0, ::2], [0, 1, 2, 3])
-    np.testing.assert_allclose(returns.cos_incidence[0, ::2], 1, atol=1e-6)
-    assert (returns.surface[0, 1::2] == NO_SURFACE).all()
-    assert (returns.semantic[0, ::2] == Semantic.CAR).all()
-    assert (returns.instance[0, ::2] == 7).all()
+    hits = Hits(Scene(primitives, Pose(z_m=2.0)), compass(0.0))
+    np.testing.assert_allclose(hits.range_m[0, ::2], [9, 9.5, 8, 9], rtol=1e-6)
+    np.testing.assert_array_equal(hits.surface[0, ::2], [0, 1, 2, 3])
+    towards_sensor = [[-1, 0, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0]]
+    np.testing.assert_allclose(hits.normal[:, 0, ::2].T, towards_sensor, atol=1e-6)
+    assert (hits.surface[0, 1::2] == NO_SURFACE).all()
 
 
 def test_nearest_surface_hides_the_others_in_any_order():
     boxes = tuple(solid(Shape.BOX, (x, 0, 2), (1, 1, 1)) for x in (20, 10, 30))
-    returns = cast(Scene(boxes, Pose(z_m=2.0)), compass(0.0))
-    assert returns.range_m[0, 0] == pytest.approx(9)
-    assert returns.surface[0, 0] == 1
+    hits = Hits(Scene(boxes, Pose(z_m=2.0)), compass(0.0))
+    assert hits.range_m[0, 0] == pytest.approx(9)
+    assert hits.surface[0, 0] == 1
 
 
 def test_incidence_on_a_turned_wall():
     # A wall turned by 60 degrees is met at 60 degrees.
     wall = solid(Shape.BOX, (10, 0, 2), (0.5, 30, 3), np.radians(60))
-    returns = cast(Scene((wall,), Pose(z_m=2.0)), compass(0.0))
-    assert returns.cos_incidence[0, 0] == pytest.approx(0.5, abs=1e-5)
-    assert returns.range_m[0, 0] == pytest.approx(10 - 0.5 / np.cos(np.radians(60)), abs=1e-5)
+    hits = Hits(Scene((wall,), Pose(z_m=2.0)), compass(0.0))
+    assert hits.cos_incidence[0, 0] == pytest.approx(0.5, abs=1e-5)
+    assert hits.range_m[0, 0] == pytest.approx(10 - 0.5 / np.cos(np.radians(60)), abs=1e-5)
 
 
 def test_incidence_on_the_cap_of_a_cylinder():
     pipe = solid(Shape.CYLINDER, (10, 0, 0.5), (3, 3, 0.5))  # its top is 1 m below the sensor
-    returns = cast(Scene((pipe,), Pose(z_m=2.0)), compass(-0.1))
-    assert returns.range_m[0, 0] == pytest.approx(10 * np.sqrt(1.01))
-    assert returns.cos_incidence[0, 0] == pytest.approx(0.1 / np.sqrt(1.01))
+    hits = Hits(Scene((pipe,), Pose(z_m=2.0)), compass(-0.1))
+    assert hits.range_m[0, 0] == pytest.approx(10 * np.sqrt(1.01))
+    assert hits.cos_incidence[0, 0] == pytest.approx(0.1 / np.sqrt(1.01))
+
+
+def test_a_slope_rises_away_from_the_sensor_and_its_walls_stay_upright():
+    slope = replace(solid(Shape.BOX, (20, 0, 0), (10, 5, 0.5)), grade=(0.1, 0.0))
+    hits = Hits(Scene((slope,), Pose(z_m=2.0), ground_m=-9), compass(-0.05))
+    # Its top is z = -1.5 + 0.1 (x - 20); the ray z = -0.05 x meets it at x = 3.5 / 0.15.
+    x = 3.5 / 0.15
+    assert hits.range_m[0, 0] == pytest.approx(x * np.sqrt(1 + 0.05**2), rel=1e-5)
+    np.testing.assert_allclose(
+        hits.normal[:, 0, 0], np.array([-0.1, 0, 1]) / np.sqrt(1.01), atol=1e-5
+    )
+    steep = replace(slope, centre=(20, 0, 3), half_size=(10, 5, 3))
+    front = Hits(Scene((steep,), Pose(z_m=2.0), ground_m=-9), compass(0.0))
+    assert front.range_m[0, 0] == pytest.approx(10)
+    np.testing.assert_allclose(front.normal[:, 0, 0], [-1, 0, 0], atol=1e-6)
 
 
 def test_a_solid_around_the_sensor_is_not_seen_from_inside():
     around = solid(Shape.ELLIPSOID, (0, 0, 2), (3, 3, 3))
-    returns = cast(Scene((around,), Pose(z_m=2.0)), compass(-0.2))
-    assert (returns.surface == GROUND).all()
+    hits = Hits(Scene((around,), Pose(z_m=2.0)), compass(-0.2))
+    assert (hits.surface == GROUND).all()
+
+
+def test_a_moving_solid_is_met_where_it_is_at_that_time():
+    car = replace(solid(Shape.BOX, (10, 0, 2), (1, 2, 1)), velocity_m_s=(20.0, 0.0))
+    scene = Scene((car,), Pose(z_m=2.0, heading_rad=0.3))
+    ray = compass(0.0)
+    late = np.full((1, 8), 0.05, dtype=np.float32)
+    ahead = Pose(z_m=2.0)
+    here, there = (Hits(Scene((car,), ahead), ray, actor_time_s=t) for t in (0 * late, late))
+    assert here.range_m[0, 0] == pytest.approx(9)
+    assert there.range_m[0, 0] == pytest.approx(10)
+    # The velocity is given in the world frame and turns with the heading.
+    turned = scene_solids(scene).velocity[0]
+    np.testing.assert_allclose(turned, [20 * np.cos(0.3), -20 * np.sin(0.3)], rtol=1e-6)
+
+
+def test_rays_get_into_foliage_as_deep_as_drawn_or_through_it():
+    crown = replace(solid(Shape.ELLIPSOID, (10, 0, 2), (2, 2, 2)), extinction_per_m=0.5)
+    wall = solid(Shape.BOX, (20, 0, 2), (1, 5, 3))
+    for depth, expected in ((0.0, 8), (0.6, 9.2), (1.9, 11.8), (2.1, 19)):
+        drawn = np.full((1, 8), depth, dtype=np.float32)
+        hits = Hits(Scene((crown, wall), Pose(z_m=2.0)), compass(0.0), optical_depth=drawn)
+        assert hits.range_m[0, 0] == pytest.approx(expected, rel=1e-5)
+    closed = Hits(Scene((crown, wall), Pose(z_m=2.0)), compass(0.0))
+    assert closed.range_m[0, 0] == pytest.approx(8)
 
 
 def brute_force(scene, rays):
@@ -167,46 +233,135 @@ def test_cast_equals_a_search_along_the_rays(seed):
         primitives.append(solid(shape, centre, half_size, draw.uniform(0, 6)))
     pose = Pose(0.3, -0.2, 1.7, draw.uniform(0, 6), draw.normal(0, 0.03), draw.normal(0, 0.03))
     scene = Scene(tuple(primitives), pose)
-    sensor = HDL64E(shots=60)
+    sensor = hdl64e(shots=60)
     # 8 of the 64 beams: the search takes 2001 steps a ray.
     rays = Rays(sensor.rays.origin[:, ::8], sensor.rays.direction[:, ::8])
     expected_range, expected_surface = brute_force(scene, rays)
-    returns = cast(scene, rays)
+    hits = Hits(scene, rays)
     near = expected_range < 39.9
-    agree = (returns.surface == expected_surface)[near]
+    agree = (hits.surface == expected_surface)[near]
     # Rays that graze an edge within one 2 cm step are missed by the search, not by the cast.
     assert agree.mean() > 0.99
-    assert (returns.surface[near] >= 0).sum() > 50
-    np.testing.assert_allclose(returns.range_m[near][agree], expected_range[near][agree], atol=2e-4)
+    assert (hits.surface[near] >= 0).sum() > 50
+    np.testing.assert_allclose(hits.range_m[near][agree], expected_range[near][agree], atol=2e-4)
 
 
-def test_windows_never_cut_a_solid(monkeypatch):
-    scene = Street(5, 3).scene(40)
-    rays = HDL64E(shots=180).rays
-    windowed = cast(scene, rays)
-    windows_of = raycast._windows
+def crowd(seed, num=120, speed_m_s=0.0):
+    """Solids all around, from below the sensor's nose to out of reach."""
+    draw = np.random.default_rng(seed)
+    primitives = []
+    for _ in range(num):
+        angle, distance = draw.uniform(0, 2 * np.pi), draw.exponential(25) + 2
+        centre = (distance * np.cos(angle), distance * np.sin(angle), draw.uniform(-1, 4))
+        shape = Shape(int(draw.integers(3)))
+        primitive = solid(shape, centre, tuple(draw.uniform(0.05, 3, 3)), draw.uniform(0, 6))
+        velocity = draw.normal(0, speed_m_s, 2) if speed_m_s else (0.0, 0.0)
+        grade = tuple(draw.uniform(-0.1, 0.1, 2))
+        primitives.append(replace(primitive, velocity_m_s=tuple(velocity), grade=grade))
+    return Scene(tuple(primitives), Pose(pitch_rad=0.02, roll_rad=-0.03))
 
-    def everything(solids, levelled):
-        found = windows_of(solids, levelled)
-        beams, shots = np.zeros_like(found.beams), np.zeros_like(found.shots)
-        beams[:, 1], shots[:, 1] = levelled.shape[2:]
-        order = np.arange(len(beams))
-        return raycast._Windows(beams, shots, np.zeros(len(beams)), order)
 
-    monkeypatch.setattr(raycast, "_windows", everything)
-    whole = cast(scene, rays)
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_windows_never_cut_a_solid(monkeypatch, seed, moving):
+    scene = crowd(seed, speed_m_s=15.0 if moving else 0.0)
+    sensor = hdl64e(shots=180)
+    rays, motion = sensor.rays, {}
+    if moving:  # the sensor moves by up to 1 m and turns by up to 2 degrees
+        shift = np.stack([20 * sensor.time_s, 2 * sensor.time_s, 0 * sensor.time_s])
+        turn = 0.7 * sensor.time_s
+        x, y, z = rays.direction
+        direction = np.stack(
+            [np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, z]
+        )
+        rays, motion = Rays(rays.origin + shift, direction), {"actor_time_s": sensor.time_s}
+    windowed = Hits(scene, rays, **motion)
+
+    def everything(solids, origin, direction, max_range_m, actor_time_s=None):
+        num, beams_shots = len(solids.shape), np.array([[0, 0], origin.shape[1:]])
+        beams, shots = (np.tile(column, (num, 1)) for column in beams_shots.T)
+        return raycast.Windows(beams, shots, np.zeros(num), np.arange(num))
+
+    monkeypatch.setattr(raycast, "windows_of", everything)
+    whole = Hits(scene, rays, **motion)
+    assert (whole.surface >= 0).mean() > 0.2
     np.testing.assert_array_equal(windowed.range_m, whole.range_m)
-    np.testing.assert_array_equal(windowed.semantic, whole.semantic)
+    np.testing.assert_array_equal(windowed.surface, whole.surface)
 
 
-def test_primitive_and_pose_are_checked():
+def test_single_rays_see_what_the_turn_sees():
+    scene = crowd(7, speed_m_s=10.0)
+    sensor = hdl64e(shots=90)
+    turn = Hits(scene, sensor.rays, actor_time_s=sensor.time_s)
+    origin, direction = (level(a, scene.pose).reshape(3, -1) for a in sensor.rays)
+    none = np.full(origin.shape[1], NO_SURFACE)
+    reach = np.full(origin.shape[1], REACH_M)
+    range_m, surface = cast_single(
+        turn.solids, origin, direction, sensor.time_s.reshape(-1), reach, none, none
+    )
+    np.testing.assert_array_equal(surface, turn.surface.reshape(-1))
+    seen = np.isfinite(range_m)
+    np.testing.assert_allclose(range_m[seen], turn.range_m.reshape(-1)[seen], rtol=1e-6)
+
+
+def test_single_rays_leave_out_and_look_inside():
+    house = solid(Shape.BOX, (10, 0, 2), (4, 5, 3))
+    pane = solid(Shape.BOX, (5.98, 0, 2), (0.01, 1, 1))
+    solids = scene_solids(Scene((house, pane), Pose(z_m=2.0)))
+    start = np.array([[5.97], [0], [0]], dtype=np.float32)
+    ahead = np.array([[1], [0], [0]], dtype=np.float32)
+    time_s, reach = np.zeros(1, dtype=np.float32), np.array([100.0])
+
+    def one(excluded, hollow):
+        found = cast_single(
+            solids, start, ahead, time_s, reach, np.array([excluded]), np.array([hollow])
+        )
+        return found[0][0], found[1][0]
+
+    # The front of the house is 0.03 m away, its back wall 8 m behind that.
+    assert one(1, NO_SURFACE) == (pytest.approx(0.03, abs=1e-5), 0)
+    assert one(1, 0) == (pytest.approx(8.03), 0)
+    assert one(0, NO_SURFACE) == (np.inf, NO_SURFACE)
+
+
+def test_each_ray_against_its_own_solid():
+    solids = scene_solids(crowd(3))
+    draw = np.random.default_rng(0)
+    index = draw.integers(0, len(solids.shape), 400)
+    towards = solids.centre[index].T + draw.normal(0, 1, (3, 400))
+    direction = (towards / np.linalg.norm(towards, axis=0)).astype(np.float32)
+    origin = np.zeros_like(direction)
+    enter, leave = surface_distance(solids, index, origin, direction)
+    hit = enter > 0
+    assert 100 < hit.sum() < 400
+    for ray in np.flatnonzero(hit)[:40]:
+        alone = type(solids)(*(column[[index[ray]]] for column in solids[:-1]), ground_m=-1e6)
+        at = surface_distance(alone, np.array([0]), origin[:, [ray]], direction[:, [ray]])
+        assert at[0][0] == enter[ray]
+        middle = (enter[ray] + leave[ray]) / 2 * direction[:, [ray]]
+        assert np.isnan(surface_distance(alone, np.array([0]), middle, direction[:, [ray]])[0]) or (
+            surface_distance(alone, np.array([0]), middle, direction[:, [ray]])[0] < 0
+        )
+
+
+def test_primitive_pose_and_scene_are_checked():
     with pytest.raises(ValueError, match="half_size must be positive"):
         solid(Shape.BOX, (0, 0, 0), (1, 0, 1))
     with pytest.raises(ValueError, match="reflectivity must lie in"):
         Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 1.5)
     with pytest.raises(ValueError, match="16 bits"):
         Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, 0.0, 65536)
+    with pytest.raises(ValueError, match="extinction_per_m"):
+        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, extinction_per_m=-1)
+    with pytest.raises(ValueError, match="grade"):
+        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, grade=(0, 0.3))
     with pytest.raises(ValueError, match="above the ground"):
-        Pose(z_m=0)
+        Scene(pose=Pose(z_m=1.0), ground_m=1.0)
     with pytest.raises(ValueError, match=r"0\.2 rad"):
         Pose(pitch_rad=0.3)
+    with pytest.raises(ValueError, match="visibility_m"):
+        Weather(visibility_m=0)
+    with pytest.raises(ValueError, match="snow_mm_h"):
+        Weather(snow_mm_h=-1)
+    with pytest.raises(ValueError, match="sun_elevation_deg"):
+        Weather(sun_elevation_deg=91)

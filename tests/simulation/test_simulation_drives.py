@@ -1,55 +1,151 @@
+import fcntl
+import io
 import json
+import math
+import multiprocessing
 import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 from r3dpa.simulation import (
     TRAIN_DRIVES,
     VAL_DRIVES,
+    Origin,
+    Pose,
+    Street,
+    Weather,
+    drive_files,
     drive_name,
     drives,
     expected_scans,
+    hdl64e,
+    load_sensor,
     simulate,
+    simulate_scan,
     split_scans,
 )
+from r3dpa.simulation.drive_files import velodyne_to_world
+from r3dpa.simulation.raycast import level
 
-SMALL = {"shots": 32}
+SMALL = {"sensor": hdl64e(32)}
+MEASURED = {"timings.csv", "report.json"}  # the files that are no function of the request
+KINDS = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
 
 
 def files_of(root):
-    return {p.relative_to(root): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+    """Bytes of all files but the measured ones."""
+    return {
+        p.relative_to(root): p.read_bytes()
+        for p in sorted(root.rglob("*"))
+        if p.is_file() and p.name not in MEASURED
+    }
 
 
 def points_folder(root, drive):
     return root / "data_3d_raw" / drive_name(drive) / "velodyne_points"
 
 
+def stems(root, kind="data"):
+    return sorted(p.stem for p in root.rglob(f"{kind}/*") if not p.name.startswith("."))
+
+
 def test_layout_and_contents(tmp_path):
     report = simulate(tmp_path, 11, seed=3, **SMALL)
-    assert sum(report.scans_per_drive.values()) == 11
-    assert report.num_written == 11
-    assert report.ms_per_scan > 0
+    assert sum(report.scans_per_drive.values()) == report.num_written == report.num_timed == 11
     for drive, count in report.scans_per_drive.items():
         folder = points_folder(tmp_path, drive)
         assert len((folder / "timestamps.txt").read_text().splitlines()) == count
         names = [f"{number:010d}" for number in range(count)]
-        assert sorted(p.name for p in (folder / "data").iterdir()) == [n + ".bin" for n in names]
-        assert sorted(p.name for p in (folder / "labels").iterdir()) == [
-            n + ".label" for n in names
-        ]
+        for kind, suffix in KINDS.items():
+            assert sorted(p.name for p in (folder / kind).iterdir()) == [n + suffix for n in names]
         for name in names:
             points = np.fromfile(folder / "data" / f"{name}.bin", np.float32).reshape(-1, 4)
             labels = np.fromfile(folder / "labels" / f"{name}.label", np.uint32)
-            assert len(points) == len(labels) > 1000
+            origins = np.fromfile(folder / "origins" / f"{name}.origin", np.uint8)
+            assert len(points) == len(labels) == len(origins) > 1000
+            assert set(origins) <= set(Origin)
     manifest = json.loads((tmp_path / "simulation.json").read_text())
-    assert manifest["seed"] == 3
-    assert manifest["scans"] == 11
+    assert (manifest["seed"], manifest["scans"]) == (3, 11)
     assert manifest["sensor"]["shots"] == 32
+    assert len(manifest["sensor"]["lasers"]["inclination_rad"]) == 64
+    assert (manifest["effects"], manifest["weather"]) == ({}, None)
+    top = {path.name for path in tmp_path.iterdir()}
+    assert top == {"data_3d_raw", "data_poses", "simulation.json", ".lock", *MEASURED}
+
+
+def test_files_of_a_scan_say_what_was_simulated(tmp_path):
+    weather, effects = Weather(rain_mm_h=4.0), {"range_noise": "off", "soft_raydrop": "auto"}
+    request = {"drives": ["0003"], "weather": weather, "effects": effects}
+    simulate(tmp_path, 3, seed=2, **request, **SMALL)
+    scene = Street(2, 3, weather).scene(2, SMALL["sensor"].mount_height_m)
+    scan = simulate_scan(scene, SMALL["sensor"], (2, "effects", 3, 2), {"range_noise": "off"})
+    folder = points_folder(tmp_path, "0003")
+    assert (folder / "data" / "0000000002.bin").read_bytes() == scan.points.tobytes()
+    assert (folder / "labels" / "0000000002.label").read_bytes() == scan.labels.tobytes()
+    assert (folder / "origins" / "0000000002.origin").read_bytes() == scan.origins.tobytes()
+    summary = json.loads((folder / "sim" / "0000000002.json").read_text())
+    assert (summary["drive"], summary["scan"]) == ("0003", 2)
+    assert Pose(**summary["pose"]) == scene.pose
+    assert summary["motion"]["speed_m_s"] == scene.motion.speed_m_s
+    assert (summary["weather"]["rain_mm_h"], summary["weather"]["visibility_m"]) == (4.0, None)
+    assert summary["primitives"] == len(scene.primitives)
+    assert summary["points"] == len(scan.points)
+    assert list(summary["effects"]) == [record.name for record in scan.effects]
+    for record in scan.effects:
+        assert summary["effects"][record.name] == {
+            "status": record.status,
+            "reason": record.reason,
+            "rays": record.rays,
+        }
+    assert summary["effects"]["range_noise"]["status"] == "off"
+    manifest = json.loads((tmp_path / "simulation.json").read_text())
+    assert manifest["effects"] == {"range_noise": "off"}
+    assert manifest["weather"]["rain_mm_h"] == 4.0
+
+
+class TestPoses:
+    def test_lines_are_those_of_the_scenes(self, tmp_path):
+        simulate(tmp_path, 3, drives=["0005"], **SMALL)
+        path = tmp_path / "data_poses" / drive_name("0005") / "velodyne_to_world.txt"
+        table = np.loadtxt(path)
+        assert table.shape == (3, 13)
+        for number, row in enumerate(table):
+            pose = Street(0, 5).scene(number, SMALL["sensor"].mount_height_m).pose
+            assert row[0] == number
+            np.testing.assert_allclose(row[1:].reshape(3, 4), velodyne_to_world(pose), rtol=1e-9)
+
+    def test_a_point_ahead_of_a_car_that_heads_north(self):
+        """10 m ahead and 2 m to the left is 10 m north and 2 m west; nose down lowers it."""
+        pose = Pose(5.0, 7.0, 2.0, heading_rad=math.pi / 2)
+        expected = [5.0 - 2.0, 7.0 + 10.0, 2.0 + 1.0]
+        np.testing.assert_allclose(velodyne_to_world(pose) @ [10, 2, 1, 1], expected)
+        dipped = velodyne_to_world(Pose(z_m=2.0, pitch_rad=0.1)) @ [10, 0, 0, 1]
+        np.testing.assert_allclose(dipped, [10 * math.cos(0.1), 0, 2.0 - 10 * math.sin(0.1)])
+        leaning = velodyne_to_world(Pose(z_m=2.0, roll_rad=0.1)) @ [0, 3, 0, 1]
+        np.testing.assert_allclose(leaning, [0, 3 * math.cos(0.1), 2.0 + 3 * math.sin(0.1)])
+
+    def test_agrees_with_the_ray_cast(self):
+        pose = Pose(3.0, -4.0, 1.6, heading_rad=0.7, pitch_rad=0.05, roll_rad=-0.03)
+        vectors = np.random.default_rng(0).normal(size=(3, 20)).astype(np.float32)
+        x, y, z = level(vectors, pose)
+        cosine, sine = math.cos(0.7), math.sin(0.7)
+        turned = np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
+        expected = turned + np.array([[3.0], [-4.0], [1.6]])
+        matrix = velodyne_to_world(pose)
+        np.testing.assert_allclose(matrix[:, :3] @ vectors + matrix[:, 3:], expected, atol=1e-6)
 
 
 def test_timestamps_are_ten_per_second(tmp_path):
-    simulate(tmp_path, 12, drives=["0003"], shots=8)
+    simulate(tmp_path, 12, drives=["0003"], sensor=hdl64e(8))
     lines = (points_folder(tmp_path, "0003") / "timestamps.txt").read_text().splitlines()
     assert lines[0] == "2013-05-28 08:46:02.000000000"
     assert lines[11] == "2013-05-28 08:46:03.100000000"
@@ -61,38 +157,108 @@ def test_same_seed_same_bytes_for_any_number_of_workers(tmp_path):
         simulate(root, 20, seed=seed, workers=workers, **SMALL)
     one, two, other = map(files_of, roots)
     assert one == two
-    scans = [path for path in one if path.suffix == ".bin"]
+    scans = [path for path in one if path.parent.name == "data"]
     assert len(scans) == 20
     assert len({one[path] for path in scans}) == 20
     assert all(one[path] != other[path] for path in scans)
 
 
 def test_repeating_a_request_does_nothing_and_an_unfinished_one_is_completed(tmp_path):
-    simulate(tmp_path, 4, **SMALL)
+    simulate(tmp_path, 6, drives=["0003"], **SMALL)
     whole = files_of(tmp_path)
-    stamps = {path: (tmp_path / path).stat().st_mtime_ns for path in whole}
-    report = simulate(tmp_path, 4, **SMALL)
-    assert (report.num_written, report.ms_per_scan) == (0, 0.0)
-    assert stamps == {path: (tmp_path / path).stat().st_mtime_ns for path in whole}
+    everything = [path for path in tmp_path.rglob("*") if path.name != ".lock"]
+    stamps = {path: path.stat().st_mtime_ns for path in everything}
+    assert simulate(tmp_path, 6, drives=["0003"], **SMALL).num_written == 0
+    assert stamps == {path: path.stat().st_mtime_ns for path in everything}
 
-    for path in [p for p in whole if p.suffix == ".bin"][:2]:
-        (tmp_path / path).unlink()
-    (tmp_path / next(p for p in whole if p.suffix == ".label")).unlink()
-    (tmp_path / next(p for p in whole if p.suffix == ".txt")).unlink()
-    assert simulate(tmp_path, 4, workers=2, **SMALL).num_written == 2
+    folder = points_folder(tmp_path, "0003")
+    for number, (kind, suffix) in enumerate(KINDS.items()):
+        (folder / kind / f"{number:010d}{suffix}").unlink()
+    for path in (folder / "timestamps.txt", *tmp_path.rglob("velodyne_to_world.txt")):
+        path.unlink()
+    report = simulate(tmp_path, 6, drives=["0003"], workers=2, **SMALL)
+    assert (report.num_written, report.num_timed) == (4, 6)
     assert files_of(tmp_path) == whole
 
 
+def test_points_are_the_last_file_of_a_scan(tmp_path, monkeypatch):
+    written = []
+
+    def record(path, content):
+        written.append(path.parent.name)
+        drive_files_write(path, content)
+
+    drive_files_write = drive_files.write
+    monkeypatch.setattr(drive_files, "write", record)
+    simulate(tmp_path, 1, **SMALL)
+    assert written[:4] == ["labels", "origins", "sim", "data"]
+
+
 def test_another_request_is_refused_with_both_values(tmp_path):
-    simulate(tmp_path, 2, seed=5, **SMALL)
+    simulate(tmp_path, 2, seed=5, effects={"range_noise": "off"}, **SMALL)
     before = files_of(tmp_path)
-    with pytest.raises(ValueError, match="seed 5 there, 6 now"):
-        simulate(tmp_path, 2, seed=6, **SMALL)
-    with pytest.raises(ValueError, match="scans 2 there, 3 now"):
-        simulate(tmp_path, 3, seed=5, **SMALL)
-    with pytest.raises(ValueError, match=r"'shots': 32.* there, .*'shots': 40.* now"):
-        simulate(tmp_path, 2, seed=5, shots=40)
+    base = {"scans": 2, "seed": 5, "effects": {"range_noise": "off"}, **SMALL}
+    for change, message in (
+        ({"seed": 6}, r"\(seed 5 there, 6 now\)"),
+        ({"scans": 3}, r"\(scans 2 there, 3 now\)"),
+        ({"sensor": hdl64e(40)}, r"\(sensor\.shots 32 there, 40 now\)"),
+        ({"sensor": hdl64e(32, 65)}, r"sensor\.lasers\.inclination_rad 64 values there"),
+        ({"effects": {}}, r"\(effects\.range_noise 'off' there, None now\)"),
+        ({"effects": {"range_noise": "on"}}, r"\(effects\.range_noise 'off' there, 'on' now\)"),
+        ({"weather": Weather()}, r"\(weather None there, {'visibility_m': None, "),
+    ):
+        with pytest.raises(ValueError, match=message):
+            simulate(tmp_path, **base | change)
     assert files_of(tmp_path) == before
+
+
+def test_data_of_an_earlier_simulator_are_refused(tmp_path):
+    simulate(tmp_path, 1, **SMALL)
+    manifest = tmp_path / "simulation.json"
+    stored = json.loads(manifest.read_text()) | {"simulator_version": 1}
+    manifest.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"\(simulator_version 1 there, \d+ now\)"):
+        simulate(tmp_path, 1, **SMALL)
+
+
+class TestSwitches:
+    def test_yaml_words_for_on_and_off(self, tmp_path):
+        """YAML 1.1 reads a bare ``on`` as true and ``off`` as false."""
+        words = {"range_noise": False, "soft_raydrop": True, "rolling_shutter": "auto"}
+        simulate(tmp_path, 1, effects=words, **SMALL)
+        manifest = json.loads((tmp_path / "simulation.json").read_text())
+        assert manifest["effects"] == {"range_noise": "off", "soft_raydrop": "on"}
+
+    def test_order_does_not_matter(self, tmp_path):
+        for name, effects in (("a", ("range_noise", "ego_occlusion")), ("b", None)):
+            effects = effects or ("ego_occlusion", "range_noise")
+            simulate(tmp_path / name, 1, effects=dict.fromkeys(effects, "off"), **SMALL)
+        assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"fogg": "off"}, r"no effect 'fogg'; there are dual_return, "),
+            ({"range_noise": "of"}, "range_noise must be auto, on or off, got 'of'"),
+        ],
+    )
+    def test_wrong_ones_leave_nothing_behind(self, tmp_path, wrong, message):
+        with pytest.raises(ValueError, match=message):
+            simulate(tmp_path / "out", 1, effects=wrong, **SMALL)
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_file_is_recorded_by_its_numbers(tmp_path):
+    """The file may be gone or changed when the data set is completed."""
+    calibration = tmp_path / "lasers.yaml"
+    calibration.write_text("lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]")
+    sensor = load_sensor(str(calibration), shots=64)
+    calibration.unlink()
+    simulate(tmp_path / "out", 1, sensor=sensor)
+    manifest = json.loads((tmp_path / "out" / "simulation.json").read_text())
+    assert manifest["sensor"]["lasers"]["inclination_rad"] == [0.02, -0.1]
+    points = np.fromfile(next(tmp_path.rglob("data/*.bin")), np.float32).reshape(-1, 4)
+    assert 0 < len(points) <= 2 * 64
 
 
 def test_foreign_data_are_left_alone(tmp_path):
@@ -122,7 +288,7 @@ def test_a_failed_write_leaves_no_part_of_a_file(tmp_path, monkeypatch):
     content = scan.read_bytes()
     scan.unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(drives.Path, "write_bytes", full_disk)
+        patch.setattr(drive_files.Path, "write_bytes", full_disk)
         with pytest.raises(OSError, match="No space left"):
             simulate(tmp_path, 2, drives=["0003"], **SMALL)
     assert sorted(p.name for p in (folder / "data").iterdir()) == ["0000000000.bin"]
@@ -131,30 +297,151 @@ def test_a_failed_write_leaves_no_part_of_a_file(tmp_path, monkeypatch):
     assert scan.read_bytes() == content
 
 
-def test_files_of_a_killed_run_are_deleted_and_those_of_a_running_one_are_not(tmp_path):
+def test_files_of_a_killed_run_are_deleted_and_those_of_others_are_not(tmp_path):
     simulate(tmp_path, 2, drives=["0003"], **SMALL)
     before = files_of(tmp_path)
-    old = points_folder(tmp_path, "0003") / "data" / ".0000000001.1a2b3c4d.partial.bin"
-    new = tmp_path / ".simulation.1a2b3c4d.partial.json"
-    for path in (old, new):
+    folder, poses = points_folder(tmp_path, "0003"), tmp_path / "data_poses" / drive_name("0003")
+    for path in (
+        folder / "data" / ".0000000001.1a2b3c4d.partial.bin",
+        folder / "sim" / ".0000000001.1a2b3c4d.partial.json",
+        poses / ".velodyne_to_world.1a2b3c4d.partial.txt",
+        tmp_path / ".simulation.1a2b3c4d.partial.json",
+        tmp_path / ".report.1a2b3c4d.partial.json",
+    ):
         path.write_bytes(b"half")
-    os.utime(old, (0, 0))
+    grid = tmp_path / "feature_grids" / ".index.1a2b3c4d.partial.json"
+    grid.parent.mkdir()
+    grid.write_bytes(b"half")
     simulate(tmp_path, 2, drives=["0003"], **SMALL)
-    assert files_of(tmp_path) == before | {new.relative_to(tmp_path): b"half"}
+    assert files_of(tmp_path) == before | {grid.relative_to(tmp_path): b"half"}
 
 
-def test_after_a_failure_waiting_tasks_do_not_run(tmp_path, monkeypatch):
+def test_after_a_failure_waiting_tasks_do_not_run(tmp_path):
     """The first of 60 tasks finds a folder in the place of its file."""
-    request = {"out": tmp_path, "scans": 480, "drives": ["0003"], "shots": 8}
     folder = points_folder(tmp_path, "0003")
-    with monkeypatch.context() as patch:
+    request = {"out": tmp_path, "scans": 480, "drives": ["0003"], "sensor": hdl64e(8)}
+    with pytest.MonkeyPatch.context() as patch:
         patch.delattr(drives, "_run")
-        with pytest.raises(NameError):  # only the folders are made
+        with pytest.raises(NameError):  # only the manifest is written
             simulate(**request)
-    (folder / "labels" / "0000000000.label").mkdir()
+    (folder / "labels" / "0000000000.label").mkdir(parents=True)
     with pytest.raises(IsADirectoryError):
         simulate(**request, workers=2)
     assert len(list((folder / "data").iterdir())) < 400
+
+
+def test_a_damaged_summary_is_named_and_made_again_when_deleted(tmp_path):
+    simulate(tmp_path, 2, drives=["0003"], **SMALL)
+    before = files_of(tmp_path)
+    summary = points_folder(tmp_path, "0003") / "sim" / "0000000001.json"
+    for text in ("{", "{}", "[]", '{"pose": {}, "effects": {"range_noise": {}}}'):
+        summary.write_text(text)
+        with pytest.raises(ValueError, match=r"sim/0000000001\.json is damaged .* delete it"):
+            simulate(tmp_path, 2, drives=["0003"], **SMALL)
+    summary.unlink()
+    simulate(tmp_path, 2, drives=["0003"], **SMALL)
+    assert files_of(tmp_path) == before
+
+
+class TestProgress:
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_counts_scans_that_are_there_and_says_how_long_it_takes(
+        self, tmp_path, monkeypatch, workers
+    ):
+        simulate(tmp_path, 24, drives=["0003"], **SMALL)
+        for path in list(tmp_path.rglob("data/*.bin"))[:18]:
+            path.unlink()
+        shown = io.StringIO()
+        forced = {"file": shown, "disable": False, "mininterval": 0}
+        monkeypatch.setattr(drives, "tqdm", lambda **options: tqdm(**options | forced))
+        simulate(tmp_path, 24, drives=["0003"], workers=workers, **SMALL)
+        states = shown.getvalue().split("\r")
+        done = [int(found[1]) for state in states if (found := re.search(r"(\d+)/24 ", state))]
+        assert (done[0], done[-1]) == (6, 24)
+        assert done == sorted(done)
+        assert len(set(done)) == 4  # 6, then tasks of 8, 8 and 2 scans in any order
+        assert any(re.search(r"\[\d+:\d+<\d+:\d+, .*(scan/s|s/scan)\]", s) for s in states)
+
+    def test_without_a_terminal_there_is_none(self, tmp_path, capfd):
+        simulate(tmp_path, 1, **SMALL)
+        assert capfd.readouterr().err == ""
+
+
+def started(root, scans, workers=2):
+    """A process of its own that simulates into a folder."""
+    code = (
+        "from pathlib import Path; from r3dpa.simulation import hdl64e, simulate; "
+        f"simulate(Path({str(root)!r}), {scans}, seed=4, workers={workers}, sensor=hdl64e(32))"
+    )
+    return subprocess.Popen([sys.executable, "-c", code])
+
+
+def wait_for_scans(root, count, process):
+    while len(stems(root)) < count:
+        assert process.poll() is None, f"ended with {process.returncode} before {count} scans"
+        time.sleep(0.002)
+
+
+class TestInterrupted:
+    def test_killed_at_random_moments_and_restarted_it_gives_the_same_bytes(self, tmp_path):
+        """Neither the parent nor, once that is gone, its workers leave half a scan."""
+        whole, killed = tmp_path / "whole", tmp_path / "killed"
+        simulate(whole, 60, seed=4, **SMALL)
+        chance = random.Random(7)
+        reached = 0
+        for _ in range(3):
+            process = started(killed, 60)
+            wait_for_scans(killed, chance.randint(reached + 1, reached + 12), process)
+            time.sleep(chance.uniform(0, 0.02))
+            process.send_signal(signal.SIGKILL)
+            assert process.wait() == -signal.SIGKILL
+            for path in killed.rglob("data/*.bin"):
+                if not path.name.startswith("."):  # what is there is whole
+                    assert path.read_bytes() == (whole / path.relative_to(killed)).read_bytes()
+            reached = len(stems(killed))
+        assert reached < 60
+        with (killed / "timings.csv").open("a") as stream:
+            stream.write("0003,5,1.2")  # a kill amid a row
+        report = simulate(killed, 60, seed=4, workers=2, **SMALL)
+        assert 60 - reached - 16 <= report.num_written <= 60 - reached
+        assert report.num_written <= report.num_timed <= 60
+        assert files_of(killed) == files_of(whole)
+
+    def test_workers_of_a_killed_run_end_with_it(self, tmp_path):
+        """Its five tasks on their way would be 40 more scans."""
+        process = started(tmp_path, 200)
+        wait_for_scans(tmp_path, 1, process)
+        process.kill()
+        process.wait()
+        time.sleep(0.2)
+        soon_after = len(stems(tmp_path))
+        time.sleep(0.6)
+        assert len(stems(tmp_path)) == soon_after < 100
+
+    def test_a_killed_worker_is_an_error_and_the_next_call_goes_on(self, tmp_path):
+        def kill_one():
+            while not stems(tmp_path):
+                time.sleep(0.002)
+            os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        with pytest.raises(ChildProcessError, match=r"worker process ended .* fewer workers"):
+            simulate(tmp_path / "a", 200, workers=2, **SMALL)
+        killer.join()
+        assert 0 < len(stems(tmp_path)) < 200
+
+    def test_a_second_call_waits_for_the_first(self, tmp_path, caplog):
+        simulate(tmp_path, 3, **SMALL)
+        second = threading.Thread(target=simulate, args=(tmp_path, 3), kwargs=SMALL)
+        with (tmp_path / ".lock").open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            second.start()
+            second.join(0.3)
+            assert second.is_alive()
+            assert "waiting for another process" in caplog.text
+        second.join(10)
+        assert not second.is_alive()
 
 
 def test_expected_scans_are_those_of_a_complete_data_set(tmp_path):
@@ -215,7 +502,7 @@ def test_split_of_chosen_drives():
         ({"scans": 0}, "scans must be 1 or greater, got 0"),
         ({"workers": 0}, "workers must be 1 or greater, got 0"),
         ({"seed": -1}, "seed must be 0 or greater, got -1"),
-        ({"shots": 3}, "shots must be at least 8"),
+        ({"sensor": "lidar"}, "no sensor 'lidar'"),
         ({"drives": ["3"]}, "got 3"),
     ],
 )
@@ -223,3 +510,13 @@ def test_bad_requests_leave_nothing_behind(tmp_path, wrong, message):
     with pytest.raises(ValueError, match=message):
         simulate(tmp_path / "out", **({"scans": 2} | wrong))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_complete_data_set_is_read_from_a_read_only_disk(tmp_path, monkeypatch):
+    written = simulate(tmp_path, 2, drives=["0003"], sensor=hdl64e(8))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    monkeypatch.setattr(drives.os, "access", lambda path, mode: mode != drives.os.W_OK)
+    report = simulate(tmp_path, 2, drives=["0003"], sensor=hdl64e(8))
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    assert report.num_written == 0
+    assert report.to_dict() == written.to_dict()

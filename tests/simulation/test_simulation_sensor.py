@@ -1,30 +1,33 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
+import yaml
 
-from r3dpa.simulation import HDL64E
+from r3dpa.simulation import Lasers, Scene, hdl64e, load_sensor, simulate_scan
+from r3dpa.simulation.sensor import hdl32e, sensor_from_dict, sensor_to_dict, vls128
 
 
-def test_two_blocks_with_the_inclinations_of_the_calibration():
-    lasers = HDL64E().lasers
-    degrees = np.degrees(lasers.inclination_rad)
-    np.testing.assert_allclose(degrees[[0, 31, 32, 63]], [1.96, -8.56, -8.78, -24.56], atol=1e-9)
+def test_two_blocks_with_the_inclinations_of_kitti():
+    degrees = np.degrees(hdl64e().lasers.inclination_rad)
+    np.testing.assert_allclose(degrees[[0, 31, 32, 63]], [1.94, -8.71, -9.03, -25.0], atol=1e-9)
     steps = -np.diff(degrees)
     assert (steps > 0).all()
-    assert steps[:31].mean() == pytest.approx(0.339, abs=5e-4)
-    assert steps[32:].mean() == pytest.approx(0.509, abs=5e-4)
+    assert steps[:31].mean() == pytest.approx(0.3435, abs=5e-4)
+    assert steps[32:].mean() == pytest.approx(0.5152, abs=5e-4)
     # Standard deviation of 31 normal draws: within 3 standard errors (13 % each).
-    assert steps[:31].std() == pytest.approx(0.042, rel=0.4)
-    assert steps[32:].std() == pytest.approx(0.094, rel=0.4)
+    assert steps[:31].std() == pytest.approx(0.045, rel=0.4)
+    assert steps[32:].std() == pytest.approx(0.070, rel=0.4)
 
 
 def test_optical_centres_and_azimuth_offsets():
-    lasers = HDL64E().lasers
+    lasers = hdl64e().lasers
     upper, lower = lasers.height_m[:32], lasers.height_m[32:]
-    assert (upper.min(), upper.max()) == (0.204, 0.217)
-    assert (lower.min(), lower.max()) == (0.144, 0.163)
+    assert (min(upper), max(upper)) == (0.198, 0.209)
+    assert (min(lower), max(lower)) == (0.116, 0.126)
     assert set(np.abs(lasers.lateral_m)) == {0.026}
+    assert lasers.lateral_m[0] < 0 < lasers.lateral_m[1]
     offset = np.degrees(lasers.azimuth_offset_rad)
     assert offset.min() >= -8.5
     assert offset.max() <= 9.9
@@ -32,13 +35,13 @@ def test_optical_centres_and_azimuth_offsets():
 
 
 def test_rays_are_unit_and_start_at_their_laser():
-    sensor = HDL64E(shots=100)
+    sensor = hdl64e(shots=100)
     origin, direction = sensor.rays
     assert origin.shape == direction.shape == (3, 64, 100)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=0), 1, atol=1e-6)
     np.testing.assert_allclose(np.hypot(origin[0], origin[1]), 0.026, atol=1e-6)
     inclination = np.arcsin(direction[2])
-    expected = np.broadcast_to(sensor.lasers.inclination_rad[:, None], (64, 100))
+    expected = np.broadcast_to(np.array(sensor.lasers.inclination_rad)[:, None], (64, 100))
     np.testing.assert_allclose(inclination, expected, atol=1e-6)
     # The optical centre lies sideways of the beam, not along it.
     across = origin[0] * direction[0] + origin[1] * direction[1]
@@ -46,21 +49,102 @@ def test_rays_are_unit_and_start_at_their_laser():
 
 
 def test_azimuth_grows_by_one_step_from_shot_to_shot():
-    _, direction = HDL64E(shots=360).rays
+    _, direction = hdl64e(shots=360).rays
     azimuth = np.unwrap(np.arctan2(direction[1], direction[0]), axis=1)
     np.testing.assert_allclose(np.diff(azimuth, axis=1), np.radians(1), atol=2e-6)
     assert (azimuth[:, 0] >= 0).all()
     assert (azimuth[:, 0] < np.radians(1) + 1e-6).all()
 
 
+def test_shots_are_fired_as_the_head_turns():
+    """Lasers that share a heading of the head fire together, whatever their azimuth offset."""
+    sensor = hdl64e()
+    time_s = sensor.time_s
+    assert time_s.shape == (64, 2083)
+    step_s = 0.1 / 2083
+    assert -0.05 <= time_s.min() < -0.05 + step_s
+    assert 0.05 - step_s < time_s.max() <= 0.05
+    _, direction = sensor.rays
+    azimuth = np.arctan2(direction[1], direction[0])
+    head = azimuth - np.array(sensor.lasers.azimuth_offset_rad)[:, None]
+    head = (head + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(time_s, head / (2 * np.pi) * 0.1, atol=1e-7)
+
+
+def test_presets_have_the_beams_of_their_datasheets():
+    for sensor, num, top, bottom in ((hdl32e(), 32, 10.67, -30.67), (vls128(), 128, 15, -25)):
+        degrees = np.degrees(sensor.lasers.inclination_rad)
+        assert len(degrees) == sensor.num_beams == num
+        np.testing.assert_allclose(degrees[[0, -1]], [top, bottom])
+        scan = simulate_scan(Scene(), dataclasses.replace(sensor, shots=32), (0,))
+        assert len(scan.points) > 100
+    around_horizon = np.abs(degrees) < 4.5
+    np.testing.assert_allclose(np.diff(degrees[around_horizon]), -0.11, atol=1e-6)
+    assert load_sensor("vls128", shots=64) == dataclasses.replace(vls128(), shots=64)
+
+
+def calibration(**changes):
+    lasers = [
+        {
+            "laser_id": number,
+            "vert_correction": vertical,
+            "rot_correction": 0.01 * number,
+            "vert_offset_correction": 0.2,
+            "horiz_offset_correction": -0.026,
+        }
+        | changes
+        for number, vertical in enumerate((-0.3, 0.03, -0.1))
+    ]
+    return {"distance_resolution": 0.002, "num_lasers": 3, "lasers": lasers}
+
+
+def test_a_calibration_file_replaces_the_beam_table(tmp_path):
+    path = tmp_path / "unit.yaml"
+    path.write_text(yaml.safe_dump(calibration()))
+    sensor = load_sensor(str(path), shots=100)
+    assert sensor.lasers.inclination_rad == (0.03, -0.1, -0.3)
+    assert sensor.lasers.azimuth_offset_rad == (0.01, 0.02, 0.0)
+    assert sensor.lasers.height_m == (0.2, 0.2, 0.2)
+    assert sensor.lasers.lateral_m == (-0.026, -0.026, -0.026)
+    assert sensor.rays.origin.shape == (3, 3, 100)
+
+
+def test_bad_calibrations_are_named(tmp_path):
+    path = tmp_path / "unit.yaml"
+    for content in ("lasers: 3", "{", "lasers: [{rot_correction: 1}]", "lasers: []", "- 1"):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=r"unit\.yaml"):
+            load_sensor(str(path))
+    path.write_text(yaml.safe_dump(calibration(vert_correction=0.1)))
+    with pytest.raises(ValueError, match=r"unit\.yaml: inclination_rad of the lasers must fall"):
+        load_sensor(str(path))
+    with pytest.raises(ValueError, match=r"no sensor 'hdl65e': give hdl64e, hdl32e, vls128 or"):
+        load_sensor("hdl65e")
+
+
+def test_stored_and_read_again():
+    sensor = hdl64e(shots=100)
+    assert sensor_from_dict(json.loads(json.dumps(sensor_to_dict(sensor)))) == sensor
+
+
 def test_frozen_and_checked():
-    sensor = HDL64E()
+    sensor = hdl64e()
     assert sensor.shots == 2083
     with pytest.raises(dataclasses.FrozenInstanceError):
         sensor.shots = 10
-    with pytest.raises(ValueError, match="shots must be at least 8 per turn, got 7"):
-        HDL64E(shots=7)
-    with pytest.raises(ValueError, match="mount_height_m"):
-        HDL64E(mount_height_m=0.0)
+    for name, value in (
+        ("shots", 7),
+        ("mount_height_m", 0.0),
+        ("min_power", float("nan")),
+        ("divergence_rad", -1.0),
+        ("return_mode", "last"),
+        ("max_range_m", 1.0),
+    ):
+        with pytest.raises(ValueError, match=name):
+            dataclasses.replace(sensor, **{name: value})
     with pytest.raises(ValueError, match="calibration_seed"):
-        HDL64E(calibration_seed=-1)
+        hdl64e(calibration_seed=-1)
+    with pytest.raises(ValueError, match="columns of one length"):
+        Lasers((0.1,), (0.0, 0.0), (0.0,), (0.0,), (0.0,), (1.0,))
+    with pytest.raises(ValueError, match="intensity_gain"):
+        dataclasses.replace(sensor.lasers, intensity_gain=(0.0,) * 64)

@@ -8,7 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from r3dpa.simulation import Weather
 
 __all__ = ["main"]
 
@@ -22,9 +25,20 @@ _STAGE_COMMANDS = {
 
 
 def simulate(
-    out: Path, scans: int = 100, seed: int = 0, workers: int = 1, drives: list[str] | None = None
+    out: Path,
+    scans: int = 100,
+    seed: int = 0,
+    workers: int = 1,
+    drives: list[str] | None = None,
+    sensor: str = "hdl64e",
+    return_mode: Literal["strongest", "dual"] = "strongest",
+    effects: dict[str, str | bool] | None = None,
+    weather: Weather | None = None,
 ) -> None:
     """Write simulated scans of a street in the KITTI-360 layout.
+
+    The same command completes what was interrupted. Prints what each effect did and cost, which
+    stays in ``report.json``; ``sim/*.json`` tells it for each scan.
 
     Args:
         out: Root of the data set to write.
@@ -32,10 +46,23 @@ def simulate(
         seed: Seed of streets and instrument.
         workers: Processes; the bytes written do not depend on it.
         drives: Four-digit drives to fill, such as '["0003"]'; all official ones where not given.
+        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
+            reads, for an HDL-64E.
+        return_mode: Strongest return of each shot, or the two strongest.
+        effects: ``auto``, ``on`` or ``off`` by effect, such as ``--effects.fog off``; those not
+            named run where the scene calls for them.
+        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; drawn where not given.
     """
+    from r3dpa.simulation import load_sensor
     from r3dpa.simulation import simulate as write
 
-    _print(write(out, scans, seed=seed, workers=workers, drives=drives))
+    lidar = load_sensor(sensor, return_mode=return_mode)
+    try:
+        report = write(out, scans, seed, workers, drives, lidar, effects, weather)
+    except KeyboardInterrupt:
+        sys.stderr.write(f"r3dpa simulate: stopped; the same command goes on in {out}\n")
+        sys.exit(130)  # as a shell reports an interrupt
+    _print(report)
 
 
 def check(path: Path) -> None:
@@ -50,6 +77,35 @@ def check(path: Path) -> None:
     _print(report)
     if not report.ok:
         sys.exit(1)
+
+
+def view(
+    source: Path, out: Path | None = None, num: int = 8, reference: Path | None = None
+) -> None:
+    """Draw scans as range images, from above, and as a page with point clouds to turn.
+
+    Args:
+        source: A ``.bin``, ``.ply`` or ``.npz`` file, or a folder of ``.bin`` scans in any layout.
+        out: Folder for the pictures and the page; ``view/<name of the source>`` where not given.
+        num: Scans to show at most, evenly spread over the folder.
+        reference: Scan to show beside the others, such as a real one beside simulated ones.
+    """
+    from r3dpa.cli.view import view as draw
+
+    _print(draw(source, out, num, reference))
+
+
+def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
+    """Compare scans with real ones, each measure beside the distance between real drives.
+
+    Args:
+        scans: Folder of ``.bin`` scans (A); one drive per folder.
+        reference: Folder of real scans (B), of two or more drives.
+        out: JSON file for the table and the curves behind it.
+    """
+    from r3dpa.cli.realism import realism as compare
+
+    _print(compare(scans, reference, out))
 
 
 def sample(
@@ -159,7 +215,8 @@ def bench(
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    command.__name__: command for command in (simulate, check, sample, convert, report, bench)
+    command.__name__: command
+    for command in (simulate, check, view, realism, sample, convert, report, bench)
 }
 
 
@@ -194,7 +251,7 @@ def _run(args: list[str]) -> None:
             _COMMANDS[args[0]],
             args=args[1:],
             prog=f"r3dpa {args[0]}",
-            as_positional=args[0] in ("check", "convert", "report"),
+            as_positional=args[0] in ("check", "view", "convert", "report"),
         )
     else:
         _print(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")

@@ -32,7 +32,7 @@ from r3dpa.geometry import (
     ScanGeometry,
     SphericalProjection,
 )
-from r3dpa.simulation import simulate
+from r3dpa.simulation import Weather, simulate
 
 _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
@@ -326,7 +326,11 @@ class SimulatedDataModule(KITTI360DataModule):
     Args:
         root: Folder of the data set; filled where it is not complete.
         num_scans: Scans to simulate, over all drives; 2 or more, a fifth of them held out.
-        simulation_seed: Seed of the streets.
+        simulation_seed: Seed of streets and instrument.
+        simulation_sensor: Instrument: ``hdl64e``, ``hdl32e``, ``vls128`` or a calibration file;
+            ``sensor`` is about the range images.
+        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
+        weather: Weather of all scans; drawn where None.
         kwargs: Arguments of :class:`LidarDataModule`.
 
     Raises:
@@ -334,13 +338,23 @@ class SimulatedDataModule(KITTI360DataModule):
     """
 
     def __init__(
-        self, root: str, num_scans: int = 1000, simulation_seed: int = 0, **kwargs: Any
+        self,
+        root: str,
+        num_scans: int = 1000,
+        simulation_seed: int = 0,
+        simulation_sensor: str = "hdl64e",
+        effects: dict[str, str | bool] | None = None,
+        weather: Weather | None = None,
+        **kwargs: Any,
     ) -> None:
         super().__init__(root, **kwargs)
         if num_scans < 2:
             raise ValueError(f"num_scans must be at least 2, one of them held out, got {num_scans}")
         self.num_scans = num_scans
         self.simulation_seed = simulation_seed
+        self.simulation_sensor = simulation_sensor
+        self.effects = effects
+        self.weather = weather
 
     def prepare_data(self) -> None:
         """Simulate the scans and make the feature grids that are missing."""
@@ -349,6 +363,9 @@ class SimulatedDataModule(KITTI360DataModule):
             scans=self.num_scans,
             seed=self.simulation_seed,
             workers=max(1, self.num_workers),
+            sensor=self.simulation_sensor,
+            effects=self.effects,
+            weather=self.weather,
         )
         super().prepare_data()
 

@@ -1,41 +1,63 @@
-"""Simulated lidar: seeded streets, ray casting, declared effects, KITTI-360 data sets."""
+"""Simulated lidar: seeded streets, ray casting, effects that a scene calls for, data sets."""
 
+from r3dpa.simulation.draws import generator_for
+from r3dpa.simulation.drive_files import drive_name
 from r3dpa.simulation.drives import (
     TRAIN_DRIVES,
     VAL_DRIVES,
-    SimulationReport,
-    drive_name,
     expected_scans,
     simulate,
     split_scans,
 )
-from r3dpa.simulation.effects import DetectionLimit, Effect, LambertianReflection
-from r3dpa.simulation.raycast import Returns, cast
-from r3dpa.simulation.scan import SimulatedScan, simulate_scan
-from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic, Shape
-from r3dpa.simulation.sensor import HDL64E
-from r3dpa.simulation.street import Street, generator_for
+from r3dpa.simulation.effects import EFFECTS, Effect, Switch
+from r3dpa.simulation.report import SimulationReport
+from r3dpa.simulation.scan import EffectRecord, SimulatedScan, effect_name, simulate_scan
+from r3dpa.simulation.scene import (
+    EgoMotion,
+    Material,
+    Pose,
+    Primitive,
+    Puddle,
+    Scene,
+    Semantic,
+    Shape,
+    Weather,
+)
+from r3dpa.simulation.sensor import Lasers, SpinningLidar, hdl64e, load_sensor
+from r3dpa.simulation.street import Street
+from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.weather import WeatherPrior
 
 __all__ = [
-    "HDL64E",
+    "EFFECTS",
     "TRAIN_DRIVES",
     "VAL_DRIVES",
-    "DetectionLimit",
     "Effect",
-    "LambertianReflection",
+    "EffectRecord",
+    "EgoMotion",
+    "Lasers",
+    "Material",
+    "Origin",
     "Pose",
     "Primitive",
-    "Returns",
+    "Puddle",
     "Scene",
     "Semantic",
     "Shape",
     "SimulatedScan",
     "SimulationReport",
+    "SpinningLidar",
     "Street",
-    "cast",
+    "Sweep",
+    "Switch",
+    "Weather",
+    "WeatherPrior",
     "drive_name",
+    "effect_name",
     "expected_scans",
     "generator_for",
+    "hdl64e",
+    "load_sensor",
     "simulate",
     "simulate_scan",
     "split_scans",

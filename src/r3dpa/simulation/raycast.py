@@ -1,107 +1,51 @@
-"""Rays against primitives: nearest hit, surface and incidence of every shot of one turn."""
+"""Rays against primitives: nearest surface and normal.
+
+Everything happens in the *scene frame*: the sensor frame in the middle of the sweep, levelled by
+the pose's roll and pitch, so that z points straight up. Letters: N solids, H beams, W shots, M
+single rays.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic, Shape
-from r3dpa.simulation.sensor import Rays
+from r3dpa.simulation.scene import Pose, Primitive, Scene, Shape
 
 Floats = NDArray[np.float32]
 
-MAX_RANGE_M = 120.0
-NO_SURFACE, GROUND = -2, -1
+EGO_BODY, NO_SURFACE, GROUND = -3, -2, -1
 
 # Slack of the windows that choose which rays are tested against a primitive; too much only costs
 # time, too little would cut off an object's rim.
 _WINDOW_SLACK_RAD = 2e-3
+# A secondary ray starts on a surface; nearer hits are that surface.
+_START_M = 1e-3
+# Slack of the heights that choose which solids are tested against a secondary ray.
+_SLACK_M = 1e-2
+# Secondary rays whose table of distances to all solids stays in the cache of a core.
+_BLOCK_RAYS = 512
+# How single foliage draws are told apart from solid to solid; any odd numbers do.
+_BEAM_STRIDE, _SHOT_STRIDE = 17, 641
 
 
-@dataclass(frozen=True)
-class Returns:
-    """What comes back for each shot; every array but the rays is ``(H, W)``, beams by shots.
-
-    Args:
-        rays: The shots, in the sensor frame; a point is ``origin + range_m * direction``.
-        range_m: Distance along the ray, float32; infinity where nothing comes back.
-        surface: Index of the primitive that was hit, ``GROUND`` or ``NO_SURFACE``; int32.
-        cos_incidence: Cosine between the ray and the surface normal, float32 in [0, 1].
-        reflectivity: Lambertian reflectivity of the surface, float32.
-        semantic: Class id of the surface, uint16; 0 where there is none.
-        instance: Object number of the surface, uint16.
-        power: Received over emitted power, m^-2, float32; 1 before any effect has been applied.
-    """
-
-    rays: Rays
-    range_m: Floats
-    surface: NDArray[np.int32]
-    cos_incidence: Floats
-    reflectivity: Floats
-    semantic: NDArray[np.uint16]
-    instance: NDArray[np.uint16]
-    power: Floats
-
-
-def cast(scene: Scene, rays: Rays) -> Returns:
-    """Nearest surface along each ray, up to ``MAX_RANGE_M``.
-
-    Every solid is scaled to its unit shape, where a ray ``p + t d`` meets a box by its slabs and a
-    cylinder or ellipsoid by a quadratic whose discriminant is written with the cross product,
-    ``|d|^2 - |p x d|^2``, which float32 can hold where ``b^2 - a c`` cancels. A ray that starts
-    inside a solid does not see it. No ray may point straight up or down.
-
-    Args:
-        scene: Solids, ground and pose; the effects are not applied here.
-        rays: Rays of one turn in the sensor frame, beams from top to bottom, shots by azimuth.
-
-    Returns:
-        The hits, with ``power`` 1 everywhere.
-    """
-    levelled = np.stack([_level(rays.origin, scene.pose), _level(rays.direction, scene.pose)])
-    nearest = np.full(levelled.shape[2:], MAX_RANGE_M, dtype=np.float32)
-    surface = np.full(nearest.shape, NO_SURFACE, dtype=np.int32)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        height_m = levelled[0, 2] + np.float32(scene.pose.z_m)
-        _keep_nearer(-height_m / levelled[1, 2], GROUND, nearest, surface)
-        solids = _solids(scene.primitives, scene.pose)
-        windows = _windows(solids, levelled)
-        for index in windows.order:
-            _cast_solid(index, solids, windows, levelled, nearest, surface)
-        cos_incidence = _cos_incidence(solids, levelled, nearest, surface)
-
-    def of_surface(values: list[float], ground: float, dtype: type) -> NDArray:
-        # GROUND and NO_SURFACE are the last and the last but one entry of the table.
-        return np.array([*values, 0, ground], dtype=dtype)[surface]
-
-    return Returns(
-        rays=rays,
-        range_m=np.where(surface == NO_SURFACE, np.float32(np.inf), nearest),
-        surface=surface,
-        cos_incidence=cos_incidence,
-        reflectivity=of_surface(
-            [p.reflectivity for p in scene.primitives], scene.ground_reflectivity, np.float32
-        ),
-        semantic=of_surface([p.semantic for p in scene.primitives], Semantic.ROAD, np.uint16),
-        instance=of_surface([p.instance for p in scene.primitives], 0, np.uint16),
-        power=np.ones_like(nearest),
-    )
-
-
-class _Solids(NamedTuple):
-    """Primitives as columns, moved into the levelled sensor frame (origin at the frame origin)."""
+class Solids(NamedTuple):
+    """Primitives as columns in the scene frame."""
 
     shape: NDArray[np.int64]  # (N,)
     centre: Floats  # (N, 3)
     half_size: Floats  # (N, 3)
     cos_yaw: Floats  # (N,)
     sin_yaw: Floats  # (N,)
+    grade: Floats  # (N, 2)
+    velocity: Floats  # (N, 2), metres per second
+    extinction: Floats  # (N,)
+    ground_m: float  # height of the ground
 
 
-class _Windows(NamedTuple):
+class Windows(NamedTuple):
     """For each solid the beams and shots that can meet it, its nearest range, and the order."""
 
     beams: NDArray[np.int64]  # (N, 2) first and one past the last
@@ -110,8 +54,18 @@ class _Windows(NamedTuple):
     order: NDArray[np.int64]  # solids within reach, near to far
 
 
-def _level(vectors: Floats, pose: Pose) -> Floats:
-    """Vectors ``(3, H, W)`` of the sensor frame, tilted by roll and pitch."""
+class _Solid(NamedTuple):
+    """Columns of one solid as scalars, or of one solid per ray as ``(M,)``."""
+
+    centre: Floats  # (3,) or (3, M)
+    half_size: Floats
+    cos_yaw: Floats
+    sin_yaw: Floats
+    grade: Floats | None  # (2,) or (2, M); None without a slope
+
+
+def level(vectors: Floats, pose: Pose) -> Floats:
+    """Vectors ``(3, ...)`` of the sensor frame, tilted by roll and pitch."""
     x, y, z = vectors
     cos_roll, sin_roll = np.float32(np.cos(pose.roll_rad)), np.float32(np.sin(pose.roll_rad))
     cos_pitch, sin_pitch = np.float32(np.cos(pose.pitch_rad)), np.float32(np.sin(pose.pitch_rad))
@@ -120,30 +74,269 @@ def _level(vectors: Floats, pose: Pose) -> Floats:
     return np.stack([x, y, z])
 
 
-def _solids(primitives: tuple[Primitive, ...], pose: Pose) -> _Solids:
+def solids_of(primitives: tuple[Primitive, ...], pose: Pose, ground_m: float) -> Solids:
+    """Primitives of the world, seen from a pose."""
+    turn = np.array(
+        [
+            [np.cos(pose.heading_rad), -np.sin(pose.heading_rad)],
+            [np.sin(pose.heading_rad), np.cos(pose.heading_rad)],
+        ]
+    )
     centre = np.array([p.centre for p in primitives], dtype=float).reshape(-1, 3)
     centre -= (pose.x_m, pose.y_m, pose.z_m)
-    cos_heading, sin_heading = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
-    x, y = centre[:, 0].copy(), centre[:, 1].copy()
-    centre[:, 0] = cos_heading * x + sin_heading * y
-    centre[:, 1] = cos_heading * y - sin_heading * x
+    centre[:, :2] = centre[:, :2] @ turn
+    velocity = np.array([p.velocity_m_s for p in primitives], dtype=float).reshape(-1, 2) @ turn
     yaw = np.array([p.yaw_rad for p in primitives], dtype=float) - pose.heading_rad
-    return _Solids(
+    return Solids(
         np.array([p.shape for p in primitives], dtype=np.int64),
         centre.astype(np.float32),
         np.array([p.half_size for p in primitives], dtype=np.float32).reshape(-1, 3),
         np.cos(yaw).astype(np.float32),
         np.sin(yaw).astype(np.float32),
+        np.array([p.grade for p in primitives], dtype=np.float32).reshape(-1, 2),
+        velocity.astype(np.float32),
+        np.array([p.extinction_per_m for p in primitives], dtype=np.float32),
+        ground_m - pose.z_m,
     )
 
 
-def _windows(solids: _Solids, levelled: Floats) -> _Windows:
-    """Beams and shots whose rays can meet each solid, from its bounding box seen from above."""
-    origin, direction = levelled.astype(np.float32)
+def subset(solids: Solids, chosen: NDArray) -> Solids:
+    """Some of the solids, by mask or index, over the same ground."""
+    columns = solids._asdict()
+    ground_m = columns.pop("ground_m")
+    return Solids(**{name: column[chosen] for name, column in columns.items()}, ground_m=ground_m)
+
+
+def scene_solids(scene: Scene) -> Solids:
+    """The solids of a scene in its scene frame."""
+    return solids_of(scene.primitives, scene.pose, scene.ground_m)
+
+
+def cast(
+    solids: Solids,
+    origin: Floats,
+    direction: Floats,
+    max_range_m: float,
+    actor_time_s: Floats | None = None,
+    optical_depth: Floats | None = None,
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Nearest surface along each ray of a turn.
+
+    Every solid is scaled to its unit shape, where a ray ``p + t d`` meets a box by its slabs and a
+    cylinder or ellipsoid by a quadratic whose discriminant is written with the cross product,
+    ``|d|^2 - |p x d|^2``, which float32 can hold where ``b^2 - a c`` cancels. A ray that starts
+    inside a solid does not see it. No ray may point straight up or down.
+
+    Args:
+        solids: Solids and ground.
+        origin: ``(3, H, W)`` where the rays start, metres.
+        direction: ``(3, H, W)`` unit vectors; shots of growing azimuth that fill the turn.
+        max_range_m: Hits from here on are left out.
+        actor_time_s: ``(H, W)`` time at which each ray meets the moving solids, seconds from the
+            middle of the sweep; None leaves them where they are then.
+        optical_depth: ``(H, W)`` draws of the exponential distribution: how deep each ray gets
+            into foliage, see ``Primitive.extinction_per_m``; None makes foliage a surface.
+
+    Returns:
+        Distance ``(H, W)``, infinite where nothing is hit, and index of the solid, ``GROUND`` or
+        ``NO_SURFACE``.
+    """
+    nearest = np.full(origin.shape[1:], max_range_m, dtype=np.float32)
+    surface = np.full(nearest.shape, NO_SURFACE, dtype=np.int32)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        _keep_nearer(
+            (np.float32(solids.ground_m) - origin[2]) / direction[2], GROUND, nearest, surface
+        )
+        windows = windows_of(solids, origin, direction, max_range_m, actor_time_s)
+        for index in windows.order:
+            solid = _Solid(
+                solids.centre[index],
+                solids.half_size[index],
+                solids.cos_yaw[index],
+                solids.sin_yaw[index],
+                solids.grade[index] if solids.grade[index].any() else None,
+            )
+            moving = actor_time_s is not None and solids.velocity[index].any()
+            foliage = optical_depth is not None and solids.extinction[index] > 0
+            for window in pieces(index, windows, origin.shape[2]):
+                near = nearest[window]
+                if near.max() <= windows.near_m[index]:
+                    continue
+                rays = (slice(None), *window)
+                start = origin[rays].reshape(3, -1)
+                if moving:
+                    assert actor_time_s is not None
+                    start = _relative(start, solids.velocity[index], actor_time_s[window].ravel())
+                towards = direction[rays].reshape(3, -1)
+                distance, leave = _crossing(solids.shape[index], solid, start, towards)
+                if foliage:
+                    assert optical_depth is not None
+                    drawn = _draws_of(index, window, optical_depth)
+                    deep = distance + drawn.ravel() / solids.extinction[index]
+                    distance = np.where((distance > 0) & (deep < leave), deep, np.float32(np.nan))
+                _keep_nearer(distance.reshape(near.shape), index, near, surface[window])
+    return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
+
+
+def cast_single(
+    solids: Solids,
+    origin: Floats,
+    direction: Floats,
+    time_s: Floats,
+    max_range_m: NDArray[np.floating],
+    excluded: NDArray[np.int32],
+    hollow: NDArray[np.int32],
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Nearest surface along single rays that start anywhere, such as reflected ones.
+
+    Foliage counts as a surface, and the ground is only seen from above.
+
+    Args:
+        solids: Solids and ground.
+        origin: ``(3, M)`` where the rays start.
+        direction: ``(3, M)`` unit vectors.
+        time_s: ``(M,)`` when they do, for the moving solids.
+        max_range_m: ``(M,)`` hits from here on are left out.
+        excluded: ``(M,)`` solid, or ``GROUND``, that the ray does not see.
+        hollow: ``(M,)`` solid that the ray sees from inside, such as the house behind a window;
+            ``NO_SURFACE`` for none.
+
+    Returns:
+        Distance ``(M,)``, infinite where nothing is hit, and index as for ``cast``.
+    """
+    nearest = max_range_m.astype(np.float32)
+    surface = np.full(len(nearest), NO_SURFACE, dtype=np.int32)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
+        to_ground[(direction[2] >= 0) | (excluded == GROUND)] = np.nan
+        _keep_nearer(to_ground, GROUND, nearest, surface)
+        ray, index = _close_pairs(solids, origin, direction, nearest, time_s)
+        keep = excluded[ray] != index
+        ray, index = ray[keep], index[keep]
+        start = _relative(origin[:, ray], solids.velocity[index].T, time_s[ray])
+        distance, leave = surface_distance(solids, index, start, direction[:, ray])
+        distance = np.where(hollow[ray] == index, leave, distance)
+        distance[~((distance > _START_M) & (distance < nearest[ray]))] = np.inf
+        np.minimum.at(nearest, ray, distance)
+        # Backwards, so that of solids equally far the first one is left standing.
+        hit = np.flatnonzero(distance == nearest[ray])[::-1]
+        surface[ray[hit]] = index[hit]
+    return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
+
+
+def surface_distance(
+    solids: Solids, index: NDArray[np.integer], origin: Floats, direction: Floats
+) -> tuple[Floats, Floats]:
+    """Where each ray ``(3, M)`` enters and leaves its own solid ``index`` (M,); NaN for a miss."""
+    enter = np.full(len(index), np.nan, dtype=np.float32)
+    leave = enter.copy()
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for shape in Shape:
+            chosen = np.flatnonzero(solids.shape[index] == shape)
+            solid = _gather(solids, index[chosen])
+            enter[chosen], leave[chosen] = _crossing(
+                shape, solid, origin[:, chosen], direction[:, chosen]
+            )
+    return enter, leave
+
+
+def normals(
+    solids: Solids, surface: NDArray[np.integer], position: Floats, time_s: Floats | None
+) -> Floats:
+    """Unit normals ``(3, M)`` of surfaces at points ``(3, M)`` on them, in the scene frame.
+
+    Args:
+        solids: Solids and ground.
+        surface: ``(M,)`` index of the solid, or ``GROUND``.
+        position: Points on these surfaces.
+        time_s: ``(M,)`` when the moving solids were hit; None in the middle of the sweep.
+    """
+    normal = np.zeros_like(position)
+    normal[2] = 1
+    hit = np.flatnonzero(surface >= 0)
+    index = surface[hit]
+    solid = _gather(solids, index)
+    at = position[:, hit]
+    if time_s is not None:
+        at = _relative(at, solids.velocity[index].T, time_s[hit])
+    unit = _unit_frame(solid, at, True)
+    shape = solids.shape[index]
+    gradient = unit.copy()
+    upright = shape == Shape.CYLINDER
+    on_cap = upright & (np.abs(unit[2]) > np.hypot(unit[0], unit[1]))
+    gradient[2, upright] = 0
+    # On a cap the height is 1 and the largest coordinate, as on the top of a box.
+    flat = np.arange(3)[:, None] == np.abs(unit).argmax(axis=0)
+    gradient = np.where((shape == Shape.BOX) | on_cap, flat * np.sign(unit), gradient)
+    gradient = gradient / solid.half_size
+    if solid.grade is not None:
+        gradient[:2] -= gradient[2] * solid.grade
+    x = solid.cos_yaw * gradient[0] - solid.sin_yaw * gradient[1]
+    y = solid.sin_yaw * gradient[0] + solid.cos_yaw * gradient[1]
+    turned = np.stack([x, y, gradient[2]])
+    normal[:, hit] = turned / np.sqrt((turned * turned).sum(axis=0))
+    return normal
+
+
+def pieces(index: int, windows: Windows, num_shots: int) -> list[tuple[slice, slice]]:
+    """The window of a solid as one or two rectangles of beams and shots."""
+    first, last = windows.shots[index]
+    turn = first // num_shots * num_shots
+    first, last = first - turn, last - turn
+    beams = slice(*windows.beams[index])
+    found = [(beams, slice(first, min(last, num_shots)))]
+    if last > num_shots:
+        found.append((beams, slice(0, last - num_shots)))
+    return found
+
+
+def windows_of(
+    solids: Solids,
+    origin: Floats,
+    direction: Floats,
+    max_range_m: float,
+    actor_time_s: Floats | None = None,
+) -> Windows:
+    """Beams and shots whose rays can meet each solid, from its bounding box seen from above.
+
+    Two passes: the first takes the rays to start anywhere that any of them does, which a moving
+    sensor spreads over a metre; the second looks up where those of the first window really start.
+    """
+    num_shots = origin.shape[2]
+    reach = np.zeros(len(solids.shape))
+    if actor_time_s is not None:
+        reach = np.hypot(*solids.velocity.T) * float(np.abs(actor_time_s).max())
+    spread_m = float(np.hypot(origin[0], origin[1]).max()) + reach
+    here = np.zeros((len(solids.shape), 2))
+    wide = _windows_from(solids, origin, direction, max_range_m, here, spread_m)
+    # The origins of each shot: their middle over the beams, and how far the farthest is from it.
+    middle = origin[:2].mean(axis=1)
+    around = np.hypot(*(origin[:2] - middle[:, None])).max(axis=0)
+    if spread_m.max(initial=0.0) < 2 * around.min() or not len(wide.order):
+        return wide
+    columns = np.arange(num_shots)
+    for index in wide.order:
+        inside = columns.take(range(*wide.shots[index]), mode="wrap")
+        here[index] = middle[:, inside[len(inside) // 2]]
+        away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
+        spread_m[index] = away.max() + reach[index]
+    return _windows_from(solids, origin, direction, max_range_m, here, spread_m)
+
+
+def _windows_from(
+    solids: Solids,
+    origin: Floats,
+    direction: Floats,
+    max_range_m: float,
+    here: NDArray[np.float64],
+    spread_m: NDArray[np.float64],
+) -> Windows:
+    """Windows for rays that start within ``spread_m`` (N,) of ``here`` (N, 2)."""
     num_shots = origin.shape[2]
     step = 2 * np.pi / num_shots
     centre, half = solids.centre.astype(float), solids.half_size.astype(float)
-    # Corners of the footprint, and the distance from the frame origin to it.
+    centre[:, :2] -= here
+    # Corners of the footprint, and the distance from the rays' origins to it.
     along = np.array([1, 1, -1, -1]) * half[:, :1]
     across = np.array([1, -1, 1, -1]) * half[:, 1:2]
     cos_yaw, sin_yaw = solids.cos_yaw[:, None], solids.sin_yaw[:, None]
@@ -151,7 +344,6 @@ def _windows(solids: _Solids, levelled: Floats) -> _Windows:
     corner_y = centre[:, 1:2] + sin_yaw * along + cos_yaw * across
     local_x = cos_yaw[:, 0] * centre[:, 0] + sin_yaw[:, 0] * centre[:, 1]
     local_y = cos_yaw[:, 0] * centre[:, 1] - sin_yaw[:, 0] * centre[:, 0]
-    spread_m = float(np.hypot(origin[0], origin[1]).max())
     near_m = np.hypot(
         (np.abs(local_x) - half[:, 0]).clip(min=0), (np.abs(local_y) - half[:, 1]).clip(min=0)
     )
@@ -160,9 +352,8 @@ def _windows(solids: _Solids, levelled: Floats) -> _Windows:
 
     # Shots: angles of the corners about the centre's direction, widened by how far the rays leave
     # their column's nominal azimuth and by the spread of their origins.
-    nominal = step * np.arange(num_shots)
-    deviation = np.arctan2(direction[1], direction[0]) - nominal
-    deviation = (deviation + np.pi) % (2 * np.pi) - np.pi
+    deviation = np.arctan2(direction[1], direction[0]) - (step * np.arange(num_shots)).astype("f4")
+    deviation -= np.float32(2 * np.pi) * np.round(deviation / np.float32(2 * np.pi))
     heading = np.arctan2(centre[:, 1], centre[:, 0])
     angle = np.arctan2(corner_y, corner_x) - heading[:, None]
     angle = (angle + np.pi) % (2 * np.pi) - np.pi
@@ -177,45 +368,84 @@ def _windows(solids: _Solids, levelled: Floats) -> _Windows:
     shots[whole_turn] = (0, num_shots)
 
     # Beams: the steepest and flattest lines from the optical centres to top and bottom.
+    half_height = half[:, 2] + (np.abs(solids.grade) * half[:, :2]).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        top = centre[:, 2] + half[:, 2] - float(origin[2].min())
-        bottom = centre[:, 2] - half[:, 2] - float(origin[2].max())
+        top = centre[:, 2] + half_height - float(origin[2].min())
+        bottom = centre[:, 2] - half_height - float(origin[2].max())
         steepest_up = np.arctan2(top, np.where(top > 0, near_m, far_m)) + _WINDOW_SLACK_RAD
         steepest_down = np.arctan2(bottom, np.where(bottom < 0, near_m, far_m)) - _WINDOW_SLACK_RAD
-    inclination = np.arcsin(direction[2].clip(-1, 1))
-    highest, lowest = inclination.max(axis=1), inclination.min(axis=1)
-    meets = (lowest <= steepest_up[:, None]) & (highest >= steepest_down[:, None])
+    highest, lowest = direction[2].max(axis=1), direction[2].min(axis=1)
+    meets = lowest <= np.sin(steepest_up)[:, None]
+    meets &= highest >= np.sin(steepest_down)[:, None]
     num_beams = len(highest)
     beams = np.stack([meets.argmax(axis=1), num_beams - meets[:, ::-1].argmax(axis=1)], axis=1)
-    reachable = np.flatnonzero(meets.any(axis=1) & (near_m < MAX_RANGE_M))
-    return _Windows(beams, shots, near_m, reachable[np.argsort(near_m[reachable], kind="stable")])
+    reachable = np.flatnonzero(meets.any(axis=1) & (near_m < max_range_m))
+    return Windows(beams, shots, near_m, reachable[np.argsort(near_m[reachable], kind="stable")])
 
 
-def _cast_solid(
-    index: int,
-    solids: _Solids,
-    windows: _Windows,
-    levelled: Floats,
-    nearest: Floats,
-    surface: NDArray[np.int32],
-) -> None:
-    """Test one solid against the rays of its window; updates ``nearest`` and ``surface``."""
-    num_shots = nearest.shape[1]
-    first, last = windows.shots[index]
-    turn = first // num_shots * num_shots
-    first, last = first - turn, last - turn
-    pieces = [(first, min(last, num_shots))]
-    if last > num_shots:
-        pieces.append((0, last - num_shots))
-    beams = slice(*windows.beams[index])
-    for piece in pieces:
-        window = (beams, slice(*piece))
-        near = nearest[window]
-        if near.max() <= windows.near_m[index]:
-            continue
-        origin, direction = levelled[(slice(None), slice(None), *window)].reshape(2, 3, -1)
-        distance = _hit_distance(index, solids, origin, direction)
-        _keep_nearer(distance.reshape(near.shape), index, near, surface[window])
+def _draws_of(index: int, window: tuple[slice, slice], drawn: Floats) -> Floats:
+    """The window's draws for one solid: those of the turn, moved on from solid to solid."""
+    num_beams, num_shots = drawn.shape
+    beams = np.arange(window[0].start, window[0].stop) + _BEAM_STRIDE * index
+    shots = np.arange(window[1].start, window[1].stop) + _SHOT_STRIDE * index
+    return drawn[np.ix_(beams % num_beams, shots % num_shots)]
+
+
+def _close_pairs(
+    solids: Solids, origin: Floats, direction: Floats, reach_m: Floats, time_s: Floats
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rays and solids (each (K,), sorted by ray) whose upright bounding cylinders they cross."""
+    level_length = np.hypot(direction[0], direction[1])
+    along = direction[:2] / level_length
+    speed = np.hypot(*solids.velocity.T)
+    radius = np.hypot(solids.half_size[:, 0], solids.half_size[:, 1])
+    radius = radius + speed * np.abs(time_s).max(initial=0.0)
+    centre = np.concatenate([solids.centre[:, :2].T, np.ones((1, len(radius)), np.float32)])
+    # Signed distances of the centres from each ray's line, and along it, seen from above.
+    offset = origin[0] * along[1] - origin[1] * along[0]
+    lines = np.stack([along[1], -along[0], -offset], axis=1)
+    start = np.stack([*along, -(origin[0] * along[0] + origin[1] * along[1])], axis=1)
+    reach_m = reach_m * level_length
+    found = []
+    for some in range(0, len(lines), _BLOCK_RAYS):
+        block = slice(some, some + _BLOCK_RAYS)
+        ahead = start[block] @ centre
+        close = np.abs(lines[block] @ centre) <= radius
+        close &= ahead >= -radius
+        close &= ahead <= reach_m[block, None] + radius
+        ray, index = np.nonzero(close)
+        found.append((ray + some, index, ahead[ray, index]))
+    if not found:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    ray, index, ahead_m = (np.concatenate(column) for column in zip(*found, strict=True))
+    # Heights of the ray where it enters and leaves the circle, and of the solid.
+    rise = (direction[2] / level_length)[ray]
+    enter = origin[2, ray] + rise * (ahead_m - radius[index]).clip(min=0)
+    leave = origin[2, ray] + rise * np.minimum(ahead_m + radius[index], reach_m[ray])
+    half_height = solids.half_size[:, 2] + _SLACK_M
+    half_height += (np.abs(solids.grade) * solids.half_size[:, :2]).sum(axis=1)
+    top, bottom = solids.centre[:, 2] + half_height, solids.centre[:, 2] - half_height
+    meets = (np.minimum(enter, leave) <= top[index]) & (np.maximum(enter, leave) >= bottom[index])
+    return ray[meets], index[meets]
+
+
+def _gather(solids: Solids, index: NDArray[np.integer]) -> _Solid:
+    grade = solids.grade[index].T
+    return _Solid(
+        solids.centre[index].T,
+        solids.half_size[index].T,
+        solids.cos_yaw[index],
+        solids.sin_yaw[index],
+        grade if grade.any() else None,
+    )
+
+
+def _relative(position: Floats, velocity: Floats, time_s: Floats) -> Floats:
+    """Positions (3, M) seen from a solid that moves with ``velocity`` ((2,) or (2, M))."""
+    moved = position.copy()
+    moved[0] -= velocity[0] * time_s
+    moved[1] -= velocity[1] * time_s
+    return moved
 
 
 def _keep_nearer(distance: Floats, index: int, nearest: Floats, surface: NDArray[np.int32]) -> None:
@@ -224,28 +454,38 @@ def _keep_nearer(distance: Floats, index: int, nearest: Floats, surface: NDArray
     np.copyto(surface, index, where=nearer)
 
 
-def _hit_distance(index: int, solids: _Solids, origin: Floats, direction: Floats) -> Floats:
-    """Distance (R,) at which rays (3, R) enter a solid; NaN or negative where they do not."""
-    cos_yaw, sin_yaw = solids.cos_yaw[index], solids.sin_yaw[index]
-    half_x, half_y, half_z = solids.half_size[index]
-    x, y, z = solids.centre[index]
-    offset_x = (cos_yaw * x + sin_yaw * y) / half_x
-    offset_y = (cos_yaw * y - sin_yaw * x) / half_y
-    cos_x, sin_x = cos_yaw / half_x, sin_yaw / half_x
-    cos_y, sin_y = cos_yaw / half_y, sin_yaw / half_y
-    px = cos_x * origin[0] + sin_x * origin[1] - offset_x
-    py = cos_y * origin[1] - sin_y * origin[0] - offset_y
-    pz = (origin[2] - z) / half_z
-    dx = cos_x * direction[0] + sin_x * direction[1]
-    dy = cos_y * direction[1] - sin_y * direction[0]
-    dz = direction[2] / half_z
-    if solids.shape[index] == Shape.ELLIPSOID:
+def _unit_frame(solid: _Solid, vectors: Floats, is_point: bool) -> Floats:
+    """Vectors (3, M) of the scene frame in the coordinates where the solid is its unit shape."""
+    half_x, half_y, half_z = solid.half_size
+    cos_x, sin_x = solid.cos_yaw / half_x, solid.sin_yaw / half_x
+    cos_y, sin_y = solid.cos_yaw / half_y, solid.sin_yaw / half_y
+    x = cos_x * vectors[0] + sin_x * vectors[1]
+    y = cos_y * vectors[1] - sin_y * vectors[0]
+    z = vectors[2]
+    if is_point:
+        at_x, at_y, at_z = solid.centre
+        x = x - (cos_x * at_x + sin_x * at_y)
+        y = y - (cos_y * at_y - sin_y * at_x)
+        z = z - at_z
+    if solid.grade is not None:
+        z = z - solid.grade[0] * half_x * x - solid.grade[1] * half_y * y
+    return np.stack([x, y, z / half_z])
+
+
+def _crossing(
+    shape: int, solid: _Solid, origin: Floats, direction: Floats
+) -> tuple[Floats, Floats]:
+    """Distances (R,) at which rays (3, R) enter and leave a solid; NaN where they miss it."""
+    px, py, pz = _unit_frame(solid, origin, True)
+    dx, dy, dz = _unit_frame(solid, direction, False)
+    if shape == Shape.ELLIPSOID:
         squared = dx * dx + dy * dy + dz * dz
         cross = (py * dz - pz * dy) ** 2 + (pz * dx - px * dz) ** 2 + (px * dy - py * dx) ** 2
         middle = px * dx + py * dy + pz * dz
-        return -(middle + np.sqrt(squared - cross)) / squared
+        half_chord = np.sqrt(squared - cross)
+        return -(middle + half_chord) / squared, (half_chord - middle) / squared
     enter_z, leave_z = _slab(pz, dz)
-    if solids.shape[index] == Shape.CYLINDER:
+    if shape == Shape.CYLINDER:
         squared = dx * dx + dy * dy
         middle = px * dx + py * dy
         half_chord = np.sqrt(squared - (px * dy - py * dx) ** 2)
@@ -256,7 +496,8 @@ def _hit_distance(index: int, solids: _Solids, origin: Floats, direction: Floats
         enter_y, leave_y = _slab(py, dy)
         enter = np.maximum(np.maximum(enter_x, enter_y), enter_z)
         leave = np.minimum(np.minimum(leave_x, leave_y), leave_z)
-    return np.where(enter <= leave, enter, np.float32(np.nan))
+    missed = ~(enter <= leave)
+    return np.where(missed, np.float32(np.nan), enter), np.where(missed, np.float32(np.nan), leave)
 
 
 def _slab(position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
@@ -266,33 +507,3 @@ def _slab(position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
     middle = -position * inverse
     half = np.abs(inverse)
     return middle - half, middle + half
-
-
-def _cos_incidence(
-    solids: _Solids, levelled: Floats, nearest: Floats, surface: NDArray[np.int32]
-) -> Floats:
-    """Cosine (H, W) between the rays and the normals of the surfaces that they hit."""
-    cosine = np.where(surface == GROUND, np.abs(levelled[1, 2]), np.float32(0))
-    hit = surface >= 0
-    index = surface[hit]
-    origin, direction = levelled[:, :, hit]
-    shape, half, centre = solids.shape[index], solids.half_size[index].T, solids.centre[index].T
-    cos_yaw, sin_yaw = solids.cos_yaw[index], solids.sin_yaw[index]
-
-    def local(x: Floats, y: Floats, z: Floats) -> Floats:
-        return np.stack([cos_yaw * x + sin_yaw * y, cos_yaw * y - sin_yaw * x, z])
-
-    direction_local = local(*direction)
-    unit = local(*(origin + nearest[hit] * direction - centre)) / half
-    height = np.abs(unit[2])
-    rim = np.hypot(unit[0], unit[1])
-    gradient = unit / half
-    gradient[2, shape == Shape.CYLINDER] = 0
-    on_cap = (shape == Shape.CYLINDER) & (height > rim)
-    # On a cap the height is 1 and the largest coordinate, as on the top of a box.
-    on_face = (shape == Shape.BOX) | on_cap
-    flat = (np.arange(3)[:, None] == np.abs(unit).argmax(axis=0)).astype(np.float32)
-    normal = np.where(on_face, flat, gradient)
-    along = np.abs((normal * direction_local).sum(axis=0))
-    cosine[hit] = along / np.sqrt((normal * normal).sum(axis=0))
-    return cosine

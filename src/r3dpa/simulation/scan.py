@@ -2,74 +2,207 @@
 
 from __future__ import annotations
 
+import re
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.raycast import cast
+from r3dpa.simulation.effects import EFFECTS, Draws, Effect, Stage, Switch
 from r3dpa.simulation.scene import Scene
-from r3dpa.simulation.sensor import HDL64E
-from r3dpa.simulation.street import generator_for
+from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.sweep import Echoes, Origin, Sweep
+
+# Two echoes of one shot are told apart from here on.
+_SECOND_RETURN_M = 1.0
+# Powers, in units of the weakest that is detected, below which the intensity is 0 and from which on
+# it is not damped.
+_ZERO_INTENSITY, _FULL_INTENSITY = 2.3, 17.0
+
+
+@dataclass(frozen=True)
+class EffectRecord:
+    """What became of one effect in one scan.
+
+    Args:
+        name: Its name, see ``effect_name``.
+        status: Whether it ran, was not called for by the scene, or was switched off.
+        reason: Why.
+        rays: Rays that it touched.
+        ms: Time that it took, its predicate included, milliseconds.
+    """
+
+    name: str
+    status: Literal["ran", "not_called", "off"]
+    reason: str
+    rays: int
+    ms: float
 
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """A scan and its labels.
+    """A scan, its labels, and how it came about.
 
     Args:
         points: ``(P, 4)`` float32, x forward, y left, z up in the sensor frame in metres, and the
             intensity in [0, 0.99] in steps of 0.01; beam after beam from the highest to the
             lowest, in each beam by growing azimuth in [0, 2 pi).
-        labels: ``(P,)`` uint32, semantic class in the lower 16 bits, instance in the upper.
+        labels: ``(P,)`` uint32, semantic class in the lower 16 bits, instance in the upper; 0 for
+            points that show no surface.
+        origins: ``(P,)`` uint8, the ``Origin`` of each point.
+        effects: One record for each effect, in the order of ``EFFECTS``.
+        parts_ms: Time of the other parts, milliseconds.
     """
 
     points: NDArray[np.float32]
     labels: NDArray[np.uint32]
+    origins: NDArray[np.uint8]
+    effects: tuple[EffectRecord, ...]
+    parts_ms: Mapping[str, float]
 
 
-def simulate_scan(scene: Scene, sensor: HDL64E, key: tuple[int | str, ...]) -> SimulatedScan:
+def effect_name(effect: Effect) -> str:
+    """Name of an effect for switches and reports: its class in snake case."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", type(effect).__name__).lower()
+
+
+def check_switches(switches: Mapping[str, Switch]) -> dict[str, Switch]:
+    """Switches of named effects, checked.
+
+    Args:
+        switches: ``auto``, ``on`` or ``off`` by effect name.
+
+    Raises:
+        ValueError: If there is no such effect or no such switch.
+    """
+    names = [effect_name(effect) for effect in EFFECTS]
+    for name, switch in switches.items():
+        if name not in names:
+            raise ValueError(f"there is no effect {name!r}; there are {', '.join(names)}")
+        if switch not in ("auto", "on", "off"):
+            raise ValueError(f"effect {name} must be auto, on or off, got {switch!r}")
+    return dict(switches)
+
+
+def simulate_scan(
+    scene: Scene,
+    sensor: SpinningLidar,
+    key: tuple[int | str, ...],
+    switches: Mapping[str, Switch] | None = None,
+) -> SimulatedScan:
     """Scan a scene.
 
     Args:
-        scene: Solids, pose and effects.
+        scene: What is scanned.
         sensor: Instrument; its mount height is not used, the pose holds the height.
-        key: Seed of the effects' random draws, see ``generator_for``. The name of its class is
-            added for each effect, so that no effect moves the draws of another.
+        key: Seed of the random draws, see ``generator_for``; the name of each effect is added, so
+            that no effect moves the draws of another.
+        switches: Effects that are not on ``auto``: ``off`` leaves one out, ``on`` runs it whether
+            the scene calls for it or not, which then changes nothing.
 
     Returns:
-        The points that came back.
+        The points that came back, and what each effect did.
+
+    Raises:
+        ValueError: If a switch is unknown.
     """
-    returns = cast(scene, sensor.rays)
-    for effect in scene.effects:
-        returns = effect(returns, scene, generator_for(*key, type(effect).__name__))
-    seen = np.isfinite(returns.range_m)
-    origin, direction = (array[:, seen] for array in returns.rays)
-    points = np.empty((origin.shape[1], 4), dtype=np.float32)
-    points[:, :3] = (origin + returns.range_m[seen] * direction).T
-    points[:, 3] = calibrated_intensity(returns.power[seen], returns.range_m[seen])
-    labels = returns.semantic | returns.instance.astype(np.uint32) << np.uint32(16)
-    order = _storage_order(points, np.nonzero(seen)[0])
-    return SimulatedScan(points[order], labels[seen][order])
+    switches = check_switches(switches or {})
+    parts_ms: dict[str, float] = {}
+    with _timed(parts_ms, "rays"):
+        sweep = Sweep(scene, sensor)
+    records = []
+    for effect in EFFECTS:
+        if effect.stage > Stage.RAYS and "cast" not in parts_ms:
+            with _timed(parts_ms, "cast"):
+                sweep.cast()
+        records.append(_run(effect, sweep, key, switches.get(effect_name(effect), "auto")))
+    with _timed(parts_ms, "points"):
+        points, labels, origins = _points(sweep)
+    return SimulatedScan(points, labels, origins, tuple(records), parts_ms)
+
+
+def _run(effect: Effect, sweep: Sweep, key: tuple[int | str, ...], switch: Switch) -> EffectRecord:
+    start = time.perf_counter()
+    name = effect_name(effect)
+    if switch == "off":
+        return EffectRecord(name, "off", "switched off", 0, 0.0)
+    reason = effect.called_by(sweep.scene, sweep.sensor)
+    touched = 0
+    if reason is not None or switch == "on":
+        rays = effect.rays(sweep)
+        touched = sweep.num_rays if isinstance(rays, slice) else len(rays)
+        if touched:
+            effect.apply(sweep, rays, Draws(sweep.num_rays, *key, name))
+    ms = 1000 * (time.perf_counter() - start)
+    if reason is None and switch == "auto":
+        return EffectRecord(name, "not_called", "nothing in the scene calls for it", 0, ms)
+    return EffectRecord(name, "ran", reason or "switched on", touched, ms)
+
+
+@contextmanager
+def _timed(parts_ms: dict[str, float], part: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    parts_ms[part] = 1000 * (time.perf_counter() - start)
+
+
+def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
+    """Points, labels and origins in storage order."""
+    first, second = sweep.first, sweep.second
+    seen = np.flatnonzero(np.isfinite(first.range_m))
+    parts = [_export(sweep, first, seen)]
+    beams = [seen // sweep.shape[1]]
+    if second is not None and sweep.sensor.return_mode == "dual":
+        apart = np.abs(second.range_m[seen] - first.range_m[seen]) > _SECOND_RETURN_M
+        seen = seen[apart & np.isfinite(second.range_m[seen])]
+        points, labels, _ = _export(sweep, second, seen)
+        parts.append((points, labels, np.full(len(seen), Origin.SECOND_RETURN, dtype=np.uint8)))
+        beams.append(seen // sweep.shape[1])
+    points, labels, origins = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    order = _storage_order(points, np.concatenate(beams))
+    return points[order], labels[order], origins[order]
+
+
+def _export(
+    sweep: Sweep, echoes: Echoes, seen: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
+    """Points along the rays as the instrument believes them: those of a sensor that stands."""
+    origin, direction = (array.reshape(3, -1)[:, seen] for array in sweep.sensor.rays)
+    range_m, surface, made_by = echoes.range_m[seen], echoes.surface[seen], echoes.origin[seen]
+    points = np.empty((len(seen), 4), dtype=np.float32)
+    points[:, :3] = (origin + range_m * direction).T
+    points[:, 3] = calibrated_intensity(echoes.power[seen], range_m, sweep.sensor.min_power)
+    return points, sweep.labels(surface, made_by), made_by
 
 
 def calibrated_intensity(
-    power: NDArray[np.float32], range_m: NDArray[np.float32]
+    power: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
 ) -> NDArray[np.float32]:
     """Intensity as KITTI stores it: corrected for range, 0 to 0.99 in steps of 0.01.
 
-    The square root stands for the instrument's gain control, which lifts weak returns::
+    The square root stands for the instrument's gain control, which lifts weak returns; the weakest
+    are reported with 0::
 
-        intensity = sqrt(power * range^2)
+        intensity = sqrt(power * range^2) * clip(ln(power / a) / ln(b / a), 0, 1)
+        a = 2.3 min_power        b = 17 min_power
+
+    Source: fitted to the intensities of KITTI's scans by range and incidence.
 
     Args:
         power: Received power of the returns, m^-2, any shape.
         range_m: Their ranges, metres, same shape.
+        min_power: Weakest power that the instrument detects.
 
     Returns:
         Float32 of the same shape.
     """
-    return np.round(np.sqrt(power * range_m**2).clip(0, 0.99), 2)
+    weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
+    ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
+    return np.round((np.sqrt(power * range_m**2) * ramp.clip(max=1)).clip(0, 0.99), 2)
 
 
 def _storage_order(points: NDArray[np.float32], beams: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,37 +1,31 @@
-"""The spinning lidar that is simulated: its laser table and the rays of one turn."""
+"""The spinning lidar that is simulated: its laser table, its limits and the rays of one turn."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-NUM_BEAMS = 64
 _BLOCK_BEAMS = 32
-# (highest, lowest, standard deviation of the step) of the elevations of each block, degrees.
-_UPPER_BLOCK_DEG = (1.96, -8.56, 0.042)
-_LOWER_BLOCK_DEG = (-8.78, -24.56, 0.094)
-_UPPER_HEIGHTS_M = (0.217, 0.204)
-_LOWER_HEIGHTS_M = (0.163, 0.144)
+# HDL-64E as fitted to scans of KITTI (z = height + r tan(elevation) for each laser, residual below
+# 1 mm): (highest, lowest, standard deviation of the step) of each block's elevations in degrees,
+# optical centres, sign of the lateral offset, spread of bias and gain. The azimuth offsets are from
+# the S3 calibration of ros-drivers; its elevations (1.96 ... -8.56, -8.78 ... -24.56) end 0.4
+# degrees higher than KITTI's.
+_UPPER_BLOCK_DEG = (1.94, -8.71, 0.045)
+_LOWER_BLOCK_DEG = (-9.03, -25.00, 0.070)
+_UPPER_HEIGHTS_M = (0.209, 0.198)
+_LOWER_HEIGHTS_M = (0.126, 0.116)
 _AZIMUTH_COLUMNS_DEG = (-8.5, 3.7, -2.4, 9.9)
 _LATERAL_OFFSET_M = 0.026
-
-
-class LaserTable(NamedTuple):
-    """Calibration of each laser; every array is ``(64,)`` float64, highest beam first.
-
-    ``inclination_rad``: elevation of the beam, falling from beam to beam. ``azimuth_offset_rad``:
-    horizontal angle between the beam and the heading of the spinning head. ``height_m``: optical
-    centre above the frame origin. ``lateral_m``: optical centre to the left of the beam.
-    """
-
-    inclination_rad: NDArray[np.float64]
-    azimuth_offset_rad: NDArray[np.float64]
-    height_m: NDArray[np.float64]
-    lateral_m: NDArray[np.float64]
+_BIAS_SD_M = 0.025
+_GAIN_SD = 0.2
 
 
 class Rays(NamedTuple):
@@ -46,52 +40,258 @@ class Rays(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HDL64E:
-    """Velodyne HDL-64E as mounted on the recording car of KITTI-360.
-
-    Two blocks of 32 lasers whose optical centres lie about 0.2 m above the frame origin, so that
-    the inclination of a point seen from the origin depends on its range::
-
-        inclinations   +1.96 ... -8.56 deg (upper block), -8.78 ... -24.56 deg (lower block)
-        heights        0.217 ... 0.204 m,                  0.163 ... 0.144 m
-
-    Source: S3 calibration of ros-drivers/velodyne; mount and shots: KITTI-360.
+class Lasers:
+    """Calibration of each laser, highest beam first.
 
     Args:
-        shots: Shots of each laser per turn, 2083 at 10 Hz.
-        mount_height_m: Frame origin above the road.
-        calibration_seed: Draws the small irregularities of the beam steps and azimuth offsets.
+        inclination_rad: Elevation of the beam, falling from beam to beam.
+        azimuth_offset_rad: Horizontal angle from the heading of the spinning head to the beam.
+        height_m: Optical centre above the frame origin.
+        lateral_m: Optical centre to the left of the beam.
+        range_bias_m: What the laser measures too much.
+        intensity_gain: Factor on its intensity.
 
     Raises:
-        ValueError: If ``shots`` is less than 8, the mount is not above the road, or the seed is
-            negative.
+        ValueError: If the columns differ in length or are empty, a value is not finite, the
+            inclinations do not fall, a beam is steeper than 80 degrees, or a gain is not positive.
     """
 
+    inclination_rad: tuple[float, ...]
+    azimuth_offset_rad: tuple[float, ...]
+    height_m: tuple[float, ...]
+    lateral_m: tuple[float, ...]
+    range_bias_m: tuple[float, ...]
+    intensity_gain: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        lengths = {name: len(column) for name, column in columns.items()}
+        if len(set(lengths.values())) > 1 or not self.inclination_rad:
+            raise ValueError(f"lasers need columns of one length of at least 1, got {lengths}")
+        for name, column in columns.items():
+            if not np.isfinite(column).all():
+                raise ValueError(f"{name} of the lasers must be finite, got {column}")
+        inclination = np.array(self.inclination_rad)
+        if (np.diff(inclination) >= 0).any():
+            raise ValueError("inclination_rad of the lasers must fall from beam to beam")
+        if np.abs(inclination).max() > math.radians(80):
+            raise ValueError("inclination_rad of the lasers must stay within 80 degrees")
+        if min(self.intensity_gain) <= 0:
+            raise ValueError("intensity_gain of the lasers must be positive")
+
+
+@dataclass(frozen=True)
+class SpinningLidar:
+    """A spinning lidar; the defaults are the Velodyne HDL-64E of KITTI-360's recording car.
+
+    The optical centres of its two blocks lie about 0.2 m above the frame origin, so that the
+    inclination of a point seen from the origin depends on its range.
+
+    Source: KITTI's scans (laser table, nearest range, noise), the datasheet (other limits,
+    divergence), KITTI-360 (mount, spin).
+
+    Args:
+        lasers: Calibration of the lasers.
+        shots: Shots of each laser per turn.
+        spin_hz: Turns per second.
+        mount_height_m: Frame origin above the road.
+        min_power: Weakest power that is detected, m^-2: 10 % asphalt seen from 1.73 m vanishes at
+            50 m, see ``effects.surface``.
+        min_range_m: Nearest range that is reported; the datasheet says 0.9 m, KITTI's scans hold
+            nothing below 1.45 m.
+        max_range_m: Farthest range that is reported.
+        divergence_rad: Full angle of the beam; 0 for a line.
+        pulse_s: Length of the pulse; echoes nearer to each other than ``c * pulse_s / 2`` merge.
+        overlap_range_m: From here on the receiver sees the whole beam.
+        threshold_spread: Standard deviation of the logarithm of the detection threshold.
+        range_sigma_m: Range noise of a strong return.
+        weak_range_sigma_m: Further range noise at a signal-to-noise ratio of 1/2.
+        range_step_m: Step in which ranges are reported; 0 for none.
+        return_mode: Report the strongest return of a shot, or the two strongest.
+
+    Raises:
+        ValueError: If a value is out of its range.
+    """
+
+    lasers: Lasers
     shots: int = 2083
+    spin_hz: float = 10.0
     mount_height_m: float = 1.73
-    calibration_seed: int = 64
+    min_power: float = 1.43e-5
+    min_range_m: float = 1.45
+    max_range_m: float = 120.0
+    divergence_rad: float = 2e-3
+    pulse_s: float = 5e-9
+    overlap_range_m: float = 5.0
+    threshold_spread: float = 0.3
+    range_sigma_m: float = 0.008
+    weak_range_sigma_m: float = 0.05
+    range_step_m: float = 0.002
+    return_mode: Literal["strongest", "dual"] = "strongest"
 
     def __post_init__(self) -> None:
         """Check the values."""
         if self.shots < 8:
             raise ValueError(f"shots must be at least 8 per turn, got {self.shots}")
-        if not self.mount_height_m > 0:
+        for name in ("spin_hz", "mount_height_m", "min_power", "overlap_range_m"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in (
+            "divergence_rad",
+            "pulse_s",
+            "threshold_spread",
+            "range_sigma_m",
+            "weak_range_sigma_m",
+            "range_step_m",
+        ):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be 0 or greater, got {getattr(self, name)}")
+        if not 0 <= self.min_range_m < self.max_range_m < math.inf:
             raise ValueError(
-                f"mount_height_m must be positive (sensor above the road), "
-                f"got {self.mount_height_m}"
+                f"ranges must satisfy 0 <= min_range_m < max_range_m, "
+                f"got {self.min_range_m} and {self.max_range_m}"
             )
-        if self.calibration_seed < 0:
-            raise ValueError(f"calibration_seed must be 0 or greater, got {self.calibration_seed}")
+        if self.return_mode not in ("strongest", "dual"):
+            raise ValueError(f"return_mode must be strongest or dual, got {self.return_mode!r}")
 
     @property
-    def lasers(self) -> LaserTable:
-        """The laser table, ``(64,)`` arrays from the highest beam to the lowest."""
-        return _laser_table(self.calibration_seed)
+    def num_beams(self) -> int:
+        """Number of lasers."""
+        return len(self.lasers.inclination_rad)
 
     @property
     def rays(self) -> Rays:
-        """The rays of one turn in the sensor frame, ``(3, 64, shots)``; read-only."""
-        return _rays(self)
+        """The rays of one turn in the sensor frame, ``(3, H, W)``; read-only."""
+        return _rays(self.lasers, self.shots)
+
+    @property
+    def time_s(self) -> NDArray[np.float32]:
+        """When each shot is fired, ``(H, W)`` seconds from the middle of the sweep; read-only.
+
+        The head looks ahead in the middle of the sweep, turns counter-clockwise, and starts and
+        ends looking backwards.
+        """
+        return _time_s(self.lasers, self.shots, self.spin_hz)
+
+
+def hdl64e(shots: int = 2083, calibration_seed: int = 64) -> SpinningLidar:
+    """Velodyne HDL-64E as mounted on the recording car of KITTI-360.
+
+    Args:
+        shots: Shots of each laser per turn, 2083 at 10 Hz.
+        calibration_seed: Draws the small irregularities of the beam table.
+
+    Raises:
+        ValueError: If the shots are too few or the seed is negative.
+    """
+    if calibration_seed < 0:
+        raise ValueError(f"calibration_seed must be 0 or greater, got {calibration_seed}")
+    return SpinningLidar(_hdl64e_lasers(calibration_seed), shots)
+
+
+def hdl32e() -> SpinningLidar:
+    """Velodyne HDL-32E: 32 beams from +10.67 to -30.67 degrees, 2170 shots at 10 Hz.
+
+    Source: the datasheet.
+    """
+    none = np.zeros(32)
+    lasers = _lasers(
+        inclination_rad=np.radians(np.linspace(10.67, -30.67, 32)),
+        azimuth_offset_rad=none,
+        height_m=none,
+        lateral_m=none,
+    )
+    return SpinningLidar(lasers, 2170, min_range_m=0.9, max_range_m=100.0)
+
+
+def vls128() -> SpinningLidar:
+    """Velodyne VLS-128: 128 beams from +15 to -25 degrees, 0.11 degrees apart around the horizon.
+
+    Source: beam angles of ros-drivers/velodyne; the datasheet (1800 shots at 10 Hz, 245 m).
+    """
+    above = (15, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98, 4.83)
+    below = (6.65, 6.85, 7.15, 7.65, 8.35, 9.24, 10.35, 11.74, 13.57, 16.04, 19.58, 25)
+    inclination_deg = np.concatenate([above, np.linspace(4.72, -6.5, 103), np.negative(below)])
+    columns_deg = (4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354, 6.354)
+    none = np.zeros(128)
+    lasers = _lasers(
+        inclination_rad=np.radians(inclination_deg),
+        azimuth_offset_rad=np.radians(np.resize(columns_deg, 128)),
+        height_m=none,
+        lateral_m=none,
+    )
+    return SpinningLidar(lasers, 1800, min_range_m=0.9, max_range_m=245.0, min_power=3.4e-6)
+
+
+PRESETS = {"hdl64e": hdl64e, "hdl32e": hdl32e, "vls128": vls128}
+
+
+def load_sensor(model: str, **changes: Any) -> SpinningLidar:
+    """A sensor by its name, or an HDL-64E with the laser table of a calibration file.
+
+    Args:
+        model: One of ``PRESETS``, or a YAML file as ``velodyne_pointcloud`` of ros-drivers reads:
+            a list ``lasers`` with ``vert_correction`` and ``rot_correction`` in radians and
+            ``vert_offset_correction`` and ``horiz_offset_correction`` in metres.
+        changes: Other values for fields of :class:`SpinningLidar`.
+
+    Raises:
+        ValueError: If there is no such preset or file, the file is not such a calibration, or a
+            value is out of its range.
+    """
+    if model in PRESETS:
+        return replace(PRESETS[model](), **changes)
+    path = Path(model)
+    if not path.is_file():
+        raise ValueError(
+            f"there is no sensor {model!r}: give {', '.join(PRESETS)} or a calibration YAML"
+        )
+    return SpinningLidar(_read_calibration(path), **changes)
+
+
+def sensor_from_dict(values: dict[str, Any]) -> SpinningLidar:
+    """The sensor whose ``dataclasses.asdict`` was stored."""
+    lasers = Lasers(**{name: tuple(column) for name, column in values["lasers"].items()})
+    return SpinningLidar(**values | {"lasers": lasers})
+
+
+def sensor_to_dict(sensor: SpinningLidar) -> dict[str, Any]:
+    """The sensor as plain values, as JSON returns them."""
+    values = asdict(sensor)
+    values["lasers"] = {name: list(column) for name, column in values["lasers"].items()}
+    return values
+
+
+def _read_calibration(path: Path) -> Lasers:
+    try:
+        content = yaml.safe_load(path.read_text())
+        table = sorted(content["lasers"], key=lambda laser: -laser["vert_correction"])
+        columns = {
+            name: np.array([float(laser.get(key, 0.0)) for laser in table])
+            for name, key in (
+                ("inclination_rad", "vert_correction"),
+                ("azimuth_offset_rad", "rot_correction"),
+                ("height_m", "vert_offset_correction"),
+                ("lateral_m", "horiz_offset_correction"),
+            )
+        }
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is not a calibration of velodyne_pointcloud ({error!r}): it needs a list "
+            f"`lasers`, each with at least vert_correction (radians)"
+        ) from error
+    try:
+        return _lasers(**columns)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _lasers(**columns: NDArray[np.float64]) -> Lasers:
+    """A table of these columns; without bias and of gain 1 where these are not given."""
+    num = len(columns["inclination_rad"])
+    columns = {"range_bias_m": np.zeros(num), "intensity_gain": np.ones(num)} | columns
+    return Lasers(**{name: tuple(map(float, column)) for name, column in columns.items()})
 
 
 def _block_inclinations(
@@ -105,51 +305,64 @@ def _block_inclinations(
 
 
 @lru_cache(maxsize=8)
-def _laser_table(seed: int) -> LaserTable:
+def _hdl64e_lasers(seed: int) -> Lasers:
     generator = np.random.Generator(np.random.Philox(seed))
     inclination_deg = np.concatenate(
         [_block_inclinations(block, generator) for block in (_UPPER_BLOCK_DEG, _LOWER_BLOCK_DEG)]
     )
-    beams = np.arange(NUM_BEAMS)
+    beams = np.arange(2 * _BLOCK_BEAMS)
     lowest_deg, highest_deg = min(_AZIMUTH_COLUMNS_DEG), max(_AZIMUTH_COLUMNS_DEG)
-    offset_deg = np.take(_AZIMUTH_COLUMNS_DEG, beams % 4) + generator.normal(0.0, 0.3, NUM_BEAMS)
-    height_m = np.concatenate(
-        [np.linspace(*heights, _BLOCK_BEAMS) for heights in (_UPPER_HEIGHTS_M, _LOWER_HEIGHTS_M)]
+    offset_deg = np.take(_AZIMUTH_COLUMNS_DEG, beams % 4) + generator.normal(0.0, 0.3, len(beams))
+    return _lasers(
+        inclination_rad=np.radians(inclination_deg),
+        azimuth_offset_rad=np.radians(offset_deg.clip(lowest_deg, highest_deg)),
+        height_m=np.concatenate(
+            [np.linspace(*ends, _BLOCK_BEAMS) for ends in (_UPPER_HEIGHTS_M, _LOWER_HEIGHTS_M)]
+        ),
+        lateral_m=np.where(beams % 2 == 0, -_LATERAL_OFFSET_M, _LATERAL_OFFSET_M),
+        range_bias_m=generator.normal(0.0, _BIAS_SD_M, len(beams)),
+        intensity_gain=np.exp(generator.normal(0.0, _GAIN_SD, len(beams))),
     )
-    table = LaserTable(
-        np.radians(inclination_deg),
-        np.radians(offset_deg.clip(lowest_deg, highest_deg)),
-        height_m,
-        np.where(beams % 2 == 0, _LATERAL_OFFSET_M, -_LATERAL_OFFSET_M),
-    )
-    for column in table:
-        column.flags.writeable = False
-    return table
+
+
+def _azimuth(lasers: Lasers, shots: int) -> NDArray[np.float64]:
+    """Azimuth (H, W) of the beams.
+
+    A laser fires at head azimuth + offset, for every head azimuth of the turn; numbering the shots
+    by the azimuth of the beam leaves only the offset's rest within one step.
+    """
+    step = 2 * np.pi / shots
+    return step * np.arange(shots) + (np.array(lasers.azimuth_offset_rad) % step)[:, None]
 
 
 @lru_cache(maxsize=4)
-def _rays(sensor: HDL64E) -> Rays:
-    lasers = sensor.lasers
-    step = 2 * np.pi / sensor.shots
-    # A laser fires at head azimuth + offset, for every head azimuth of the turn; renumbering the
-    # shots by the azimuth of the beam leaves only the offset's rest within one step.
-    azimuth = step * np.arange(sensor.shots) + (lasers.azimuth_offset_rad % step)[:, None]
+def _time_s(lasers: Lasers, shots: int, spin_hz: float) -> NDArray[np.float32]:
+    head = _azimuth(lasers, shots) - np.array(lasers.azimuth_offset_rad)[:, None]
+    turns = head / (2 * np.pi)
+    time_s = ((turns + 0.5) % 1.0 - 0.5) / spin_hz
+    time_s = time_s.astype(np.float32)
+    time_s.flags.writeable = False
+    return time_s
+
+
+@lru_cache(maxsize=4)
+def _rays(lasers: Lasers, shots: int) -> Rays:
+    azimuth = _azimuth(lasers, shots)
     cos_azimuth, sin_azimuth = np.cos(azimuth), np.sin(azimuth)
-    cos_inclination = np.cos(lasers.inclination_rad)[:, None]
-    lateral = lasers.lateral_m[:, None]
-    shape = azimuth.shape
+    inclination = np.array(lasers.inclination_rad)[:, None]
+    lateral = np.array(lasers.lateral_m)[:, None]
     origin = np.stack(
         [
             -lateral * sin_azimuth,
             lateral * cos_azimuth,
-            np.broadcast_to(lasers.height_m[:, None], shape),
+            np.broadcast_to(np.array(lasers.height_m)[:, None], azimuth.shape),
         ]
     )
     direction = np.stack(
         [
-            cos_inclination * cos_azimuth,
-            cos_inclination * sin_azimuth,
-            np.broadcast_to(np.sin(lasers.inclination_rad)[:, None], shape),
+            np.cos(inclination) * cos_azimuth,
+            np.cos(inclination) * sin_azimuth,
+            np.broadcast_to(np.sin(inclination), azimuth.shape),
         ]
     )
     rays = Rays(origin.astype(np.float32), direction.astype(np.float32))

@@ -1,59 +1,59 @@
-"""Seeded endless streets: every block, car and pose follows from (seed, drive, scan) alone."""
+"""Seeded endless streets: every block, actor and pose follows from (seed, drive, scan) alone."""
 
 from __future__ import annotations
 
 import math
-import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from r3dpa.simulation.effects import DetectionLimit, Effect, LambertianReflection
-from r3dpa.simulation.roadside import (
-    BLOCK_M,
-    DISTRICTS,
-    KERB_M,
-    Builder,
-    Frame,
-    build_kerbside,
-    build_side_street,
-)
-from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic
+from r3dpa.simulation.builder import Builder, build_ground
+from r3dpa.simulation.course import BLOCK_M, SCAN_PERIOD_S, Course, course_of
+from r3dpa.simulation.draws import generator_for
+from r3dpa.simulation.roadside import build_plots, build_side_street
+from r3dpa.simulation.scene import EgoMotion, Pose, Primitive, Puddle, Scene, Weather
+from r3dpa.simulation.vehicles import Body, cyclist, person, recording_car, vehicle
+from r3dpa.simulation.weather import WeatherPrior
 
 # Blocks behind and ahead of the car's own that are built: beyond lies less than 1 % of the
 # returns of real scans.
-_BLOCKS_BEHIND, _BLOCKS_AHEAD = 4, 4
+_BLOCKS_BEHIND, _BLOCKS_AHEAD = 3, 3
+# Details (licence plates, seats, panes) exist up to here.
+_DETAIL_M = 30.0
 # One character of the surroundings (town, houses, ...) per side lasts this many blocks.
-_BLOCKS_PER_DISTRICT = 8
-_TERRAIN_M = 0.15
-_MAX_OBJECTS_PER_BLOCK = 80
-_STATIC_BLOCKS = 700  # instance numbers of blocks repeat after 700 blocks = 14 km
-_MOVING_INSTANCES = 1 + _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
-_CAR_GAP_M = 34.0
+_BLOCKS_PER_DISTRICT = 6
+# Weather lasts this many scans.
+_SCANS_PER_WEATHER = 100
+# Instance numbers: those of blocks repeat after 800 blocks = 19 km, those of actors of one kind
+# in one lane after 1000.
+_MAX_OBJECTS_PER_BLOCK = 64
+_STATIC_BLOCKS = 800
+_ACTORS_PER_STREAM = 1000
+_FIRST_ACTOR = 1 + _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
+# The level ground lies this far below the lowest road of a scene.
+_LEVEL_GROUND_M = 4.0
 
-_DRY_EFFECTS: tuple[Effect, ...] = (LambertianReflection(), DetectionLimit())
 
-
-def generator_for(*key: int | str) -> np.random.Generator:
-    """Random generator of a key of numbers (0 or greater) and words; equal keys, equal draws."""
-    words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(words)))
+_PRIOR = WeatherPrior()
 
 
 @dataclass(frozen=True)
 class Street:
     """An endless street along which one drive is recorded.
 
-    The axis bends gently; s runs along it, the lateral coordinate points to the left. Roadway,
-    pavements, buildings, parked cars, lamps, signs, trees, hedges, fences and people stand still
-    in blocks of 20 m, cars move in two lanes, and the recording car advances 1.0 to 1.4 m a scan.
+    The axis bends gently and rises and falls; ``s`` runs along it, the lateral coordinate points
+    to the left. Road, pavements, buildings, parked cars, lamps, signs, trees, hedges and fences
+    stand still in blocks of 24 m. Vehicles, cyclists and people move in lanes. The recording car
+    advances 1.0 to 1.4 m a scan or stands for a while. By its number a drive leads through a dense
+    town, a suburb, a green edge of town, or along an arterial road.
 
     Args:
         seed: Seed of the data set.
         drive: Number of the drive; each has a street of its own.
+        weather: Weather of all scans, or the prior from which one is drawn every 100 scans.
 
     Raises:
         ValueError: If the seed or the drive is negative.
@@ -61,6 +61,7 @@ class Street:
 
     seed: int
     drive: int
+    weather: Weather | WeatherPrior = _PRIOR
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -77,164 +78,188 @@ class Street:
             sensor_height_m: Frame origin of the sensor above the road.
 
         Returns:
-            Standing and moving primitives within about 90 m, the pose, and the effects of a dry
-            scene: Lambertian reflection and the detection limit.
+            Standing and moving primitives within 72 to 96 m along the street, pose and motion of
+            the sensor, weather and puddles.
+
+        Raises:
+            ValueError: If ``scan`` is negative.
+        """
+        weather = self.weather_of(scan)
+        course = course_of(self.seed, self.drive)
+        s = course.position(scan)
+        own = math.floor(s / BLOCK_M)
+        primitives: list[Primitive] = []
+        details: list[Primitive] = []
+        puddles: list[Puddle] = []
+        for number in range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 1):
+            block = _block(self.seed, self.drive, number)
+            primitives += block.primitives
+            details += block.details
+            puddles += block.puddles
+        for builder in _actors(course, scan):
+            primitives += builder.primitives
+            details += builder.details
+        pose = _pose(course, scan, sensor_height_m)
+        primitives += [
+            p for p in details if math.dist(p.centre[:2], (pose.x_m, pose.y_m)) < _DETAIL_M
+        ]
+        return Scene(
+            tuple(primitives),
+            pose,
+            _motion(course, scan),
+            weather,
+            tuple(puddles) if weather.water_film_mm > 0 else (),
+            recording_car(),
+            _lowest_m(course, own) - _LEVEL_GROUND_M,
+            course.road_reflectivity,
+        )
+
+    def weather_of(self, scan: int) -> Weather:
+        """The weather of one scan.
 
         Raises:
             ValueError: If ``scan`` is negative.
         """
         if scan < 0:
             raise ValueError(f"scan must be 0 or greater, got {scan}")
-        plan = _plan(self)
-        s = plan.position(scan)
-        block = math.floor(s / BLOCK_M)
-        blocks = range(block - _BLOCKS_BEHIND, block + _BLOCKS_AHEAD + 1)
-        primitives = [primitive for b in blocks for primitive in _block(self, b)]
-        primitives += _traffic(self, plan, scan)
-        x, y, heading = _frame(plan, s)(s, -plan.lane_m)
-        tilt = generator_for(self.seed, "tilt", self.drive, scan).normal(0.0, 0.002, 2)
-        pose = Pose(
-            x, y, sensor_height_m, heading, plan.pitch_rad + tilt[0], plan.roll_rad + tilt[1]
-        )
-        return Scene(tuple(primitives), pose, _DRY_EFFECTS, plan.road_reflectivity)
+        if isinstance(self.weather, Weather):
+            return self.weather
+        stretch = scan // _SCANS_PER_WEATHER
+        return self.weather.draw(generator_for(self.seed, "weather", self.drive, stretch))
 
 
-class _Plan(NamedTuple):
-    """What stays the same along a drive; lengths in metres, angles in radians."""
-
-    half_road_m: float
-    pavement_m: float
-    lane_m: float  # lateral distance of each lane's centre from the axis
-    crossing_every: int
-    road_reflectivity: float
-    pitch_rad: float
-    roll_rad: float
-    step_m: float
-    sway_m: float
-    sway_period: float
-    sway_phase: float
-    bends: NDArray[np.float64]  # (2, 3): amplitude, length, phase of the axis' heading
-
-    def position(self, scan: float) -> float:
-        """Where along the axis the recording car is at a scan; grows by 1.0 to 1.4 m a scan."""
-        phase = 2 * math.pi * scan / self.sway_period + self.sway_phase
-        return self.step_m * scan + self.sway_m * math.sin(phase)
-
-    def heading(self, s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Direction of the axis at s, radians."""
-        amplitude, length, phase = self.bends.T[:, :, None]
-        return (amplitude * np.sin(2 * np.pi * s / length + phase)).sum(axis=0)
-
-
-@lru_cache(maxsize=32)
-def _plan(street: Street) -> _Plan:
-    draw = generator_for(street.seed, "plan", street.drive)
-    half_road_m = draw.uniform(5.0, 6.2)
-    period = draw.uniform(40.0, 90.0)
-    bends = np.stack(
-        [draw.uniform(0.1, 0.2, 2), draw.uniform([260, 450], [400, 800]), draw.uniform(0, 6.28, 2)],
-        axis=1,
-    )
-    return _Plan(
-        half_road_m=half_road_m,
-        pavement_m=draw.uniform(1.8, 3.6),
-        lane_m=(half_road_m - 2.2) / 2,
-        crossing_every=int(draw.integers(5, 10)),
-        road_reflectivity=draw.uniform(0.12, 0.18),
-        pitch_rad=draw.normal(0.0, 0.006),
-        roll_rad=draw.normal(0.0, 0.006),
-        step_m=draw.uniform(1.1, 1.3),
-        sway_m=draw.uniform(0.3, 1.0) * 0.1 * period / (2 * math.pi),
-        sway_period=period,
-        sway_phase=draw.uniform(0, 2 * math.pi),
-        bends=bends,
-    )
-
-
-def _frame(plan: _Plan, s_block: float) -> Frame:
-    """Street to world coordinates in the block that holds ``s_block``.
-
-    The axis is a chain of chords, one a block; its corners are summed from block 0 on, so that
-    each block lies at the same place in every scan. The heading follows the smooth bend.
-    """
-    block = math.floor(s_block / BLOCK_M)
-    sign = 1 if block >= 0 else -1
-    before = np.arange(block) if block >= 0 else np.arange(-1, block - 1, -1)
-    chords = plan.heading((before + 0.5) * BLOCK_M)
-    x = sign * BLOCK_M * float(np.cos(chords).cumsum()[-1]) if block else 0.0
-    y = sign * BLOCK_M * float(np.sin(chords).cumsum()[-1]) if block else 0.0
-    chord = _chord(plan, block)
-    cos_chord, sin_chord = math.cos(chord), math.sin(chord)
-
-    def world(s: float, lateral: float) -> tuple[float, float, float]:
-        along = s - block * BLOCK_M
-        heading = float(plan.heading(np.array([s]))[0])
-        return (
-            x + along * cos_chord - lateral * sin_chord,
-            y + along * sin_chord + lateral * cos_chord,
-            heading,
-        )
-
-    return world
-
-
-def _chord(plan: _Plan, block: int) -> float:
-    """Direction of the straight piece of axis in a block, radians."""
-    return float(plan.heading(np.array([(block + 0.5) * BLOCK_M]))[0])
+class _Block(NamedTuple):
+    primitives: tuple[Primitive, ...]
+    details: tuple[Primitive, ...]
+    puddles: tuple[Puddle, ...]
 
 
 @lru_cache(maxsize=256)
-def _block(street: Street, block: int) -> tuple[Primitive, ...]:
-    """Standing primitives of one block of 20 m, in world coordinates."""
-    plan = _plan(street)
-    start = block * BLOCK_M
+def _block(seed: int, drive: int, block: int) -> _Block:
+    """What stands still in one block of 24 m, in world coordinates."""
+    course = course_of(seed, drive)
     first_instance = 1 + block % _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
-    builder = Builder(_frame(plan, start + BLOCK_M / 2), _chord(plan, block), first_instance)
-    # Blocks behind the start of the drive have negative numbers; keys must not.
-    key = block + 1000
-    draw = generator_for(street.seed, "block", street.drive, key)
-    crossing = key % plan.crossing_every == 0
+    builder = Builder(course, course.section_of(block), first_instance)
+    draw = generator_for(seed, "block", drive, block)
+    crosses = block % course.crossing_every == 0
+    only_side = draw.choice((-1.0, 0.0, 1.0))  # 0: a crossing, else a T
     for side in (1.0, -1.0):
-        district = generator_for(
-            street.seed, "district", street.drive, key // _BLOCKS_PER_DISTRICT, int(side > 0)
-        )
-        edge_m = plan.half_road_m + plan.pavement_m
-        if crossing:
-            build_side_street(builder, draw, start, side, plan.half_road_m)
+        stretch = block // _BLOCKS_PER_DISTRICT
+        district = generator_for(seed, "district", drive, stretch, int(side > 0))
+        opening = bool(crosses and only_side in (0.0, side))
+        build_ground(builder, draw, side, opening)
+        if opening:
+            build_side_street(builder, draw, side)
         else:
-            size = (BLOCK_M + 1.0, plan.pavement_m, KERB_M)
-            lateral = side * (plan.half_road_m + plan.pavement_m / 2)
-            builder.box((start + BLOCK_M / 2, lateral), size, Semantic.SIDEWALK, 0.25)
-            size = (BLOCK_M + 3.0, 50.0, _TERRAIN_M)
-            builder.box((start + BLOCK_M / 2, side * (edge_m + 25.0)), size, Semantic.TERRAIN, 0.3)
-            build_district = DISTRICTS[int(district.integers(len(DISTRICTS)))]
-            build_district(builder, draw, start, side, edge_m)
-            build_kerbside(builder, draw, start, side, plan.half_road_m, plan.pavement_m, district)
+            build_plots(builder, draw, side, district)
     assert builder.num_objects < _MAX_OBJECTS_PER_BLOCK, f"block {block} has too many objects"
-    return tuple(builder.primitives)
+    return _Block(tuple(builder.primitives), tuple(builder.details), tuple(builder.puddles))
 
 
-def _traffic(street: Street, plan: _Plan, scan: int) -> list[Primitive]:
-    """Cars in motion: the own lane keeps its distance, the other one comes towards us."""
-    primitives: list[Primitive] = []
-    own_s = plan.position(scan)
-    reach_m = _BLOCKS_AHEAD * BLOCK_M
-    oncoming_m = -1.1 * plan.step_m * scan
-    for lane, (moved, lateral) in enumerate(((own_s, -plan.lane_m), (oncoming_m, plan.lane_m))):
-        first = math.ceil((own_s - reach_m - moved) / _CAR_GAP_M)
-        last = math.floor((own_s + reach_m - moved) / _CAR_GAP_M)
+def _pose(course: Course, scan: int, sensor_height_m: float) -> Pose:
+    """Where the sensor is: it follows the road, and the body of the car rocks a little."""
+    s, lateral = course.position(scan), course.ego_lateral_m
+    x, y, z = course.section(s).at(s, lateral)
+    heading, _, slope = course.smooth(s)
+    cross = course.section(s).cross + course.surface_cross(lateral)
+    rocking = generator_for(course.seed, "tilt", course.drive, scan).normal(0.0, 0.002, 2)
+    return Pose(
+        x,
+        y,
+        z + course.surface_m(lateral) + sensor_height_m,
+        heading,
+        course.mount_pitch_rad - math.atan(slope) + rocking[0],
+        # Uphill to the left means: the right side is down.
+        course.mount_roll_rad + math.atan(cross) + rocking[1],
+    )
+
+
+def _motion(course: Course, scan: int) -> EgoMotion:
+    s, along_m_s = course.position(scan), course.speed_m_s(scan)
+    speed_m_s = along_m_s * course.section(s).stretch(course.ego_lateral_m)
+    return EgoMotion(speed_m_s, along_m_s * course.smooth(s)[1])
+
+
+def _lowest_m(course: Course, own: int) -> float:
+    numbers = range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 2)
+    return min(course.section_of(number).z_m for number in numbers)
+
+
+class _Stream(NamedTuple):
+    """Actors of one kind in one lane, all of one speed and at uneven distances.
+
+    ``direction``: 1 with the recording car, -1 against it. ``speed_m_s``: None for the speed of
+    the recording car, whose lane it is.
+    """
+
+    kind: Callable[[np.random.Generator], Body]
+    lateral_m: float
+    direction: int
+    speed_m_s: float | None
+    gap_m: float
+
+
+@lru_cache(maxsize=32)
+def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
+    """Lanes, cyclists beside them and people on the pavements."""
+    course = course_of(seed, drive)
+    character = course.character
+    draw = generator_for(seed, "streams", drive)
+    streams = []
+    for lane in range(course.lanes[0]):
+        own = lane == course.ego_lane
+        speed_m_s = None if own else 10 * course.step_m * draw.uniform(0.85, 1.15)
+        lateral = -(lane + 0.5) * course.lane_m
+        streams.append(_Stream(vehicle, lateral, 1, speed_m_s, draw.uniform(*character.car_gap_m)))
+    for lane in range(course.lanes[1]):
+        lateral, gap_m = (lane + 0.5) * course.lane_m, draw.uniform(*character.car_gap_m)
+        streams.append(_Stream(vehicle, lateral, -1, draw.uniform(9, 15), gap_m))
+    for side in (-1, 1):
+        kerb = course.kerb(side)
+        if course.lanes[side > 0]:
+            speed_m_s, gap_m = draw.uniform(3.5, 6.5), draw.uniform(80, 300)
+            streams.append(_Stream(cyclist, side * (kerb.lanes_m - 0.35), -side, speed_m_s, gap_m))
+        if kerb.pavement_m > 1.5:
+            lateral = side * (kerb.edge_m + kerb.pavement_m - 0.5)
+            for direction in (-1, 1):
+                gap_m = draw.uniform(*character.people_gap_m)
+                speed_m_s = draw.uniform(0.9, 1.7)
+                streams.append(
+                    _Stream(person, lateral - 0.25 * direction, direction, speed_m_s, gap_m)
+                )
+    return tuple(streams)
+
+
+@lru_cache(maxsize=1024)
+def _actor(seed: int, drive: int, stream: int, number: int) -> tuple[float, float, Body]:
+    """How far an actor is from its even place, along and across, and its body."""
+    draw = generator_for(seed, "actor", drive, stream, number)
+    kind = _streams(seed, drive)[stream].kind
+    return draw.uniform(-0.3, 0.3), draw.normal(0.0, 0.08), kind(draw)
+
+
+def _actors(course: Course, scan: int) -> Iterator[Builder]:
+    """The moving actors near the recording car."""
+    own_s = course.position(scan)
+    behind_m, ahead_m = (_BLOCKS_BEHIND - 0.1) * BLOCK_M, (_BLOCKS_AHEAD - 0.1) * BLOCK_M
+    for index, stream in enumerate(_streams(course.seed, course.drive)):
+        speed_m_s = course.speed_m_s(scan) if stream.speed_m_s is None else stream.speed_m_s
+        moved_m = stream.direction * speed_m_s * SCAN_PERIOD_S * scan
+        if stream.speed_m_s is None:
+            moved_m = own_s
+        first = math.ceil((own_s - behind_m - moved_m) / stream.gap_m)
+        last = math.floor((own_s + ahead_m - moved_m) / stream.gap_m)
         for number in range(first, last + 1):
-            # Number 0 of the own lane is the recording car itself.
-            draw = generator_for(street.seed, "car", street.drive, lane, number + 2**24)
-            jitter = draw.uniform(-0.35, 0.35)
-            if draw.random() < 0.5 or (lane == 0 and number == 0):
-                continue
-            s = moved + _CAR_GAP_M * (number + jitter)
-            frame = _frame(plan, s)
-            heading = frame(s, 0.0)[2]
-            instance = _MOVING_INSTANCES + 2 * (number % 500) + lane
-            builder = Builder(frame, heading, instance)
-            yaw_rad = 0.0 if lane == 0 else math.pi
-            builder.car((s, lateral + draw.normal(0, 0.12)), draw, yaw_rad, instance)
-            primitives += builder.primitives
-    return primitives
+            if stream.speed_m_s is None and number == 0:
+                continue  # the recording car itself
+            # Keys must not be negative.
+            along, across, body = _actor(course.seed, course.drive, index, number + 2**24)
+            s = moved_m + stream.gap_m * (number + along)
+            section = course.section(s)
+            instance = _FIRST_ACTOR + index * _ACTORS_PER_STREAM + number % _ACTORS_PER_STREAM
+            builder = Builder(course, section, instance)
+            yaw_rad = 0.0 if stream.direction > 0 else math.pi
+            lateral = stream.lateral_m + across
+            speed = speed_m_s * section.stretch(lateral)
+            builder.body(body, (s, lateral), yaw_rad, instance, speed)
+            yield builder

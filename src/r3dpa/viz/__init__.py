@@ -9,12 +9,17 @@ pictures of different scenes can be compared. Dark means that there is no return
 from r3dpa.viz.curves import Series, loss_curves, read_metrics
 from r3dpa.viz.features import feature_grid_picture, latents_picture, pca_colours
 from r3dpa.viz.figures import birds_eye_view, reconstruction_figure, scenes_sheet
+from r3dpa.viz.page import Category, PageScan, scan_page
 from r3dpa.viz.pixels import save
 from r3dpa.viz.scans import birds_eye_picture, encoded_picture, range_image_picture, scene_3d
+from r3dpa.viz.sheets import birds_eye_sheet, range_strips
 
 __all__ = [
+    "Category",
+    "PageScan",
     "Series",
     "birds_eye_picture",
+    "birds_eye_sheet",
     "birds_eye_view",
     "encoded_picture",
     "feature_grid_picture",
@@ -22,9 +27,11 @@ __all__ = [
     "loss_curves",
     "pca_colours",
     "range_image_picture",
+    "range_strips",
     "read_metrics",
     "reconstruction_figure",
     "save",
+    "scan_page",
     "scene_3d",
     "scenes_sheet",
 ]

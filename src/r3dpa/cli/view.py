@@ -1,0 +1,146 @@
+"""``r3dpa view``: scans as pictures and as a page to walk around in."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa import viz
+from r3dpa.atomic import atomic_path
+from r3dpa.data.scans import find_scans, read_npz, read_ply, read_scan
+from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.simulation import Origin, Semantic
+
+__all__ = ["view"]
+
+# Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
+# that is not named here takes one of the palette.
+_COLOURS = {
+    **{"ROAD": "#75688f", "SIDEWALK": "#c77dba", "TERRAIN": "#a7c957", "BUILDING": "#c9b48c"},
+    **{"WALL": "#a08c80", "FENCE": "#c08552", "POLE": "#f2f2f2", "SIGN": "#ffd84d"},
+    **{"VEGETATION": "#46b36b", "PERSON": "#ff5c5c", "CAR": "#4e9bff"},
+    **{"SURFACE": "#56606e", "MIXED": "#ffb000", "FOLIAGE": "#46b36b", "GLASS": "#5ce1e6"},
+    **{"MIRROR": "#c792ea", "FOG": "#aab4c8", "RAIN": "#4e9bff", "SNOW": "#ffffff"},
+    **{"SPRAY": "#7fd1ff", "BLOOMING": "#ff6b6b", "SUN": "#ffe14d", "SECOND_RETURN": "#f78fb3"},
+}
+_DATA = ("velodyne_points", "data")  # of a scan in the KITTI-360 layout, beside labels and origins
+
+
+class _Source(NamedTuple):
+    """A scan still to be read: a file, or a member of a ``.npz`` file."""
+
+    name: str
+    path: Path
+    member: str | None = None
+
+
+def view(source: Path, out: Path | None, num: int, reference: Path | None) -> str:
+    """Writes ``range_images.png``, ``birds_eye.png`` and ``view.html``; see ``r3dpa view --help``.
+
+    Args:
+        source: Folder of ``.bin`` scans in any layout, or a ``.bin``, ``.ply`` or ``.npz`` file.
+        out: Folder to write to; ``view/<name of the source>`` if None.
+        num: Scans to show at most, evenly spread over those there are.
+        reference: Scan shown beside the others; of several, the first one.
+
+    Returns:
+        What was shown and the paths, one a line.
+
+    Raises:
+        ValueError: If ``num`` is below 1, there is no scan, or a scan or what lies beside it
+            cannot be used; the message names the file.
+    """
+    if num < 1:
+        raise ValueError(f"num must be 1 or greater, got {num}")
+    sources = _sources(source)
+    chosen = [sources[i] for i in _spread(len(sources), num)]
+    scans = [_read(entry) for entry in chosen]
+    beside = None
+    if reference is not None:
+        first = _sources(reference)[0]
+        beside = _read(first._replace(name=f"reference: {first.name}"))  # unlike every other name
+    drawn = {scan.name: scan.points for scan in [*scans, *([beside] if beside else [])]}
+    resolved = source.resolve()
+    out = out or Path("view") / (resolved.name if resolved.is_dir() else resolved.stem)
+
+    pictures = {
+        "range_images.png": viz.range_strips(drawn, SphericalProjection(LidarSensor())),
+        "birds_eye.png": viz.birds_eye_sheet(drawn),
+    }
+    paths = [viz.save(figure, out / name) for name, figure in pictures.items()]
+    page = viz.scan_page(
+        scans,
+        f"{resolved.name} - r3dpa view",
+        {0: viz.Category("no label", "#8a8f98"), **_categories(Semantic)},
+        _categories(Origin),
+        beside,
+    )
+    with atomic_path(out / "view.html") as temporary:
+        temporary.write_text(page, "utf-8")
+    paths.append(out / "view.html")
+    lines = [f"{len(scans)} of {len(sources)} scans in {source}"]
+    if beside:
+        lines.append(beside.name)
+    return "\n".join([*lines, *map(str, paths), "open the .html file in a browser"])
+
+
+def _sources(source: Path) -> list[_Source]:
+    """Scans of a folder or file, in order."""
+    if source.suffix == ".npz" and source.is_file():
+        return [_Source(f"{source.stem}/{name}", source, name) for name in read_npz(source)]
+    scans = find_scans(source)
+    if source.is_file():
+        path = scans[0].path
+        if path.suffix not in (".bin", ".ply"):
+            raise ValueError(f"{source}: is no scan; give a .bin, .ply or .npz file, or a folder")
+        parent = path.parents[2] if path.parts[-3:-1] == _DATA else path.parent
+        return [_Source(f"{parent.name}/{path.stem}", path)]
+    return [_Source(scan.name, scan.path) for scan in scans]
+
+
+def _spread(count: int, num: int) -> list[int]:
+    """Up to ``num`` places out of ``count``, evenly spread, the first one among them."""
+    num = min(num, count)
+    return [place * count // num for place in range(num)]
+
+
+def _read(source: _Source) -> viz.PageScan:
+    """A scan with its labels and origins where there are files of them."""
+    name, path, member = source
+    if member is not None:
+        return viz.PageScan(name, read_npz(path)[member])
+    if path.suffix == ".ply":
+        return viz.PageScan(name, read_ply(path))
+    points = read_scan(path)
+    if path.parts[-3:-1] != _DATA:
+        return viz.PageScan(name, points)
+    beside = path.parents[1]
+    labels = _column(beside / "labels" / f"{path.stem}.label", "<u4", path, len(points))
+    origins = _column(beside / "origins" / f"{path.stem}.origin", "u1", path, len(points))
+    return viz.PageScan(name, points, labels, origins)
+
+
+def _column(path: Path, dtype: str, scan: Path, num_points: int) -> NDArray[np.integer] | None:
+    """A number for each point of a scan; None where the file is missing."""
+    if not path.exists():
+        return None
+    data = path.read_bytes()
+    size = np.dtype(dtype).itemsize
+    if len(data) != num_points * size:
+        raise ValueError(
+            f"{path} holds {len(data) / size:g} numbers but {scan} {num_points} points; "
+            "simulate both again, or delete the one that does not belong"
+        )
+    return np.frombuffer(data, dtype=dtype)
+
+
+def _categories(names: type[IntEnum]) -> dict[int, viz.Category]:
+    """Names and colours of the members of an enumeration."""
+    return {
+        int(member): viz.Category(member.name.lower().replace("_", " "), _COLOURS.get(member.name))
+        for member in names
+    }

@@ -1,0 +1,288 @@
+"""Structure of one scan: neighbours along each ring, the ground, and surface directions.
+
+Letters: P returns, R rings.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.geometry.rays import angles_of
+from r3dpa.geometry.rings import rings_in_order
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+GROUND_BAND_M = 0.2  # returns at most this far above or below the plane are ground
+MAX_GAP_SHOTS = 10  # a longer gap says nothing about the surface on both sides of it
+
+_MOUNT_HEIGHT_M = 1.73  # KITTI and KITTI-360
+_GROUND_BANDS_M = (0.5, 0.3, GROUND_BAND_M, GROUND_BAND_M, GROUND_BAND_M)
+_GROUND_DISTANCES_M = (3.0, 20.0)  # nearer is the car, farther the road bends away from a plane
+_MIN_GROUND_RETURNS = 500
+_MAX_GROUND_SLOPE = 0.2
+_JITTER_RAD = 0.1  # the azimuth of a real ring may step back by some milliradians
+_UNBROKEN = 1.35  # times the median step; real steps are 0.09 or 0.18 degrees, a loss gives 0.27
+_SLOPE_PER_SHOT = 0.02  # change of range per shot, as a share of the range: incidence < 81 degrees
+_SMOOTH_M = 0.1  # 4 standard deviations of the interpolation error at 2 cm noise
+_VERTICAL_SMOOTH_M = 0.4  # lasers of the real HDL-64E are biased by up to 0.1 m against each other
+_REACH = 3  # returns to each side that give the direction along the ring
+_MAX_UPRIGHT_NORMAL_Z = 0.5  # normals less than 30 degrees from the horizon
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Returns of one scan in ring order, with their neighbours along azimuth.
+
+    The number of shots per turn is not stored in a scan. It follows from the mean azimuth step
+    over unbroken neighbours; the median would not do, since the encoder of the real HDL-64E gives
+    steps of 0.09 and 0.18 degrees.
+
+    Args:
+        order: ``(P,)`` where each return stands among those given.
+        ring: ``(P,)`` ring from 0 (highest), never falling.
+        num_rings: R.
+        azimuth: ``(P,)`` radians in [0, 2 pi).
+        shot_rad: Mean azimuth between two shots of a laser.
+        missing: ``(P,)`` shots without a return between each return and the following one of its
+            ring; the last one of a ring is followed by its first.
+    """
+
+    order: Indices
+    ring: Indices
+    num_rings: int
+    azimuth: Floats
+    shot_rad: float
+    missing: Indices
+
+    @property
+    def shots(self) -> float:
+        """Shots of each laser per turn."""
+        return 2 * math.pi / self.shot_rad
+
+    def neighbour(self, offset: int) -> Indices:
+        """Index ``(P,)`` of the return ``offset`` places further on, around its ring."""
+        return _around(self.ring, offset)
+
+    def other_ring(self, step: int) -> tuple[Indices, NDArray[np.bool_]]:
+        """Return of the ring ``step`` rings lower whose azimuth is the nearest.
+
+        Returns:
+            Index ``(P,)``, and whether it lies within 1.5 shots and in the right ring.
+        """
+        key = self.ring * 2 * math.pi + self.azimuth
+        ascending = np.argsort(key, kind="stable")
+        wanted = key + step * 2 * math.pi
+        after = np.searchsorted(key, wanted, sorter=ascending).clip(1, len(key) - 1)
+        before_key, after_key = key[ascending[after - 1]], key[ascending[after]]
+        nearest = np.where(wanted - before_key < after_key - wanted, after - 1, after)
+        index = ascending[nearest]
+        close = np.abs(key[index] - wanted) < 1.5 * self.shot_rad
+        return index, close & (self.ring[index] == self.ring + step)
+
+
+def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
+    """Ring structure of the returns of one scan.
+
+    Args:
+        points: ``(P, 3)`` metres, returns only, in storage order.
+        sensor: Tells ring order from other orders, see ``rings_in_order``.
+
+    Returns:
+        The structure, or None where the scan is not stored ring after ring (highest first, azimuth
+        growing) or has hardly any neighbours.
+    """
+    inclination, azimuth = angles_of(torch.from_numpy(points))
+    try:
+        in_order, num_rings = rings_in_order(inclination, azimuth, sensor)
+    except ValueError:
+        return None
+    ring = in_order.numpy()
+    order = np.argsort(ring, kind="stable")
+    ring, turn = ring[order], azimuth.numpy()[order] % (2 * math.pi)
+    following = _around(ring, 1)
+    step = (turn[following] - turn + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
+    ahead = step[step > 0]
+    if len(ahead) == 0:
+        return None
+    shot_rad = float(ahead[ahead < _UNBROKEN * np.median(ahead)].mean())
+    missing = np.maximum(np.rint(step / shot_rad).astype(np.int64) - 1, 0)
+    return Sweep(order, ring, num_rings, turn, shot_rad, missing)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Plane ``z = slope_x * x + slope_y * y + offset_m`` in the sensor frame."""
+
+    slope_x: float
+    slope_y: float
+    offset_m: float
+
+    def height_m(self, points: Floats) -> Floats:
+        """Vertical distance ``(P,)`` of points ``(P, 3)`` above the plane, metres."""
+        return points[:, 2] - (
+            self.slope_x * points[:, 0] + self.slope_y * points[:, 1] + self.offset_m
+        )
+
+    def incidence_deg(self, points: Floats) -> Floats:
+        """Angle ``(P,)`` between the plane's normal and the ray to each of ``(P, 3)`` points."""
+        normal = np.array([-self.slope_x, -self.slope_y, 1.0])
+        return _incidence_deg(points, np.broadcast_to(normal, points.shape))
+
+
+def fit_ground(points: Floats) -> Ground | None:
+    """Ground plane around the car by least squares in a band that narrows step by step.
+
+    Starts from a level plane 1.73 m below the sensor, the mount of KITTI and KITTI-360.
+
+    Args:
+        points: ``(P, 3)`` metres.
+
+    Returns:
+        The plane, or None where fewer than 500 returns between 3 and 20 m lie near it, or where
+        it is steeper than 20 %.
+    """
+    distance = np.hypot(points[:, 0], points[:, 1])
+    near = points[(distance > _GROUND_DISTANCES_M[0]) & (distance < _GROUND_DISTANCES_M[1])]
+    ground = Ground(0.0, 0.0, -_MOUNT_HEIGHT_M)
+    for band_m in _GROUND_BANDS_M:
+        close = near[np.abs(ground.height_m(near)) < band_m]
+        if len(close) < _MIN_GROUND_RETURNS:
+            return None
+        design = np.column_stack([close[:, :2], np.ones(len(close))])
+        coefficients = np.linalg.lstsq(design.T @ design, design.T @ close[:, 2], rcond=None)[0]
+        ground = Ground(*map(float, coefficients))
+    steep = math.hypot(ground.slope_x, ground.slope_y) > _MAX_GROUND_SLOPE
+    return None if steep else ground
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What each return lies on, from its neighbours; arrays ``(P,)`` in the order of a sweep.
+
+    Args:
+        ground: Near the ground plane.
+        upright: On a smooth surface that stands up, such as a facade or the side of a car.
+        incidence_deg: Angle between ray and surface normal, NaN off ground and upright places.
+        residual_m: Range minus the line through both neighbours along the ring, divided by the
+            error growth of that line, so that its deviation is that of one range. NaN where a
+            neighbouring shot is lost or the returns farther out do not lie on a line.
+        step_m: Range minus the line through the neighbouring rings, metres; NaN except on
+            upright places met at less than 60 degrees.
+    """
+
+    ground: NDArray[np.bool_]
+    upright: NDArray[np.bool_]
+    incidence_deg: Floats
+    residual_m: Floats
+    step_m: Floats
+
+
+def surfaces_of(
+    points: Floats, range_m: Floats, sweep: Sweep, ground_plane: Ground | None
+) -> Surfaces:
+    """Surfaces met by the returns of one scan.
+
+    Args:
+        points: ``(P, 3)`` metres in the order of the sweep.
+        range_m: ``(P,)`` their distances.
+        sweep: Ring structure.
+        ground_plane: None where no plane was found; nothing is ground then.
+    """
+    num_points = len(points)
+    is_ground = np.zeros(num_points, dtype=bool)
+    if ground_plane is not None:
+        is_ground = np.abs(ground_plane.height_m(points)) < GROUND_BAND_M
+    on_line = _on_line(range_m, sweep)
+
+    up, has_up = sweep.other_ring(-1)
+    down, has_down = sweep.other_ring(1)
+    bend = np.abs(range_m[up] - 2 * range_m + range_m[down])
+    upright = ~is_ground & on_line & has_up & has_down & (bend < _VERTICAL_SMOOTH_M)
+    along = points[sweep.neighbour(_REACH)] - points[sweep.neighbour(-_REACH)]
+    normal = np.cross(along, points[up] - points[down])
+    length = np.linalg.norm(normal, axis=1)
+    upright &= np.abs(normal[:, 2]) < _MAX_UPRIGHT_NORMAL_Z * length
+
+    incidence_deg = np.full(num_points, np.nan)
+    if ground_plane is not None:
+        incidence_deg[is_ground] = ground_plane.incidence_deg(points[is_ground])
+    incidence_deg[upright] = _incidence_deg(points[upright], normal[upright])
+
+    inclination = np.arcsin((points[:, 2] / range_m).clip(-1, 1))
+    share = _share(inclination[down], inclination, inclination[up])
+    step_m = range_m - (range_m[down] + share * (range_m[up] - range_m[down]))
+    facing = upright & (incidence_deg < 60.0)
+    residual_m = _residual(range_m, sweep)
+    return Surfaces(
+        is_ground,
+        upright,
+        incidence_deg,
+        np.where(on_line & (is_ground | upright), residual_m, np.nan),
+        np.where(facing, step_m, np.nan),
+    )
+
+
+def level_enough(left_m: Floats, right_m: Floats, shots: Indices) -> NDArray[np.bool_]:
+    """Whether two ranges ``shots`` shots apart along a ring may belong to one surface."""
+    return np.abs(left_m - right_m) <= _SLOPE_PER_SHOT * np.minimum(left_m, right_m) * shots
+
+
+def _around(ring: Indices, offset: int) -> Indices:
+    counts = np.bincount(ring)
+    start = (np.cumsum(counts) - counts)[ring]
+    place = start + (np.arange(len(ring)) - start + offset) % counts[ring]
+    return place.astype(np.int64)
+
+
+def _on_line(range_m: Floats, sweep: Sweep) -> NDArray[np.bool_]:
+    """Whether the outer neighbours lie on a line; the inner ones and the return have no say.
+
+    A test that looked at the residuals themselves would cut their tails.
+    """
+    first, last = sweep.neighbour(-_REACH), sweep.neighbour(_REACH)
+    from_first = _turned(sweep, first, last)
+    reach = 2 * (_REACH + MAX_GAP_SHOTS) * sweep.shot_rad
+    smooth = (from_first > 0) & (from_first < reach)
+    shots = np.maximum(np.rint(from_first / sweep.shot_rad).astype(np.int64), 1)
+    smooth &= level_enough(range_m[first], range_m[last], shots)
+    for inner in (sweep.neighbour(1 - _REACH), sweep.neighbour(_REACH - 1)):
+        share = _turned(sweep, first, inner) / np.where(from_first > 0, from_first, 1.0)
+        line = range_m[first] + share * (range_m[last] - range_m[first])
+        smooth &= np.abs(range_m[inner] - line) < _SMOOTH_M
+    return smooth
+
+
+def _residual(range_m: Floats, sweep: Sweep) -> Floats:
+    before, after = sweep.neighbour(-1), sweep.neighbour(1)
+    whole = _turned(sweep, before, after)
+    unbroken = (sweep.missing[before] == 0) & (sweep.missing == 0) & (whole > 0)
+    share = _turned(sweep, before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
+    line = range_m[before] + share * (range_m[after] - range_m[before])
+    growth = np.sqrt(1 + share**2 + (1 - share) ** 2)
+    inside = unbroken & (share > 0) & (share < 1)
+    return np.where(inside, (range_m - line) / growth, np.nan)
+
+
+def _turned(sweep: Sweep, start: Indices, end: Indices) -> Floats:
+    """Azimuth from one return to another one further on, radians in [-0.1, 2 pi - 0.1)."""
+    turned = sweep.azimuth[end] - sweep.azimuth[start]
+    return (turned + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
+
+
+def _share(low: Floats, value: Floats, high: Floats) -> Floats:
+    """Place of a value between two others, 0 at the first; halfway where these are equal."""
+    span = high - low
+    return np.where(span > 0, (value - low) / np.where(span > 0, span, 1.0), 0.5)
+
+
+def _incidence_deg(points: Floats, normal: Floats) -> Floats:
+    scale = np.linalg.norm(points, axis=1) * np.linalg.norm(normal, axis=1)
+    cosine = np.abs((points * normal).sum(axis=1)) / scale
+    return np.degrees(np.arccos(cosine.clip(0, 1)))

@@ -1,0 +1,198 @@
+"""The files of one simulated drive, in the layout of KITTI-360.
+
+::
+
+    data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/
+        timestamps.txt                  one line a scan, 10 Hz
+        data/%010d.bin                  (P, 4) float32 x, y, z, intensity
+        labels/%010d.label              (P,) uint32 semantic | instance << 16
+        origins/%010d.origin            (P,) uint8 what made each point, see ``Origin``
+        sim/%010d.json                  the scene in short, and what became of each effect
+    data_poses/2013_05_28_drive_XXXX_sync/
+        velodyne_to_world.txt           one line a scan: number, then (3, 4) row by row
+
+KITTI-360's own ``poses.txt``, of the same format, holds poses of its inertial unit, which is not
+simulated; hence the other name. Every file here follows from the request alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.atomic import atomic_path
+from r3dpa.simulation.scan import SimulatedScan
+from r3dpa.simulation.scene import Pose, Scene, Weather
+
+# In the order in which they are written: whoever finds the points of a scan finds all of it.
+_SUFFIXES = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
+_FIRST_SCAN = datetime(2013, 5, 28, 8, 46, 2)
+_SCAN_PERIOD = timedelta(seconds=0.1)
+
+
+@dataclass(frozen=True)
+class DriveFiles:
+    """Reads and writes the files of a drive.
+
+    Args:
+        root: Root folder of the data set.
+        drive: Four-digit number.
+    """
+
+    root: Path
+    drive: str
+
+    @property
+    def points_folder(self) -> Path:
+        """Folder of the scans."""
+        return self.root / "data_3d_raw" / drive_name(self.drive) / "velodyne_points"
+
+    def missing(self, count: int) -> list[int]:
+        """Numbers below ``count`` of the scans that lack any of their files."""
+        complete: set[str] | None = None
+        for kind in _SUFFIXES:
+            folder = self.points_folder / kind
+            stems = {path.stem for path in folder.iterdir()} if folder.is_dir() else set()
+            complete = stems if complete is None else complete & stems
+        return [number for number in range(count) if _stem(number) not in (complete or ())]
+
+    def write_scan(self, number: int, scene: Scene, scan: SimulatedScan) -> None:
+        """Write the files of a scan, the points last.
+
+        Args:
+            number: Of the scan in the drive.
+            scene: What was scanned.
+            scan: What came back.
+        """
+        summary = {
+            "drive": self.drive,
+            "scan": number,
+            "pose": asdict(scene.pose),
+            "motion": asdict(scene.motion),
+            "weather": weather_to_dict(scene.weather),
+            "primitives": len(scene.primitives),
+            "moving_primitives": sum(any(p.velocity_m_s) for p in scene.primitives),
+            "puddles": len(scene.puddles),
+            "points": len(scan.points),
+            "effects": {
+                effect.name: {"status": effect.status, "reason": effect.reason, "rays": effect.rays}
+                for effect in scan.effects
+            },
+        }
+        contents = {
+            "labels": scan.labels.astype("<u4").tobytes(),
+            "origins": scan.origins.tobytes(),
+            "sim": to_json(summary),
+            "data": scan.points.astype("<f4").tobytes(),
+        }
+        for kind in _SUFFIXES:
+            write(self._path(kind, number), contents[kind])
+
+    def summaries(self, count: int) -> list[dict[str, Any]]:
+        """What ``sim/*.json`` says of the first ``count`` scans.
+
+        Raises:
+            ValueError: If a file is damaged; the message names it.
+        """
+        return [self._summary(self._path("sim", number)) for number in range(count)]
+
+    def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
+        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` unless they are there.
+
+        Args:
+            summaries: Of all scans of the drive, in order.
+        """
+        stamps = (_FIRST_SCAN + summary["scan"] * _SCAN_PERIOD for summary in summaries)
+        # KITTI-360 stores nanoseconds.
+        times = "".join(f"{stamp:%Y-%m-%d %H:%M:%S.%f}000\n" for stamp in stamps)
+        write(self.points_folder / "timestamps.txt", times.encode())
+        lines = []
+        for summary in summaries:
+            matrix = velodyne_to_world(Pose(**summary["pose"]))
+            numbers = " ".join(f"{value:.12g}" for value in matrix.flat)
+            lines.append(f"{summary['scan']} {numbers}\n")
+        poses = self.root / "data_poses" / drive_name(self.drive) / "velodyne_to_world.txt"
+        write(poses, "".join(lines).encode())
+
+    def partial_files(self) -> Iterator[Path]:
+        """Temporary files of this drive: of writers that are at work, or were killed."""
+        for top in ("data_3d_raw", "data_poses"):
+            yield from (self.root / top / drive_name(self.drive)).rglob(".*.partial.*")
+
+    def _path(self, kind: str, number: int) -> Path:
+        return self.points_folder / kind / f"{_stem(number)}{_SUFFIXES[kind]}"
+
+    def _summary(self, path: Path) -> dict[str, Any]:
+        try:
+            summary = json.loads(path.read_text())
+            Pose(**summary["pose"])
+            for effect in summary["effects"].values():
+                effect["status"], effect["reason"], effect["rays"]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"{path} is damaged ({error!r}): delete it and simulate again, which completes "
+                f"the data set"
+            ) from error
+        return summary
+
+
+def drive_name(number: str) -> str:
+    """Folder of a drive in the KITTI-360 layout, of its four-digit number."""
+    return f"2013_05_28_drive_{number}_sync"
+
+
+def velodyne_to_world(pose: Pose) -> NDArray[np.float64]:
+    """Matrix ``(3, 4)`` that takes points of the sensor frame, in metres, to the world frame.
+
+    Of the middle of the sweep; world x east, y north, z up::
+
+        [Rz(heading) Ry(pitch) Rx(roll) | (x, y, z)]
+    """
+    (cos_h, sin_h), (cos_p, sin_p), (cos_r, sin_r) = (
+        (math.cos(angle), math.sin(angle))
+        for angle in (pose.heading_rad, pose.pitch_rad, pose.roll_rad)
+    )
+    heading = np.array([[cos_h, -sin_h, 0], [sin_h, cos_h, 0], [0, 0, 1]])
+    pitch = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
+    roll = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
+    return np.column_stack([heading @ pitch @ roll, (pose.x_m, pose.y_m, pose.z_m)])
+
+
+def weather_to_dict(weather: Weather) -> dict[str, Any]:
+    """The weather as JSON holds it: a visibility of None, not infinity, without fog."""
+    values = asdict(weather)
+    if math.isinf(weather.visibility_m):
+        values["visibility_m"] = None
+    return values
+
+
+def to_json(values: Any) -> bytes:
+    """Plain values and NumPy scalars as the bytes of a JSON file."""
+    text = json.dumps(values, indent=1, allow_nan=False, default=np.generic.item)
+    return f"{text}\n".encode()
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file whole, or leave it alone where it holds these bytes already."""
+    if path.is_file() and path.read_bytes() == content:
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def delete(paths: Iterable[Path]) -> None:
+    """Delete files, of which some may have just gone."""
+    for path in list(paths):
+        path.unlink(missing_ok=True)
+
+
+def _stem(number: int) -> str:
+    return f"{number:010d}"

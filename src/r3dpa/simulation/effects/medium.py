@@ -1,0 +1,307 @@
+"""Fog and spray: droplets too many to tell apart, and what all effects of the air share.
+
+The receiver of a real instrument sees little of its beam close by. With the overlap ``xi`` of the
+two that grows as the square up to ``r0 = overlap_range_m``, the echo of a scatterer goes with::
+
+    xi(r) / r^2 = min(1, (r / r0)^2) / r^2 = 1 / max(r, r0)^2
+
+Without it the nearest metres of fog would outshine every target. Soft echoes depend on ``r0`` and
+backscatter together only, so that ``r0`` also absorbs the factor of pi that lies between a
+backscatter coefficient and a diffuse reflectivity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.raycast import (
+    NO_SURFACE,
+    Floats,
+    Solids,
+    solids_of,
+    surface_distance,
+)
+from r3dpa.simulation.scene import Primitive, Scene, Semantic, Shape
+from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+
+_LIGHT_M_S = 299_792_458.0
+# Backscatter over extinction of clouds of water droplets, see Fog.
+_BACKSCATTER = 0.046 / math.log(20)
+_FOG_STEP_M = 0.05
+_FAST_M_S = 10.0
+_PLUME_S, _PLUME_MAX_M, _PLUME_HEIGHT_M = 0.6, 12.0, 1.8
+# Undersides of vehicles lie about this much above the road.
+_CLEARANCE_M = 0.2
+
+
+def attenuate(sweep: Sweep, extinction_per_m: float) -> None:
+    """Weaken every echo of the turn by its way there and back."""
+    # Not 0 in float32 either, which times an infinite range would be no number.
+    twice = np.float32(max(2 * extinction_per_m, 1e-30))
+    for echoes in sweep.echoes():
+        echoes.power *= np.exp(-twice * echoes.range_m)
+
+
+def overlap_by_square(range_m: NDArray[np.floating], sensor: SpinningLidar) -> NDArray:
+    """``xi(r) / r^2`` of the module's docstring, m^-2."""
+    return np.maximum(range_m, sensor.overlap_range_m) ** -2.0
+
+
+def range_edges(sensor: SpinningLidar, step_m: float) -> NDArray[np.float64]:
+    """Ranges from the nearest to the farthest that is reported, in even steps of about a size."""
+    num = math.ceil((sensor.max_range_m - sensor.min_range_m) / step_m)
+    return np.linspace(sensor.min_range_m, sensor.max_range_m, num + 1)
+
+
+def steps_before_target(sweep: Sweep, edges: NDArray[np.float64]) -> Floats:
+    """How many steps of ``edges`` (K,) lie before each ray's strongest echo, ``(R,)``."""
+    target = np.minimum(sweep.first.range_m, np.float32(edges[-1]))
+    steps = (target - np.float32(edges[0])) * np.float32(1 / (edges[1] - edges[0]))
+    return steps.clip(0, len(edges) - 1)
+
+
+def weakest_recorded(sweep: Sweep) -> Floats:
+    """Power ``(R,)`` that an echo needs to be recorded beside those there are."""
+    return sweep.first.power if sweep.second is None else sweep.second.power
+
+
+def all_rays(called: bool) -> RayIndex:
+    """All rays, or none."""
+    return slice(None) if called else np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Droplets too many to tell apart weaken every echo and make a soft one of their own.
+
+    With the meteorological optical range MOR, the speed of light c and the pulse length tau::
+
+        extinction = ln(20) / MOR        backscatter = 0.046 / MOR
+        hard echo: power * exp(-2 extinction R)
+        soft echo: W(r) = backscatter * integral of exp(-2 extinction s) xi(s) / s^2 over the
+                   pulse, s = r - c tau / 4 .. r + c tau / 4
+
+    A ray's soft echo has the largest W before its target, and is kept if stronger than the hard
+    one. Its range is drawn with the density W before the target: fog is turbulent, and the peak of
+    a waveform that is nearly flat lies anywhere on it.
+
+    Extinction at MOR 50 m leaves 2.75 % of the power of a target at 30 m. At every finite MOR some
+    echo is weakened, so every finite MOR calls for the effect.
+
+    Source: Rasshofer et al. 2011 and Hahner et al., ICCV 2021, for both coefficients.
+    """
+
+    stage: ClassVar[Stage] = Stage.MEDIUM
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """A finite visibility."""
+        visibility_m = scene.weather.visibility_m
+        return f"visibility of {visibility_m:g} m" if math.isfinite(visibility_m) else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """All, in fog."""
+        return all_rays(math.isfinite(sweep.scene.weather.visibility_m))
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Weaken the echoes and offer the soft ones."""
+        sensor, visibility_m = sweep.sensor, sweep.scene.weather.visibility_m
+        extinction = math.log(20) / visibility_m
+        attenuate(sweep, extinction)
+        edges, waveform = soft_waveform(visibility_m, sensor)
+        peak = np.maximum.accumulate(waveform).astype(np.float32)
+        peak[0] = 0.0
+        steps = np.append(0.0, ((waveform[1:] + waveform[:-1]) / 2).cumsum())
+        before = steps_before_target(sweep, edges).astype(np.intp)
+        power = peak[before]
+        chosen = np.flatnonzero(power > weakest_recorded(sweep))
+        if not len(chosen):
+            return
+        share = draws.uniform(chosen) * steps[before[chosen]]
+        range_m = np.interp(share, steps, edges).astype(np.float32)
+        sweep.offer(chosen, range_m, power[chosen], NO_SURFACE, Origin.FOG)
+
+
+def soft_waveform(
+    visibility_m: float, sensor: SpinningLidar
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Echo of fog by range, see :class:`Fog`.
+
+    Args:
+        visibility_m: Meteorological optical range.
+        sensor: Instrument, for its pulse, its overlap and its limits.
+
+    Returns:
+        Ranges ``(K,)`` from the nearest to the farthest that is reported, metres, and the power
+        ``(K,)`` received from there, m^-2.
+    """
+    extinction, half_pulse_m = math.log(20) / visibility_m, _LIGHT_M_S * sensor.pulse_s / 4
+    edges = range_edges(sensor, _FOG_STEP_M)
+    everywhere = np.arange(0.0, sensor.max_range_m + half_pulse_m + _FOG_STEP_M, _FOG_STEP_M)
+    density = np.exp(-2 * extinction * everywhere) * overlap_by_square(everywhere, sensor)
+    energy = np.append(0.0, ((density[1:] + density[:-1]) / 2).cumsum() * _FOG_STEP_M)
+    received = np.interp(edges + half_pulse_m, everywhere, energy)
+    received -= np.interp(edges - half_pulse_m, everywhere, energy)
+    return edges, _BACKSCATTER * extinction * received
+
+
+@dataclass(frozen=True)
+class Spray:
+    """Fast vehicles on a wet road draw a plume of droplets behind them.
+
+    The plume is a box as wide as the vehicle and 1.8 m high from the road on that begins at its
+    rear and holds what was thrown up in the last 0.6 s, at most 12 m. With the speed v and the
+    depth w of the water, the air in it has the extinction::
+
+        extinction = max_extinction * clip((v - 10 m/s) / 10 m/s, 0, 1) * clip(w / 1.2 mm, 0, 1)
+
+    Over the path L within the box, echoes from behind are weakened by exp(-2 extinction L), and a
+    soft echo as of fog (backscatter / extinction = 0.046 / ln 20) comes from its near side: at
+    the depth s with the density exp(-2 extinction s), of the power::
+
+        backscatter * min(c tau / 2, L) * xi(r) / r^2
+
+    Source: 0.05 to 0.2 per metre in the plumes of cars at 60 to 90 km/h; the depth at which a road
+    counts as flooded is that of wet-ground models.
+
+    Args:
+        max_extinction_per_m: Extinction behind a vehicle at 20 m/s or more on a flooded road.
+
+    Raises:
+        ValueError: If the extinction is negative or infinite.
+    """
+
+    max_extinction_per_m: float = 0.2
+
+    stage: ClassVar[Stage] = Stage.MEDIUM
+
+    def __post_init__(self) -> None:
+        """Check the value."""
+        if not 0 <= self.max_extinction_per_m < math.inf:
+            raise ValueError(
+                f"max_extinction_per_m must be 0 or greater, got {self.max_extinction_per_m}"
+            )
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """A wet road with a fast vehicle on it."""
+        film_mm = scene.weather.water_film_mm
+        if not film_mm or not any(_is_fast(primitive) for primitive in scene.primitives):
+            return None
+        return f"fast vehicles on {film_mm:.2g} mm of water"
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those whose window meets a plume."""
+        inside = np.zeros(sweep.num_rays, dtype=bool)
+        for window in sweep.rays_near(_plume_solids(sweep.scene), sweep.time_s):
+            inside[window] = True
+        return np.flatnonzero(inside)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Weaken the echoes from behind each plume and offer its own."""
+        sensor, boxes = sweep.sensor, _plumes(sweep.scene)
+        solids = _plume_solids(sweep.scene)
+        drawn = draws.uniform(slice(None))
+        for index, window in enumerate(sweep.rays_near(solids, sweep.time_s)):
+            chosen, start = _around(solids, index, sweep, window)
+            enter, leave = surface_distance(
+                solids, np.full(len(chosen), index), start, sweep.direction[:, chosen]
+            )
+            enter = np.maximum(enter, np.float32(sensor.min_range_m))
+            crossed = leave > enter
+            chosen, enter, leave = chosen[crossed], enter[crossed], leave[crossed]
+            twice = np.float32(2 * self._extinction_per_m(boxes[index], sweep.scene))
+            for echoes in sweep.echoes():
+                path = np.minimum(leave, echoes.range_m[chosen]) - enter
+                echoes.power[chosen] *= np.exp(-twice * path.clip(0))
+            path = (np.minimum(leave, sweep.first.range_m[chosen]) - enter).clip(0)
+            within_pulse = path.clip(max=_LIGHT_M_S * sensor.pulse_s / 2)
+            power = np.float32(_BACKSCATTER) * twice / 2 * within_pulse
+            power *= overlap_by_square(enter, sensor)
+            if twice:
+                depth = -np.log1p(drawn[chosen] * np.expm1(-twice * path)) / twice
+                sweep.offer(chosen, enter + depth, power, NO_SURFACE, Origin.SPRAY)
+
+    def _extinction_per_m(self, plume: Primitive, scene: Scene) -> float:
+        faster = (math.hypot(*plume.velocity_m_s) - _FAST_M_S) / 10.0
+        flooded = scene.weather.water_film_mm / 1.2
+        return self.max_extinction_per_m * min(faster, 1.0) * min(flooded, 1.0)
+
+
+def _is_fast(primitive: Primitive) -> bool:
+    return math.hypot(*primitive.velocity_m_s) > _FAST_M_S
+
+
+def _plumes(scene: Scene) -> tuple[Primitive, ...]:
+    """One box behind each fast vehicle, in the world frame; none on a dry road."""
+    vehicles = defaultdict(list)
+    if scene.weather.water_film_mm > 0:
+        for index, primitive in enumerate(scene.primitives):
+            if _is_fast(primitive):
+                # Solids that belong to no object are vehicles of their own.
+                vehicles[primitive.instance or -1 - index].append(primitive)
+    return tuple(_plume(parts) for parts in vehicles.values())
+
+
+def _plume_solids(scene: Scene) -> Solids:
+    return solids_of(_plumes(scene), scene.pose, scene.ground_m)
+
+
+def _around(
+    solids: Solids, index: int, sweep: Sweep, rays: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Floats]:
+    """Those rays that meet a box as seen from above, and where they start, seen from the box."""
+    direction, shift = sweep.direction[:2, rays], solids.velocity[index][:, None]
+    to_centre = solids.centre[index, :2, None] + shift * sweep.time_s[rays]
+    to_centre -= sweep.start[:2, rays]
+    # Rays in the box's axes, and how far it reaches along them and to their sides.
+    half_long, half_wide, _ = solids.half_size[index]
+    cosine, sine = solids.cos_yaw[index], solids.sin_yaw[index]
+    long = np.abs(cosine * direction[0] + sine * direction[1])
+    wide = np.abs(cosine * direction[1] - sine * direction[0])
+    across = direction[0] * to_centre[1] - direction[1] * to_centre[0]
+    ahead = direction[0] * to_centre[0] + direction[1] * to_centre[1]
+    meets = np.abs(across) <= half_long * wide + half_wide * long
+    meets &= ahead >= -(half_long * long + half_wide * wide)
+    met = rays[meets]
+    start = sweep.start[:, met]
+    start[:2] -= shift * sweep.time_s[met]
+    return met, start
+
+
+def _plume(parts: list[Primitive]) -> Primitive:
+    speed = math.hypot(*parts[0].velocity_m_s)
+    ahead_x, ahead_y = (component / speed for component in parts[0].velocity_m_s)
+    heading = math.atan2(ahead_y, ahead_x)
+    rear, right, left = math.inf, math.inf, -math.inf
+    for part in parts:
+        x, y, _ = part.centre
+        cosine, sine = math.cos(part.yaw_rad - heading), math.sin(part.yaw_rad - heading)
+        half_long, half_wide, _ = part.half_size
+        reach_ahead = abs(half_long * cosine) + abs(half_wide * sine)
+        reach_aside = abs(half_long * sine) + abs(half_wide * cosine)
+        aside = y * ahead_x - x * ahead_y
+        rear = min(rear, x * ahead_x + y * ahead_y - reach_ahead)
+        right, left = min(right, aside - reach_aside), max(left, aside + reach_aside)
+    length = min(_PLUME_S * speed, _PLUME_MAX_M)
+    along, aside = rear - length / 2, (left + right) / 2
+    road_m = min(part.centre[2] - part.half_size[2] for part in parts) - _CLEARANCE_M
+    return Primitive(
+        Shape.BOX,
+        (
+            along * ahead_x - aside * ahead_y,
+            along * ahead_y + aside * ahead_x,
+            road_m + _PLUME_HEIGHT_M / 2,
+        ),
+        (length / 2, (left - right) / 2, _PLUME_HEIGHT_M / 2),
+        Semantic.UNLABELED,
+        reflectivity=1.0,
+        yaw_rad=heading,
+        velocity_m_s=parts[0].velocity_m_s,
+    )

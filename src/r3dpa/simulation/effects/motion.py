@@ -1,0 +1,188 @@
+"""Effects that move rays and solids while the head turns, and what stands in the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.raycast import (
+    EGO_BODY,
+    NO_SURFACE,
+    Floats,
+    cast,
+    level,
+    normals,
+    solids_of,
+    subset,
+)
+from r3dpa.simulation.scene import Material, Pose, Primitive, Scene
+from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.sweep import RayIndex, Sweep
+
+_EGO_REFLECTIVITY = 0.3
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """The sensor drives on while it turns, and its points are not corrected for it.
+
+    At time t from the middle of the sweep, with speed v and yaw rate w, a shot starts and points::
+
+        position = v / w * (sin(w t), 1 - cos(w t))        heading = w t
+
+    while the point is stored as if the sensor had stood still: at 50 km/h the two ends of the
+    sweep, which meet behind the car, differ by 1.39 m.
+
+    Source: raw scans of KITTI-360 are not motion-compensated; its development kit "curls" them.
+    """
+
+    stage: ClassVar[Stage] = Stage.RAYS
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """A moving or turning sensor."""
+        motion = scene.motion
+        if not motion.speed_m_s and not motion.yaw_rate_rad_s:
+            return None
+        turn_deg = np.degrees(motion.yaw_rate_rad_s)
+        return f"ego moves at {motion.speed_m_s:.1f} m/s, {turn_deg:.1f} deg/s"
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """All."""
+        return slice(None)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Turn and shift the rays in the frame of the sensor, then level them."""
+        motion, pose = sweep.scene.motion, sweep.scene.pose
+        angle = np.float32(motion.yaw_rate_rad_s) * sweep.time_s
+        # sinc(x) = sin(pi x) / (pi x) stands for sin(w t / 2) / (w t / 2): no division by w.
+        chord = np.float32(motion.speed_m_s) * sweep.time_s * np.sinc(angle / np.float32(2 * np.pi))
+        cosine, sine = np.cos(angle), np.sin(angle)
+        origin, direction = (array.reshape(3, -1) for array in sweep.sensor.rays)
+
+        def turned(vectors: Floats) -> Floats:
+            x = cosine * vectors[0] - sine * vectors[1]
+            y = sine * vectors[0] + cosine * vectors[1]
+            return np.stack([x, y, vectors[2]])
+
+        start = turned(origin)
+        start[0] += chord * np.cos(angle / 2)
+        start[1] += chord * np.sin(angle / 2)
+        sweep.start = level(start.astype(np.float32), pose)
+        sweep.direction = level(turned(direction), pose)
+
+
+@dataclass(frozen=True)
+class MovingActors:
+    """A moving solid is met where it is when the shot is fired.
+
+    ::
+
+        position(t) = position(0) + velocity * t
+
+    so that an object crossing at v is sheared by ``v * (its width in azimuth) / (2 pi) * 0.1 s``.
+    """
+
+    stage: ClassVar[Stage] = Stage.RAYS
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """A solid that moves."""
+        count = sum(any(p.velocity_m_s) for p in scene.primitives)
+        return f"{count} moving solids" if count else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those whose azimuth window meets a moving solid at any time of the sweep."""
+        return _rays_near(sweep, np.any(sweep.solids.velocity, axis=1), sweep.time_s)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Tell the ray cast when these rays are fired."""
+        sweep.actor_time_s = np.zeros_like(sweep.time_s)
+        sweep.actor_time_s[rays] = sweep.time_s[rays]
+
+
+@dataclass(frozen=True)
+class FoliageOcclusion:
+    """A crown is a medium of leaves: a ray gets into it, and sometimes through it.
+
+    With the extinction k per metre, the depth s at which a leaf is hit has the density::
+
+        p(s) = k exp(-k s)        mean depth 1 / k
+
+    and a ray that leaves the crown first goes on. Successive crowns are independent, as a process
+    without memory asks for.
+    """
+
+    stage: ClassVar[Stage] = Stage.RAYS
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Solids that are foliage."""
+        count = sum(p.extinction_per_m > 0 for p in scene.primitives)
+        return f"{count} crowns, bushes and hedges" if count else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those whose window meets foliage."""
+        return _rays_near(sweep, sweep.solids.extinction > 0, None)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Draw for the ray cast how deep each ray gets."""
+        sweep.optical_depth = draws.exponential(slice(None))
+
+
+@dataclass(frozen=True)
+class EgoOcclusion:
+    """The recording car hides what lies behind its roof; the mask is the same in every scan."""
+
+    stage: ClassVar[Stage] = Stage.SURFACE
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Parts of the car in the scene."""
+        return f"{len(scene.ego_body)} parts of the recording car" if scene.ego_body else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Rays that meet the car."""
+        return _ego_mask(sweep.scene.ego_body, sweep.sensor).rays
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Put the car's surface before whatever the rays hit."""
+        mask = _ego_mask(sweep.scene.ego_body, sweep.sensor)
+        nearer = mask.range_m < sweep.first.range_m[mask.rays]
+        hit = mask.rays[nearer]
+        sweep.first.range_m[hit] = mask.range_m[nearer]
+        sweep.first.surface[hit] = EGO_BODY
+        sweep.first.power[hit] = 1
+        sweep.first.origin[hit] = 0
+        sweep.cos_incidence[hit] = mask.cos_incidence[nearer]
+        sweep.reflectivity[hit] = _EGO_REFLECTIVITY
+        sweep.material[hit] = Material.PAINT
+
+
+@dataclass(frozen=True)
+class _EgoMask:
+    rays: NDArray[np.int64]
+    range_m: Floats
+    cos_incidence: Floats
+
+
+@lru_cache(maxsize=8)
+def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMask:
+    """Rays that meet the car, where, and how; once per rig."""
+    body = solids_of(ego_body, Pose(z_m=0.0), ground_m=-1e6)
+    origin, direction = sensor.rays
+    range_m, surface = cast(body, origin, direction, sensor.max_range_m)
+    hit = surface != NO_SURFACE
+    position = origin[:, hit] + range_m[hit] * direction[:, hit]
+    normal = normals(body, surface[hit], position, None)
+    cosine = np.abs((normal * direction[:, hit]).sum(axis=0))
+    return _EgoMask(np.flatnonzero(hit), range_m[hit], cosine)
+
+
+def _rays_near(sweep: Sweep, chosen: NDArray, actor_time_s: Floats | None) -> NDArray[np.int64]:
+    """Rays that can meet the chosen solids."""
+    inside = np.zeros(sweep.num_rays, dtype=bool)
+    for rays in sweep.rays_near(subset(sweep.solids, chosen), actor_time_s):
+        inside[rays] = True
+    return np.flatnonzero(inside)

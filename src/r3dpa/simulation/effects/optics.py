@@ -1,0 +1,361 @@
+"""Surfaces that let the beam through or throw it on: glass, polished metal, water.
+
+Secondary rays go one step: what they meet counts as matt, be it glass, metal or sheeting again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.effects.surface import surface_power
+from r3dpa.simulation.raycast import (
+    NO_SURFACE,
+    Floats,
+    cast_single,
+    normals,
+    surface_distance,
+)
+from r3dpa.simulation.scene import Material, Scene
+from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+
+# A pane belongs to the wall that it is this close to.
+_FASTENED_M = 0.25
+# Water stands where the ground is steeper than this nowhere.
+_LEVEL_COS = 0.9
+
+
+def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
+    """Share of unpolarised light that one smooth surface from air to a medium reflects.
+
+    With c the cosine of incidence and c' that of refraction, ``c'^2 = 1 - (1 - c^2) / n^2``::
+
+        F = ((c - n c') / (c + n c'))^2 / 2 + ((n c - c') / (n c + c'))^2 / 2
+
+    Source: Fresnel's equations. Glass (n = 1.52): 0.043 at 0 and 0.61 at 85 degrees; water
+    (n = 1.33): 0.020, 0.35 at 80 and 0.80 at 88 degrees.
+
+    Args:
+        cos_incidence: In [0, 1], any shape.
+        index: Refractive index n of the medium, greater than 1.
+    """
+    cosine = cos_incidence
+    refracted = np.sqrt(1 - (1 - cosine * cosine) / np.float32(index * index))
+    across = (cosine - index * refracted) / (cosine + index * refracted)
+    along = (index * cosine - refracted) / (index * cosine + refracted)
+    return (across * across + along * along) / 2
+
+
+@dataclass(frozen=True)
+class Glass:
+    """Of a pane one sees the dirt, what is behind it, or what it mirrors; the strongest wins.
+
+    A pane has two surfaces of reflectance F; light that runs to and fro between them included, it
+    lets through and mirrors::
+
+        T = (1 - F) / (1 + F)        1 - T = 2 F / (1 + F)
+
+    0.918 and 0.082 at normal incidence, 0.24 and 0.76 at 85 degrees (where F of one surface is
+    0.61). With ``surface_power`` along the whole path, the echoes have the power::
+
+        dirt      that of the pane's own reflectivity      its surface, as cast
+        behind    T^2 * surface_power(object)              0.843 of it at normal incidence
+        mirrored  (1 - T)^2 * surface_power(object)        at the first direction
+
+    A solid of glass that is nowhere thin is a hollow shell, such as a cabin: a ray that leaves it
+    again passes a second pane. A thin pane fastened to a closed solid of the same instance is a
+    window: through it the solid is seen from inside. The glint of a pane that faces the sensor to
+    within the beam's divergence is left out.
+
+    Args:
+        index: Refractive index of the glass.
+        pane_m: Solids of glass that are thinner than this are single panes.
+
+    Raises:
+        ValueError: If the index is not greater than 1 or the thickness is not positive.
+    """
+
+    index: float = 1.52
+    pane_m: float = 0.1
+    stage: ClassVar[Stage] = Stage.OPTICAL_PATH
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_index(self.index)
+        if not self.pane_m > 0:
+            raise ValueError(f"pane_m must be positive, got {self.pane_m}")
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Solids of glass."""
+        count = sum(p.material is Material.GLASS for p in scene.primitives)
+        return f"{count} panes and cabins of glass" if count else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those that hit glass."""
+        return sweep.of_material(Material.GLASS)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Look behind the panes, then into the mirror."""
+        struck = _struck(sweep, rays)
+        is_shell = 2 * sweep.solids.half_size[struck.surface].min(axis=1) >= self.pane_m
+        hollow = np.where(is_shell, NO_SURFACE, _fastened_to(sweep, struck.surface))
+        passed = self._transmittance(_cosine(struck.direction, struck.normal))
+        seen = _look(sweep, struck, struck.direction, hollow.astype(np.int32))
+        two_way = passed * passed
+        again = np.flatnonzero(is_shell & np.isfinite(seen.distance_m))
+        leaving = self._leaving(sweep, struck.only(again), seen.distance_m[again])
+        two_way[again] *= leaving * leaving
+        sweep.offer(struck.rays, seen.range_m, two_way * seen.power, seen.surface, Origin.GLASS)
+        _offer_mirrored(sweep, struck, 1 - passed)
+
+    def _transmittance(self, cos_incidence: Floats) -> Floats:
+        reflectance = fresnel_reflectance(cos_incidence, self.index)
+        return (1 - reflectance) / (1 + reflectance)
+
+    def _leaving(self, sweep: Sweep, struck: _Struck, distance_m: Floats) -> Floats:
+        """Transmittance where rays leave their shell; 1 for those that end within it."""
+        start = struck.at.copy()
+        start[:2] -= sweep.solids.velocity[struck.surface].T * struck.time_s
+        _, leave_m = surface_distance(sweep.solids, struck.surface, start, struck.direction)
+        beyond = np.flatnonzero(distance_m > leave_m)
+        out = struck.only(beyond)
+        exit_at = out.at + leave_m[beyond] * out.direction
+        normal = normals(sweep.solids, out.surface, exit_at, out.time_s)
+        transmittance = np.ones_like(distance_m)
+        transmittance[beyond] = self._transmittance(_cosine(out.direction, normal))
+        return transmittance
+
+
+@dataclass(frozen=True)
+class PolishedMetal:
+    """Polished metal shows what it mirrors, at the first direction and the length of the path.
+
+    With the reflectance q, and ``surface_power`` along the whole path::
+
+        mirrored  q^2 * surface_power(object)        direct  (1 - q) * (the metal's own echo)
+
+    so that the image of a point lies where a flat mirror shows it. Curved metal mirrors as the
+    plane that touches it; that it spreads the beam is left out.
+
+    Args:
+        reflectance: Share of the light that is mirrored, 0.9 for steel and aluminium at 905 nm.
+
+    Raises:
+        ValueError: If the reflectance lies outside [0, 1].
+    """
+
+    reflectance: float = 0.9
+    stage: ClassVar[Stage] = Stage.OPTICAL_PATH
+
+    def __post_init__(self) -> None:
+        """Check the value."""
+        if not 0 <= self.reflectance <= 1:
+            raise ValueError(f"reflectance must lie in [0, 1], got {self.reflectance}")
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Solids of polished metal."""
+        count = sum(p.material is Material.POLISHED_METAL for p in scene.primitives)
+        return f"{count} solids of polished metal" if count else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those that hit polished metal."""
+        return sweep.of_material(Material.POLISHED_METAL)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Weaken the metal's own echo and offer the mirrored one."""
+        sweep.first.power[rays] *= np.float32(1 - self.reflectance)
+        struck = _struck(sweep, rays)
+        _offer_mirrored(sweep, struck, np.full_like(struck.leg_m, self.reflectance))
+
+
+@dataclass(frozen=True)
+class WetGround:
+    """Water darkens the ground and mirrors the beam away, the more the flatter it comes in.
+
+    A film that covers the share f of the ground lets the beam in and its echo out through one
+    surface of reflectance F each, and widens what comes out by n^2::
+
+        f = min(film / full film, 1)
+        power -> power * (1 - f + f (1 - F)^2 / n^2)
+
+    0.54 at normal incidence and 0.023 at 88 degrees. In a puddle f = 1, and there is a mirrored
+    echo of F^2 * ``surface_power(object)``, below the ground. A puddle has the size that the scene
+    gives it when the film is full; its area shrinks with the film, and is gone with it.
+
+    Source: film model of Hahner et al. (LiDAR snowfall simulation, CVPR 2022), depth 1.2 mm.
+
+    Args:
+        index: Refractive index of water.
+        full_film_mm: Depth from which on the film covers the ground.
+
+    Raises:
+        ValueError: If the index is not greater than 1 or the depth is not positive.
+    """
+
+    index: float = 1.33
+    full_film_mm: float = 1.2
+    stage: ClassVar[Stage] = Stage.SURFACE
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_index(self.index)
+        if not self.full_film_mm > 0:
+            raise ValueError(f"full_film_mm must be positive, got {self.full_film_mm}")
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Water on the ground."""
+        film_mm = scene.weather.water_film_mm
+        return f"{film_mm:g} mm of water, {len(scene.puddles)} puddles" if film_mm > 0 else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Those that hit the ground."""
+        return sweep.on_ground()
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Weaken the echoes of the ground; offer what the puddles mirror."""
+        assert not isinstance(rays, slice)
+        film = min(sweep.scene.weather.water_film_mm / self.full_film_mm, 1.0)
+        cover = np.full(len(rays), film, dtype=np.float32)
+        cosine = sweep.cos_incidence[rays]
+        standing = self._in_puddles(sweep, rays, film)
+        cover[standing] = 1
+        # Water stands level, whatever the slope of the ground.
+        cosine[standing] = np.abs(sweep.direction[2, rays[standing]])
+        reflectance = fresnel_reflectance(cosine, self.index)
+        passed = 1 - reflectance
+        sweep.first.power[rays] *= 1 - cover + cover * passed * passed / np.float32(self.index**2)
+        struck = _struck(sweep, rays[standing])
+        struck.normal[:] = np.array([0, 0, 1], dtype=np.float32)[:, None]
+        _offer_mirrored(sweep, struck, reflectance[standing])
+
+    def _in_puddles(self, sweep: Sweep, rays: NDArray[np.int64], film: float) -> NDArray[np.int64]:
+        """Which of the rays end in standing water."""
+        pose = sweep.scene.pose
+        cosine, sine = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
+        x, y, _ = sweep.position(rays)
+        inside = np.zeros(len(rays), dtype=bool)
+        for puddle in sweep.scene.puddles:
+            east, north = puddle.x_m - pose.x_m, puddle.y_m - pose.y_m
+            ahead, left = cosine * east + sine * north, cosine * north - sine * east
+            inside |= (x - ahead) ** 2 + (y - left) ** 2 < film * puddle.radius_m**2
+        found = np.flatnonzero(inside)
+        return found[_struck(sweep, rays[found]).normal[2] > _LEVEL_COS]
+
+
+class _Struck(NamedTuple):
+    """Where and how rays strike the surfaces that they were cast on."""
+
+    rays: NDArray[np.int64]  # (M,)
+    surface: NDArray[np.int32]  # (M,)
+    leg_m: Floats  # (M,) range
+    time_s: Floats  # (M,) when they meet moving solids
+    at: Floats  # (3, M)
+    direction: Floats  # (3, M)
+    normal: Floats  # (3, M)
+
+    def only(self, chosen: NDArray[np.int64]) -> _Struck:
+        """Some of them."""
+        return _Struck(
+            self.rays[chosen],
+            self.surface[chosen],
+            self.leg_m[chosen],
+            self.time_s[chosen],
+            self.at[:, chosen],
+            self.direction[:, chosen],
+            self.normal[:, chosen],
+        )
+
+
+def _struck(sweep: Sweep, rays: RayIndex) -> _Struck:
+    rays = np.arange(sweep.num_rays)[rays]
+    surface, at = sweep.first.surface[rays], sweep.position(rays)
+    time_s = np.zeros(len(rays), dtype=np.float32)
+    if sweep.actor_time_s is not None:
+        time_s = sweep.actor_time_s[rays]
+    normal = normals(sweep.solids, surface, at, time_s)
+    leg_m, direction = sweep.first.range_m[rays], sweep.direction[:, rays]
+    return _Struck(rays, surface, leg_m, time_s, at, direction, normal)
+
+
+class _Seen(NamedTuple):
+    """What secondary rays meet, ``(M,)``; infinitely far and without power: nothing."""
+
+    distance_m: Floats  # from where they start
+    range_m: Floats  # of the whole path
+    power: Floats  # as if nothing lay on the path
+    surface: NDArray[np.int32]
+
+
+def _look(sweep: Sweep, struck: _Struck, direction: Floats, hollow: NDArray[np.int32]) -> _Seen:
+    """Follow the rays on from where they struck, see ``cast_single``."""
+    distance_m, surface = cast_single(
+        sweep.solids,
+        struck.at,
+        direction,
+        struck.time_s,
+        sweep.sensor.max_range_m - struck.leg_m,
+        struck.surface,
+        hollow,
+    )
+    onward_m = np.nan_to_num(distance_m, posinf=0.0)
+    at = struck.at + onward_m * direction
+    normal = normals(sweep.solids, surface, at, struck.time_s)
+    range_m = struck.leg_m + distance_m
+    solids, scene = sweep.scene.primitives, sweep.scene
+    power = surface_power(
+        sweep.of_surface(
+            [p.reflectivity for p in solids], scene.ground_reflectivity, np.float32, surface
+        ),
+        _cosine(direction, normal),
+        sweep.of_surface([p.material for p in solids], Material.ASPHALT, np.uint8, surface),
+        range_m,
+    )
+    return _Seen(distance_m, range_m, power, surface)
+
+
+def _offer_mirrored(sweep: Sweep, struck: _Struck, reflectance: Floats) -> None:
+    """Offer what surfaces of this reflectance mirror, where a white object would win."""
+    recorded = sweep.first if sweep.second is None else sweep.second
+    best = (reflectance / struck.leg_m) ** 2
+    chosen = np.flatnonzero(best > recorded.power[struck.rays])
+    struck, two_way = struck.only(chosen), reflectance[chosen] ** 2
+    across = (struck.direction * struck.normal).sum(axis=0)
+    mirrored = struck.direction - 2 * across * struck.normal
+    seen = _look(sweep, struck, mirrored, np.full(len(chosen), NO_SURFACE, dtype=np.int32))
+    sweep.offer(struck.rays, seen.range_m, two_way * seen.power, seen.surface, Origin.MIRROR)
+
+
+def _fastened_to(sweep: Sweep, panes: NDArray[np.int32]) -> NDArray[np.int64]:
+    """The closed solid of the same instance that each pane ``(M,)`` is fastened to, if any."""
+    solids, primitives = sweep.solids, sweep.scene.primitives
+    instance = np.array([p.instance for p in primitives])
+    closed = np.array([p.material is not Material.GLASS for p in primitives], dtype=bool)
+    closed &= (instance > 0) & (solids.extinction == 0)
+    different, back = np.unique(panes, return_inverse=True)
+    found = np.full(len(different), NO_SURFACE)
+    for row, pane in enumerate(different):
+        mates = np.flatnonzero(closed & (instance == instance[pane]))
+        if not len(mates):
+            continue
+        # How far the middle of the pane is from the box around each of them.
+        x, y, z = (solids.centre[pane] - solids.centre[mates]).T
+        cosine, sine = solids.cos_yaw[mates], solids.sin_yaw[mates]
+        turned = np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1)
+        gap_m = np.hypot.reduce((np.abs(turned) - solids.half_size[mates]).clip(min=0), axis=1)
+        if gap_m.min() < _FASTENED_M:
+            found[row] = mates[gap_m.argmin()]
+    return found[back]
+
+
+def _cosine(direction: Floats, normal: Floats) -> Floats:
+    return np.abs((direction * normal).sum(axis=0))
+
+
+def _check_index(index: float) -> None:
+    if not index > 1:
+        raise ValueError(f"index must be greater than 1, that of air, got {index}")

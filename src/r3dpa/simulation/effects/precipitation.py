@@ -1,0 +1,254 @@
+"""Rain and snow: drops and flakes of which each may be seen alone."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.effects.medium import (
+    all_rays,
+    attenuate,
+    overlap_by_square,
+    range_edges,
+    steps_before_target,
+    weakest_recorded,
+)
+from r3dpa.simulation.raycast import NO_SURFACE
+from r3dpa.simulation.scene import Scene, Weather
+from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+
+_STEP_M = 0.2
+_POWERS = 64
+# SoftRaydrop lowers no threshold by more spreads than this.
+_WIDE = 4.0
+
+
+class DropTable(NamedTuple):
+    """M(p, r) of :class:`Rain` and :class:`Snow` on a grid."""
+
+    edges: NDArray[np.float64]  # (K,) ranges, metres
+    powers: NDArray[np.float64]  # (P,) growing, even in their logarithms, m^-2
+    expected: NDArray[np.float32]  # (P, K) mean number of stronger drops before each range
+
+
+@dataclass(frozen=True)
+class _Hydrometeors(ABC):
+    """Drops or flakes with an exponential distribution of sizes, each of which may be seen alone.
+
+    At the rate R in mm/h there are, per cubic metre and millimetre of diameter D::
+
+        N(D) = N0 exp(-Lambda D)        N0 = n R^a        Lambda = l R^b
+        extinction = integral of 2 (pi D^2 / 4) N(D) = 1e-6 pi N0 / Lambda^3   per metre
+
+    One of them within the beam, a cone of the diameter d = divergence * r, sends back::
+
+        power = reflectivity * min(D / d, 1)^2 * exp(-2 extinction r) * xi(r) / r^2
+
+    so that those above a power p before the range r are a Poisson process of the mean::
+
+        M(p, r) = integral of N0 / Lambda exp(-Lambda D_p(s)) pi (d / 2)^2 ds,   up to r
+
+    with D_p the diameter that gives p, without the ranges where even D = d falls short. The
+    strongest one before a target at R then has the power p at which M(p, R) equals a draw of the
+    exponential distribution (none if M stays below it at the weakest power that can be detected),
+    and a range with the density dM/dp there: exact, with two draws per ray however many there are.
+    """
+
+    reflectivity: float
+    intercept: tuple[float, float]
+    slope: tuple[float, float]
+
+    stage: ClassVar[Stage] = Stage.MEDIUM
+    origin: ClassVar[Origin]
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0 <= self.reflectivity <= 1:
+            raise ValueError(f"reflectivity must lie in [0, 1], got {self.reflectivity}")
+        if not (self.intercept[0] > 0 and self.slope[0] > 0):
+            raise ValueError(
+                f"intercept and slope of the size distribution must start with a positive factor, "
+                f"got {self.intercept} and {self.slope}"
+            )
+
+    @abstractmethod
+    def rate_mm_h(self, weather: Weather) -> float:
+        """How much of it falls."""
+
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Some of it falls."""
+        rate = self.rate_mm_h(scene.weather)
+        return f"{rate:g} mm/h of {self.origin.name.lower()}" if rate > 0 else None
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """All, while it falls."""
+        return all_rays(self.rate_mm_h(sweep.scene.weather) > 0)
+
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Weaken the echoes and offer the strongest drop or flake of each ray."""
+        rate = self.rate_mm_h(sweep.scene.weather)
+        attenuate(sweep, self.extinction_per_m(rate))
+        table = self.drop_table(rate, sweep.sensor)
+        if table is None:
+            return
+        edges, powers, expected = table
+        log_step = math.log(powers[1] / powers[0])
+        weakest = weakest_recorded(sweep)
+        row = np.log(np.maximum(weakest, powers[0]) / powers[0]) / np.float32(log_step)
+        row = row.astype(np.intp).clip(max=_POWERS)
+        before = steps_before_target(sweep, edges)
+
+        # Which rays have a drop that is stronger than their echo, and how strong it is.
+        drawn = draws.exponential(slice(None))
+        chosen = np.flatnonzero(_between(expected, row, before) > drawn)
+        drawn, row, before = drawn[chosen], row[chosen], before[chosen]
+        row = _last_where(
+            lambda middle: _between(expected, middle, before) > drawn,
+            row,
+            np.full_like(row, _POWERS),
+        )
+        above, beyond = _between(expected, row, before), _between(expected, row + 1, before)
+        power = powers[row] * np.exp(log_step * (above - drawn) / (above - beyond))
+        stronger = power > weakest[chosen]
+        chosen, row, before, power = (a[stronger] for a in (chosen, row, before, power))
+        if not len(chosen):
+            return
+
+        # Where it is: the drops of this row's powers, up to the target.
+        in_row = np.ascontiguousarray(expected[:-1] - expected[1:])
+        level = draws.uniform(chosen) * _between(in_row, row, before)
+        step = _last_where(
+            lambda middle: in_row[row, middle] <= level,
+            np.zeros_like(row),
+            before.astype(np.intp) + 1,
+        )
+        lower, upper = in_row[row, step], in_row[row, (step + 1).clip(max=len(edges) - 1)]
+        part = np.divide(
+            level - lower, upper - lower, out=np.zeros_like(level), where=upper > lower
+        )
+        at = np.minimum(step + part, before)
+        range_m = edges[0] + (edges[1] - edges[0]) * at
+        sweep.offer(
+            chosen,
+            range_m.astype(np.float32),
+            power.astype(np.float32),
+            NO_SURFACE,
+            self.origin,
+        )
+
+    def extinction_per_m(self, rate_mm_h: float) -> float:
+        """Extinction at a rate, see the class."""
+        exponent = self.intercept[1] - 3 * self.slope[1]
+        return 1e-6 * math.pi * self.intercept[0] / self.slope[0] ** 3 * rate_mm_h**exponent
+
+    def drop_table(self, rate_mm_h: float, sensor: SpinningLidar) -> DropTable | None:
+        """M(p, r) of the class for an instrument; None where no single drop can be detected."""
+        edges = range_edges(sensor, _STEP_M)
+        middle = (edges[1:] + edges[:-1]) / 2
+        through = np.exp(-2 * self.extinction_per_m(rate_mm_h) * middle)
+        filling = self.reflectivity * through * overlap_by_square(middle, sensor)
+        weakest = sensor.min_power * math.exp(-_WIDE * sensor.threshold_spread)
+        if not (sensor.divergence_rad > 0 and filling.max() > weakest):
+            return None
+        powers = np.geomspace(weakest, filling.max(), _POWERS + 1)
+        per_mm = self.slope[0] * rate_mm_h ** self.slope[1]
+        per_m3 = self.intercept[0] * rate_mm_h ** self.intercept[1] / per_mm
+        with np.errstate(divide="ignore", over="ignore"):
+            squared = powers[:, None] / filling
+        diameter_mm = 1000 * sensor.divergence_rad * middle * np.sqrt(squared)
+        density = per_m3 * np.exp(-per_mm * diameter_mm) * (squared <= 1)
+        density *= math.pi * (sensor.divergence_rad * middle / 2) ** 2
+        expected = np.zeros((len(powers), len(edges)))
+        # Nothing is stronger than the last power.
+        np.cumsum(density[:-1] * (edges[1] - edges[0]), axis=1, out=expected[:-1, 1:])
+        return DropTable(edges, powers, expected.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Rain(_Hydrometeors):
+    """Rain weakens every echo, and a drop in the beam may outshine a weak target.
+
+    Equations: :class:`_Hydrometeors`. A sphere of the refractive index n = 1.33 sends back from
+    its front and, focused, from its rear ``F / 4 (1 + (1 - F)^2 (n / (2 - n))^2) = 0.024`` of what
+    a white disk does, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
+
+    Source: Marshall and Palmer 1948 for the sizes.
+
+    Args:
+        reflectivity: Of a drop as wide as the beam, beside a diffuse surface.
+        intercept: n per m^3 and mm, and a.
+        slope: l per mm, and b.
+
+    Raises:
+        ValueError: If the reflectivity lies outside [0, 1] or n or l is not positive.
+    """
+
+    reflectivity: float = 0.02
+    intercept: tuple[float, float] = (8000.0, 0.0)
+    slope: tuple[float, float] = (4.1, -0.21)
+
+    origin: ClassVar[Origin] = Origin.RAIN
+
+    def rate_mm_h(self, weather: Weather) -> float:
+        """Rain rate."""
+        return weather.rain_mm_h
+
+
+@dataclass(frozen=True)
+class Snow(_Hydrometeors):
+    """Snow weakens every echo, and flakes before weak targets are taken for them.
+
+    Equations: :class:`_Hydrometeors`. Diameters are those of the molten flakes. A flake is no
+    white disk (0.9): ice crystals send back 2 pi / S = 0.3 of that, with S = 20 sr their ratio of
+    extinction to backscatter. At 1 mm/h the extinction is 1.4e-3 per metre.
+
+    Source: Gunn and Marshall 1958 for the sizes, with twice their number as in LISA (molten
+    flakes hide less than real ones).
+
+    Args:
+        reflectivity: Of a flake as wide as the beam, beside a diffuse surface.
+        intercept: n per m^3 and mm, and a.
+        slope: l per mm, and b.
+
+    Raises:
+        ValueError: If the reflectivity lies outside [0, 1] or n or l is not positive.
+    """
+
+    reflectivity: float = 0.3
+    intercept: tuple[float, float] = (7600.0, -0.87)
+    slope: tuple[float, float] = (2.55, -0.48)
+
+    origin: ClassVar[Origin] = Origin.SNOW
+
+    def rate_mm_h(self, weather: Weather) -> float:
+        """Snow rate."""
+        return weather.snow_mm_h
+
+
+def _between(table: NDArray, row: NDArray[np.intp], column: NDArray) -> NDArray:
+    """Entries (M,) of rows of a table (P, K), between its columns."""
+    left = np.minimum(column.astype(np.intp), table.shape[1] - 2)
+    flat, at = table.reshape(-1), row * table.shape[1] + left
+    lower = flat[at]
+    return lower + (column - left) * (flat[at + 1] - lower)
+
+
+def _last_where(
+    holds: Callable[[NDArray[np.intp]], NDArray[np.bool_]],
+    low: NDArray[np.intp],
+    high: NDArray[np.intp],
+) -> NDArray[np.intp]:
+    """Last index (M,) in [low, high) where something holds that holds at low and then ceases."""
+    while (high - low > 1).any():
+        middle = (low + high) // 2
+        held = holds(middle)
+        low, high = np.where(held, middle, low), np.where(held, high, middle)
+    return low

@@ -1,0 +1,231 @@
+"""One self-contained HTML page that shows scans as point clouds to walk around in.
+
+The page is ``page.html`` with ``page_cloud.js`` (points to pixels) and ``page_viewer.js`` (panes,
+camera, legend); it loads nothing and needs no GPU. Letters: P points.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import Colormap
+from numpy.typing import NDArray
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.viz.figures import EGO_OUTLINE_M
+from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part
+from r3dpa.viz.scans import HEIGHT_LIMITS_M, HEIGHT_MAP
+from r3dpa.viz.sheets import range_ticks
+
+#: Step of the coordinates in a page, metres; larger only for a scan that int16 could not hold.
+STEP_M = 0.005
+GROUND_M = -1.73  # KITTI's Velodyne stands 1.73 m above the road
+# As RANGE_MAP, but its far end stands out from the dark also where it is a few thin points.
+PAGE_RANGE_MAP = bright_part("plasma", 0.15).reversed()
+INTENSITY_MAP = bright_part("inferno", 0.25)
+_SCRIPTS = ("page_cloud.js", "page_viewer.js")
+# Distinct on the dark background; for categories that come without a colour.
+PALETTE = (
+    *("#4e9bff", "#ffb000", "#3ddc97", "#ff6b6b", "#c792ea", "#5ce1e6", "#f78fb3", "#b5e853"),
+    *("#ff8c42", "#9fa8da", "#e6d690", "#8bd3c7"),
+)
+
+
+class Category(NamedTuple):
+    """What a category number means, and its colour ``#rrggbb`` (one of the palette if None)."""
+
+    name: str
+    colour: str | None = None
+
+
+@dataclass(frozen=True)
+class PageScan:
+    """One scan of a page.
+
+    Args:
+        name: Shown as it is.
+        points: ``(P, 3)`` x forward, y left, z up in metres, or ``(P, 4)`` with the intensity.
+        labels: ``(P,)`` semantic class in the lower 16 bits, instance in the upper 16.
+        origins: ``(P,)`` number from 0 to 255 of what made the point.
+    """
+
+    name: str
+    points: Array
+    labels: NDArray[np.integer] | None = None
+    origins: NDArray[np.integer] | None = None
+
+
+def scan_page(
+    scans: Sequence[PageScan],
+    title: str,
+    semantics: Mapping[int, Category],
+    origins: Mapping[int, Category],
+    reference: PageScan | None = None,
+    sensor: LidarSensor | None = None,
+) -> str:
+    """HTML page with one scan at a time, turned, moved and coloured by the reader.
+
+    Coordinates are rounded to steps of 5 mm, so each is off by 2.5 mm at most (for a scan that
+    reaches beyond 163 m: by half of its reach / 32767); intensities to 1/255 of their largest
+    value (at least 1; negative ones become 0). Packed, a scan of 120 000 points takes about half
+    a megabyte.
+
+    Args:
+        scans: Scans to leaf through, at least one.
+        title: Title of the page.
+        semantics: Categories of the labels by number; a number without one is shown as it is.
+        origins: Categories of the origins by number, likewise.
+        reference: Scan that stays beside the others, seen by the same camera.
+        sensor: Gives the limits of the range colours; the default sensor if None.
+
+    Raises:
+        ValueError: If there is no scan, or a scan has no point, another shape than above, values
+            that are not finite, or another number of labels or origins than of points.
+    """
+    if not scans:
+        raise ValueError("scan_page got no scan; give at least one")
+    shown = [*scans, *([] if reference is None else [reference])]
+    packed = [pack_scan(scan) for scan in shown]
+    sensor = sensor or LidarSensor()
+    heights_m = np.arange(HEIGHT_LIMITS_M[0], HEIGHT_LIMITS_M[1] + 1).tolist()
+    brightest = max(header["intensity_max"] for header, _ in packed)
+    page = {
+        "background": BACKGROUND,
+        "ground_m": GROUND_M,
+        "ego": [(x, y) for y, x in EGO_OUTLINE_M],
+        "mode": "height",
+        "scales": {
+            "height": _scale("height above the sensor (m)", HEIGHT_MAP, 1.0, heights_m),
+            "range": _scale("range (m)", PAGE_RANGE_MAP, 0.5, range_ticks(sensor)),
+            "intensity": _scale("intensity", INTENSITY_MAP, 0.5, [0, brightest / 4, brightest]),
+        },
+        "categories": {
+            "semantic": _category_rows(
+                semantics, [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
+            ),
+            "origin": _category_rows(
+                origins, [scan.origins for scan in shown if scan.origins is not None]
+            ),
+        },
+        "scans": [header for header, _ in packed],
+        "reference": None if reference is None else len(scans),
+    }
+    # JSON may hold "<" within strings only, where its escape means the same: no name ends a script.
+    text = json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    points = "\n".join(
+        f'<script type="text/plain" id="points-{number}">{data}</script>'
+        for number, (_, data) in enumerate(packed)
+    )
+    folder = files("r3dpa.viz")
+    script = "\n".join((folder / name).read_text("utf-8") for name in _SCRIPTS)
+    parts = {
+        "title": html.escape(title),
+        "background": "#{:02x}{:02x}{:02x}".format(*BACKGROUND),
+        "page": text,
+        "points": points,
+        "script": script,
+    }
+    template = (folder / "page.html").read_text("utf-8")
+    # In one pass, so that a part that holds such a placeholder stays as it is.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+
+
+def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
+    """A scan as the page holds it.
+
+    The data are columns, one after the other, deflated (zlib) and in base64: x, y and z as int16
+    steps, each the difference from the point before (which wraps around); then, where known,
+    semantic and instance as uint16, intensity and origin as uint8. All are little-endian.
+
+    Args:
+        scan: What to pack.
+
+    Returns:
+        Header (``name``, ``count``, ``step_m``, ``intensity_max``, ``columns``), and the data.
+
+    Raises:
+        ValueError: As :func:`scan_page`; the message names the scan.
+    """
+    points = as_numpy(scan.points, ("P", "3 or 4"))
+    count = len(points)
+    if points.shape[1] not in (3, 4) or not count:
+        raise ValueError(f"{scan.name}: points must be (P, 3) or (P, 4), got {points.shape}")
+    if not np.isfinite(points).all():
+        raise ValueError(f"{scan.name}: has NaN or infinite values; drop these points first")
+    step_m = max(STEP_M, float(np.abs(points[:, :3]).max()) / 32767)
+    steps = np.rint(points[:, :3] / step_m).astype("<i2")
+    columns = ["x", "y", "z"]
+    data = [column.tobytes() for column in np.diff(steps, axis=0, prepend=np.int16(0)).T]
+    if scan.labels is not None:
+        labels = _checked(scan, "labels", scan.labels, 0xFFFFFFFF)
+        columns += ["semantic", "instance"]
+        data += [(labels & 0xFFFF).astype("<u2").tobytes(), (labels >> 16).astype("<u2").tobytes()]
+    intensity_max = 1.0
+    if points.shape[1] == 4:
+        intensity_max = max(1.0, float(points[:, 3].max()))
+        columns.append("intensity")
+        share = np.clip(points[:, 3], 0, None) / intensity_max
+        data.append(np.rint(255 * share).astype(np.uint8).tobytes())
+    if scan.origins is not None:
+        columns.append("origin")
+        data.append(_checked(scan, "origins", scan.origins, 0xFF).astype(np.uint8).tobytes())
+    header = {
+        "name": scan.name,
+        "count": count,
+        "step_m": step_m,
+        "intensity_max": intensity_max,
+        "columns": columns,
+    }
+    return header, base64.b64encode(zlib.compress(b"".join(data), 9)).decode("ascii")
+
+
+def _checked(
+    scan: PageScan, what: str, values: NDArray[np.integer], largest: int
+) -> NDArray[np.int64]:
+    """The numbers of each point, checked to be one for each and within 0 to ``largest``."""
+    if values.shape != (len(scan.points),):
+        raise ValueError(
+            f"{scan.name}: {what} are {values.shape} but points {tuple(scan.points.shape)}; give "
+            "one number per point"
+        )
+    if values.min() < 0 or values.max() > largest:
+        raise ValueError(
+            f"{scan.name}: {what} go from {values.min()} to {values.max()}; give 0 to {largest}"
+        )
+    return values.astype(np.int64)
+
+
+def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) -> dict[str, Any]:
+    """Colour scale from the first to the last tick, with its 256 colours as RGB bytes."""
+    rgb = colours(np.arange(256), bytes=True)[:, :3]
+    return {
+        "label": label,
+        "low": ticks[0],
+        "high": ticks[-1],
+        "power": power,
+        "ticks": [(tick, f"{tick:.3g}") for tick in ticks],
+        "rgb": base64.b64encode(rgb.tobytes()).decode("ascii"),
+    }
+
+
+def _category_rows(
+    categories: Mapping[int, Category], used: Sequence[NDArray[np.integer]]
+) -> list[tuple[int, str, str]]:
+    """Number, name and colour of the categories that occur, and of numbers without a category."""
+    present = sorted({int(number) for values in used for number in np.unique(values)})
+    order = {number: place for place, number in enumerate(sorted({*categories, *present}))}
+    rows = []
+    for number in present:
+        category = categories.get(number, Category(f"number {number}"))
+        colour = category.colour or PALETTE[order[number] % len(PALETTE)]
+        rows.append((number, category.name, colour))
+    return rows

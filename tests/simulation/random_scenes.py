@@ -1,0 +1,178 @@
+"""Random scenes and instruments: every parameter drawn on its own, odd values among them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from r3dpa.simulation.scene import (
+    EgoMotion,
+    Material,
+    Pose,
+    Primitive,
+    Puddle,
+    Scene,
+    Semantic,
+    Shape,
+    Weather,
+)
+from r3dpa.simulation.sensor import Lasers, hdl32e, hdl64e, vls128
+
+
+class Dice:
+    """Draws of one scene."""
+
+    def __init__(self, seed):
+        self.generator = np.random.Generator(np.random.Philox(seed))
+
+    def chance(self, probability):
+        return self.generator.random() < probability
+
+    def among(self, *values):
+        return values[self.generator.integers(len(values))]
+
+    def even(self, low, high):
+        return float(self.generator.uniform(low, high))
+
+    def magnitude(self, low, high):
+        """Even on a logarithmic scale."""
+        return math.exp(self.even(math.log(low), math.log(high)))
+
+
+def random_case(seed):
+    """Scene and sensor of a seed; a scan of them takes some milliseconds."""
+    dice = Dice(seed)
+    sensor = random_sensor(dice)
+    return random_scene(dice), sensor
+
+
+def random_scene(dice):
+    count = 0 if dice.chance(0.05) else int(dice.generator.integers(1, 26))
+    height_m = dice.among(1.73, 1.73, 1.73, dice.magnitude(0.3, 30))
+    ground_m = dice.among(0.0, 0.0, 0.0, dice.even(-3, 0), -1e4)
+    pose = Pose(
+        dice.among(0.0, dice.even(-1e3, 1e3)),
+        dice.among(0.0, dice.even(-1e3, 1e3)),
+        height_m + max(ground_m, -3.0),
+        dice.among(0.0, dice.even(-9, 9)),
+        dice.among(0.0, dice.even(-0.14, 0.14)),
+        dice.among(0.0, dice.even(-0.14, 0.14)),
+    )
+    # Few kinds at a time, so that what the others bring is not called for.
+    materials = [m for m in Material if dice.chance(0.3)] or [Material.CONCRETE]
+    moving, leafy = dice.chance(0.4), dice.chance(0.3)
+    return Scene(
+        tuple(_primitive(dice, pose, materials, moving, leafy) for _ in range(count)),
+        pose,
+        EgoMotion(
+            dice.among(0.0, 0.0, 0.0, 1e-6, dice.even(-15, 40)),
+            dice.among(0.0, 0.0, 0.0, 1e-6, dice.even(-1.5, 1.5)),
+        ),
+        _weather(dice),
+        tuple(
+            Puddle(pose.x_m + dice.even(-12, 12), pose.y_m + dice.even(-12, 12), dice.even(0.01, 8))
+            for _ in range(dice.among(0, 0, 1, 4))
+        ),
+        tuple(_car_part(dice) for _ in range(dice.among(0, 0, 1, 3))),
+        ground_m,
+        dice.among(0.15, 1.0, 1e-3, dice.even(0.05, 0.6)),
+    )
+
+
+def random_sensor(dice):
+    shots = dice.among(8, 60, 64, 64, 90, 120)
+    sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), hdl32e(), vls128(), hdl64e())
+    lasers = sensor.lasers
+    if dice.chance(0.1):
+        lasers = _few_lasers(dice)
+    elif dice.chance(0.3):
+        num = sensor.num_beams
+        lasers = replace(lasers, range_bias_m=(0.0,) * num, intensity_gain=(1.0,) * num)
+    quiet = dice.chance(0.25)
+    return replace(
+        sensor,
+        lasers=lasers,
+        shots=shots,
+        spin_hz=dice.among(10.0, 10.0, 20.0, 1.0),
+        min_power=dice.among(1.43e-5, 1.43e-5, 1e-20, dice.magnitude(1e-8, 1e-2)),
+        min_range_m=dice.among(1.45, 1.45, 0.0, 5.0),
+        max_range_m=dice.among(120.0, 120.0, 20.0, 400.0),
+        divergence_rad=dice.among(2e-3, 2e-3, 0.0, 1e-5, 3e-2),
+        pulse_s=dice.among(5e-9, 5e-9, 0.0, 1e-7),
+        overlap_range_m=dice.among(5.0, 5.0, 1e-2, 50.0),
+        threshold_spread=dice.among(0.3, 0.3, 0.0, 1e-3, 2.0),
+        range_sigma_m=0.0 if quiet else dice.among(0.008, 0.0, 0.5),
+        weak_range_sigma_m=0.0 if quiet else dice.among(0.05, 0.0, 1.0),
+        range_step_m=0.0 if quiet else dice.among(0.002, 0.0, 0.1),
+        return_mode=dice.among("strongest", "strongest", "dual"),
+    )
+
+
+def _few_lasers(dice):
+    num = int(dice.generator.integers(1, 9))
+    return Lasers(
+        tuple(np.sort(dice.generator.uniform(-1.0, 0.6, num))[::-1].tolist()),
+        tuple(dice.generator.uniform(-7.0, 7.0, num).tolist()),
+        tuple(dice.generator.uniform(-0.2, 0.3, num).tolist()),
+        tuple(dice.generator.uniform(-0.2, 0.2, num).tolist()),
+        tuple(dice.generator.uniform(-0.1, 0.1, num).tolist()),
+        tuple(dice.generator.uniform(0.2, 5.0, num).tolist()),
+    )
+
+
+def _weather(dice):
+    def some(*values):
+        return 0.0 if dice.chance(0.6) else dice.among(*values)
+
+    return Weather(
+        dice.among(math.inf, math.inf, math.inf, 0.1, 1e5, 1e30, dice.magnitude(5, 2e3)),
+        some(1e-6, 100.0, dice.magnitude(0.1, 50)),
+        some(1e-6, 100.0, dice.magnitude(0.1, 10)),
+        some(1e-9, 5.0, dice.even(0.05, 2)),
+        dice.chance(0.8),
+        dice.among(-90.0, -1e-6, 0.0, 1e-6, 90.0, dice.even(0, 40), dice.even(0, 30)),
+        dice.even(-400, 400),
+    )
+
+
+def _primitive(dice, pose, materials, moving, leafy):
+    azimuth, distance_m = dice.even(-math.pi, math.pi), dice.magnitude(0.5, 60)
+    size = dice.among(
+        (dice.even(0.2, 3), dice.even(0.2, 3), dice.even(0.2, 3)),
+        (dice.even(0.5, 12), dice.magnitude(1e-3, 0.3), dice.even(0.3, 5)),
+        (dice.magnitude(1e-3, 0.2), dice.magnitude(1e-3, 0.2), dice.even(0.5, 4)),
+        (dice.even(5, 60), dice.even(5, 60), dice.magnitude(1e-3, 0.5)),
+    )
+    speed = dice.among(0.0, 1e-9, 10.0, dice.even(0, 60)) if moving else 0.0
+    heading = dice.even(-math.pi, math.pi)
+    extinction = dice.among(0.0, dice.magnitude(0.2, 3), 1e-3, 1e3) if leafy else 0.0
+    return Primitive(
+        Shape(int(dice.generator.integers(len(Shape)))),
+        (
+            pose.x_m + distance_m * math.cos(azimuth),
+            pose.y_m + distance_m * math.sin(azimuth),
+            pose.z_m + dice.among(-1.7, -1.7 + size[2], dice.even(-2, 4)),
+        ),
+        size,
+        list(Semantic)[dice.generator.integers(len(Semantic))],
+        dice.among(dice.even(0.01, 1), 1.0, 1e-4),
+        dice.among(0.0, dice.even(-9, 9)),
+        dice.among(0, 1, 2, 0xFFFF),
+        materials[dice.generator.integers(len(materials))],
+        (speed * math.cos(heading), speed * math.sin(heading)),
+        dice.among((0.0, 0.0), (dice.even(-0.2, 0.2), dice.even(-0.2, 0.2))),
+        extinction,
+    )
+
+
+def _car_part(dice):
+    """A piece of the recording car, in the sensor frame."""
+    return Primitive(
+        Shape.BOX,
+        (dice.even(-2, 2), dice.even(-1, 1), dice.even(-1.2, -0.2)),
+        (dice.even(0.05, 1.5), dice.even(0.05, 1.2), dice.even(0.02, 0.3)),
+        Semantic.EGO_VEHICLE,
+        0.3,
+        dice.among(0.0, dice.even(-1, 1)),
+        material=dice.among(*Material),
+    )

@@ -1,0 +1,357 @@
+"""Beams of finite width at edges, against hand-made figures and a cast of every rim."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from r3dpa.simulation import (
+    EgoMotion,
+    Material,
+    Origin,
+    Pose,
+    Primitive,
+    Scene,
+    Semantic,
+    Shape,
+    Sweep,
+    hdl64e,
+    simulate_scan,
+)
+from r3dpa.simulation.draws import generator_for
+from r3dpa.simulation.effects import (
+    DiffuseReflection,
+    Draws,
+    DualReturn,
+    FoliageOcclusion,
+    MixedPixels,
+    MovingActors,
+    RollingShutter,
+)
+from r3dpa.simulation.raycast import GROUND, NO_SURFACE, cast
+
+SENSOR = hdl64e()
+LEVEL = 5  # a beam within 0.3 degrees of the horizon
+SHOT = 40
+RING = np.sqrt(2 / 3) * SENSOR.divergence_rad / 2
+PATH = (DiffuseReflection(), MixedPixels())
+
+
+def applied(sweep, effect):
+    rays = effect.rays(sweep)
+    if isinstance(rays, slice) or len(rays):
+        effect.apply(sweep, rays, Draws(sweep.num_rays, "test", type(effect).__name__))
+    return sweep
+
+
+def swept(scene, sensor=SENSOR, before=(), after=PATH):
+    sweep = Sweep(scene, sensor)
+    for effect in before:
+        applied(sweep, effect)
+    sweep.cast()
+    for effect in after:
+        applied(sweep, effect)
+    return sweep
+
+
+def state(sweep):
+    arrays = [sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.min_power]
+    arrays += [sweep.start, sweep.direction]
+    return [array.copy() for echoes in sweep.echoes() for array in echoes.columns()] + [
+        array.copy() for array in arrays
+    ]
+
+
+def beside_ray(near_m, far_m, offset):
+    """Walls at two distances; the nearer one covers all that lies left of ``offset`` ring radii
+    to the left of one ray. None for a distance leaves that wall out."""
+    ray = LEVEL * SENSOR.shots + SHOT
+    start, towards = (array.reshape(3, -1)[:, ray].astype(float) for array in SENSOR.rays)
+    left = np.array([-towards[1], towards[0]]) / np.hypot(*towards[:2])
+    ahead = towards[:2] / np.hypot(*towards[:2])
+    yaw = float(np.arctan2(ahead[1], ahead[0]))
+
+    def wall(distance_m, edge_m):
+        centre = start[:2] + (distance_m + 0.05) * ahead + (edge_m + 10) * left
+        return Primitive(
+            Shape.BOX, (*centre, 0), (0.05, 10, 30), Semantic.WALL, 0.5, yaw, 0, Material.PAINT
+        )
+
+    walls = [wall(near_m, offset * RING * near_m)]
+    if far_m is not None:
+        walls.append(wall(far_m, -9))
+    return Scene(tuple(walls), Pose(z_m=0.0), ground_m=-1000), ray, 1 / np.hypot(*towards[:2])
+
+
+def test_echoes_within_a_pulse_merge_to_their_energy_weighted_range():
+    """Left of -0.2 radii lie the axis and three points of the ring: 1/4 + 3/8 of the power."""
+    scene, ray, slant = beside_ray(10.0, 10.5, -0.2)
+    plain, sweep = swept(scene, after=PATH[:1]), swept(scene)
+    assert plain.first.range_m[ray] == pytest.approx(10 * slant, rel=1e-5)
+    near, far = 5 / 8 / 10.0**2, 3 / 8 / 10.5**2
+    expected = slant * (10 * near + 10.5 * far) / (near + far)
+    # 1e-4: the points of the ring meet the wall at slightly other angles.
+    assert sweep.first.range_m[ray] == pytest.approx(expected, rel=1e-4)
+    assert sweep.first.power[ray] == pytest.approx(0.5 * (near + far), rel=2e-3)
+    assert sweep.first.origin[ray] == Origin.MIXED
+    assert sweep.first.surface[ray] == 0
+
+
+@pytest.mark.parametrize(
+    ("offset", "axis_share", "rest_m"),
+    [(-0.2, 5 / 8, 12.0), (0.2, 5 / 8, 10.0), (0.2, 5 / 8, None)],
+)
+def test_echoes_farther_apart_stay_apart(offset, axis_share, rest_m):
+    """The axis keeps its range bitwise and its share; the other side is the second echo."""
+    far_m = None if rest_m is None else 12.0
+    scene, ray, slant = beside_ray(10.0, far_m, offset)
+    sweeps = [
+        swept(scene, replace(SENSOR, return_mode="dual"), (DualReturn(),), after)
+        for after in (PATH[:1], PATH)
+    ]
+    plain, sweep = sweeps
+    if rest_m is None:
+        # The axis misses the only wall; three points of the ring meet it.
+        assert plain.first.surface[ray] == NO_SURFACE
+        assert sweep.first.range_m[ray] == pytest.approx(10 * slant, rel=1e-5)
+        assert sweep.first.power[ray] == pytest.approx(3 / 8 * 0.5 / 100, rel=2e-3)
+        assert sweep.material[ray] == Material.PAINT
+        return
+    on_axis = 10.0 if offset < 0 else 12.0
+    echoes = {
+        on_axis: axis_share * 0.5 / on_axis**2,
+        rest_m: (1 - axis_share) * 0.5 / rest_m**2,
+    }
+    ranked = sorted(echoes, key=lambda there_m: -echoes[there_m])
+    for found, there_m in zip(sweep.echoes(), ranked, strict=True):
+        assert found.range_m[ray] == pytest.approx(there_m * slant, rel=1e-4)
+        assert found.power[ray] == pytest.approx(echoes[there_m], rel=3e-3)
+        assert found.origin[ray] == Origin.SURFACE
+        if there_m == on_axis:
+            assert found.range_m[ray] == plain.first.range_m[ray]
+
+
+def test_pulse_length_decides_what_merges():
+    """c tau / 2 is 0.6 m at 4 ns and 1.5 m at 10 ns."""
+    scene, ray, _ = beside_ray(10.0, 11.0, -0.2)
+    for pulse_s, origin in ((4e-9, Origin.SURFACE), (10e-9, Origin.MIXED), (0.0, Origin.SURFACE)):
+        sweep = swept(scene, replace(SENSOR, pulse_s=pulse_s))
+        assert sweep.first.origin[ray] == origin
+
+
+def test_steps_below_the_edge_change_nothing():
+    scene, _, _ = beside_ray(10.0, 10.25, -0.2)
+    plain, sweep = swept(scene, after=PATH[:1]), swept(scene)
+    inner = np.abs(plain.grid(plain.first.surface)).max(axis=0) <= 1
+    for before, after in zip(plain.first.columns(), sweep.first.columns(), strict=True):
+        # All shots whose footprint lies on the two walls.
+        columns = np.flatnonzero(inner)[2:-2]
+        np.testing.assert_array_equal(plain.grid(before)[:, columns], sweep.grid(after)[:, columns])
+
+
+@pytest.mark.parametrize("divergence_rad", [0.0, 2e-3])
+def test_hit_rate_of_thin_poles(divergence_rad):
+    """(w + sqrt(2/3) * footprint) / pitch of each beam, over 50 poles 40 m away and 64 beams."""
+    width_m, distance_m = 0.03, 40.0
+    bearings = np.linspace(0, 2 * np.pi, 50, endpoint=False) + generator_for(1).random(50) / 20
+    poles = tuple(
+        Primitive(
+            Shape.CYLINDER,
+            (distance_m * np.cos(bearing), distance_m * np.sin(bearing), 0.0),
+            (width_m / 2, width_m / 2, 40.0),
+            Semantic.POLE,
+            0.3,
+        )
+        for bearing in bearings
+    )
+    sensor = replace(SENSOR, divergence_rad=divergence_rad)
+    sweep = swept(Scene(poles, Pose(z_m=0.0), ground_m=-1000), sensor)
+    hits = (sweep.first.surface >= 0) & (sweep.first.power > 0)
+    footprint = divergence_rad * distance_m / np.cos(sensor.lasers.inclination_rad)
+    pitch = 2 * np.pi * distance_m / sensor.shots
+    expected = ((width_m + np.sqrt(2 / 3) * footprint) / pitch).mean()
+    # 4 standard errors of 3200 trials.
+    rate = hits.sum() / (len(poles) * sensor.num_beams)
+    assert rate == pytest.approx(expected, abs=4 * np.sqrt(0.25 / 3200))
+    shares = sweep.first.power[hits] * sweep.first.range_m[hits] ** 2
+    assert shares.max() <= 0.3 * 1.0001
+    if divergence_rad:
+        # The mean share of all shots is the share of the pole in a pitch.
+        assert (shares / 0.3).sum() / (50 * 64) < 1.05 * width_m / pitch
+
+
+def random_scene(seed):
+    generator = generator_for("edges", seed)
+    solids = []
+    for _ in range(60):
+        bearing, distance = generator.uniform(0, 2 * np.pi), generator.uniform(6, 60)
+        half_size = generator.uniform((0.02, 0.02, 0.5), (1.5, 1.5, 3.0))
+        solids.append(
+            Primitive(
+                Shape(int(generator.integers(3))),
+                (distance * np.cos(bearing), distance * np.sin(bearing), half_size[2] + 0.3),
+                tuple(half_size),
+                Semantic.BUILDING,
+                0.4,
+                generator.uniform(0, 3),
+                velocity_m_s=tuple(generator.uniform(-10, 10, 2) * (generator.random() < 0.3)),
+            )
+        )
+    return Scene(tuple(solids), motion=EgoMotion(12.0, 0.2))
+
+
+def test_edges_are_those_of_a_cast_of_every_rim():
+    """Of the rays whose rim, cast through the whole scene, meets an edge, 95 % are found; of those
+    that change, 98 % have one, and what their whole footprint returns is the same."""
+    scene, moving = random_scene(0), (RollingShutter(), MovingActors())
+    plain, sweep = swept(scene, SENSOR, moving, PATH[:1]), swept(scene, SENSOR, moving)
+    own, own_m = plain.first.surface, plain.first.range_m
+    direction = sweep.direction
+    left = np.stack([-direction[1], direction[0], np.zeros_like(direction[0])])
+    left /= np.linalg.norm(left, axis=0)
+    above = np.cross(direction, left, axis=0)
+    edge = np.zeros(sweep.num_rays, dtype=bool)
+    kept = np.full(sweep.num_rays, 2 / 8)
+    for angle in np.arange(6) * np.pi / 3:
+        aside = direction + RING * (np.cos(angle) * left + np.sin(angle) * above)
+        rim_m, rim = (
+            array.reshape(-1)
+            for array in cast(
+                sweep.solids,
+                sweep.grid(sweep.start),
+                sweep.grid(aside.astype(np.float32)),
+                SENSOR.max_range_m,
+                sweep.grid(sweep.actor_time_s),
+            )
+        )
+        kept += (rim == own) / 8
+        nearer = np.where(own_m < rim_m, own, rim)
+        with np.errstate(invalid="ignore"):
+            edge |= (rim != own) & (nearer >= 0) & ~(np.abs(rim_m - own_m) <= 0.3)
+    changed = (sweep.first.power != plain.first.power) | (sweep.first.range_m != own_m)
+    assert edge.sum() > 500
+    assert (edge & changed).sum() > 0.95 * edge.sum()
+    assert (edge & changed).sum() > 0.98 * changed.sum()
+    alone = changed & (sweep.first.surface == own) & (sweep.first.origin == Origin.SURFACE)
+    share = sweep.first.power[alone] / plain.first.power[alone]
+    assert alone.sum() > 200
+    assert (np.abs(share - kept[alone]) < 1e-3).mean() > 0.95
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 9.0])
+def test_thin_solids_that_all_axes_miss(speed_m_s):
+    """A rod of 2 mm, 60 m away, stands at one point of a rim when its shot is fired: 1/8 of the
+    power at normal incidence."""
+    ray = LEVEL * SENSOR.shots + SHOT
+    start, towards = (array.reshape(3, -1)[:, ray].astype(float) for array in SENSOR.rays)
+    left = np.array([-towards[1], towards[0]]) / np.hypot(*towards[:2])
+    x, y = start[:2] + 60 * (towards[:2] + RING * left)
+    fired_s = SENSOR.time_s.reshape(-1)[ray]
+    rod = Primitive(
+        Shape.CYLINDER,
+        (x, y - speed_m_s * fired_s, 0.0),
+        (1e-3, 1e-3, 30.0),
+        Semantic.POLE,
+        0.8,
+        material=Material.PAINT,
+        velocity_m_s=(0, speed_m_s),
+    )
+    scene = Scene((rod,), Pose(z_m=0.0), ground_m=-1000)
+    assert swept(scene, SENSOR, (MovingActors(),), PATH[:1]).first.surface[ray] == NO_SURFACE
+    sweep = swept(scene, SENSOR, (MovingActors(),))
+    assert sweep.first.surface[ray] == 0
+    assert sweep.first.range_m[ray] == pytest.approx(60, rel=1e-4)
+    # The axis of the rod is met to within a third of its radius.
+    assert sweep.first.power[ray] == pytest.approx(0.8 / 60**2 / 8, rel=0.06)
+    assert sweep.material[ray] == Material.PAINT
+
+
+def test_tiles_of_ground_do_not_mix():
+    """A pavement of tiles that meet at grazing incidence, with a step of 12 cm."""
+    tiles = tuple(
+        Primitive(
+            Shape.BOX,
+            (5.0 * number, 0, 0.06 * (number % 2)),
+            (2.5, 50, 0.06),
+            Semantic.SIDEWALK,
+            0.2,
+            material=Material.PAVING,
+        )
+        for number in range(-8, 9)
+    )
+    plain, sweep = swept(Scene(tiles), after=PATH[:1]), swept(Scene(tiles))
+    for before, after in zip(state(plain), state(sweep), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_leaves_fill_the_beam():
+    crown = Primitive(
+        Shape.ELLIPSOID,
+        (12.0, 0, 2.5),
+        (2, 2, 2),
+        Semantic.VEGETATION,
+        0.5,
+        material=Material.FOLIAGE,
+        extinction_per_m=0.8,
+    )
+    scene = Scene((crown,))
+    foliage = (FoliageOcclusion(),)
+    plain, sweep = swept(scene, before=foliage, after=PATH[:1]), swept(scene, before=foliage)
+    assert (plain.first.origin == Origin.FOLIAGE).sum() > 100
+    for before, after in zip(state(plain), state(sweep), strict=True):
+        np.testing.assert_array_equal(before, after)
+    # A pole before the crown takes its share of the leaves behind it.
+    pole = Primitive(Shape.CYLINDER, (8.0, 0.0, 2.0), (0.1, 0.1, 3.0), Semantic.POLE, 0.3)
+    both = swept(Scene((crown, pole)), before=foliage, after=PATH[:1])
+    mixed = swept(Scene((crown, pole)), before=foliage)
+    less = (both.first.origin == Origin.FOLIAGE) & (mixed.first.power != both.first.power)
+    assert less.sum() > 3
+
+
+def same_scans(scene, sensor):
+    scans = [
+        simulate_scan(scene, sensor, ("seed", 1), {"mixed_pixels": switch})
+        for switch in ("off", "auto", "on")
+    ]
+    for scan in scans[1:]:
+        np.testing.assert_array_equal(scan.points, scans[0].points)
+        np.testing.assert_array_equal(scan.labels, scans[0].labels)
+        np.testing.assert_array_equal(scan.origins, scans[0].origins)
+
+
+@pytest.mark.parametrize("height_m", [0.02, 1.73])
+def test_forced_on_where_nothing_calls_for_it(height_m):
+    roof = Primitive(Shape.BOX, (-1, 0, -0.2), (0.5, 0.5, 0.05), Semantic.EGO_VEHICLE, 0.3)
+    far = replace(SENSOR, min_power=1e-12, max_range_m=1000.0)
+    bare = Scene((), Pose(z_m=height_m), ego_body=(roof,))
+    assert MixedPixels().called_by(bare, far) is None
+    same_scans(bare, far)
+    line = replace(SENSOR, divergence_rad=0.0)
+    assert MixedPixels().called_by(random_scene(1), line) is None
+    same_scans(random_scene(1), line)
+    assert "2 mrad" in MixedPixels().called_by(random_scene(1), SENSOR)
+
+
+def test_narrow_beams_tend_to_lines():
+    scene = random_scene(2)
+    plain = swept(scene, after=PATH[:1])
+    changes = []
+    for divergence_rad in (2e-3, 2e-4, 2e-5):
+        sweep = swept(scene, replace(SENSOR, divergence_rad=divergence_rad))
+        changes.append((sweep.first.power != plain.first.power).sum())
+    assert changes[0] > 5 * changes[1] > 10 * changes[2]
+
+
+def test_only_its_rays_change():
+    scene, sensor = random_scene(3), replace(SENSOR, return_mode="dual")
+    sweep = swept(scene, sensor, (DualReturn(), RollingShutter(), MovingActors()), PATH[:1])
+    before, rays = state(sweep), MixedPixels().rays(sweep)
+    assert 100 < len(rays) < 0.1 * sweep.num_rays
+    MixedPixels().apply(sweep, rays, Draws(sweep.num_rays, "test"))
+    others = np.setdiff1d(np.arange(sweep.num_rays), rays)
+    for old, new in zip(before, state(sweep), strict=True):
+        np.testing.assert_array_equal(old[..., others], new[..., others])
+    assert (before[0] != sweep.first.range_m).any()
+    assert np.isfinite(sweep.second.range_m).any()
+    assert (sweep.second.power <= sweep.first.power).all()
+    assert (sweep.first.surface[rays] != GROUND).any()

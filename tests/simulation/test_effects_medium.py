@@ -1,0 +1,432 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from r3dpa.simulation.effects import (
+    DiffuseReflection,
+    Draws,
+    DualReturn,
+    Fog,
+    Rain,
+    Snow,
+    Spray,
+)
+from r3dpa.simulation.effects.medium import soft_waveform
+from r3dpa.simulation.raycast import NO_SURFACE
+from r3dpa.simulation.scan import effect_name, simulate_scan
+from r3dpa.simulation.scene import Material, Pose, Primitive, Scene, Semantic, Shape, Weather
+from r3dpa.simulation.sensor import Lasers, hdl64e
+from r3dpa.simulation.sweep import Origin, Sweep
+
+# Fixed here, so that the numbers below do not depend on the fit of the default instrument.
+SENSOR = replace(
+    hdl64e(shots=360),
+    min_power=1.43e-5,
+    min_range_m=1.45,
+    overlap_range_m=5.0,
+    threshold_spread=0.0,
+)
+WALL = Primitive(Shape.BOX, (31.0, 0, 2), (1, 40, 6), Semantic.WALL, 0.6)
+CAR = Primitive(
+    Shape.BOX,
+    (25.0, 1.0, 0.95),
+    (2.0, 0.9, 0.75),
+    Semantic.CAR,
+    0.2,
+    instance=7,
+    material=Material.PAINT,
+    velocity_m_s=(15.0, 0.0),
+)
+# Effect and a weather that calls for it.
+CALLED = (
+    (Fog(), Weather(visibility_m=60)),
+    (Rain(), Weather(rain_mm_h=20)),
+    (Snow(), Weather(snow_mm_h=2)),
+    (Spray(), Weather(water_film_mm=1.0)),
+)
+NAMES = [effect_name(effect) for effect, _ in CALLED]
+
+
+def surfaces(scene, sensor=SENSOR):
+    """The echoes of the solids."""
+    sweep = Sweep(scene, sensor)
+    sweep.cast()
+    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "surface"))
+    return sweep
+
+
+def applied(effect, scene, sensor=SENSOR, key="draws", dual=False):
+    sweep = Sweep(scene, sensor)
+    if dual:
+        DualReturn().apply(sweep, slice(None), Draws(sweep.num_rays, "dual"))
+    sweep.cast()
+    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "surface"))
+    rays = effect.rays(sweep)
+    effect.apply(sweep, rays, Draws(sweep.num_rays, key))
+    return sweep
+
+
+def arrays(sweep):
+    columns = [column for echoes in sweep.echoes() for column in echoes.columns()]
+    return [*columns, sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material]
+
+
+# All four.
+
+
+@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
+def test_called_by_its_weather_only(effect, weather):
+    assert effect.called_by(Scene((CAR,), weather=weather), SENSOR)
+    for other, _ in CALLED:
+        if other is not effect:
+            assert other.called_by(Scene((CAR,), weather=weather), SENSOR) is None
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", NAMES)
+def test_forced_on_without_cause_changes_nothing(name):
+    scene = Scene((WALL, CAR))
+    plain = simulate_scan(scene, hdl64e(shots=360), (1,))
+    forced = simulate_scan(scene, hdl64e(shots=360), (1,), {name: "on"})
+    for field in ("points", "labels", "origins"):
+        assert getattr(forced, field).tobytes() == getattr(plain, field).tobytes()
+
+
+@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
+def test_repeats_and_changes_no_other_ray(effect, weather):
+    scene = Scene((WALL, CAR), weather=weather)
+    before, after, again = surfaces(scene), applied(effect, scene), applied(effect, scene)
+    rays = np.arange(before.num_rays)[effect.rays(before)]
+    outside = np.setdiff1d(np.arange(before.num_rays), rays)
+    for old, new, repeated in zip(arrays(before), arrays(after), arrays(again), strict=True):
+        assert (old[outside] == new[outside]).all()
+        assert (new == repeated).all()
+    assert (after.first.power != before.first.power).any()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("effect", "weather"),
+    [
+        (Fog(), Weather(visibility_m=1e9)),
+        (Rain(), Weather(rain_mm_h=1e-12)),
+        (Snow(), Weather(snow_mm_h=1e-12)),
+        (Spray(), Weather(water_film_mm=1e-9)),
+    ],
+    ids=NAMES,
+)
+def test_vanishes_with_its_cause(effect, weather):
+    scene = Scene((WALL, CAR), weather=weather)
+    before, after = surfaces(scene), applied(effect, scene)
+    np.testing.assert_allclose(after.first.power, before.first.power, rtol=1e-5, atol=1e-8)
+    heard = after.first.power > 1e-8
+    assert (after.first.range_m == before.first.range_m)[heard].all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("effect", "weather"),
+    [
+        (Fog(), Weather(visibility_m=1e-3)),
+        (Rain(), Weather(rain_mm_h=1e4)),
+        (Snow(), Weather(snow_mm_h=5e-324)),
+        (Spray(), Weather(water_film_mm=1e4)),
+    ],
+    ids=NAMES,
+)
+def test_extreme_weather(effect, weather):
+    after = applied(effect, Scene((WALL, CAR), weather=weather))
+    assert (after.first.power >= 0).all()
+    assert not np.isnan(after.first.range_m).any()
+
+
+@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
+def test_second_echoes_leave_the_first_alone(effect, weather):
+    scene = Scene((WALL, CAR), weather=weather)
+    single, dual = applied(effect, scene), applied(effect, scene, dual=True)
+    for one, two in zip(single.first.columns(), dual.first.columns(), strict=True):
+        assert (one == two).all()
+    # A hard echo that lost against the air, or one from the air that lost, comes second.
+    assert (dual.second.power > 0).any()
+    assert (dual.second.power <= dual.first.power).all()
+
+
+def test_echoes_of_the_air_lie_before_the_target():
+    near = replace(CAR, centre=(16.0, 1.0, 0.95))
+    for effect, weather in CALLED:
+        scene = Scene((near,), weather=weather)
+        before, after = surfaces(scene), applied(effect, scene)
+        air = after.first.origin > 0
+        assert air.any()
+        assert (after.first.range_m[air] <= before.first.range_m[air] + 1e-4).all()
+        assert (after.first.range_m[air] >= SENSOR.min_range_m).all()
+        assert (after.first.surface[air] == NO_SURFACE).all()
+
+
+# Fog.
+
+
+def test_transmission_of_fog():
+    """exp(-2 ln(20) / 50 * 30) = 20^-1.2 = 0.0275, without soft echoes in its way."""
+    sensor = replace(SENSOR, pulse_s=0.0)
+    before = surfaces(Scene((WALL,)), sensor)
+    after = applied(Fog(), Scene((WALL,), weather=Weather(visibility_m=50)), sensor)
+    hit = np.flatnonzero(np.abs(before.first.range_m - 30) < 0.1)
+    ratio = after.first.power[hit] / before.first.power[hit]
+    assert len(hit) > 10
+    np.testing.assert_allclose(ratio, 0.0275, rtol=0.015)
+
+
+@pytest.mark.parametrize(
+    ("visibility_m", "last_m"), [(50, 17.9), (100, 24.7), (200, 31.7), (math.inf, 50.0)]
+)
+def test_last_ground_ring_in_fog(visibility_m, last_m):
+    """10 % asphalt from 1.73 m falls below the limit at 50 m in clear air.
+
+    There 0.358 * 0.1 / 50^2 = 1.43e-5, with 0.358 = A cos + B sin^2 of ``surface_power``; in fog
+    the last ring is where 0.0358 / R^2 * 20^(-2 R / MOR) comes to the same, but for the factor
+    (0.388 at 18 m, 0.376 at 25 m, 0.369 at 32 m).
+    """
+    slope = 1.73 / np.linspace(15, 55, 801)
+    none = (0.0,) * len(slope)
+    steep_first = tuple(map(float, -np.arctan(slope[::-1])))
+    lasers = Lasers(steep_first, none, none, none, none, (1.0,) * len(slope))
+    sensor = replace(SENSOR, lasers=lasers, shots=8, pulse_s=0.0)
+    scene = Scene(ground_reflectivity=0.1, weather=Weather(visibility_m=visibility_m))
+    after = (
+        applied(Fog(), scene, sensor) if math.isfinite(visibility_m) else surfaces(scene, sensor)
+    )
+    seen = after.first.range_m[after.first.power >= SENSOR.min_power]
+    assert seen.max() == pytest.approx(last_m, abs=0.1)
+
+
+def test_waveform_of_fog():
+    """Inside the overlap backscatter c tau / 2 / r0^2 exp(-2 alpha r); beyond it falls as r^-2."""
+    edges, waveform = soft_waveform(50.0, SENSOR)
+    alpha = math.log(20) / 50
+    flat = 0.046 / 50 * 0.7495 / 25
+    at = np.searchsorted(edges, [3.0, 15.0])
+    expected = flat * np.exp(-2 * alpha * edges[at]) * np.array([1, (5 / edges[at[1]]) ** 2])
+    np.testing.assert_allclose(waveform[at], expected, rtol=3e-3)
+
+
+def test_soft_echoes_of_the_sky_follow_the_waveform():
+    sweep = applied(Fog(), Scene(weather=Weather(visibility_m=50)))
+    ranges = sweep.first.range_m[np.isinf(surfaces(Scene()).first.range_m)]
+    edges, waveform = soft_waveform(50.0, SENSOR)
+    steps = np.append(0.0, ((waveform[1:] + waveform[:-1]) / 2).cumsum())
+    share = np.interp(np.sort(ranges), edges, steps / steps[-1])
+    # Kolmogorov-Smirnov distance; 1.63 / sqrt(n) is exceeded once in 100 keys.
+    assert len(ranges) > 1000
+    distance = np.abs(share - (np.arange(len(share)) + 0.5) / len(share)).max()
+    assert distance < 1.63 / math.sqrt(len(share))
+    sky_power = sweep.first.power[sweep.first.range_m < np.inf].min()
+    assert sky_power == pytest.approx(waveform.max(), rel=1e-6)
+
+
+def test_no_fog_is_heard_before_a_target_nearer_than_is_reported():
+    sweep = Sweep(Scene(weather=Weather(visibility_m=20)), SENSOR)
+    sweep.first.range_m[:] = SENSOR.min_range_m - 0.1
+    Fog().apply(sweep, slice(None), Draws(sweep.num_rays, "draws"))
+    assert not sweep.first.power.any()
+
+
+# Rain and snow.
+
+
+def test_extinction_of_rain_and_snow():
+    """The plan's figures: 1.0e-3, 1.6e-3, 3.1e-3 at 5, 10, 30 mm/h; snow 1.4e-3 at 1 mm/h."""
+    found = [Rain().extinction_per_m(rate) for rate in (5, 10, 30)]
+    np.testing.assert_allclose(found, [1.0e-3, 1.56e-3, 3.11e-3], rtol=0.01)
+    assert Snow().extinction_per_m(1) == pytest.approx(1.44e-3, rel=0.01)
+    # By quadrature of 2 (pi D^2 / 4) N(D), D in mm.
+    diameter = np.linspace(0, 20, 200_001)
+    number = 8000 * np.exp(-4.1 * 10**-0.21 * diameter)
+    section = (2 * math.pi / 4 * diameter**2 * number).sum() * (diameter[1] - diameter[0])
+    assert Rain().extinction_per_m(10) == pytest.approx(1e-6 * section, rel=1e-4)
+
+
+def strongest_drops(num_rays, target_m, reflectivity, intercept, slope, extinction):
+    """Power and range of the strongest drop of each ray, drop by drop; power 0 for none."""
+    generator = np.random.default_rng(5)
+    near, half_angle, smallest = SENSOR.min_range_m, SENSOR.divergence_rad / 2, 0.1
+    volume = math.pi * half_angle**2 * (target_m**3 - near**3) / 3
+    mean = intercept / slope * math.exp(-slope * smallest) * volume
+    count = generator.poisson(mean, num_rays)
+    ray = np.repeat(np.arange(num_rays), count)
+    range_m = (near**3 + generator.random(len(ray)) * (target_m**3 - near**3)) ** (1 / 3)
+    diameter = smallest + generator.exponential(1 / slope, len(ray))
+    filled = np.minimum(diameter / (1000 * 2 * half_angle * range_m), 1)
+    overlap = np.minimum(1, (range_m / SENSOR.overlap_range_m) ** 2)
+    power = reflectivity * filled**2 * np.exp(-2 * extinction * range_m) * overlap / range_m**2
+    best, best_range = np.zeros(num_rays), np.zeros(num_rays)
+    order = np.argsort(power)
+    best[ray[order]], best_range[ray[order]] = power[order], range_m[order]
+    return best, best_range
+
+
+@pytest.mark.parametrize(
+    ("effect", "weather", "intercept", "slope"),
+    [
+        (Rain(), Weather(rain_mm_h=20), 8000.0, 4.1 * 20**-0.21),
+        (Snow(), Weather(snow_mm_h=1), 7600.0, 2.55),
+    ],
+    ids=["rain", "snow"],
+)
+def test_drops_against_drop_by_drop(effect, weather, intercept, slope):
+    """Sky and rays at a target at 6 m, against a simulation of each drop in the beam."""
+    rate = effect.rate_mm_h(weather)
+    sensor = replace(SENSOR, shots=720)
+    for target_m in (6.0, 20.0):
+        sweep = Sweep(Scene(weather=weather), sensor)
+        sweep.first.range_m[:] = target_m
+        sweep.first.power[:] = SENSOR.min_power
+        effect.apply(sweep, slice(None), Draws(sweep.num_rays, "drops"))
+        dark = SENSOR.min_power * math.exp(-2 * effect.extinction_per_m(rate) * target_m)
+        power, range_m = strongest_drops(
+            sweep.num_rays,
+            target_m,
+            effect.reflectivity,
+            intercept,
+            slope,
+            effect.extinction_per_m(rate),
+        )
+        weakest = SENSOR.min_power
+        seen = sweep.first.power[(sweep.first.origin > 0) & (sweep.first.power > weakest)]
+        where = sweep.first.range_m[(sweep.first.origin > 0) & (sweep.first.power > weakest)]
+        expected = power > weakest
+        assert dark < weakest
+        # Four standard errors of the difference of two counts and two means.
+        assert abs(len(seen) - expected.sum()) < 4 * math.sqrt(len(seen) + expected.sum())
+        for mine, theirs in (
+            (np.log(seen), np.log(power[expected])),
+            (where, range_m[expected]),
+        ):
+            error = math.hypot(mine.std() / math.sqrt(len(mine)), theirs.std() / len(theirs) ** 0.5)
+            assert abs(mine.mean() - theirs.mean()) < 4 * error + 0.005 * abs(theirs.mean())
+            np.testing.assert_allclose(mine.std(), theirs.std(), rtol=0.1)
+
+
+def test_number_of_drops():
+    """At 10 mm/h 2789 drops of more than 0.05 mm per cubic metre: N0 / Lambda exp(-0.05 Lambda)."""
+    slope = 4.1 * 10**-0.21
+    assert 8000 / slope * math.exp(-0.05 * slope) == pytest.approx(2789, rel=1e-3)
+    # Where the limit is at 0, every drop counts: the mean is N0 / Lambda times the cone's volume.
+    table = Rain().drop_table(10.0, replace(SENSOR, min_power=1e-20))
+    far = SENSOR.max_range_m
+    cone = math.pi * 1e-3**2 * (far**3 - SENSOR.min_range_m**3) / 3
+    assert table.expected[0, -1] == pytest.approx(8000 / slope * cone, rel=1e-3)
+
+
+def test_a_flake_as_wide_as_the_beam_is_the_strongest():
+    """No flake has the power p from beyond sqrt(reflectivity / p), nor any at all the last p."""
+    table = Snow().drop_table(1.0, replace(SENSOR, divergence_rad=1e-4))
+    assert table.powers[-1] == pytest.approx(0.3 / 25, rel=0.02)
+    for row in (0, 20, 40, 60, 64):
+        reach_m = math.sqrt(0.3 / table.powers[row])
+        beyond = table.expected[row, table.edges > reach_m + 0.2]
+        assert (beyond == table.expected[row, -1]).all()
+    assert (table.expected[-1] == 0).all()
+
+
+def test_a_beam_without_width_meets_no_drop():
+    line = replace(SENSOR, divergence_rad=0.0)
+    scene = Scene((WALL,), weather=Weather(rain_mm_h=30))
+    after = applied(Rain(), scene, line)
+    assert not after.first.origin.any()
+    ratio = after.first.power / surfaces(scene, line).first.power.clip(1e-30)
+    assert ratio.max() < 1
+
+
+def test_more_rain_more_drops():
+    counts = []
+    for rate in (1, 5, 30):
+        after = applied(Rain(), Scene(weather=Weather(rain_mm_h=rate)))
+        counts.append((after.first.origin == Origin.RAIN).sum())
+    assert 0 < counts[0] < counts[1] < counts[2]
+
+
+# Spray.
+
+
+def test_plume_of_a_car():
+    """A car of 1.8 m width at 15 m/s, rear at x = 14 m: the plume spans 5..14 m, |y - 1| < 0.9."""
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=Weather(water_film_mm=1.2))
+    sensor = replace(SENSOR, spin_hz=1e6)  # no time for the car to move
+    before, after = surfaces(scene, sensor), applied(Spray(), scene, sensor)
+    # Rays at the car's rear have 9 m of spray with 0.2 * 0.5 per metre before them.
+    x, y, z = before.position(slice(None))
+    rear = np.isclose(x, 14, atol=0.01) & (np.abs(y - 1) < 0.4) & (z < -0.5)
+    ratio = after.first.power[rear] / before.first.power[rear]
+    slant = before.first.range_m[rear] * 9 / 14
+    assert rear.sum() > 3
+    np.testing.assert_allclose(ratio, np.exp(-2 * 0.1 * slant), rtol=0.03)
+    # Its own echoes lie within it, most of them near its near side.
+    spray = np.flatnonzero(after.first.origin == Origin.SPRAY)
+    x, y, z = after.position(spray)
+    assert len(spray) > 10
+    assert x.min() > 4.99
+    assert np.median(x) < 9.5
+    assert x.max() < 14.01
+    assert np.abs(y - 1).max() < 0.91
+    assert z.max() < 1.8 - 1.73 + 0.01
+
+
+def test_one_plume_per_vehicle():
+    roof = replace(CAR, centre=(25.0, 1.0, 2.0), half_size=(1.0, 0.8, 0.3))
+    beside = replace(CAR, centre=(25.0, -3.0, 0.95), instance=0)
+    wet = Weather(water_film_mm=1.2)
+    one = applied(Spray(), Scene((CAR,), weather=wet))
+    same = applied(Spray(), Scene((CAR, roof), weather=wet))
+    two = applied(Spray(), Scene((CAR, beside), weather=wet))
+    sprayed = [(sweep.first.origin == Origin.SPRAY).sum() for sweep in (one, same, two)]
+    assert sprayed[1] == pytest.approx(sprayed[0], abs=5)  # the roof hides some ground behind it
+    assert sprayed[2] > 1.5 * sprayed[0]
+
+
+def test_slow_vehicles_and_dry_roads_spray_nothing():
+    slow = replace(CAR, velocity_m_s=(0.0, 10.0))
+    for scene in (Scene((slow,), weather=Weather(water_film_mm=1.0)), Scene((CAR,))):
+        assert Spray().called_by(scene, SENSOR) is None
+        assert len(Spray().rays(Sweep(scene, SENSOR))) == 0
+
+
+def test_plume_follows_the_heading():
+    """A car that leaves to the left leaves its plume to the right of it, whatever its pose."""
+    car = replace(CAR, centre=(15.0, 10.0, 0.95), yaw_rad=math.pi / 2, velocity_m_s=(0.0, 15.0))
+    scene = Scene((car,), Pose(heading_rad=0.0), weather=Weather(water_film_mm=1.2))
+    after = applied(Spray(), scene, replace(SENSOR, spin_hz=1e6))
+    x, y, _ = after.position(np.flatnonzero(after.first.origin == Origin.SPRAY))
+    assert y.min() > -1.01
+    assert y.max() < 8.01
+    assert x.min() > 14.09
+    assert x.max() < 15.91
+
+
+def test_plume_moves_with_its_car():
+    """Seen from a car at 40 m/s that passes on the left, 25 ms after the middle of the sweep."""
+    car = replace(CAR, centre=(8.0, 5.0, 0.95), velocity_m_s=(40.0, 0.0))
+    after = applied(Spray(), Scene((car,), weather=Weather(water_film_mm=1.2)))
+    spray = np.flatnonzero(after.first.origin == Origin.SPRAY)
+    x = after.position(spray)[0]
+    left = np.abs(x) < 3
+    assert after.time_s[spray][left].min() > 0.01
+    seen_from_car = x - 40 * after.time_s[spray]
+    assert seen_from_car.min() > -6.01
+    assert seen_from_car.max() < 6.01
+    assert x.max() > 6.1
+
+
+@pytest.mark.parametrize("reflectivity", [-0.1, 1.1])
+def test_checks_reflectivity(reflectivity):
+    with pytest.raises(ValueError, match="reflectivity must lie"):
+        Rain(reflectivity=reflectivity)
+
+
+def test_checks_sizes_and_spray():
+    with pytest.raises(ValueError, match="size distribution"):
+        Snow(slope=(0.0, -0.48))
+    with pytest.raises(ValueError, match="max_extinction_per_m"):
+        Spray(max_extinction_per_m=-1.0)

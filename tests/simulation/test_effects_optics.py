@@ -1,0 +1,372 @@
+"""Glass, polished metal and water, against hand-made figures."""
+
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+
+from r3dpa.simulation import (
+    Material,
+    Origin,
+    Pose,
+    Primitive,
+    Puddle,
+    Scene,
+    Semantic,
+    Shape,
+    Sweep,
+    Weather,
+    hdl64e,
+    simulate_scan,
+)
+from r3dpa.simulation.effects import (
+    DetectionLimit,
+    DiffuseReflection,
+    Draws,
+    Glass,
+    MovingActors,
+    PolishedMetal,
+    WetGround,
+)
+from r3dpa.simulation.effects.optics import fresnel_reflectance
+
+SENSOR = hdl64e(shots=720)
+
+
+def box(centre, half_size, material=Material.PAINT, reflectivity=0.5, **others):
+    return Primitive(
+        Shape.BOX, centre, half_size, Semantic.BUILDING, reflectivity, material=material, **others
+    )
+
+
+WALL = box((10.5, 0, 3), (0.5, 30, 3))
+PANE = box((5.01, 0, 3), (0.01, 2, 3), Material.GLASS, 1e-4)
+
+
+def swept(*primitives, effects=(), sensor=SENSOR, **others):
+    """A sweep after the ray cast, diffuse reflection and some effects."""
+    sweep = Sweep(Scene(primitives, **others), sensor)
+    sweep.cast()
+    for effect in (DiffuseReflection(), *effects):
+        effect.apply(sweep, effect.rays(sweep), Draws(sweep.num_rays, "test"))
+    return sweep
+
+
+def with_origin(sweep, origin):
+    seen = np.isfinite(sweep.first.range_m)
+    return np.flatnonzero(seen & (sweep.first.origin == origin))
+
+
+def image(sweep, rays):
+    """Where the instrument believes the points of these rays."""
+    return sweep.start[:, rays] + sweep.first.range_m[rays] * sweep.direction[:, rays]
+
+
+def surface_reflectance(cosine, index):
+    """Fresnel's equations in Snell's angles."""
+    angle = np.arccos(cosine.astype(float))
+    inner = np.arcsin(np.sin(angle) / index)
+    across = (np.sin(angle - inner) / np.sin(angle + inner)) ** 2
+    along = (np.tan(angle - inner) / np.tan(angle + inner)) ** 2
+    return (across + along) / 2
+
+
+def pane_transmittance(cosine):
+    """The sum over all inner reflections, not the closed form."""
+    surface = surface_reflectance(cosine, 1.52)
+    return sum((1 - surface) ** 2 * surface ** (2 * n) for n in range(60))
+
+
+@pytest.mark.parametrize(
+    ("index", "degrees", "expected"),
+    [(1.52, 0, 0.04258), (1.52, 85, 0.61), (1.33, 0, 0.0201), (1.33, 80, 0.35), (1.33, 88, 0.80)],
+)
+def test_fresnel_reflectance(index, degrees, expected):
+    cosine = np.cos(np.radians(np.float32(degrees)))
+    assert fresnel_reflectance(cosine, index) == pytest.approx(expected, rel=0.02)
+
+
+def test_power_behind_a_pane():
+    plain, sweep = swept(WALL), swept(WALL, PANE, effects=[Glass()])
+    rays = with_origin(sweep, Origin.GLASS)
+    rays = rays[sweep.first.surface[rays] == 0]
+    assert len(rays) > 500
+    np.testing.assert_allclose(sweep.first.range_m[rays], plain.first.range_m[rays], rtol=1e-5)
+    ratio = sweep.first.power[rays] / plain.first.power[rays]
+    cosine = sweep.cos_incidence[rays]
+    np.testing.assert_allclose(ratio, pane_transmittance(cosine.clip(max=1 - 1e-6)) ** 2, rtol=1e-3)
+    assert cosine.max() > 0.9999
+    assert ratio[cosine.argmax()] == pytest.approx(0.843, abs=5e-4)
+
+
+def test_a_pane_before_nothing_shows_its_dirt():
+    plain, sweep = swept(PANE), swept(PANE, effects=[Glass()])
+    upward = np.flatnonzero((plain.first.surface == 0) & (plain.direction[2] > 0))
+    assert len(upward) > 100
+    assert (sweep.first.origin[upward] == Origin.SURFACE).all()
+    assert (sweep.first.power[upward] == plain.first.power[upward]).all()
+    assert (sweep.first.range_m[upward] == plain.first.range_m[upward]).all()
+
+
+@pytest.mark.parametrize(
+    ("of_house", "of_window", "gap_m", "seen_at"),
+    [(7, 7, 0.02, 16.0), (0, 0, 0.02, 6.0), (7, 8, 0.02, 6.0), (7, 7, 1.0, 6.0)],
+)
+def test_a_window_shows_the_back_wall_of_its_own_house_only(of_house, of_window, gap_m, seen_at):
+    house = box((11.0, 0, 3), (5.0, 30, 3), instance=of_house)
+    at = (6 - gap_m - 0.01, 0, 3)
+    window = box(at, (0.01, 2, 3), Material.GLASS, 1e-4, instance=of_window)
+    sweep = swept(house, window, effects=[Glass()])
+    rays = with_origin(sweep, Origin.GLASS)
+    # The room is 30 m wide and 6 m high: the rest sees its side walls, ceiling and the floor.
+    level = rays[(np.abs(sweep.direction[2, rays]) < 0.1) & (sweep.direction[0, rays] > 0.9)]
+    assert len(level) > 200
+    assert (sweep.first.surface[level] == 0).all()
+    np.testing.assert_allclose(image(sweep, level)[0], seen_at, rtol=1e-4)
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (0.0, 20.0)])
+def test_a_cabin_is_crossed_by_two_panes(velocity):
+    cabin = box((6, 0, 3), (1, 4, 3), Material.GLASS, 1e-4, instance=3, velocity_m_s=velocity)
+    seat = box((6, 1, 1.2), (0.2, 0.4, 0.5), Material.CLOTH, instance=3, velocity_m_s=velocity)
+    scene = Scene((WALL, cabin, seat))
+    bare = Scene((WALL, seat))
+    sweeps = []
+    for each in (bare, scene):
+        sweep = Sweep(each, SENSOR)
+        MovingActors().apply(sweep, MovingActors().rays(sweep), Draws(sweep.num_rays, "test"))
+        sweep.cast()
+        DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+        sweeps.append(sweep)
+    plain, sweep = sweeps
+    # In by the front and out by the back, which is parallel to it.
+    rays = Glass().rays(sweep)
+    front = np.abs(sweep.position(rays)[0] - 5) < 1e-3
+    inside_y = np.abs(image(plain, rays)[1] * 7 / 10 - sweep.time_s[rays] * velocity[1]) < 3.9
+    low = sweep.direction[2, rays] < 0.1
+    rays = rays[front & inside_y & low & (plain.first.range_m[rays] < 15)]
+    cosine = sweep.cos_incidence[rays]
+    Glass().apply(sweep, Glass().rays(sweep), Draws(sweep.num_rays, "test"))
+    rays, cosine = (a[sweep.first.origin[rays] == Origin.GLASS] for a in (rays, cosine))
+    passed = pane_transmittance(cosine.clip(max=1 - 1e-6)) ** 2
+    ratio = sweep.first.power[rays] / plain.first.power[rays]
+    on_wall = (sweep.first.surface[rays] == 0) & (plain.first.surface[rays] == 0)
+    on_seat = (sweep.first.surface[rays] == 2) & (plain.first.surface[rays] == 1)
+    assert on_wall.sum() > 100
+    assert on_seat.sum() > 20
+    np.testing.assert_allclose(ratio[on_wall], passed[on_wall] ** 2, rtol=2e-3)
+    np.testing.assert_allclose(ratio[on_seat], passed[on_seat], rtol=2e-3)
+
+
+def test_glass_mirrors_at_grazing_incidence():
+    """A long pane beside the street shows the wall at its end behind itself."""
+    pane = box((20, 2.01, 3), (15, 0.01, 3), Material.GLASS, 1e-4)
+    wall = box((40.5, -10, 3), (0.5, 11, 3), reflectivity=0.8)
+    sweep = swept(pane, wall, effects=[Glass()])
+    rays = with_origin(sweep, Origin.MIRROR)
+    rays = rays[sweep.first.surface[rays] == 1]
+    x, y, _ = image(sweep, rays)
+    # Mirrored at y = 2, the wall's face from y = -21 to 1 lies from 3 to 25, and its side at 3.
+    assert ((y > 3 - 1e-3) & (y < 25)).all()
+    face = y > 3 + 1e-3
+    assert face.sum() > 20
+    np.testing.assert_allclose(x[face], 40, rtol=1e-5)
+    rays = rays[face]
+    incidence = sweep.cos_incidence[rays]
+    reflectance = 1 - pane_transmittance(incidence)
+    facing = sweep.direction[0, rays]
+    expected = reflectance**2 * 0.8 * facing / sweep.first.range_m[rays] ** 2
+    np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=2e-3)
+
+
+def test_image_in_a_metal_mirror():
+    # The mirror's face goes through (10, 0), turned by 45 degrees: it swaps x - 10 and y.
+    at, thick = np.array([10.0, 0.0]), 0.02
+    normal = np.array([-1.0, 1.0]) / np.sqrt(2)
+    centre = (*(at - thick * normal), 2.0)
+    mirror = box(centre, (2, thick, 2), Material.POLISHED_METAL, 0.2, yaw_rad=np.pi / 4)
+    wall = box((10, 8.5, 3), (6, 0.5, 3), reflectivity=0.6)
+    plain = swept(mirror, wall)
+    sweep = swept(mirror, wall, effects=[PolishedMetal()])
+    rays = with_origin(sweep, Origin.MIRROR)
+    rays = rays[sweep.first.surface[rays] == 1]
+    assert len(rays) > 100
+    x, y, _ = image(sweep, rays)
+    # Its face y = 8 shows at x = 18.
+    np.testing.assert_allclose(x, 18, rtol=1e-4)
+    assert (np.abs(y) < 6).all()
+    expected = 0.81 * 0.6 * sweep.direction[0, rays] / sweep.first.range_m[rays] ** 2
+    np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=1e-3)
+    direct = np.flatnonzero((plain.first.surface == 0) & (sweep.first.origin == Origin.SURFACE))
+    assert len(direct) > 10
+    np.testing.assert_allclose(sweep.first.power[direct], plain.first.power[direct] / 10, rtol=1e-5)
+
+
+def test_mirrored_echo_is_the_second_one_in_dual_mode():
+    sensor = replace(SENSOR, return_mode="dual")
+    mirror = box((10, 0, 2), (0.1, 3, 2), Material.POLISHED_METAL, 0.9, yaw_rad=0.5)
+    wall = box((0, 20, 3), (40, 0.5, 3), reflectivity=0.1)
+    scene = Scene((mirror, wall))
+    everything = simulate_scan(scene, sensor, (1,))
+    strongest = simulate_scan(scene, SENSOR, (1,))
+    first = everything.points[everything.origins != Origin.SECOND_RETURN]
+    assert (everything.origins == Origin.SECOND_RETURN).sum() > 20
+    assert first.tobytes() == strongest.points.tobytes()
+
+
+def test_wet_ground_loses_power():
+    plain = swept(effects=[])
+    ground = plain.on_ground()
+    for film_mm, share in ((1.2, 1.0), (5.0, 1.0), (0.3, 0.25)):
+        wet = swept(effects=[WetGround()], weather=Weather(water_film_mm=film_mm))
+        ratio = wet.first.power[ground] / plain.first.power[ground]
+        degrees = np.degrees(np.arccos(wet.cos_incidence[ground]))
+        at_88 = ratio[np.abs(degrees - 88).argmin()]
+        assert np.abs(degrees - 88).min() < 0.2
+        assert at_88 == pytest.approx(1 - share + share * 0.2**2 / 1.77, abs=0.005)
+        passed = 1 - surface_reflectance(wet.cos_incidence[ground], 1.33)
+        np.testing.assert_allclose(ratio, 1 - share + share * passed**2 / 1.33**2, rtol=1e-3)
+
+
+def test_far_rings_of_wet_ground_vanish_first():
+    def reach(film_mm):
+        weather = Weather(water_film_mm=film_mm)
+        sweep = swept(effects=[WetGround(), DetectionLimit()], weather=weather)
+        seen = np.isfinite(sweep.first.range_m)
+        return sweep.first.range_m[seen].min(), sweep.first.range_m[seen].max()
+
+    nearest, farthest = zip(*map(reach, (0.0, 0.3, 0.6, 1.2)), strict=True)
+    assert len(set(nearest)) == 1
+    assert (np.diff(farthest) < 0).all()
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 2.0])
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.02])
+def test_image_in_a_puddle(heading_rad, pitch_rad):
+    """A wall 15 m ahead shows upside down; the puddle lies 10 m ahead and 1 m to the left."""
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    here = np.array([100.0, 50.0])
+    wall = box((*(turn @ [15.5, 0] + here), 2), (0.5, 20, 2), yaw_rad=heading_rad)
+    puddle = Puddle(*(turn @ [10, 1] + here), 2.0)
+    pose = Pose(*here, 1.73, heading_rad, pitch_rad)
+    wet = {"pose": pose, "weather": Weather(water_film_mm=2.0)}
+    sweep = swept(wall, puddles=(puddle,), effects=[WetGround()], **wet)
+    dry = swept(wall, effects=[WetGround()], **wet)
+    rays = with_origin(sweep, Origin.MIRROR)
+    assert len(rays) > 20
+    x, _, z = image(sweep, rays)
+    np.testing.assert_allclose(x, 15, rtol=1e-3)
+    # Below the ground, and no deeper than the wall is high.
+    assert ((z < -1.73) & (z > -1.73 - 4)).all()
+    legs = image(dry, rays)
+    assert (np.hypot(legs[0] - 10, legs[1] - 1) < 2.001).all()
+    down = np.abs(sweep.direction[2, rays])
+    reflectance = fresnel_reflectance(down, 1.33)
+    expected = reflectance**2 * 0.5 * sweep.direction[0, rays] / sweep.first.range_m[rays] ** 2
+    np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=1e-3)
+
+
+def test_water_stands_level_on_a_slope():
+    road = Primitive(
+        Shape.BOX, (10, 0, -0.2), (6, 6, 0.3), Semantic.ROAD, 0.1, 0.0, 0, Material.ASPHALT,
+        grade=(0.08, 0.0),
+    )  # fmt: skip
+    wall = box((20.5, 0, 3), (0.5, 20, 3))
+    wet = {"weather": Weather(water_film_mm=2.0), "puddles": (Puddle(10.0, 0.0, 2.0),)}
+    dry, sweep = swept(road, wall), swept(road, wall, effects=[WetGround()], **wet)
+    rays = with_origin(sweep, Origin.MIRROR)
+    assert len(rays) > 20
+    assert (dry.first.surface[rays] == 0).all()
+    down, ahead = np.abs(sweep.direction[2, rays]), sweep.direction[0, rays]
+    expected = surface_reflectance(down, 1.33) ** 2 * 0.5 * ahead / sweep.first.range_m[rays] ** 2
+    np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=1e-3)
+    np.testing.assert_allclose(image(sweep, rays)[0], 20, rtol=1e-5)
+
+
+def test_no_water_no_puddle():
+    """A puddle shrinks with the film; without one it is neither dark nor a mirror."""
+    puddles = (Puddle(10.0, 0.0, 3.0), Puddle(4.0, 2.0, 1.0))
+
+    def scan(film_mm, switch, spots=puddles):
+        scene = Scene((WALL,), puddles=spots, weather=Weather(water_film_mm=film_mm))
+        return simulate_scan(scene, SENSOR, (5,), {"wet_ground": switch})
+
+    off, on, trace = scan(0.0, "off"), scan(0.0, "on"), scan(1e-6, "auto")
+    for name in ("points", "labels", "origins"):
+        assert getattr(on, name).tobytes() == getattr(off, name).tobytes()
+    assert off.effects[6].reason == "switched off"
+    np.testing.assert_allclose(trace.points, off.points, atol=0.011)
+    assert (scan(1.2, "auto").origins == Origin.MIRROR).any()
+    assert not (scan(1.2, "auto", ()).origins == Origin.MIRROR).any()
+
+
+@pytest.mark.parametrize("name", ["glass", "polished_metal", "wet_ground"])
+def test_switched_on_without_cause_changes_nothing(name):
+    scene = Scene((WALL, box((4, 3, 1), (1, 1, 1), instance=4)))
+    off, on, auto = (
+        simulate_scan(scene, SENSOR, (2,), {name: switch}) for switch in ("off", "on", "auto")
+    )
+    for scan in (on, auto):
+        assert scan.points.tobytes() == off.points.tobytes()
+        assert scan.labels.tobytes() == off.labels.tobytes()
+        assert scan.origins.tobytes() == off.origins.tobytes()
+    assert {e.name: e.status for e in auto.effects}[name] == "not_called"
+
+
+def arrays(sweep):
+    return (
+        *sweep.first.columns(), *sweep.second.columns(), sweep.start, sweep.direction,
+        sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.time_s,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [Glass(), PolishedMetal(), WetGround()])
+def test_other_rays_are_left_alone(effect):
+    metal = box((2, 8, 1), (2, 0.1, 1), Material.POLISHED_METAL, 0.2)
+    scene = Scene(
+        (WALL, PANE, metal),
+        weather=Weather(water_film_mm=1.0),
+        puddles=(Puddle(4.0, 0.0, 1.5),),
+    )
+    sweep = Sweep(scene, SENSOR)
+    sweep.second = type(sweep.first).none(sweep.num_rays)
+    sweep.cast()
+    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+    before = [array.copy() for array in arrays(sweep)]
+    rays = effect.rays(sweep)
+    assert effect.called_by(scene, SENSOR)
+    effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
+    others = np.setdiff1d(np.arange(sweep.num_rays), rays)
+    for old, new in zip(before, arrays(sweep), strict=True):
+        assert old[..., others].tobytes() == new[..., others].tobytes()
+    assert any((old != new).any() for old, new in zip(before, arrays(sweep), strict=True))
+
+
+def test_weak_effects_tend_to_none():
+    metal = box((5, 0, 2), (0.1, 3, 2), Material.POLISHED_METAL, 0.2, yaw_rad=0.4)
+    plain = swept(metal, WALL)
+    matt = swept(metal, WALL, effects=[PolishedMetal(reflectance=0.0)])
+    for old, new in zip(astuple(plain.first), astuple(matt.first), strict=True):
+        assert old.tobytes() == new.tobytes()
+    # Glass as thin as air is as good as none.
+    absent, clear = swept(WALL), swept(WALL, PANE, effects=[Glass(index=1 + 1e-6)])
+    seen = clear.first.surface == absent.first.surface
+    seen &= np.isfinite(absent.first.range_m)
+    assert (seen & (clear.first.origin == Origin.GLASS)).sum() > 500
+    np.testing.assert_allclose(clear.first.power[seen], absent.first.power[seen], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "name"),
+    [
+        (Glass, {"index": 1.0}, "index"),
+        (Glass, {"pane_m": 0.0}, "pane_m"),
+        (PolishedMetal, {"reflectance": 1.1}, "reflectance"),
+        (WetGround, {"index": 0.5}, "index"),
+        (WetGround, {"full_film_mm": 0.0}, "full_film_mm"),
+    ],
+)
+def test_values_are_checked(effect, values, name):
+    with pytest.raises(ValueError, match=name):
+        effect(**values)

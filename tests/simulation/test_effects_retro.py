@@ -1,0 +1,204 @@
+"""Retro-reflecting sheets and their halo, against hand-made figures."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from r3dpa.simulation import (
+    Material,
+    Origin,
+    Primitive,
+    Scene,
+    Semantic,
+    Shape,
+    Sweep,
+    Weather,
+    hdl64e,
+    simulate_scan,
+)
+from r3dpa.simulation.effects import Blooming, DiffuseReflection, Draws, Fog, RetroReflection
+
+SENSOR = hdl64e()
+
+
+def sheet(x, y, half_m, yaw_rad=0.0, reflectivity=0.9, material=Material.RETROREFLECTOR):
+    return Primitive(
+        Shape.BOX, (x, y, 1.9), (0.01, half_m, half_m), Semantic.SIGN, reflectivity, yaw_rad,
+        material=material,
+    )  # fmt: skip
+
+
+def swept(scene, effects):
+    sweep = Sweep(scene, SENSOR)
+    sweep.cast()
+    for effect in (DiffuseReflection(), *effects):
+        effect.apply(sweep, effect.rays(sweep), Draws(sweep.num_rays, "test"))
+    return sweep
+
+
+def angles_to(sweep, rays, sources):
+    """Smallest angle in degrees between each ray and the sources."""
+    cosine = sweep.direction[:, rays].astype(float).T @ sweep.direction[:, sources].astype(float)
+    return np.degrees(np.arccos(cosine.clip(max=1))).min(axis=1)
+
+
+@pytest.mark.parametrize(("degrees", "coefficient"), [(0, 70.0), (30, 30.0), (60, 1.1)])
+def test_gain_is_that_of_the_norm(degrees, coefficient):
+    scene = Scene((sheet(10, 0, 0.6, np.radians(degrees)),))
+    matt, bright = swept(scene, []), swept(scene, [RetroReflection()])
+    rays = RetroReflection().rays(bright)
+    gain = bright.first.power[rays] / matt.first.power[rays]
+    nearest = np.abs(np.degrees(np.arccos(bright.cos_incidence[rays])) - degrees).argmin()
+    # Intensity of a matt surface: reflectivity / pi times the cosine of its area to either side.
+    expected = 1 + np.pi * coefficient / (0.9 * np.cos(np.radians(degrees)) ** 2)
+    assert gain[nearest] == pytest.approx(expected, rel=0.06)
+    scan = simulate_scan(scene, SENSOR, (1,), {"blooming": "off", "laser_calibration": "off"})
+    on_sheet = (scan.labels & 0xFFFF) == Semantic.SIGN
+    if degrees < 60:
+        assert (scan.points[on_sheet, 3] > 0.98).all()
+
+
+def test_sheeting_outshines_fog():
+    """Where the fog hides a matt board, it shows the sheet."""
+
+    def seen(material):
+        scene = Scene((sheet(60, 0, 1.5, material=material),), weather=Weather(visibility_m=60))
+        scan = simulate_scan(scene, SENSOR, (1,))
+        return ((scan.labels & 0xFFFF) == Semantic.SIGN).sum()
+
+    assert Fog().called_by(Scene(weather=Weather(visibility_m=60)), SENSOR)
+    assert seen(Material.RETROREFLECTOR) > 20
+    assert seen(Material.PAINT) == 0
+
+
+def halo_counts(sweep, turns, effect):
+    """How often each ray of the turn is dazzled in so many turns."""
+    count = np.zeros(sweep.num_rays)
+    echoes = sweep.first
+    for turn in range(turns):
+        sweep.first = copy.deepcopy(echoes)
+        effect.apply(sweep, effect.rays(sweep), Draws(sweep.num_rays, "test", turn))
+        count += sweep.first.origin == Origin.BLOOMING
+    sweep.first = echoes
+    return count
+
+
+def test_chance_of_a_halo_is_gaussian_in_the_angle():
+    sweep = swept(Scene((sheet(20, 3, 0.4),)), [RetroReflection()])
+    sources = RetroReflection().rays(sweep)
+    beside = Blooming().rays(sweep)
+    # All neighbours within half a degree, and no others.
+    around = np.flatnonzero(sweep.direction[:, sources].mean(axis=1) @ sweep.direction > 0.99)
+    candidates = np.setdiff1d(around, sources)
+    angle = angles_to(sweep, candidates, sources)
+    inner, outer = candidates[angle < 0.4999], candidates[angle < 0.5001]
+    assert set(inner) <= set(beside) <= set(outer)
+    turns = 200
+    count = halo_counts(sweep, turns, Blooming(spill=1.0))[beside]
+    chance = np.exp(-((angles_to(sweep, beside, sources) / 0.2) ** 2))
+    # Five standard errors of each count, and of their sum.
+    variance = turns * chance * (1 - chance)
+    assert (np.abs(count - turns * chance) < 5 * np.sqrt(variance) + 3).all()
+    assert abs(count.sum() - turns * chance.sum()) < 5 * np.sqrt(variance.sum())
+
+
+def test_halo_of_weak_sheeting_shrinks_with_range():
+    """Below saturation the chance goes with the root of the power, as 1 / R; above it is 1."""
+
+    def points_of_halo(distance_m, retroreflection):
+        scene = Scene((sheet(distance_m, 0, 0.02 * distance_m),), ground_reflectivity=1e-3)
+        sweep = swept(scene, [RetroReflection(retroreflection)])
+        return halo_counts(sweep, 60, Blooming(spill=1.0)).sum()
+
+    assert points_of_halo(20, 0.05) / points_of_halo(40, 0.05) == pytest.approx(2, rel=0.15)
+    assert points_of_halo(20, 70.0) / points_of_halo(40, 70.0) == pytest.approx(1, rel=0.15)
+
+
+def test_halo_has_the_range_of_the_sheet_and_no_label():
+    scene = Scene((sheet(15, 5, 0.4),))
+    scan = simulate_scan(scene, SENSOR, (4,), {"range_noise": "off", "laser_calibration": "off"})
+    halo, sheeting = (scan.origins == Origin.BLOOMING), (scan.labels & 0xFFFF) == Semantic.SIGN
+    assert halo.sum() > 3
+    assert (scan.labels[halo] == 0).all()
+    range_m = np.linalg.norm(scan.points[:, :3], axis=1)
+    assert range_m[sheeting].min() - 0.02 < range_m[halo].min()
+    assert range_m[halo].max() < range_m[sheeting].max() + 0.02
+    # sqrt(0.002 * 220), a little less off the sheet's normal.
+    assert np.median(scan.points[halo, 3]) == pytest.approx(0.62, abs=0.08)
+
+
+def test_halo_runs_across_the_end_of_the_turn():
+    """The sheet begins just to the left of azimuth 0: its halo reaches the last shots."""
+    sweep = swept(Scene((sheet(20, 0.46, 0.4),)), [RetroReflection()])
+    _, shot = np.divmod(RetroReflection().rays(sweep), SENSOR.shots)
+    assert shot.max() < SENSOR.shots // 2
+    _, beside = np.divmod(Blooming().rays(sweep), SENSOR.shots)
+    assert (beside >= SENSOR.shots - 2).any()
+    assert (beside < SENSOR.shots // 2).any()
+
+
+@pytest.mark.parametrize("effect", [RetroReflection(), Blooming()])
+def test_without_sheets_nothing_is_touched(effect):
+    scene = Scene((sheet(15, 5, 0.4, material=Material.PAINT),))
+    assert effect.called_by(scene, SENSOR) is None
+    sweep = swept(scene, [])
+    assert len(effect.rays(sweep)) == 0
+    assert len(effect.rays(swept(Scene(), []))) == 0
+    names = {"retro_reflection", "blooming"}
+    off, on = (
+        simulate_scan(scene, SENSOR, (1,), dict.fromkeys(names, switch)) for switch in ("off", "on")
+    )
+    for name in ("points", "labels", "origins"):
+        assert getattr(on, name).tobytes() == getattr(off, name).tobytes()
+
+
+def arrays(sweep):
+    return (
+        *sweep.first.columns(), *sweep.second.columns(), sweep.start, sweep.direction,
+        sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.time_s,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [RetroReflection(), Blooming(spill=1.0)])
+def test_other_rays_are_left_alone(effect):
+    sweep = swept(Scene((sheet(15, 5, 0.4),)), [])
+    sweep.second = type(sweep.first).none(sweep.num_rays)
+    # Strong enough for a halo before the effect under test runs.
+    sweep.first.power[sweep.of_material(Material.RETROREFLECTOR)] *= 100
+    before = [array.copy() for array in arrays(sweep)]
+    rays = effect.rays(sweep)
+    assert effect.called_by(sweep.scene, SENSOR)
+    effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
+    others = np.setdiff1d(np.arange(sweep.num_rays), rays)
+    for old, new in zip(before, arrays(sweep), strict=True):
+        assert old[..., others].tobytes() == new[..., others].tobytes()
+    assert any((old != new).any() for old, new in zip(before, arrays(sweep), strict=True))
+
+
+def test_weak_effects_tend_to_none():
+    scene = Scene((sheet(15, 5, 0.4),))
+    matt, bright = swept(scene, []), swept(scene, [RetroReflection(0.0)])
+    assert matt.first.power.tobytes() == bright.first.power.tobytes()
+    assert halo_counts(swept(scene, [RetroReflection()]), 3, Blooming(spill=0.0)).sum() == 0
+
+
+def test_same_key_same_halo():
+    scene = Scene((sheet(15, 5, 0.4),))
+    first, again, other = (simulate_scan(scene, SENSOR, key) for key in ((1,), (1,), (2,)))
+    assert first.points.tobytes() == again.points.tobytes()
+    assert first.origins.tobytes() != other.origins.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "name"),
+    [
+        (RetroReflection, {"retroreflection": -1.0}, "retroreflection"),
+        (Blooming, {"halo_deg": 0.0}, "halo_deg"),
+        (Blooming, {"halo_deg": 9.0}, "halo_deg"),
+        (Blooming, {"spill": 2.0}, "spill"),
+    ],
+)
+def test_values_are_checked(effect, values, name):
+    with pytest.raises(ValueError, match=name):
+        effect(**values)

@@ -1,0 +1,384 @@
+"""The page of ``r3dpa view``: what it holds, and its script run in node."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.viz import Category, PageScan, birds_eye_sheet, range_strips, scan_page
+from r3dpa.viz.page import PAGE_RANGE_MAP, PALETTE, STEP_M, pack_scan
+from r3dpa.viz.pixels import BACKGROUND, paint
+from r3dpa.viz.scans import range_scale
+
+SEMANTICS = {7: Category("road", "#102030"), 26: Category("car")}
+ORIGINS = {0: Category("surface", "#56606e"), 6: Category("rain", "#4e9bff")}
+TYPES = {
+    **dict.fromkeys(("x", "y", "z"), "<i2"),
+    **dict.fromkeys(("semantic", "instance"), "<u2"),
+    **dict.fromkeys(("intensity", "origin"), "u1"),
+}
+EVIL = "</script><script>alert(1)</script><!-- \" & '{{points}}"
+
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+
+
+def example(name="drive/0000000000", num_points=500, reach_m=80.0):
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-reach_m, reach_m, (num_points, 4)).astype(np.float32)
+    points[:, 3] = generator.uniform(0, 1, num_points)
+    labels = generator.choice([7, 26, 26 | 5 << 16, 33 | 65535 << 16], num_points)
+    return PageScan(name, points, labels.astype("<u4"), generator.choice([0, 6], num_points))
+
+
+def page_data(page):
+    return json.loads(re.search(r'id="page">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def unpacked(page, number):
+    """Columns of a scan of a page, decoded by the description in ``pack_scan``."""
+    header = page_data(page)["scans"][number]
+    text = re.search(rf'id="points-{number}">([\w+/=]*)</script>', page)[1]
+    data = zlib.decompress(base64.b64decode(text))
+    columns = {}
+    for name in header["columns"]:
+        size = header["count"] * np.dtype(TYPES[name]).itemsize
+        columns[name] = np.frombuffer(data[:size], TYPES[name])
+        data = data[size:]
+    assert data == b""
+    for axis in "xyz":
+        columns[axis] = np.cumsum(columns[axis], dtype=np.int16) * header["step_m"]
+    columns["intensity"] = columns["intensity"] / 255 * header["intensity_max"]
+    return header, columns
+
+
+class TestData:
+    def test_points_are_kept_to_half_a_step_and_labels_exactly(self):
+        scan = example()
+        header, columns = unpacked(scan_page([scan], "a title", SEMANTICS, ORIGINS), 0)
+        assert header["name"] == scan.name
+        assert header["step_m"] == STEP_M
+        xyz = np.stack([columns[axis] for axis in "xyz"], axis=1)
+        # Neighbours are up to 160 m apart, 32000 steps: the largest differences nearly fill int16.
+        assert np.abs(xyz - scan.points[:, :3]).max() <= STEP_M / 2 + 1e-6
+        assert np.abs(columns["intensity"] - scan.points[:, 3]).max() <= 0.5 / 255 + 1e-6
+        assert (columns["semantic"] == scan.labels & 0xFFFF).all()
+        assert (columns["instance"] == scan.labels >> 16).all()
+        assert (columns["origin"] == scan.origins).all()
+
+    def test_differences_that_wrap_around_and_a_longer_reach_come_back(self):
+        points = np.array([[163, 0, 0, 0], [-163, 0, 0, 0], [163, 1, 2, 9]], np.float32)
+        _, columns = unpacked(scan_page([PageScan("a", points)], "", {}, {}), 0)
+        assert columns["x"] == pytest.approx([163, -163, 163], abs=STEP_M / 2 + 1e-6)
+        assert columns["intensity"] == pytest.approx([0, 0, 9])
+        header, columns = unpacked(scan_page([PageScan("a", 10 * points)], "", {}, {}), 0)
+        assert header["step_m"] == pytest.approx(1630 / 32767)
+        assert columns["x"] == pytest.approx([1630, -1630, 1630], abs=header["step_m"] / 2)
+
+    def test_columns_are_there_only_where_known(self):
+        plain = PageScan("plain", torch.ones(3, 3))
+        assert pack_scan(plain)[0]["columns"] == ["x", "y", "z"]
+        assert pack_scan(example())[0]["columns"] == list(TYPES)
+
+    def test_categories_are_those_that_occur_with_a_name_and_colour_each(self):
+        page = page_data(scan_page([example()], "", SEMANTICS, ORIGINS | {9: Category("sun")}))
+        assert page["categories"]["semantic"] == [
+            [7, "road", "#102030"],
+            [26, "car", PALETTE[1]],
+            [33, "number 33", PALETTE[2]],
+        ]
+        assert page["categories"]["origin"] == [[0, "surface", "#56606e"], [6, "rain", "#4e9bff"]]
+
+    def test_the_reference_comes_last_and_its_categories_count(self):
+        scans = [PageScan("a", np.ones((2, 3))), PageScan("b", np.ones((2, 3)))]
+        page = page_data(scan_page(scans, "", SEMANTICS, ORIGINS, reference=example("real")))
+        assert [header["name"] for header in page["scans"]] == ["a", "b", "real"]
+        assert page["reference"] == 2
+        assert len(page["categories"]["semantic"]) == 3
+        assert page_data(scan_page(scans, "", {}, {}))["reference"] is None
+
+    def test_size_of_a_page(self):
+        """A smooth scan of 100 000 points takes well under its 1.6 MB as a file."""
+        turn = np.linspace(0, 100 * np.pi, 100_000)
+        radius = 5 + turn / 10
+        points = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn - 1.7], axis=1)
+        assert len(scan_page([PageScan("a", points)], "", {}, {})) < 500_000
+
+
+class TestSafety:
+    def test_page_loads_nothing_from_anywhere(self):
+        page = scan_page([example()], "title", SEMANTICS, ORIGINS)
+        assert "://" not in page
+        assert not re.search(r"<link|<img|<iframe|@import|url\(|\bsrc=|\bfetch\(|import\(", page)
+        assert "default-src 'none'" in page
+        assert "{{" not in page
+
+    def test_names_cannot_end_the_script_or_become_markup(self):
+        scan = example(name=EVIL)
+        semantics = {7: Category(EVIL), 26: Category("car")}
+        page = scan_page([scan], EVIL, semantics, ORIGINS, reference=example(name=EVIL))
+        harmless = scan_page([scan], "t", SEMANTICS, ORIGINS, reference=example(name="b"))
+        for markup in ("<script", "</script", "<!--"):
+            assert page.count(markup) == harmless.count(markup)
+        assert f"<title>{html.escape(EVIL)}</title>" in page
+        assert [header["name"] for header in page_data(page)["scans"]] == [EVIL, EVIL]
+        assert page_data(page)["categories"]["semantic"][0][1] == EVIL
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"points": np.ones((3, 2))}, r"s: points must be \(P, 3\) or \(P, 4\), got \(3, 2\)"),
+            ({"points": np.ones((0, 4))}, r"got \(0, 4\)"),
+            ({"points": np.ones(3)}, r"expected shape \(P, 3 or 4\)"),
+            ({"points": np.full((3, 3), np.nan)}, "s: has NaN or infinite values"),
+            ({"labels": np.ones(2, int)}, r"s: labels are \(2,\) but points \(3, 4\)"),
+            ({"origins": np.ones(4, int)}, r"s: origins are \(4,\) but points \(3, 4\)"),
+            ({"origins": np.array([0, 1, 256])}, "s: origins go from 0 to 256; give 0 to 255"),
+            ({"labels": np.array([0, 1, -1])}, "s: labels go from -1 to 1"),
+        ],
+    )
+    def test_says_which_scan_and_what_is_wrong(self, change, message):
+        with pytest.raises(ValueError, match=message):
+            scan_page([PageScan(**({"name": "s", "points": np.ones((3, 4))} | change))], "", {}, {})
+
+    def test_refuses_no_scan(self):
+        for draw in (
+            lambda: scan_page([], "", {}, {}),
+            lambda: birds_eye_sheet({}),
+            lambda: range_strips({}, SphericalProjection(LidarSensor())),
+        ):
+            with pytest.raises(ValueError, match="no scan"):
+                draw()
+
+
+@pytest.mark.parametrize(("count", "cells"), [(1, 1), (3, 3), (5, 6), (8, 8), (9, 9)])
+def test_sheets_hold_every_scan_once_with_its_name_as_it_is(count, cells):
+    scans = {f"$\\scan_{number}$ of ${count}": torch.eye(3) * 5 for number in range(count)}
+    sheet = birds_eye_sheet(scans)
+    assert len(sheet.axes) == cells + 1
+    shown = [axes for axes in sheet.axes[:-1] if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in shown] == list(scans)
+    assert all(axes.images for axes in shown)
+    strips = range_strips(scans, SphericalProjection(LidarSensor()))
+    assert [axes.get_title(loc="left") for axes in strips.axes[:-1]] == list(scans)
+    sheet.draw_without_rendering()
+    strips.draw_without_rendering()
+
+
+# The script
+
+
+def run_node(body, **given):
+    """What ``body`` returns as JSON; it sees ``Cloud`` and the given values."""
+    cloud = (files("r3dpa.viz") / "page_cloud.js").read_text("utf-8")
+    code = f"{cloud}\n(async (given) => {{ {body} }})({json.dumps(given)})"
+    code += ".then((result) => console.log(JSON.stringify(result)));"
+    command = subprocess.run(
+        ["node", "-"], input=code, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert command.returncode == 0, command.stderr
+    return json.loads(command.stdout)
+
+
+def camera(**change):
+    usual = {"target": [2.0, 1.0, -1.0], "distance": 30.0, "yaw": 0.7, "pitch": 0.4, "flat": False}
+    return usual | change
+
+
+def projected(points, view, width, height):
+    """Column, row and depth of points by a homogeneous camera matrix, as in textbooks."""
+    yaw, pitch = view["yaw"], view["pitch"]
+    forward = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)]
+    right = [np.sin(yaw), -np.cos(yaw), 0]
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    seen = (points - view["target"]) @ rotation.T + [0, 0, view["distance"]]
+    focal = np.sqrt(width * height) / 2 / np.tan(np.radians(25))
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    depth = np.full(len(seen), view["distance"]) if view["flat"] else seen[:, 2]
+    pixel = (seen[:, :2] / depth[:, None]) @ matrix[:2, :2] + matrix[:2, 2]
+    return pixel, seen[:, 2]
+
+
+@needs_node
+class TestScript:
+    def test_scripts_are_valid(self, tmp_path):
+        for name in ("page_cloud.js", "page_viewer.js"):
+            path = tmp_path / name
+            path.write_text((files("r3dpa.viz") / name).read_text("utf-8"), "utf-8")
+            subprocess.run(["node", "--check", str(path)], check=True, timeout=60)
+
+    def test_unpacks_what_python_packed(self):
+        scan = example(num_points=50)
+        header, text = pack_scan(scan)
+        cloud = run_node(
+            "const cloud = await Cloud.unpack(given.header, given.text);"
+            "for (const name in cloud) if (name !== 'count') cloud[name] = [...cloud[name]];"
+            "return cloud;",
+            header=header,
+            text=text,
+        )
+        xyz = np.reshape(cloud["xyz"], (-1, 3))
+        assert np.abs(xyz - scan.points[:, :3]).max() <= STEP_M / 2 + 1e-5
+        ranges = np.linalg.norm(scan.points[:, :3], axis=1)
+        assert cloud["range"] == pytest.approx(ranges, abs=STEP_M)
+        assert cloud["intensity"] == pytest.approx(scan.points[:, 3], abs=0.51 / 255)
+        assert cloud["semantic"] == (scan.labels & 0xFFFF).tolist()
+        assert cloud["instance"] == (scan.labels >> 16).tolist()
+        assert cloud["origin"] == scan.origins.tolist()
+        bare_header, bare = pack_scan(PageScan("a", scan.points[:, :3]))
+        names = run_node(
+            "return Object.keys(await Cloud.unpack(given.header, given.text));",
+            header=bare_header,
+            text=bare,
+        )
+        assert names == ["count", "xyz", "range"]
+
+    @pytest.mark.parametrize("flat", [False, True])
+    def test_projection_is_that_of_a_camera_matrix(self, flat):
+        points = np.random.default_rng(1).uniform(-10, 10, (40, 3))
+        view, size = camera(flat=flat), (320, 180)
+        found = run_node(
+            "const p = Cloud.projectionOf(given.view, ...given.size);"
+            "return given.points.map((point) => Cloud.project(p, ...point));",
+            view=view,
+            size=size,
+            points=points.tolist(),
+        )
+        pixel, depth = projected(points, view, *size)
+        assert np.array(found)[:, :2] == pytest.approx(pixel, abs=1e-6)
+        assert np.array(found)[:, 2] == pytest.approx(depth, abs=1e-9)
+
+    def test_seen_from_above_forward_is_up_and_left_is_left(self):
+        view = camera(target=[0, 0, 0], yaw=0, pitch=np.pi / 2, flat=True, distance=50)
+        ahead, left = run_node(
+            "const p = Cloud.projectionOf(given.view, 100, 100);"
+            "return [Cloud.project(p, 10, 0, 0), Cloud.project(p, 0, 10, 0)];",
+            view=view,
+        )
+        metre = 100 / 2 / np.tan(np.radians(25)) / 50
+        assert ahead[:2] == pytest.approx([50, 50 - 10 * metre])
+        assert left[:2] == pytest.approx([50 - 10 * metre, 50])
+
+    def test_drawn_pixels_are_those_of_numpy_and_the_nearest_point_shows(self):
+        points = np.random.default_rng(2).uniform(-12, 12, (4000, 3)).astype(np.float32)
+        view, (width, height) = camera(), (96, 54)
+        drawn = run_node(
+            "const xyz = Float32Array.from(given.points.flat());"
+            "const cloud = { count: given.points.length, xyz };"
+            "const colours = new Uint32Array(cloud.count).map((_, i) => (i % 7 ? i : 0));"
+            "const frame = Cloud.newFrame(...given.size);"
+            "const p = Cloud.projectionOf(given.view, ...given.size);"
+            "Cloud.drawPoints(frame, p, cloud, colours, 1, null);"
+            "return { index: [...frame.index], colour: [...frame.colour] };",
+            points=points.tolist(),
+            view=view,
+            size=(width, height),
+        )
+        # So far away that every point is one pixel at size 1: 0.05 m * focal / depth < 1.5.
+        pixel, depth = projected(points, view, width, height)
+        column, row = np.floor(pixel).astype(int).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth > 0.3)
+        shown = np.flatnonzero(inside & (np.arange(len(points)) % 7 != 0))
+        expected = np.full((height, width), -1)
+        for point in shown[np.argsort(-depth[shown], kind="stable")]:
+            expected[row[point], column[point]] = point
+        # Projected in another order of operations, a point on the edge of a pixel may fall beside.
+        found = np.reshape(drawn["index"], (height, width))
+        assert (found != expected).mean() < 1e-3
+        assert (found >= 0).sum() > 500
+        assert drawn["colour"] == np.where(found < 0, 0, found).ravel().tolist()
+
+    def test_a_point_behind_the_camera_is_not_drawn_and_large_ones_are_clipped(self):
+        counts = run_node(
+            "const view = { target: [0, 0, 0], distance: 1, yaw: 0, pitch: 0, flat: false };"
+            "const frame = Cloud.newFrame(40, 40), p = Cloud.projectionOf(view, 40, 40);"
+            "return given.points.map((point) => {"
+            "  const cloud = { count: 1, xyz: Float32Array.from(point) };"
+            "  Cloud.drawPoints(frame, p, cloud, new Uint32Array([1]), 4, null);"
+            "  return frame.index.filter((i) => i === 0).length;"
+            "});",
+            points=[[-5, 0, 0], [0, 0, 0], [0, 0.46, 0.46]],
+        )
+        behind, ahead, corner = counts
+        assert behind == 0
+        assert ahead == 9 * 9 - 4  # 0.05 m * 4 * 42.9 px/m = 8.6, less the corners
+        assert 0 < corner < ahead
+
+    def test_fading_mixes_with_the_background(self):
+        colour = run_node(
+            "const view = { target: [0, 0, 0], distance: 10, yaw: 0, pitch: 0, flat: false };"
+            "const frame = Cloud.newFrame(21, 21), p = Cloud.projectionOf(view, 21, 21);"
+            "const cloud = { count: 1, xyz: Float32Array.from([70, 0, 0]) };"
+            "const white = new Uint32Array([0xffffffff]);"
+            "Cloud.drawPoints(frame, p, cloud, white, 1, given.background);"
+            "const rgba = frame.colour.find((v) => v);"
+            "return [rgba & 255, (rgba >> 8) & 255, (rgba >> 16) & 255, rgba >>> 24];",
+            background=BACKGROUND,
+        )
+        share = (80 - 30) / 100  # depth 80 m; fading starts at 20 + 10 and takes 90 + 10 metres
+        expected = [*(255 + share * (np.array(BACKGROUND) - 255)), 255]
+        assert colour == pytest.approx(expected, abs=1)
+
+    def test_picks_the_nearest_drawn_point_within_the_radius(self):
+        found = run_node(
+            "const frame = Cloud.newFrame(20, 10);"
+            "frame.index[3 * 20 + 5] = 7; frame.index[3 * 20 + 9] = 8; frame.index[0] = 9;"
+            "return given.at.map(([column, row]) => Cloud.pick(frame, column, row, 3));",
+            at=[[5.5, 3.2], [8.1, 3.0], [6.5, 3.5], [5, 6], [5, 7], [19, 9], [-1, -1]],
+        )
+        assert found == [7, 8, 7, 7, -1, -1, 9]
+
+    def test_colours_are_those_of_matplotlib_and_hidden_categories_vanish(self):
+        scan = example(num_points=300)
+        page = page_data(scan_page([scan], "", SEMANTICS, ORIGINS))
+        header, text = pack_scan(scan)
+        drawn = run_node(
+            "const cloud = await Cloud.unpack(given.header, given.text);"
+            "const rgb = Cloud.bytesOf(given.scale.rgb);"
+            "const colours = Uint32Array.from({ length: 256 }, (_, i) =>"
+            "  Cloud.pack(rgb[3 * i], rgb[3 * i + 1], rgb[3 * i + 2]));"
+            "const table = new Map(given.rows.map(([id, , hex]) => [id, Cloud.packHex(hex)]));"
+            "const colour = (mode, table, hidden) =>"
+            "  [...Cloud.colourise(cloud, mode, table, new Set(hidden))];"
+            "delete cloud.origin;"
+            "return {"
+            "  range: colour('range', { ...given.scale, colours }, []),"
+            "  exact: [...cloud.range],"
+            "  semantic: colour('semantic', table, [26]),"
+            "  instance: colour('instance', null, []),"
+            "  origin: colour('origin', table, []),"
+            "  counts: [...Cloud.countValues(cloud.semantic)],"
+            "};",
+            header=header,
+            text=text,
+            scale=page["scales"]["range"],
+            rows=page["categories"]["semantic"],
+        )
+
+        def packed(rgb):
+            return (0xFF000000 | rgb[..., 2] << 16 | rgb[..., 1] << 8 | rgb[..., 0]).tolist()
+
+        sensor = LidarSensor()
+        painted = paint(np.array(drawn["exact"]), PAGE_RANGE_MAP, range_scale(sensor))
+        assert drawn["range"] == packed(painted.astype(np.int64))
+        colours = {7: 0xFF302010, 26: 0, 33: packed(np.array([0x3D, 0xDC, 0x97]))}
+        semantic = (scan.labels & 0xFFFF).tolist()
+        assert drawn["semantic"] == [colours[number] for number in semantic]
+        instances = (scan.labels >> 16).tolist()
+        by_instance = dict(zip(instances, drawn["instance"], strict=True))
+        assert len(set(by_instance.values())) == len(by_instance) == 3
+        assert drawn["instance"] == [by_instance[number] for number in instances]
+        assert len(set(drawn["origin"])) == 1  # not known: all grey
+        assert dict(drawn["counts"]) == {number: semantic.count(number) for number in (7, 26, 33)}
