@@ -121,16 +121,19 @@ def _few_lasers(dice):
 
 
 def _weather(dice):
-    def some(*values):
-        return 0.0 if dice.chance(0.6) else dice.among(*values)
+    clear_air = dice.chance(0.4)
 
+    def some(*values):
+        return 0.0 if clear_air or dice.chance(0.4) else dice.among(*values)
+
+    visibility_m = dice.among(math.inf, 0.1, 1e5, 1e30, dice.magnitude(5, 2e3))
     return Weather(
-        dice.among(math.inf, math.inf, math.inf, 0.1, 1e5, 1e30, dice.magnitude(5, 2e3)),
+        math.inf if clear_air else visibility_m,
         some(1e-6, 100.0, dice.magnitude(0.1, 50)),
         some(1e-6, 100.0, dice.magnitude(0.1, 10)),
-        some(1e-9, 5.0, dice.even(0.05, 2)),
+        dice.among(0.0, 0.0, 0.0, 1e-9, 5.0, dice.even(0.05, 2)),
         dice.chance(0.8),
-        dice.among(-90.0, -1e-6, 0.0, 1e-6, 90.0, dice.even(0, 40), dice.even(0, 30)),
+        dice.among(-90.0, -1e-6, 0.0, 1e-6, 90.0, *(dice.even(0, 30) for _ in range(5))),
         dice.even(-400, 400),
     )
 

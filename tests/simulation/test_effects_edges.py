@@ -28,7 +28,7 @@ from r3dpa.simulation.effects import (
     MovingActors,
     RollingShutter,
 )
-from r3dpa.simulation.raycast import GROUND, NO_SURFACE, cast
+from r3dpa.simulation.raycast import EGO_BODY, GROUND, NO_SURFACE, cast
 
 SENSOR = hdl64e()
 LEVEL = 5  # a beam within 0.3 degrees of the horizon
@@ -242,7 +242,7 @@ def test_edges_are_those_of_a_cast_of_every_rim():
 def test_thin_solids_that_all_axes_miss(speed_m_s):
     """A rod of 2 mm, 60 m away, stands at one point of a rim when its shot is fired: 1/8 of the
     power at normal incidence."""
-    ray = LEVEL * SENSOR.shots + SHOT
+    ray = LEVEL * SENSOR.shots + 1000  # nearly behind, where the sweep ends
     start, towards = (array.reshape(3, -1)[:, ray].astype(float) for array in SENSOR.rays)
     left = np.array([-towards[1], towards[0]]) / np.hypot(*towards[:2])
     x, y = start[:2] + 60 * (towards[:2] + RING * left)
@@ -330,6 +330,17 @@ def test_forced_on_where_nothing_calls_for_it(height_m):
     assert MixedPixels().called_by(random_scene(1), line) is None
     same_scans(random_scene(1), line)
     assert "2 mrad" in MixedPixels().called_by(random_scene(1), SENSOR)
+
+
+def test_diverted_rays_and_the_recording_car_keep_their_echoes():
+    sweep = swept(random_scene(4), after=PATH[:1])
+    mirrored, car, kept = np.array_split(MixedPixels().rays(sweep), 3)
+    sweep.first.origin[mirrored] = Origin.MIRROR
+    sweep.first.surface[car] = EGO_BODY
+    rays = MixedPixels().rays(sweep)
+    assert not np.isin(rays, mirrored).any()
+    assert not np.isin(rays, car).any()
+    assert np.isin(rays, kept).any()
 
 
 def test_narrow_beams_tend_to_lines():

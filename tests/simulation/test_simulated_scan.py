@@ -166,13 +166,15 @@ def test_an_effect_is_switched_by_its_name():
 
 def test_intensity_rises_with_the_root_of_the_reflectivity_and_weak_returns_have_none():
     min_power = 1e-5
-    power = np.float32([0.25 / 100, 2.3e-5, 1.0, 1.7e-4, np.sqrt(2.3 * 17) * 1e-5])
-    range_m = np.float32([10, 30, 10, 50, 50])
+    weakest, strong = scan._ZERO_INTENSITY * min_power, scan._FULL_INTENSITY * min_power
+    middle = np.sqrt(weakest * strong)
+    power = np.float32([25 * strong, weakest, 1.0, strong, middle])
+    range_m = np.sqrt(0.09 / power)
     intensity = calibrated_intensity(power, range_m, min_power)
-    # Half way between the two limits, in the logarithm, half of the intensity is left.
-    halfway = 0.5 * np.sqrt(np.sqrt(2.3 * 17) * 1e-5 * 2500)
-    expected = [0.5, 0.0, 0.99, np.sqrt(1.7e-4 * 2500), halfway]
-    np.testing.assert_allclose(intensity, np.round(expected, 2), atol=1e-6)
+    # The root of power * range^2 is 0.3; between the limits, half way in the logarithm, half of it.
+    np.testing.assert_allclose(intensity, [0.3, 0.0, 0.3, 0.3, 0.15], atol=1e-6)
+    bright = calibrated_intensity(np.float32([1.0]), np.float32([2.0]), min_power)
+    np.testing.assert_allclose(bright, 0.99)
 
 
 def test_dual_mode_adds_second_returns_to_the_strongest():

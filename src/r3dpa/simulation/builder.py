@@ -191,7 +191,6 @@ def build_ground(builder: Builder, draw: np.random.Generator, side: float, openi
         *asphalt,
     )
     beyond = (side * edge_m, side * (edge_m + _TERRAIN_M))
-    ground_m = course.surface_m(side * (edge_m + 1))
     paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.12, 0.18))
     for _ in range(int(draw.poisson(0.7))):
         at = draw.uniform(0.5, edge_m) * side
@@ -199,13 +198,4 @@ def build_ground(builder: Builder, draw: np.random.Generator, side: float, openi
     if opening:
         half_m = draw.uniform(2.8, 4.2)
         near, far = (0.0, BLOCK_M / 2 - half_m), (BLOCK_M / 2 + half_m, BLOCK_M)
-        builder.slab((near[1], far[0]), beyond, ground_m - course.kerb_m, 0.0, *asphalt)
-        for piece in (near, far):
-            builder.slab(piece, beyond, ground_m, 0.0, *paving)
-        return
-    if pavement_m:
-        kerb = (side * edge_m, side * (edge_m + pavement_m))
-        builder.slab(whole, kerb, ground_m, 0.0, *paving)
-        beyond = (kerb[1], beyond[1])
-    soil = (Semantic.TERRAIN, Material.SOIL, draw.uniform(0.14, 0.22))
-    builder.slab(whole, beyond, ground_m, 0.0, *soil)
+        

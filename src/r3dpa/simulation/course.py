@@ -20,6 +20,7 @@ SCAN_PERIOD_S = 0.1
 _CAMBER = 0.02
 _GUTTER_M = (0.5, 1.3)
 _PARKING_M = 2.1
+_RISE = (-0.01, 0.06)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32
@@ -54,7 +55,7 @@ CHARACTERS = (
         parked=(0.3, 0.65),
         parking=0.8,
         pavement=1.0,
-        trees=(0.1, 0.5),
+        trees=(0.2, 0.8),
         car_gap_m=(40, 90),
         people_gap_m=(50, 110),
         crossing_every=(3, 6),
@@ -66,7 +67,7 @@ CHARACTERS = (
         parked=(0.3, 0.7),
         parking=0.75,
         pavement=0.95,
-        trees=(0.1, 0.5),
+        trees=(0.2, 0.8),
         car_gap_m=(60, 140),
         people_gap_m=(60, 160),
         crossing_every=(4, 8),
@@ -78,7 +79,7 @@ CHARACTERS = (
         parked=(0.3, 0.6),
         parking=0.4,
         pavement=0.6,
-        trees=(0.1, 0.5),
+        trees=(0.2, 0.8),
         car_gap_m=(60, 140),
         people_gap_m=(80, 200),
         crossing_every=(6, 10),
@@ -90,7 +91,7 @@ CHARACTERS = (
         parked=(0.3, 0.6),
         parking=0.5,
         pavement=0.8,
-        trees=(0.1, 0.5),
+        trees=(0.2, 0.8),
         car_gap_m=(40, 70),
         people_gap_m=(60, 160),
         crossing_every=(5, 9),
@@ -100,12 +101,16 @@ CHARACTERS = (
 
 
 class Kerb(NamedTuple):
-    """One side of the road, metres: lanes, kerb, pavement (0 for a verge); places to park."""
+    """One side of the road, metres: lanes, kerb, pavement (0 for a verge); places to park.
+
+    ``rise``: how much the terrain beyond it rises, or falls, per metre away from the road.
+    """
 
     lanes_m: float
     edge_m: float
     pavement_m: float
     parking: bool
+    rise: float
 
 
 class Section(NamedTuple):
@@ -187,18 +192,22 @@ class Course(NamedTuple):
     def surface_m(self, lateral: float) -> float:
         """Height of road, pavement or terrain above the plane of the section.
 
-        The road falls by 2 % from the axis to both kerbs.
+        The road falls by 2 % from the axis to both kerbs; the pavement is level.
         """
         kerb = self.kerb(lateral)
         if abs(lateral) < kerb.edge_m:
             return -_CAMBER * abs(lateral)
-        return self.kerb_m - _CAMBER * kerb.edge_m
+        beyond_m = max(abs(lateral) - kerb.edge_m - kerb.pavement_m, 0.0)
+        return self.kerb_m - _CAMBER * kerb.edge_m + kerb.rise * beyond_m
 
     def surface_cross(self, lateral: float) -> float:
         """Rise of that surface per metre to the left, above the plane of the section."""
-        if abs(lateral) < self.kerb(lateral).edge_m:
+        kerb = self.kerb(lateral)
+        if abs(lateral) < kerb.edge_m:
             return math.copysign(_CAMBER, -lateral)
-        return 0.0
+        if abs(lateral) < kerb.edge_m + kerb.pavement_m:
+            return 0.0
+        return math.copysign(kerb.rise, lateral)
 
     def _moving(self, scan: int) -> tuple[int, bool]:
         """Scans before this one in which the car moved, and whether it stands in this one."""
@@ -257,17 +266,18 @@ def course_of(seed: int, drive: int) -> Course:
         parking = bool(draw.random() < character.parking)
         lanes_m = count * lane_m + draw.uniform(*_GUTTER_M)
         pavement_m = draw.uniform(1.5, 4.0) if draw.random() < character.pavement else 0.0
-        kerbs.append(Kerb(lanes_m, lanes_m + parking * _PARKING_M, pavement_m, parking))
+        edge_m, rise = lanes_m + parking * _PARKING_M, draw.uniform(*_RISE)
+        kerbs.append(Kerb(lanes_m, edge_m, pavement_m, parking, rise))
     period = draw.uniform(40.0, 90.0)
     # Sums of two waves: (amplitude, length, phase) of the heading and of the slope.
     bends = np.stack(
         [
-            draw.uniform(0.08, 0.25, 2),
-            draw.uniform([320, 500], [480, 900]),
+            draw.uniform(0.1, 0.28, 2),
+            draw.uniform([260, 420], [400, 700]),
             draw.uniform(0, 6.28, 2),
         ]
     )
-    steepest = draw.uniform(0.1, 0.5) * character.slope
+    steepest = draw.uniform(0.2, 0.5) * character.slope
     slopes = np.stack(
         [np.full(2, steepest), draw.uniform([240, 520], [300, 800]), draw.uniform(0, 6.28, 2)]
     )

@@ -23,7 +23,7 @@ def tree(builder: Builder, draw: np.random.Generator, s: float, lateral: float, 
     """A trunk below one to four crowns; a low one in a garden, a high one in a street."""
     instance = builder.new_instance()
     trunk_m = draw.uniform(0.4, 1.3) if low else draw.uniform(2.1, 3.0)
-    crown_m = draw.uniform(2.0, 4.5) if low else draw.uniform(3.0, 5.5)
+    crown_m = draw.uniform(2.0, 4.5) if low else draw.uniform(4.0, 7.5)
     tall_m = crown_m * draw.uniform(0.8, 1.4)
     thick_m = draw.uniform(0.15, 0.25) if low else draw.uniform(0.2, 0.5)
     builder.solid(

@@ -40,6 +40,8 @@ class Solids(NamedTuple):
     cos_yaw: Floats  # (N,)
     sin_yaw: Floats  # (N,)
     grade: Floats  # (N, 2)
+    matrix: Floats  # (N, 3, 3) and
+    offset: Floats  # (N, 3): matrix @ point - offset are the unit coordinates of ``Primitive``
     velocity: Floats  # (N, 2), metres per second
     extinction: Floats  # (N,)
     ground_m: float  # height of the ground
@@ -55,13 +57,11 @@ class Windows(NamedTuple):
 
 
 class _Solid(NamedTuple):
-    """Columns of one solid as scalars, or of one solid per ray as ``(M,)``."""
+    """Matrix and offset of one solid, or of one solid per ray as ``(3, 3, M)`` and ``(3, M)``."""
 
-    centre: Floats  # (3,) or (3, M)
-    half_size: Floats
-    cos_yaw: Floats
-    sin_yaw: Floats
-    grade: Floats | None  # (2,) or (2, M); None without a slope
+    matrix: Floats
+    offset: Floats
+    sloped: bool
 
 
 def level(vectors: Floats, pose: Pose) -> Floats:
@@ -87,16 +87,27 @@ def solids_of(primitives: tuple[Primitive, ...], pose: Pose, ground_m: float) ->
     centre[:, :2] = centre[:, :2] @ turn
     velocity = np.array([p.velocity_m_s for p in primitives], dtype=float).reshape(-1, 2) @ turn
     yaw = np.array([p.yaw_rad for p in primitives], dtype=float) - pose.heading_rad
+    half_size = np.array([p.half_size for p in primitives], dtype=float).reshape(-1, 3)
+    grade = np.array([p.grade for p in primitives], dtype=float).reshape(-1, 2)
+    matrix = np.zeros((len(primitives), 3, 3))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = np.cos(yaw)
+    matrix[:, 0, 1] = np.sin(yaw)
+    matrix[:, 1, 0] = -matrix[:, 0, 1]
+    matrix[:, 2, 2] = 1
+    matrix[:, 2] -= np.einsum("ni,nij->nj", grade, matrix[:, :2])
+    matrix /= half_size[:, :, None]
     return Solids(
-        np.array([p.shape for p in primitives], dtype=np.int64),
-        centre.astype(np.float32),
-        np.array([p.half_size for p in primitives], dtype=np.float32).reshape(-1, 3),
-        np.cos(yaw).astype(np.float32),
-        np.sin(yaw).astype(np.float32),
-        np.array([p.grade for p in primitives], dtype=np.float32).reshape(-1, 2),
-        velocity.astype(np.float32),
-        np.array([p.extinction_per_m for p in primitives], dtype=np.float32),
-        ground_m - pose.z_m,
+        shape=np.array([p.shape for p in primitives], dtype=np.int64),
+        centre=centre.astype(np.float32),
+        half_size=half_size.astype(np.float32),
+        cos_yaw=np.cos(yaw).astype(np.float32),
+        sin_yaw=np.sin(yaw).astype(np.float32),
+        grade=grade.astype(np.float32),
+        matrix=matrix.astype(np.float32),
+        offset=np.einsum("nij,nj->ni", matrix, centre).astype(np.float32),
+        velocity=velocity.astype(np.float32),
+        extinction=np.array([p.extinction_per_m for p in primitives], dtype=np.float32),
+        ground_m=ground_m - pose.z_m,
     )
 
 
@@ -149,13 +160,8 @@ def cast(
         )
         windows = windows_of(solids, origin, direction, max_range_m, actor_time_s)
         for index in windows.order:
-            solid = _Solid(
-                solids.centre[index],
-                solids.half_size[index],
-                solids.cos_yaw[index],
-                solids.sin_yaw[index],
-                solids.grade[index] if solids.grade[index].any() else None,
-            )
+            sloped = bool(solids.grade[index].any())
+            solid = _Solid(solids.matrix[index], solids.offset[index], sloped)
             moving = actor_time_s is not None and solids.velocity[index].any()
             foliage = optical_depth is not None and solids.extinction[index] > 0
             for window in pieces(index, windows, origin.shape[2]):
@@ -173,7 +179,8 @@ def cast(
                     assert optical_depth is not None
                     drawn = _draws_of(index, window, optical_depth)
                     deep = distance + drawn.ravel() / solids.extinction[index]
-                    distance = np.where((distance > 0) & (deep < leave), deep, np.float32(np.nan))
+                    distance = np.where(distance > 0, deep, np.float32(np.nan))
+                distance = np.where(distance <= leave, distance, np.float32(np.nan))
                 _keep_nearer(distance.reshape(near.shape), index, near, surface[window])
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
 
@@ -213,8 +220,9 @@ def cast_single(
         ray, index = _close_pairs(solids, origin, direction, nearest, time_s)
         keep = excluded[ray] != index
         ray, index = ray[keep], index[keep]
-        start = _relative(origin[:, ray], solids.velocity[index].T, time_s[ray])
-        distance, leave = surface_distance(solids, index, start, direction[:, ray])
+        velocity = solids.velocity.T.take(index, axis=1)
+        start = _relative(origin.take(ray, axis=1), velocity, time_s[ray])
+        distance, leave = surface_distance(solids, index, start, direction.take(ray, axis=1))
         distance = np.where(hollow[ray] == index, leave, distance)
         distance[~((distance > _START_M) & (distance < nearest[ray]))] = np.inf
         np.minimum.at(nearest, ray, distance)
@@ -234,9 +242,10 @@ def surface_distance(
         for shape in Shape:
             chosen = np.flatnonzero(solids.shape[index] == shape)
             solid = _gather(solids, index[chosen])
-            enter[chosen], leave[chosen] = _crossing(
-                shape, solid, origin[:, chosen], direction[:, chosen]
-            )
+            start, towards = (array.take(chosen, axis=1) for array in (origin, direction))
+            enter[chosen], leave[chosen] = _crossing(shape, solid, start, towards)
+    missed = ~(enter <= leave)
+    enter[missed] = leave[missed] = np.nan
     return enter, leave
 
 
@@ -255,26 +264,31 @@ def normals(
     normal[2] = 1
     hit = np.flatnonzero(surface >= 0)
     index = surface[hit]
+    at = position.take(hit, axis=1)
+    if time_s is not None and solids.velocity.any():
+        at = _relative(at, solids.velocity.T.take(index, axis=1), time_s[hit])
     solid = _gather(solids, index)
-    at = position[:, hit]
-    if time_s is not None:
-        at = _relative(at, solids.velocity[index].T, time_s[hit])
-    unit = _unit_frame(solid, at, True)
+    unit = np.stack(_unit_frame(solid, at, True))
+    # The gradient of a solid's equation, by its unit coordinates; of a box the face that is met.
+    x, y, z = np.abs(unit)
+    face = np.where(z >= np.maximum(x, y), 2, np.where(y > x, 1, 0))
     shape = solids.shape[index]
-    gradient = unit.copy()
-    upright = shape == Shape.CYLINDER
-    on_cap = upright & (np.abs(unit[2]) > np.hypot(unit[0], unit[1]))
-    gradient[2, upright] = 0
-    # On a cap the height is 1 and the largest coordinate, as on the top of a box.
-    flat = np.arange(3)[:, None] == np.abs(unit).argmax(axis=0)
-    gradient = np.where((shape == Shape.BOX) | on_cap, flat * np.sign(unit), gradient)
-    gradient = gradient / solid.half_size
-    if solid.grade is not None:
-        gradient[:2] -= gradient[2] * solid.grade
-    x = solid.cos_yaw * gradient[0] - solid.sin_yaw * gradient[1]
-    y = solid.sin_yaw * gradient[0] + solid.cos_yaw * gradient[1]
-    turned = np.stack([x, y, gradient[2]])
-    normal[:, hit] = turned / np.sqrt((turned * turned).sum(axis=0))
+    round_ones = np.flatnonzero(shape != Shape.BOX)
+    gradient = unit.take(round_ones, axis=1)
+    upright = shape[round_ones] == Shape.CYLINDER
+    on_cap = upright & (np.abs(gradient[2]) > np.hypot(gradient[0], gradient[1]))
+    gradient[:2, on_cap] = 0
+    gradient[2, upright & ~on_cap] = 0
+    rows = np.moveaxis(solids.matrix, 2, 0).reshape(3, -1)
+    towards = rows.take(3 * index + face, axis=1)
+    towards *= np.sign(unit[face, np.arange(len(face))])
+    matrix = solid.matrix.take(round_ones, axis=2)
+    towards[:, round_ones] = np.einsum("ijm,im->jm", matrix, gradient)
+    towards /= np.sqrt(np.einsum("im,im->m", towards, towards))
+    if len(hit) == len(surface):
+        return towards
+    for axis in range(3):
+        normal[axis, hit] = towards[axis]
     return normal
 
 
@@ -302,38 +316,70 @@ def windows_of(
     Two passes: the first takes the rays to start anywhere that any of them does, which a moving
     sensor spreads over a metre; the second looks up where those of the first window really start.
     """
-    num_shots = origin.shape[2]
+    fan = _fan(origin, direction)
     reach = np.zeros(len(solids.shape))
     if actor_time_s is not None:
         reach = np.hypot(*solids.velocity.T) * float(np.abs(actor_time_s).max())
     spread_m = float(np.hypot(origin[0], origin[1]).max()) + reach
     here = np.zeros((len(solids.shape), 2))
-    wide = _windows_from(solids, origin, direction, max_range_m, here, spread_m)
+    wide = _windows_from(solids, fan, max_range_m, here, spread_m)
     # The origins of each shot: their middle over the beams, and how far the farthest is from it.
     middle = origin[:2].mean(axis=1)
     around = np.hypot(*(origin[:2] - middle[:, None])).max(axis=0)
-    if spread_m.max(initial=0.0) < 2 * around.min() or not len(wide.order):
+    if spread_m.max(initial=0.0) < 2 * around.min():
         return wide
-    columns = np.arange(num_shots)
     for index in wide.order:
-        inside = columns.take(range(*wide.shots[index]), mode="wrap")
-        here[index] = middle[:, inside[len(inside) // 2]]
-        away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
-        spread_m[index] = away.max() + reach[index]
-    return _windows_from(solids, origin, direction, max_range_m, here, spread_m)
+        first, last = wide.shots[index]
+        if last - first < fan.num_shots:
+            inside = np.arange(first, last) % fan.num_shots
+            here[index] = middle[:, inside[len(inside) // 2]]
+            away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
+            spread_m[index] = away.max() + reach[index]
+    return _windows_from(solids, fan, max_range_m, here, spread_m)
+
+
+class _Fan(NamedTuple):
+    """How far the rays of a turn leave their nominal azimuth and inclination."""
+
+    num_shots: int
+    least_deviation: float  # of the azimuth from shot * 2 pi / W, radians
+    most_deviation: float
+    highest: Floats  # (H,) sine of the inclination
+    lowest: Floats
+    least_height_m: float  # of the origins
+    most_height_m: float
+
+
+def _fan(origin: Floats, direction: Floats) -> _Fan:
+    num_shots = origin.shape[2]
+    azimuth = 2 * np.pi / num_shots * np.arange(num_shots)
+    cosine, sine = np.cos(azimuth).astype(np.float32), np.sin(azimuth).astype(np.float32)
+    across = cosine * direction[1] - sine * direction[0]
+    highest, lowest = direction[2].max(axis=1), direction[2].min(axis=1)
+    # |across| <= sin(deviation) * level length, so that this is never too little.
+    steepest = max(abs(float(highest.max())), abs(float(lowest.min())))
+    length = np.sqrt(1 - steepest**2)
+    most, least = max(float(across.max()), 0.0), min(float(across.min()), 0.0)
+    return _Fan(
+        num_shots,
+        float(np.arcsin(max(least / length, -1.0))),
+        float(np.arcsin(min(most / length, 1.0))),
+        highest,
+        lowest,
+        float(origin[2].min()),
+        float(origin[2].max()),
+    )
 
 
 def _windows_from(
     solids: Solids,
-    origin: Floats,
-    direction: Floats,
+    fan: _Fan,
     max_range_m: float,
     here: NDArray[np.float64],
     spread_m: NDArray[np.float64],
 ) -> Windows:
     """Windows for rays that start within ``spread_m`` (N,) of ``here`` (N, 2)."""
-    num_shots = origin.shape[2]
-    step = 2 * np.pi / num_shots
+    step = 2 * np.pi / fan.num_shots
     centre, half = solids.centre.astype(float), solids.half_size.astype(float)
     centre[:, :2] -= here
     # Corners of the footprint, and the distance from the rays' origins to it.
@@ -352,8 +398,6 @@ def _windows_from(
 
     # Shots: angles of the corners about the centre's direction, widened by how far the rays leave
     # their column's nominal azimuth and by the spread of their origins.
-    deviation = np.arctan2(direction[1], direction[0]) - (step * np.arange(num_shots)).astype("f4")
-    deviation -= np.float32(2 * np.pi) * np.round(deviation / np.float32(2 * np.pi))
     heading = np.arctan2(centre[:, 1], centre[:, 0])
     angle = np.arctan2(corner_y, corner_x) - heading[:, None]
     angle = (angle + np.pi) % (2 * np.pi) - np.pi
@@ -361,23 +405,22 @@ def _windows_from(
     margin = _WINDOW_SLACK_RAD + np.arcsin(
         np.where(around, 1.0, spread_m / np.where(around, 1.0, near_m))
     )
-    first = heading + angle.min(axis=1) - margin - deviation.max()
-    last = heading + angle.max(axis=1) + margin - deviation.min()
+    first = heading + angle.min(axis=1) - margin - fan.most_deviation
+    last = heading + angle.max(axis=1) + margin - fan.least_deviation
     shots = np.stack([np.floor(first / step), np.ceil(last / step) + 1], axis=1).astype(int)
-    whole_turn = around | (shots[:, 1] - shots[:, 0] >= num_shots)
-    shots[whole_turn] = (0, num_shots)
+    whole_turn = around | (shots[:, 1] - shots[:, 0] >= fan.num_shots)
+    shots[whole_turn] = (0, fan.num_shots)
 
     # Beams: the steepest and flattest lines from the optical centres to top and bottom.
     half_height = half[:, 2] + (np.abs(solids.grade) * half[:, :2]).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        top = centre[:, 2] + half_height - float(origin[2].min())
-        bottom = centre[:, 2] - half_height - float(origin[2].max())
+        top = centre[:, 2] + half_height - fan.least_height_m
+        bottom = centre[:, 2] - half_height - fan.most_height_m
         steepest_up = np.arctan2(top, np.where(top > 0, near_m, far_m)) + _WINDOW_SLACK_RAD
         steepest_down = np.arctan2(bottom, np.where(bottom < 0, near_m, far_m)) - _WINDOW_SLACK_RAD
-    highest, lowest = direction[2].max(axis=1), direction[2].min(axis=1)
-    meets = lowest <= np.sin(steepest_up)[:, None]
-    meets &= highest >= np.sin(steepest_down)[:, None]
-    num_beams = len(highest)
+    meets = fan.lowest <= np.sin(steepest_up)[:, None]
+    meets &= fan.highest >= np.sin(steepest_down)[:, None]
+    num_beams = len(fan.highest)
     beams = np.stack([meets.argmax(axis=1), num_beams - meets[:, ::-1].argmax(axis=1)], axis=1)
     reachable = np.flatnonzero(meets.any(axis=1) & (near_m < max_range_m))
     return Windows(beams, shots, near_m, reachable[np.argsort(near_m[reachable], kind="stable")])
@@ -430,14 +473,10 @@ def _close_pairs(
 
 
 def _gather(solids: Solids, index: NDArray[np.integer]) -> _Solid:
-    grade = solids.grade[index].T
-    return _Solid(
-        solids.centre[index].T,
-        solids.half_size[index].T,
-        solids.cos_yaw[index],
-        solids.sin_yaw[index],
-        grade if grade.any() else None,
-    )
+    # Taken from rows, so that every row of the result lies in one piece.
+    matrix = np.ascontiguousarray(np.moveaxis(solids.matrix, 0, 2)).take(index, axis=2)
+    offset = np.ascontiguousarray(solids.offset.T).take(index, axis=1)
+    return _Solid(matrix, offset, bool(solids.grade.any()))
 
 
 def _relative(position: Floats, velocity: Floats, time_s: Floats) -> Floats:
@@ -454,28 +493,31 @@ def _keep_nearer(distance: Floats, index: int, nearest: Floats, surface: NDArray
     np.copyto(surface, index, where=nearer)
 
 
-def _unit_frame(solid: _Solid, vectors: Floats, is_point: bool) -> Floats:
+def _unit_frame(solid: _Solid, vectors: Floats, is_point: bool) -> tuple[Floats, Floats, Floats]:
     """Vectors (3, M) of the scene frame in the coordinates where the solid is its unit shape."""
-    half_x, half_y, half_z = solid.half_size
-    cos_x, sin_x = solid.cos_yaw / half_x, solid.sin_yaw / half_x
-    cos_y, sin_y = solid.cos_yaw / half_y, solid.sin_yaw / half_y
-    x = cos_x * vectors[0] + sin_x * vectors[1]
-    y = cos_y * vectors[1] - sin_y * vectors[0]
-    z = vectors[2]
+    matrix = solid.matrix
+    x = matrix[0, 0] * vectors[0]
+    x += matrix[0, 1] * vectors[1]
+    y = matrix[1, 0] * vectors[0]
+    y += matrix[1, 1] * vectors[1]
+    z = matrix[2, 2] * vectors[2]
+    if solid.sloped:
+        z += matrix[2, 0] * vectors[0]
+        z += matrix[2, 1] * vectors[1]
     if is_point:
-        at_x, at_y, at_z = solid.centre
-        x = x - (cos_x * at_x + sin_x * at_y)
-        y = y - (cos_y * at_y - sin_y * at_x)
-        z = z - at_z
-    if solid.grade is not None:
-        z = z - solid.grade[0] * half_x * x - solid.grade[1] * half_y * y
-    return np.stack([x, y, z / half_z])
+        x -= solid.offset[0]
+        y -= solid.offset[1]
+        z -= solid.offset[2]
+    return x, y, z
 
 
 def _crossing(
     shape: int, solid: _Solid, origin: Floats, direction: Floats
 ) -> tuple[Floats, Floats]:
-    """Distances (R,) at which rays (3, R) enter and leave a solid; NaN where they miss it."""
+    """Distances (R,) at which rays (3, R) enter and leave a solid.
+
+    A ray that misses it has NaN, or enters after it leaves.
+    """
     px, py, pz = _unit_frame(solid, origin, True)
     dx, dy, dz = _unit_frame(solid, direction, False)
     if shape == Shape.ELLIPSOID:
@@ -496,14 +538,13 @@ def _crossing(
         enter_y, leave_y = _slab(py, dy)
         enter = np.maximum(np.maximum(enter_x, enter_y), enter_z)
         leave = np.minimum(np.minimum(leave_x, leave_y), leave_z)
-    missed = ~(enter <= leave)
-    return np.where(missed, np.float32(np.nan), enter), np.where(missed, np.float32(np.nan), leave)
+    return enter, leave
 
 
 def _slab(position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
     """Where ``position + t velocity`` enters and leaves [-1, 1]."""
-    # Bounded, because a ray along the slab (velocity 0) would give inf - inf.
-    inverse = np.clip(np.reciprocal(velocity), np.float32(-1e30), np.float32(1e30))
-    middle = -position * inverse
+    # Not 0, because a ray along the slab would give inf - inf.
+    inverse = np.reciprocal(velocity + np.float32(1e-30))
+    middle = position * inverse
     half = np.abs(inverse)
-    return middle - half, middle + half
+    return -half - middle, half - middle

@@ -32,6 +32,7 @@ RayIndex = NDArray[np.int64] | slice
 
 # Leaves are turned every way: mean of |cos| over a sphere.
 _FOLIAGE_COS = 0.5
+_BLOCK_RAYS = 16384
 
 
 class Origin(IntEnum):
@@ -104,8 +105,9 @@ class Sweep:
         cos_incidence: ``(R,)`` cosine between ray and normal of the surface that was hit.
         reflectivity: ``(R,)`` of that surface.
         material: ``(R,)`` of that surface; meaningless where nothing is hit.
-        first: The strongest echo of each shot.
-        second: The second strongest, or None where it is not recorded.
+        first: The strongest echo of each shot. It stays the first where the air weakens it below
+            the second: an instrument that records one echo knows of no other.
+        second: The next echo of each shot, or None where it is not recorded.
         min_power: ``(R,)`` weakest power that is detected, m^-2.
     """
 
@@ -168,15 +170,24 @@ class Sweep:
     def _cos_incidence(self) -> Floats:
         surface = self.first.surface
         cosine = np.where(surface == GROUND, np.abs(self.direction[2]), np.float32(0))
-        hit = np.flatnonzero(surface >= 0)
-        time_s = None if self.actor_time_s is None else self.actor_time_s[hit]
-        normal = normals(self.solids, surface[hit], self.position(hit), time_s)
-        cosine[hit] = np.abs((normal * self.direction[:, hit]).sum(axis=0))
+        every_hit = np.flatnonzero(surface >= 0)
+        # In blocks, whose temporaries stay in the cache: twice as fast.
+        for first in range(0, len(every_hit), _BLOCK_RAYS):
+            hit = every_hit[first : first + _BLOCK_RAYS]
+            time_s = None if self.actor_time_s is None else self.actor_time_s[hit]
+            normal = normals(self.solids, surface[hit], self.position(hit), time_s)
+            cosine[hit] = np.abs(np.einsum("im,im->m", normal, self.direction.take(hit, axis=1)))
         return cosine
 
     def position(self, rays: RayIndex) -> Floats:
         """Where rays meet the surface of their first echo, ``(3, M)`` in the scene frame."""
-        return self.start[:, rays] + self.first.range_m[rays] * self.direction[:, rays]
+        if isinstance(rays, slice):
+            return self.start[:, rays] + self.first.range_m[rays] * self.direction[:, rays]
+        # Much faster than indexing the second axis.
+        towards = self.direction.take(rays, axis=1)
+        towards *= self.first.range_m[rays]
+        towards += self.start.take(rays, axis=1)
+        return towards
 
     def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
         """For each solid the rays (M,) that can meet it, from its bounding box.
@@ -238,6 +249,12 @@ class Sweep:
         if self.second is not None:
             yield self.second
 
+    def weakest_recorded(self) -> Floats:
+        """Power ``(R,)`` that an echo needs to be recorded beside those there are."""
+        if self.second is None:
+            return self.first.power
+        return np.minimum(self.first.power, self.second.power)
+
     def offer(
         self,
         rays: NDArray[np.int64],
@@ -246,7 +263,9 @@ class Sweep:
         surface: NDArray[np.int32] | int,
         origin: NDArray[np.uint8] | int,
     ) -> None:
-        """Further echoes of some rays: the strongest is kept first, the next as the second.
+        """Further echoes of some rays: one that is stronger than the first takes its place.
+
+        Of the echo that is left over and the second one, the stronger is the second.
 
         Args:
             rays: ``(M,)`` different rays.
@@ -259,17 +278,18 @@ class Sweep:
             np.broadcast_to(np.asarray(values), rays.shape)
             for values in (range_m, power, surface, origin)
         ]
+        first = self.first.columns()
         stronger = power > self.first.power[rays]
-        winners = rays[stronger]
         if self.second is not None:
-            weaker = ~stronger & (power > self.second.power[rays])
-            for old, values, second in zip(
-                self.first.columns(), offered, self.second.columns(), strict=True
-            ):
-                second[winners] = old[winners]
-                second[rays[weaker]] = values[weaker]
-        for old, values in zip(self.first.columns(), offered, strict=True):
-            old[winners] = values[stronger]
+            left_over = [
+                np.where(stronger, old[rays], values)
+                for old, values in zip(first, offered, strict=True)
+            ]
+            again = left_over[1] > self.second.power[rays]
+            for old, values in zip(self.second.columns(), left_over, strict=True):
+                old[rays[again]] = values[again]
+        for old, values in zip(first, offered, strict=True):
+            old[rays[stronger]] = values[stronger]
 
     def labels(self, surface: NDArray[np.int32], origin: NDArray[np.uint8]) -> NDArray[np.uint32]:
         """Label of each point: semantic class in the lower 16 bits, instance in the upper.

@@ -42,8 +42,8 @@ EFFECTS: tuple[Effect, ...] = (
     Blooming(),
     SoftRaydrop(),
     DetectionLimit(),
-    LaserCalibration(),
     RangeNoise(),
+    LaserCalibration(),
 )
 
 __all__ = [

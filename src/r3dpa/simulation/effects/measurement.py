@@ -46,7 +46,8 @@ class LaserCalibration:
 
         range -> range + bias        power -> power * gain^2
 
-    because the stored intensity is the root of the power.
+    because the stored intensity is the root of the power. Both come after the noise: they are what
+    the calibration leaves in ranges that have been measured and rounded.
     """
 
     stage: ClassVar[Stage] = Stage.MEASUREMENT

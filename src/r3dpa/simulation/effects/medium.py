@@ -68,11 +68,6 @@ def steps_before_target(sweep: Sweep, edges: NDArray[np.float64]) -> Floats:
     return steps.clip(0, len(edges) - 1)
 
 
-def weakest_recorded(sweep: Sweep) -> Floats:
-    """Power ``(R,)`` that an echo needs to be recorded beside those there are."""
-    return sweep.first.power if sweep.second is None else sweep.second.power
-
-
 def all_rays(called: bool) -> RayIndex:
     """All rays, or none."""
     return slice(None) if called else np.empty(0, dtype=np.int64)
@@ -121,7 +116,7 @@ class Fog:
         steps = np.append(0.0, ((waveform[1:] + waveform[:-1]) / 2).cumsum())
         before = steps_before_target(sweep, edges).astype(np.intp)
         power = peak[before]
-        chosen = np.flatnonzero(power > weakest_recorded(sweep))
+        chosen = np.flatnonzero(power > sweep.weakest_recorded())
         if not len(chosen):
             return
         share = draws.uniform(chosen) * steps[before[chosen]]

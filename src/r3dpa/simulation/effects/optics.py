@@ -320,9 +320,8 @@ def _look(sweep: Sweep, struck: _Struck, direction: Floats, hollow: NDArray[np.i
 
 def _offer_mirrored(sweep: Sweep, struck: _Struck, reflectance: Floats) -> None:
     """Offer what surfaces of this reflectance mirror, where a white object would win."""
-    recorded = sweep.first if sweep.second is None else sweep.second
     best = (reflectance / struck.leg_m) ** 2
-    chosen = np.flatnonzero(best > recorded.power[struck.rays])
+    chosen = np.flatnonzero(best > sweep.weakest_recorded()[struck.rays])
     struck, two_way = struck.only(chosen), reflectance[chosen] ** 2
     across = (struck.direction * struck.normal).sum(axis=0)
     mirrored = struck.direction - 2 * across * struck.normal

@@ -18,7 +18,6 @@ from r3dpa.simulation.effects.medium import (
     overlap_by_square,
     range_edges,
     steps_before_target,
-    weakest_recorded,
 )
 from r3dpa.simulation.raycast import NO_SURFACE
 from r3dpa.simulation.scene import Scene, Weather
@@ -101,7 +100,7 @@ class _Hydrometeors(ABC):
             return
         edges, powers, expected = table
         log_step = math.log(powers[1] / powers[0])
-        weakest = weakest_recorded(sweep)
+        weakest = sweep.weakest_recorded()
         row = np.log(np.maximum(weakest, powers[0]) / powers[0]) / np.float32(log_step)
         row = row.astype(np.intp).clip(max=_POWERS)
         before = steps_before_target(sweep, edges)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import platform
 import resource
 import sys
 import tempfile
@@ -26,9 +25,9 @@ from jsonargparse import ArgumentParser
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa import __version__
 from r3dpa.atomic import atomic_path
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, source_commit
+from r3dpa.bench.provenance import machine, one_line, versions
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
@@ -148,7 +147,16 @@ def training(
         simulate(Path(folder) / "scans", scans=settings.batch_size)
         for stage in tqdm(stages, unit="stage", desc="bench"):
             costs.append(_in_new_process(stage, conf, Path(folder), settings))
-    about = {"settings": asdict(settings), "machine": _machine(settings), "versions": _versions()}
+    on_gpu = settings.accelerator == "cuda"
+    about = {
+        "settings": asdict(settings),
+        "machine": machine()
+        | {
+            "threads": torch.get_num_threads(),
+            "gpu": torch.cuda.get_device_name() if on_gpu else None,
+        },
+        "versions": versions(torch, L),
+    }
     if out is not None:
         content = {**about, "stages": [asdict(cost) for cost in costs]}
         with atomic_path(out) as temporary:
@@ -157,7 +165,7 @@ def training(
     header += ["first s", "next s", "host GiB", "GPU GiB", "loss"]
     lines = [format_table(header, (cost.row() for cost in costs))]
     for name, values in about.items():
-        lines.append(f"{name}: " + ", ".join(f"{key} {value}" for key, value in values.items()))
+        lines.append(f"{name}: {one_line(values)}")
     return "\n".join(lines)
 
 
@@ -305,25 +313,3 @@ def _peak_host_bytes() -> int:
         return int(line.split()[1]) * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-def _machine(settings: StepSettings) -> dict[str, Any]:
-    cpu_info = Path("/proc/cpuinfo")
-    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    on_gpu = settings.accelerator == "cuda"
-    return {
-        "cpu": names[0] if names else platform.processor(),
-        "threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name() if on_gpu else None,
-    }
-
-
-def _versions() -> dict[str, str | None]:
-    return {
-        "r3dpa": __version__,
-        "commit": source_commit(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "lightning": L.__version__,
-    }

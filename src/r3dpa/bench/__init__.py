@@ -1,0 +1,1 @@
+"""What training steps and simulated scans cost, measured on the machine at hand."""

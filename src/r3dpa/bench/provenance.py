@@ -1,0 +1,46 @@
+"""Where and with what a figure was measured: what a reader needs to judge or repeat it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from r3dpa import __version__
+from r3dpa.checkpoints import source_commit
+
+
+def machine() -> dict[str, Any]:
+    """Processor, processors that this process may use, and how many are busy, as it says itself."""
+    cpu_info = Path("/proc/cpuinfo")
+    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2),
+    }
+
+
+def versions(*packages: ModuleType) -> dict[str, str | None]:
+    """Version and commit of this code, of Python, and of some packages."""
+    return {
+        "r3dpa": __version__,
+        "commit": source_commit(),
+        "python": platform.python_version(),
+        **{package.__name__: package.__version__ for package in packages},
+    }
+
+
+def command() -> str:
+    """The command line of this process, without the folder of the program."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def one_line(values: dict[str, Any]) -> str:
+    """Names and values for a line of text."""
+    return ", ".join(f"{name} {value}" for name, value in values.items())
