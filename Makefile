@@ -19,10 +19,10 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo bench clean
+.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation clean
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
 
 install: $(READY) ## set .venv up; does nothing when it is up to date
 
@@ -65,8 +65,13 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 	$(BIN)/r3dpa report $(OUT)/vae_alignment
 	$(BIN)/r3dpa report $(OUT)/joint
 
-bench: $(READY) ## one full-size training step of each stage: time and peak memory
-	$(BIN)/r3dpa bench
+bench: bench-training bench-simulation ## both of the following
+
+bench-training: $(READY) ## one full-size training step of each stage: time and peak memory
+	$(BIN)/r3dpa bench training
+
+bench-simulation: $(READY) ## what a simulated scan costs on one core, by part and effect
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench simulation
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

@@ -12,8 +12,7 @@ import pytest
 import torch
 import yaml
 
-from r3dpa import bench
-from r3dpa.bench import STAGES, StepSettings, training
+from r3dpa.bench.training import STAGES, StepSettings, training
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "xl": (1152, 28, 16)}
@@ -157,6 +156,6 @@ def killed(*args):
 
 
 def test_bench_says_which_stage_was_killed(small_conf, monkeypatch):
-    monkeypatch.setattr(bench, "_measure", killed)
+    monkeypatch.setattr("r3dpa.bench.training._measure", killed)
     with pytest.raises(RuntimeError, match=r"joint was killed.*batch_size 1"):
         training(small_conf, ("joint",))

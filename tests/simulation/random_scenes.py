@@ -80,7 +80,7 @@ def random_scene(dice):
 
 
 def random_sensor(dice):
-    shots = dice.among(8, 60, 64, 64, 90, 120)
+    shots = 600 if dice.chance(0.03) else dice.among(8, 60, 64, 64, 90, 120)
     sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), hdl32e(), vls128(), hdl64e())
     lasers = sensor.lasers
     if dice.chance(0.1):

@@ -117,7 +117,8 @@ def test_halo_of_weak_sheeting_shrinks_with_range():
 
 def test_halo_has_the_range_of_the_sheet_and_no_label():
     scene = Scene((sheet(15, 5, 0.4),))
-    scan = simulate_scan(scene, SENSOR, (4,), {"range_noise": "off", "laser_calibration": "off"})
+    plain = dict.fromkeys(("range_noise", "laser_calibration", "surface_texture"), "off")
+    scan = simulate_scan(scene, SENSOR, (4,), plain)
     halo, sheeting = (scan.origins == Origin.BLOOMING), (scan.labels & 0xFFFF) == Semantic.SIGN
     assert halo.sum() > 3
     assert (scan.labels[halo] == 0).all()

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from r3dpa.simulation import Material, Pose, Primitive, Scene, Semantic, Shape, Sweep, hdl64e
-from r3dpa.simulation.effects import DetectionLimit, DiffuseReflection, Draws, surface_power
+from r3dpa.simulation.effects import (
+    DetectionLimit,
+    DiffuseReflection,
+    Draws,
+    SurfaceTexture,
+    surface_power,
+)
 
 SENSOR = hdl64e()
 
@@ -88,3 +94,21 @@ def test_last_ground_return(smooth):
     expected = (0.1 * 1.73 / 1.38e-6) ** (1 / 3) if smooth else 50.0
     assert expected == pytest.approx(50.0, abs=0.1)
     assert farthest == pytest.approx(expected, abs=0.15)
+
+
+def test_texture_scatters_the_power_around_its_median():
+    """ln(power) of one material at one range has the standard deviation of its spread."""
+    wall = Primitive(Shape.BOX, (12, 0, 2), (2, 60, 9), Semantic.WALL, 0.5, material=Material.BRICK)
+    hedge = replace(wall, centre=(-12, 0, 2), material=Material.FOLIAGE)
+    sweep = Sweep(Scene((wall, hedge)), SENSOR)
+    sweep.cast()
+    SurfaceTexture(0.3, 0.8).apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+    for index, spread in enumerate((0.3, 0.8)):
+        drawn = np.log(sweep.first.power[sweep.first.surface == index]) / spread
+        assert len(drawn) > 5000
+        # Standard errors of mean and standard deviation of n normal draws.
+        assert drawn.mean() == pytest.approx(0, abs=4 / np.sqrt(len(drawn)))
+        assert drawn.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(drawn)))
+    assert (sweep.first.power[np.isinf(sweep.first.range_m)] == 0).all()
+    with pytest.raises(ValueError, match="leaf_spread must be 0 or greater, got -1"):
+        SurfaceTexture(leaf_spread=-1)

@@ -41,6 +41,8 @@ def command() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def one_line(values: dict[str, Any]) -> str:
-    """Names and values for a line of text."""
+def one_line(values: str | dict[str, Any]) -> str:
+    """A text, or names and values, for a line of text."""
+    if isinstance(values, str):
+        return values
     return ", ".join(f"{name} {value}" for name, value in values.items())

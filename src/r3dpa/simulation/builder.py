@@ -132,17 +132,15 @@ class Builder:
         self,
         along: tuple[float, float],
         across: tuple[float, float],
-        height_m: float,
-        cross: float,
         semantic: Semantic,
         material: Material,
         reflectivity: float,
+        sunk_m: float = 0.0,
     ) -> None:
         """Add a piece of ground between two distances along the chord and two lateral ones.
 
-        Its top lies ``height_m`` above the section's plane in its middle and rises by ``cross``
-        to the left, beyond the slope of the plane. At the ends of the block it reaches over the
-        wedge that the bend of the street opens.
+        It follows the surface of the street in its middle, ``sunk_m`` below it. At the ends of the
+        block it reaches over the wedge that the bend of the street opens.
         """
         first, last = along
         widest = max(map(abs, across))
@@ -150,17 +148,19 @@ class Builder:
             first -= widest * abs(self.section.corner_before)
         if last == BLOCK_M:
             last += widest * abs(self.section.corner_after)
-        x, y, z = self.section.on_chord((first + last) / 2, sum(across) / 2)
+        lateral = sum(across) / 2
+        x, y, z = self.section.on_chord((first + last) / 2, lateral)
+        z += self.course.surface_m(lateral) - sunk_m
         self.primitives.append(
             Primitive(
                 Shape.BOX,
-                (x, y, z + height_m - _SLAB_M / 2),
+                (x, y, z - _SLAB_M / 2),
                 ((last - first) / 2, abs(across[1] - across[0]) / 2, _SLAB_M / 2),
                 semantic,
                 reflectivity,
                 self.section.heading_rad,
                 material=material,
-                grade=(self.section.slope, self.section.cross + cross),
+                grade=(self.section.slope, self.section.cross + self.course.surface_cross(lateral)),
             )
         )
 
@@ -181,21 +181,24 @@ def build_ground(builder: Builder, draw: np.random.Generator, side: float, openi
     """Roadway, pavement or verge, and terrain; with the opening of a side street."""
     course, whole = builder.course, (0.0, BLOCK_M)
     edge_m, pavement_m = course.kerb(side).edge_m, course.kerb(side).pavement_m
-    middle = side * edge_m / 2
     asphalt = (Semantic.ROAD, Material.ASPHALT, course.road_reflectivity)
-    builder.slab(
-        whole,
-        (0.0, side * edge_m),
-        course.surface_m(middle),
-        course.surface_cross(middle),
-        *asphalt,
-    )
-    beyond = (side * edge_m, side * (edge_m + _TERRAIN_M))
-    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.12, 0.18))
+    builder.slab(whole, (0.0, side * edge_m), *asphalt)
+    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.13, 0.19))
     for _ in range(int(draw.poisson(0.7))):
         at = draw.uniform(0.5, edge_m) * side
         builder.puddle(draw, (builder.section.block + draw.random()) * BLOCK_M, at)
+    pavement = (side * edge_m, side * (edge_m + pavement_m))
+    beyond = (pavement[1], side * (edge_m + _TERRAIN_M))
+    strips = (pavement, beyond) if pavement_m else (beyond,)
     if opening:
         half_m = draw.uniform(2.8, 4.2)
         near, far = (0.0, BLOCK_M / 2 - half_m), (BLOCK_M / 2 + half_m, BLOCK_M)
-        
+        for strip in strips:
+            builder.slab((near[1], far[0]), strip, *asphalt, course.kerb_m)
+            builder.slab(near, strip, *paving)
+            builder.slab(far, strip, *paving)
+        return
+    if pavement_m:
+        builder.slab(whole, pavement, *paving)
+    soil = (Semantic.TERRAIN, Material.SOIL, draw.uniform(0.15, 0.22))
+    builder.slab(whole, beyond, *soil)

@@ -20,7 +20,7 @@ SCAN_PERIOD_S = 0.1
 _CAMBER = 0.02
 _GUTTER_M = (0.5, 1.3)
 _PARKING_M = 2.1
-_RISE = (-0.01, 0.06)
+_RISE = (-0.01, 0.08)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32
@@ -52,10 +52,10 @@ CHARACTERS = (
     Character(
         lanes=((1, 1), (1, 1), (1, 0)),
         districts=(0.75, 0.1, 0.1, 0.05),
-        parked=(0.3, 0.65),
+        parked=(0.35, 0.75),
         parking=0.8,
         pavement=1.0,
-        trees=(0.2, 0.8),
+        trees=(0.15, 0.65),
         car_gap_m=(40, 90),
         people_gap_m=(50, 110),
         crossing_every=(3, 6),
@@ -64,10 +64,10 @@ CHARACTERS = (
     Character(
         lanes=((1, 1), (1, 0)),
         districts=(0.1, 0.75, 0.1, 0.05),
-        parked=(0.3, 0.7),
+        parked=(0.35, 0.75),
         parking=0.75,
         pavement=0.95,
-        trees=(0.2, 0.8),
+        trees=(0.15, 0.65),
         car_gap_m=(60, 140),
         people_gap_m=(60, 160),
         crossing_every=(4, 8),
@@ -76,10 +76,10 @@ CHARACTERS = (
     Character(
         lanes=((1, 1),),
         districts=(0.05, 0.2, 0.65, 0.1),
-        parked=(0.3, 0.6),
+        parked=(0.3, 0.7),
         parking=0.4,
         pavement=0.6,
-        trees=(0.2, 0.8),
+        trees=(0.15, 0.65),
         car_gap_m=(60, 140),
         people_gap_m=(80, 200),
         crossing_every=(6, 10),
@@ -88,10 +88,10 @@ CHARACTERS = (
     Character(
         lanes=((2, 2), (2, 1), (2, 2)),
         districts=(0.25, 0.15, 0.4, 0.2),
-        parked=(0.3, 0.6),
+        parked=(0.3, 0.7),
         parking=0.5,
         pavement=0.8,
-        trees=(0.2, 0.8),
+        trees=(0.15, 0.65),
         car_gap_m=(40, 70),
         people_gap_m=(60, 160),
         crossing_every=(5, 9),
@@ -291,7 +291,7 @@ def course_of(seed: int, drive: int) -> Course:
         kerbs=(kerbs[0], kerbs[1]),
         kerb_m=draw.uniform(0.08, 0.15),
         crossing_every=int(draw.integers(*character.crossing_every, endpoint=True)),
-        road_reflectivity=draw.uniform(0.12, 0.2),
+        road_reflectivity=draw.uniform(0.13, 0.19),
         mount_pitch_rad=draw.normal(0.009, 0.003),
         mount_roll_rad=draw.normal(0.0, 0.004),
         step_m=draw.uniform(1.12, 1.28),

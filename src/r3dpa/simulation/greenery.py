@@ -13,7 +13,7 @@ from r3dpa.simulation.builder import FOOTING_M, Builder
 from r3dpa.simulation.course import BLOCK_M
 from r3dpa.simulation.scene import Material, Primitive, Semantic, Shape
 
-_LEAVES = 0.2
+_LEAVES = 0.17
 # Chance of a hit per metre of a crown: half the area of its leaves per volume, and more, as a beam
 # of some centimetres seldom finds a gap.
 _CROWN_PER_M = (0.8, 2.5)
@@ -31,7 +31,7 @@ def tree(builder: Builder, draw: np.random.Generator, s: float, lateral: float, 
         Semantic.VEGETATION, Material.WOOD, 0.15, instance, -FOOTING_M,
     )  # fmt: skip
     extinction = draw.uniform(*_CROWN_PER_M)
-    for crown in range(int(draw.choice([1, 2, 3, 4], p=[0.5, 0.3, 0.15, 0.05]))):
+    for crown in range(int(draw.choice([1, 2, 3, 4], p=[0.6, 0.27, 0.1, 0.03]))):
         ds, dl, dz = draw.normal(0.0, 0.22 * crown_m, 3) * (crown > 0)
         scale = 1.0 if crown == 0 else draw.uniform(0.6, 0.9)
         size = (crown_m * scale, crown_m * scale * draw.uniform(0.8, 1.2), tall_m * scale)
@@ -66,13 +66,16 @@ def wood(builder: Builder, draw: np.random.Generator, s: float, lateral: float) 
 def grass(builder: Builder, draw: np.random.Generator, side: float, edge_m: float) -> None:
     """A meadow: a thin layer of blades over the terrain."""
     course, section, deep_m = builder.course, builder.section, draw.uniform(0.15, 0.4)
-    x, y, z = section.on_chord(BLOCK_M / 2, side * (edge_m + 10.5))
-    z += course.surface_m(side * (edge_m + 1))
+    extinction = draw.uniform(1.5, 4.0)
+    lateral = side * (edge_m + 10.5)
+    x, y, z = section.on_chord(BLOCK_M / 2, lateral)
+    z += course.surface_m(lateral)
     builder.primitives.append(
         Primitive(
             Shape.BOX, (x, y, z + deep_m / 2), (BLOCK_M / 2, 9.0, deep_m / 2), Semantic.TERRAIN,
             _LEAVES, section.heading_rad, material=Material.FOLIAGE,
-            grade=(section.slope, section.cross), extinction_per_m=draw.uniform(1.5, 4.0),
+            grade=(section.slope, section.cross + course.surface_cross(lateral)),
+            extinction_per_m=extinction,
         )
     )  # fmt: skip
 

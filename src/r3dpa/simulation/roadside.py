@@ -14,7 +14,7 @@ from r3dpa.simulation.builder import FOOTING_M, Builder
 from r3dpa.simulation.course import BLOCK_M
 from r3dpa.simulation.greenery import bush, grass, row, tree, wood
 from r3dpa.simulation.scene import Material, Semantic, Shape
-from r3dpa.simulation.vehicles import DIRT, bicycle, parked_vehicle, person
+from r3dpa.simulation.vehicles import DIRT, bicycle, coat, parked_vehicle, person
 
 
 def _building(
@@ -25,14 +25,14 @@ def _building(
     side: float,
     size: tuple[float, float, float],
 ) -> None:
-    """A building whose front stands ``front_m`` from the axis, with an oriel and windows.
+    """A building whose front stands ``front_m`` from the axis, with bay, door, pipe and windows.
 
     Windows only on the ground floor: the highest beam rises by less than 2 degrees. A pane stands
     before its place in the wall, sometimes, as many are covered or dirty.
     """
     instance = builder.new_instance()
     brick = draw.random() < 0.25
-    reflectivity = draw.uniform(0.1, 0.16) if brick else draw.uniform(0.1, 0.22)
+    reflectivity = draw.uniform(0.11, 0.17) if brick else draw.uniform(0.13, 0.22)
     look = (Semantic.BUILDING, Material.BRICK if brick else Material.CONCRETE, reflectivity)
     width, depth, height = size
     builder.solid(
@@ -43,8 +43,17 @@ def _building(
         at = (centre_s + draw.uniform(-0.4, 0.4) * width, side * (front_m + 0.1))
         bay = (draw.uniform(1.2, 3.0), draw.uniform(0.5, 1.0), draw.uniform(2.6, 5.0))
         builder.solid(Shape.BOX, at, bay, *look, instance, -0.2)
+    if draw.random() < 0.6:
+        at = (centre_s + draw.uniform(-0.35, 0.35) * width, side * (front_m - 0.03))
+        door = (Semantic.BUILDING, Material.PAINT, coat(draw), instance)
+        size = (draw.uniform(1.0, 3.2), 0.1, draw.uniform(2.0, 2.6))
+        builder.solid(Shape.BOX, at, size, *door, detail=True)
+    if draw.random() < 0.6:
+        at = (centre_s + draw.choice((-0.5, 0.5)) * (width - 0.4), side * (front_m - 0.06))
+        pipe = (Semantic.BUILDING, Material.CONCRETE, 0.15, instance, -FOOTING_M)
+        builder.solid(Shape.CYLINDER, at, (0.1, 0.1, 5.0), *pipe, detail=True)
     places = int(width / 3)
-    for place in np.flatnonzero(draw.random(places) < 0.15):
+    for place in np.flatnonzero(draw.random(places) < 0.3):
         at = (centre_s + width * ((place + 0.5) / places - 0.5), side * (front_m - 0.03))
         pane = (draw.uniform(1.0, 1.9), 0.02, draw.uniform(1.1, 1.6))
         glass = (Semantic.BUILDING, Material.GLASS, DIRT)
@@ -60,7 +69,7 @@ def _behind(
         wood(builder, draw, s, lateral)
     else:
         size = (draw.uniform(10, 20), 8.0, draw.uniform(5, 10) + FOOTING_M)
-        look = (Semantic.BUILDING, Material.CONCRETE, draw.uniform(0.1, 0.2))
+        look = (Semantic.BUILDING, Material.CONCRETE, draw.uniform(0.13, 0.22))
         builder.solid(Shape.BOX, (s, lateral), size, *look, builder.new_instance(), -FOOTING_M)
 
 

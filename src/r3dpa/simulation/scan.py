@@ -21,7 +21,7 @@ from r3dpa.simulation.sweep import Echoes, Origin, Sweep
 _SECOND_RETURN_M = 1.0
 # Powers, in units of the weakest that is detected, below which the intensity is 0 and from which on
 # it is not damped.
-_ZERO_INTENSITY, _FULL_INTENSITY = 7.0, 16.0
+_ZERO_INTENSITY, _FULL_INTENSITY = 6.0, 13.0
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def calibrated_intensity(
     are reported with 0::
 
         intensity = sqrt(power * range^2) * clip(ln(power / a) / ln(b / a), 0, 1)
-        a = 7 min_power        b = 16 min_power
+        a = 6 min_power        b = 13 min_power
 
     Source: fitted to the intensities of KITTI's scans by range and incidence.
 

@@ -22,7 +22,7 @@ from r3dpa.simulation.weather import WeatherPrior
 # returns of real scans.
 _BLOCKS_BEHIND, _BLOCKS_AHEAD = 3, 3
 # Details (licence plates, seats, panes) exist up to here.
-_DETAIL_M = 30.0
+_DETAIL_M = 25.0
 # One character of the surroundings (town, houses, ...) per side lasts this many blocks.
 _BLOCKS_PER_DISTRICT = 6
 # Weather lasts this many scans.

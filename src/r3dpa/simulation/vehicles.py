@@ -11,8 +11,8 @@ from r3dpa.simulation.scene import Material, Primitive, Semantic, Shape
 
 _PLATE_M = (0.02, 0.52, 0.12)
 # What is left of a pane or a mirror after all that goes through or away: dirt.
-DIRT = 0.02
-_DARK_PAINT = (0.001, 0.03)
+DIRT = 0.0015
+_DARK, _SEATS = (0.0007, 0.02), (0.0004, 0.006)
 
 
 class Part(NamedTuple):
@@ -50,14 +50,14 @@ def _plate(x: float, z: float, semantic: Semantic) -> Part:
     return Part((x, 0, z), _PLATE_M, semantic, Material.RETROREFLECTOR, 0.9, detail=True)
 
 
-def _paint(draw: np.random.Generator) -> float:
+def coat(draw: np.random.Generator) -> float:
     """Reflectivity of a coat of paint.
 
     Under its clear coat a dark car sends hardly anything back to where it came from: at 5 m it
     has an intensity of 0, at 15 m it is lost.
     """
-    if draw.random() < 0.4:
-        return float(np.exp(draw.uniform(*np.log(_DARK_PAINT))))
+    if draw.random() < 0.45:
+        return float(np.exp(draw.uniform(*np.log(_DARK))))
     return draw.uniform(0.06, 0.25)
 
 
@@ -67,13 +67,16 @@ def _cabin(
     size: tuple[float, float, float],
     roof: Part,
 ) -> list[Part]:
-    """A band of windows with seats behind it and a roof above."""
-    seats_m = (0.7 * size[0], 0.8 * size[1], 0.8 * size[2])
-    seats_at = (centre[0], centre[1], centre[2] - 0.1 * size[2])
-    semantic = roof.semantic
+    """A band of windows with seats behind it and a roof above.
+
+    Hardly anything comes back from inside: panes of vehicles absorb, seats are dark.
+    """
+    seats_m = (0.9 * size[0], 0.9 * size[1], 0.95 * size[2])
+    seats_at = (centre[0], centre[1], centre[2] - 0.025 * size[2])
+    semantic, cloth = roof.semantic, float(np.exp(draw.uniform(*np.log(_SEATS))))
     return [
         Part(centre, size, semantic, Material.GLASS, DIRT),
-        Part(seats_at, seats_m, semantic, Material.CLOTH, draw.uniform(0.1, 0.2), detail=True),
+        Part(seats_at, seats_m, semantic, Material.CLOTH, cloth, detail=True),
         roof,
     ]
 
@@ -84,7 +87,7 @@ def car(draw: np.random.Generator) -> Body:
     floor_m, body_m, cabin_m = 0.2, draw.uniform(0.6, 0.72), draw.uniform(0.44, 0.56)
     cabin_long = length * draw.uniform(0.45, 0.68)
     cabin_at = -0.5 * (length - cabin_long) * draw.uniform(0.3, 0.95)
-    top_m, paint = floor_m + body_m, _paint(draw)
+    top_m, paint = floor_m + body_m, coat(draw)
     of_car = partial(
         Part, semantic=Semantic.CAR, material=Material.PAINT, reflectivity=paint, shape=Shape.BOX
     )
@@ -106,7 +109,7 @@ def car(draw: np.random.Generator) -> Body:
 def van(draw: np.random.Generator) -> Body:
     """A delivery van: box, bonnet, windscreen and plates."""
     length, width, height = draw.uniform(4.8, 6.4), draw.uniform(1.9, 2.05), draw.uniform(1.8, 2.5)
-    paint, bonnet_m = _paint(draw), 0.9
+    paint, bonnet_m = coat(draw), 0.9
     side = Part(
         (-bonnet_m / 2, 0, 0.25 + height / 2),
         (length - bonnet_m, width, height),
@@ -144,7 +147,7 @@ def truck(draw: np.random.Generator) -> Body:
         (cab_m, width, 2.5),
         Semantic.TRUCK,
         Material.PAINT,
-        _paint(draw),
+        coat(draw),
     )
     screen = Part(
         (front_m + 0.03, 0, 2.2), (0.03, 0.88 * width, 0.9), Semantic.TRUCK, Material.GLASS, DIRT

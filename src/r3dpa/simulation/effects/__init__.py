@@ -19,7 +19,11 @@ from r3dpa.simulation.effects.optics import Glass, PolishedMetal, WetGround
 from r3dpa.simulation.effects.precipitation import Rain, Snow
 from r3dpa.simulation.effects.retro import Blooming, RetroReflection
 from r3dpa.simulation.effects.sun import SunGlare
-from r3dpa.simulation.effects.surface import DiffuseReflection, surface_power
+from r3dpa.simulation.effects.surface import (
+    DiffuseReflection,
+    SurfaceTexture,
+    surface_power,
+)
 
 #: Every effect, in the order in which they are applied.
 EFFECTS: tuple[Effect, ...] = (
@@ -29,6 +33,7 @@ EFFECTS: tuple[Effect, ...] = (
     FoliageOcclusion(),
     EgoOcclusion(),
     DiffuseReflection(),
+    SurfaceTexture(),
     WetGround(),
     RetroReflection(),
     Glass(),
@@ -71,6 +76,7 @@ __all__ = [
     "Spray",
     "Stage",
     "SunGlare",
+    "SurfaceTexture",
     "Switch",
     "WetGround",
     "surface_power",

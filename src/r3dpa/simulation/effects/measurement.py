@@ -19,6 +19,10 @@ _MAX_SIGMA_M = 0.1
 class DualReturn:
     """The instrument reports the two strongest echoes of a shot, if more than 1 m apart.
 
+    ::
+
+        second = the strongest echo but the first, where |range_second - range_first| > 1 m
+
     The second echoes are those that other effects find on the way: behind a pane, beside an edge,
     behind a drop. An instrument in the mode "strongest" does not report them.
     """
@@ -77,7 +81,7 @@ class LaserCalibration:
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """Ranges scatter, weak echoes more than strong ones, and come in steps.
+    """Ranges scatter, weak echoes more than strong ones, come in steps, and are never negative.
 
     ::
 
@@ -108,7 +112,7 @@ class RangeNoise:
             power = np.maximum(echoes.power[rays], np.finfo(np.float32).tiny)
             variance = np.float32(sensor.range_sigma_m**2) + weak / power
             sigma = np.sqrt(variance.clip(max=_MAX_SIGMA_M**2))
-            range_m = echoes.range_m[rays] + sigma * drawn
+            range_m = (echoes.range_m[rays] + sigma * drawn).clip(min=0)
             if sensor.range_step_m:
                 step = np.float32(sensor.range_step_m)
                 range_m = np.round(range_m / step) * step

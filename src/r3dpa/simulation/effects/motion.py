@@ -124,8 +124,8 @@ class FoliageOcclusion:
         return f"{count} crowns, bushes and hedges" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those whose window meets foliage."""
-        return _rays_near(sweep, sweep.solids.extinction > 0, None)
+        """Those whose window meets foliage, where it is when they are fired."""
+        return _rays_near(sweep, sweep.solids.extinction > 0, sweep.actor_time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Draw for the ray cast how deep each ray gets."""
@@ -134,7 +134,12 @@ class FoliageOcclusion:
 
 @dataclass(frozen=True)
 class EgoOcclusion:
-    """The recording car hides what lies behind its roof; the mask is the same in every scan."""
+    """The recording car hides what lies behind its roof; the mask is the same in every scan.
+
+    ::
+
+        range -> min(range, range to the car)
+    """
 
     stage: ClassVar[Stage] = Stage.SURFACE
 

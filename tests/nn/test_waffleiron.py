@@ -1,0 +1,249 @@
+import pytest
+import torch
+
+from r3dpa.nn.backbones import ScaLR, ScanGrid, WaffleIron, collate_scans, prepare_scan
+from r3dpa.nn.backbones.scalr import _official_name
+from r3dpa.nn.backbones.waffleiron import SpatialMixing
+
+GRID = ScanGrid(
+    minimum_m=(-8.0, -8.0, -2.0), maximum_m=(8.0, 8.0, 2.0), cell_m=1.0, num_neighbors=4
+)
+INTENSITY, X, Y, Z, RADIUS = range(5)
+
+
+def cloud(num_points, seed=0):
+    """Random points, most of them in the field of view of GRID."""
+    generator = torch.Generator().manual_seed(seed)
+    xyz = torch.randn(num_points, 3, generator=generator) * torch.tensor([4.0, 4.0, 1.0])
+    return torch.cat([xyz, torch.rand(num_points, 1, generator=generator)], dim=1)
+
+
+def prepare(points):
+    return prepare_scan(points.numpy(), GRID)
+
+
+@pytest.fixture
+def network():
+    """Small network with random norms and scales, so that no layer is close to nothing."""
+    torch.manual_seed(0)
+    network = WaffleIron(width=12, depth=4, cells=GRID.cells, head_dim=7)
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if "running_var" in name:
+                value.uniform_(0.5, 2.0)
+            elif name.endswith("scale") or "running_mean" in name or "norm" in name:
+                value.copy_(torch.randn(value.shape))
+    return network.eval()
+
+
+def test_voxel_keeps_its_first_point_and_the_border_is_left_out():
+    points = torch.tensor(
+        [
+            [0.02, 0.0, 0.0, 0.5],
+            [-1.0, 0.0, 0.0, 0.1],  # the minimum, from which voxels are counted
+            [0.01, 0.0, 0.0, 0.6],  # in the voxel of point 0, which came first
+            [7.99995, 0.0, 0.0, 0.2],  # nearer to the border than 0.1 mm
+            [9.0, 0.0, 0.0, 0.3],
+            [-1.0, 0.5, 0.0, 0.4],
+        ]
+    )
+    scan = prepare(points)
+    assert scan.kept.tolist() == [1, 5, 0]
+    # The dropped points have the nearest kept one.
+    assert scan.upsample.tolist() == [2, 0, 2, 2, 2, 1]
+    features = scan.features[1]
+    assert features[INTENSITY].item() == pytest.approx((0.4 - 0.294584) / 0.147190, rel=1e-5)
+    assert features[[X, Y, Z]].tolist() == [-1.0, 0.5, 0.0]
+    assert features[RADIUS].item() == pytest.approx(1.25**0.5)
+    # Row and column, counted from (-8, -8, -2) in metres: x and y of 16, z of 4 cells.
+    assert scan.cells[:, 1].tolist() == [7 * 16 + 8, 7 * 4 + 2, 8 * 4 + 2]
+    # Three points: two neighbours each, the farthest repeated.
+    assert scan.neighbors.tolist() == [[1, 2, 2, 2], [0, 2, 2, 2], [0, 1, 1, 1]]
+
+
+def test_neighbours_agree_with_all_distances():
+    scan = prepare(cloud(300))
+    xyz = scan.features[:, X:RADIUS].double()
+    distances = torch.cdist(xyz, xyz).fill_diagonal_(torch.inf)
+    assert torch.equal(scan.neighbors, distances.topk(4, largest=False).indices)
+
+
+def test_single_points_and_empty_scans(network):
+    point = torch.tensor([[1.0, 2.0, 0.5, 0.3]])
+    one = prepare(point)
+    assert one.neighbors.tolist() == [[0, 0, 0, 0]]
+    empty = prepare(cloud(0))
+    assert [len(empty.features), len(empty.upsample)] == [0, 0]
+    outside = prepare(cloud(5) + 20)
+    assert len(outside.features) == 0
+    assert outside.upsample.tolist() == [0] * 5  # M = 0: no point to take from
+    extractor = ScaLR(network, GRID)
+    assert extractor(cloud(0)).shape == (0, 12)
+    assert torch.equal(extractor(cloud(5) + 20), torch.zeros(5, 12))
+    assert extractor(point).norm().item() == pytest.approx(1)
+    # An empty scan changes nothing for the others of its batch.
+    other = prepare(cloud(50))
+    mixed = network(collate_scans([empty, other, one]))
+    torch.testing.assert_close(mixed[:-1], network(collate_scans([other])))
+    torch.testing.assert_close(mixed[-1:], network(collate_scans([one])))
+
+
+def test_refused_input(network):
+    points = cloud(3)
+    with pytest.raises(ValueError, match=r"must be \(P, 4\).*got \(3, 3\)"):
+        prepare(points[:, :3])
+    points[1, 3] = torch.nan
+    with pytest.raises(ValueError, match="1 of 3 points are NaN or infinite"):
+        prepare(points)
+    with pytest.raises(ValueError, match="at least one scan"):
+        collate_scans([])
+    with pytest.raises(ValueError, match=r"whole number of cells of 0\.3 m"):
+        ScanGrid(cell_m=0.3)
+    with pytest.raises(ValueError, match="width and depth must be positive, got 8 and 0"):
+        WaffleIron(width=8, depth=0)
+    with pytest.raises(ValueError, match=r"cells \(16, 16, 4\), but grid has \(256, 256, 32\)"):
+        ScaLR(network)
+
+
+def test_spatial_mixing_agrees_with_matrices(network):
+    """Means and copies as products with the N x cells matrix that the network does without."""
+    scans = [prepare(cloud(150, seed)) for seed in (0, 1)]
+    batch = collate_scans(scans)
+    starts = [0, len(scans[0].features), len(batch.features)]
+    tokens = torch.randn(len(batch.features), 12, generator=torch.Generator().manual_seed(2))
+    for plane, (rows, columns) in enumerate([(16, 16), (16, 4), (16, 4)]):
+        layer: SpatialMixing = network.spatial[plane]
+        actual = layer(tokens, network._planes(batch)[plane])
+        for i, scan in enumerate(scans):
+            own = tokens[starts[i] : starts[i + 1]]
+            member = torch.nn.functional.one_hot(scan.cells[plane], rows * columns).float()
+            assert member.sum(dim=0).max() > 1
+            means = torch.linalg.pinv(member) @ layer.norm(own)
+            image = layer.convs(means.T.reshape(1, 12, rows, columns))
+            expected = own + layer.scale * (member @ image.reshape(12, -1).T)
+            torch.testing.assert_close(
+                actual[starts[i] : starts[i + 1]], expected, atol=2e-5, rtol=1e-5
+            )
+
+
+@torch.no_grad()
+def test_scans_of_a_batch_do_not_meet(network):
+    scans = [prepare(cloud(count, count)) for count in (200, 90)]
+    together = network(collate_scans(scans)).split([len(scan.features) for scan in scans])
+    for scan, tokens in zip(scans, together, strict=True):
+        torch.testing.assert_close(tokens, network(collate_scans([scan])), atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_order_of_points_does_not_matter(network):
+    points = cloud(300)
+    extractor = ScaLR(network, GRID)
+    features = extractor(points)
+    # No two points share a voxel, otherwise the order decides which of them is kept.
+    assert (prepare(points).kept.numel()) == (points[:, :3].abs() < torch.tensor([8, 8, 2])).all(
+        dim=1
+    ).sum()
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(extractor(points[order]), features[order], atol=1e-5, rtol=1e-5)
+    assert features.std(dim=0).max() > 0.1  # and points differ
+
+
+def test_gradients_reach_every_parameter_and_statistics_follow_real_points(network):
+    network.train()
+    batch = collate_scans([prepare(cloud(100, 0)), prepare(cloud(30, 1))])
+    mean = network.embedding.norm.running_mean.clone()
+    network.head(network(batch)).square().mean().backward()
+    without = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not without
+    assert all(torch.isfinite(p.grad).all() for p in network.parameters())
+    torch.testing.assert_close(
+        network.embedding.norm.running_mean, 0.9 * mean + 0.1 * batch.features.mean(dim=0)
+    )
+
+
+@torch.no_grad()
+def test_neighbours_one_by_one_equal_all_at_once(network):
+    """Evaluation takes the maximum over neighbours in a loop, training in one step."""
+    scan = prepare(cloud(60))
+    expected = network.embedding(scan.features, scan.neighbors)
+    for norm in (module for module in network.modules() if hasattr(module, "running_mean")):
+        norm.eval()
+    network.embedding.training = True  # the norms stay in evaluation mode
+    torch.testing.assert_close(network.embedding(scan.features, scan.neighbors), expected)
+
+
+@torch.no_grad()
+def test_bfloat16_keeps_coordinates_and_sums_in_float32(network):
+    """Points 12 cm apart at 60 m share their coordinates in bfloat16 (spacing 25 cm)."""
+    far = torch.tensor([[60.0, 0.0, 0.0, 0.3, 60.0], [60.12, 0.0, 0.0, 0.3, 60.12]])
+    assert far.bfloat16().unique(dim=0).shape[0] == 1
+    batch = collate_scans([prepare(cloud(200))])
+    tokens = network(batch)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = network(batch)
+    assert rounded.dtype == torch.float32
+    assert 0 < (rounded - tokens).norm() / tokens.norm() < 0.01
+    network.embedding.neighbor.weight.zero_()  # of the two parts that of the point itself
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        near, there = network.embedding(far, torch.tensor([[1], [0]]))
+    near_exact, there_exact = network.embedding(far, torch.tensor([[1], [0]]))
+    torch.testing.assert_close(there - near, there_exact - near_exact)
+    assert (there - near).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_compiles_as_one_graph(network):
+    batch = collate_scans([prepare(cloud(80))])
+    compiled = torch.compile(network, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(batch), network(batch))
+
+
+def official_file(network, path, prefix="module.", **changes):
+    """The network as the distillation saves it; a change of None leaves the weight out."""
+    weights = {_official_name(key): value for key, value in network.state_dict().items()} | changes
+    weights = {prefix + key: value for key, value in weights.items() if value is not None}
+    torch.save({"model_point": weights, "epoch": 1, "optim": {"state": {}}}, path)
+    return path
+
+
+def test_checkpoint_round_trip(tmp_path):
+    network = WaffleIron(width=4, depth=3, head_dim=5)
+    scalr = ScaLR.from_checkpoint(official_file(network, tmp_path / "ckpt.pth"))
+    assert (scalr.dim, scalr.network.depth, scalr.name) == (4, 3, "scalr")
+    for key, value in scalr.network.state_dict().items():
+        assert torch.equal(value, network.state_dict()[key]), key
+    assert not any(p.requires_grad for p in scalr.parameters())
+    assert not scalr.train().network.embedding.norm.training
+    # The same weights are the same features, others are not.
+    again = ScaLR.from_checkpoint(official_file(network, tmp_path / "again.pth", prefix=""))
+    assert again.settings == scalr.settings
+    assert ScaLR(WaffleIron(width=4, depth=3)).settings != scalr.settings
+    points = cloud(20)
+    assert scalr.point_features(points).dtype == torch.float32
+    torch.testing.assert_close(scalr(points).norm(dim=1), torch.ones(20))
+
+
+def test_refused_checkpoints(tmp_path):
+    network = WaffleIron(width=4, depth=2, head_dim=5)
+    path = tmp_path / "ckpt.pth"
+
+    def refused(match):
+        with pytest.raises(ValueError, match=match) as error:
+            ScaLR.from_checkpoint(path)
+        assert str(path) in str(error.value)
+
+    refused("no such file; give ckpt_last.pth")
+    path.write_bytes(b"PK no checkpoint")
+    refused("is damaged")
+    torch.save({"model_point": torch.nn.Linear(1, 1)}, path)
+    refused("holds more than tensors and plain values")
+    torch.save({"state_dict": {}}, path)
+    refused("neither model_points nor model_point")
+    official_file(network, path, **{"classif.weight": None})
+    refused("holds no WaffleIron with a head")
+    official_file(network, path, **{"embed.final.bias": None, "extra": torch.zeros(1)})
+    refused(r"1 missing \['embed.final.bias'\], 1 unexpected \['extra'\]")
+    official_file(network, path, **{"embed.final.weight": torch.zeros(4, 8, 2)})
+    refused(r"embed.final.weight has shape \(4, 8, 2\), but \(4, 8\) is expected")
+    official_file(network, path, **{"waffleiron.spatial_mix.1.scale.weight": None})
+    refused("1 missing")

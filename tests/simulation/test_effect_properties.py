@@ -1,0 +1,505 @@
+"""What holds for every effect: properties over random scenes, and limits.
+
+That the bytes do not depend on the number of worker processes is shown on whole data sets, see
+``test_same_seed_same_bytes_for_any_number_of_workers``.
+"""
+
+import copy
+import inspect
+import math
+import re
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from random_scenes import random_case
+
+from r3dpa.simulation import (
+    EFFECTS,
+    EgoMotion,
+    Material,
+    Primitive,
+    Puddle,
+    Scene,
+    Semantic,
+    Shape,
+    Sweep,
+    Weather,
+    effect_name,
+    hdl64e,
+    scan,
+    simulate_scan,
+)
+from r3dpa.simulation.effects import (
+    Blooming,
+    Draws,
+    PolishedMetal,
+    RetroReflection,
+    Spray,
+    Stage,
+    SunGlare,
+    SurfaceTexture,
+)
+from r3dpa.simulation.sweep import Echoes
+
+# No effect warns, whatever the scene.
+pytestmark = pytest.mark.filterwarnings("error")
+
+SEEDS = range(240)
+NAMES = [effect_name(effect) for effect in EFFECTS]
+each_scene = pytest.mark.parametrize("seed", SEEDS)
+each_effect = pytest.mark.parametrize("name", NAMES)
+
+
+def box(centre, half_size, **values):
+    return Primitive(
+        Shape.BOX, centre, half_size, **{"semantic": Semantic.WALL, "reflectivity": 0.4} | values
+    )
+
+
+WALL = box((30.5, 0.0, 2.0), (0.5, 40.0, 6.0), material=Material.BRICK)
+POLE = Primitive(Shape.CYLINDER, (9.0, -2.0, 2.0), (0.05, 0.05, 4.0), Semantic.POLE, 0.5)
+CAR = box(
+    (12.0, 3.0, 0.95), (2.0, 0.9, 0.75), instance=7, material=Material.PAINT, velocity_m_s=(20.0, 0)
+)
+CROWN = Primitive(
+    Shape.ELLIPSOID, (6.0, 8.0, 2.0), (2.0, 2.0, 2.0), Semantic.VEGETATION, 0.5,
+    material=Material.FOLIAGE, extinction_per_m=0.8,
+)  # fmt: skip
+PANE = box((8.0, -6.0, 1.5), (2.0, 0.02, 1.5), reflectivity=0.02, material=Material.GLASS)
+METAL = box((7.0, 2.5, 0.8), (0.1, 1.5, 0.8), reflectivity=0.2, material=Material.POLISHED_METAL)
+SHEET = box((14.0, -3.0, 1.5), (0.02, 1.0, 1.0), material=Material.RETROREFLECTOR)
+ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2))
+PUDDLES = (Puddle(15.0, 2.0, 4.0), Puddle(0.0, 4.0, 1.0))
+SUNNY = Weather(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=150.0)
+FOUL = Weather(visibility_m=80.0, rain_mm_h=30.0, snow_mm_h=2.0, water_film_mm=1.0)
+# Between them these two call for every effect.
+BUSY_SCENES = [
+    Scene(
+        (WALL, POLE, CAR, CROWN, PANE, METAL, SHEET),
+        motion=EgoMotion(12.0, 0.3),
+        weather=weather,
+        puddles=PUDDLES,
+        ego_body=(ROOF,),
+    )
+    for weather in (SUNNY, FOUL)
+]
+SENSOR = hdl64e(shots=1080)
+SENSORS = [replace(SENSOR, return_mode="dual"), SENSOR]
+
+
+def scanned(seed, switches=None):
+    return simulate_scan(*random_case(seed), ("property", seed), switches)
+
+
+@cache
+def auto(seed):
+    return scanned(seed)
+
+
+def differs(one, other):
+    columns = ("points", "labels", "origins")
+    return any(getattr(one, c).tobytes() != getattr(other, c).tobytes() for c in columns)
+
+
+def test_random_scenes_call_for_every_effect_and_do_without_it():
+    touched, idle = dict.fromkeys(NAMES, 0), dict.fromkeys(NAMES, 0)
+    for seed in SEEDS:
+        for record in auto(seed).effects:
+            touched[record.name] += record.rays > 0
+            idle[record.name] += record.status == "not_called"
+    assert min(touched.values()) >= 5, touched
+    base = [name for name, effect in zip(NAMES, EFFECTS, strict=True) if is_base(effect)]
+    assert [name for name, count in idle.items() if count < 30] == base
+
+
+def is_base(effect):
+    return effect.called_by(Scene(), SENSOR) == "base"
+
+
+class TestSoundness:
+    @each_scene
+    def test_what_is_not_called_for_changes_nothing_when_switched_on(self, seed):
+        plain = auto(seed)
+        idle = [record.name for record in plain.effects if record.status == "not_called"]
+        assert np.isfinite(plain.points).all()
+        together = differs(plain, scanned(seed, dict.fromkeys(idle, "on")))
+        alone = idle if together or seed % 4 == 0 else []
+        assert [name for name in alone if differs(plain, scanned(seed, {name: "on"}))] == []
+        assert not together
+
+    @pytest.mark.parametrize("number", [0, 1])
+    def test_switching_on_what_is_called_for_changes_nothing(self, number):
+        case = BUSY_SCENES[number], SENSORS[number], ("busy", number)
+        assert not differs(simulate_scan(*case), simulate_scan(*case, dict.fromkeys(NAMES, "on")))
+
+
+@each_effect
+def test_necessity(name):
+    """A new effect that neither scene calls for fails here: add what it is for to them."""
+    changed = [
+        differs(
+            simulate_scan(scene, sensor, ("busy",)),
+            simulate_scan(scene, sensor, ("busy",), {name: "off"}),
+        )
+        for scene, sensor in zip(BUSY_SCENES, SENSORS, strict=True)
+    ]
+    assert any(changed)
+
+
+def arrays_of(sweep):
+    """Copies of all arrays of a sweep, by name."""
+    found = {name: value for name, value in vars(sweep).items() if isinstance(value, np.ndarray)}
+    for which in ("first", "second"):
+        echoes = getattr(sweep, which)
+        if echoes is not None:
+            found |= {f"{which}.{f.name}": getattr(echoes, f.name) for f in fields(Echoes)}
+    return {name: array.copy() for name, array in found.items()}
+
+
+def cast_arrays_of(sweep):
+    """What the sweep's arrays would be after the cast."""
+    tried = copy.copy(sweep)
+    tried.first = Echoes.none(sweep.num_rays)
+    tried.cast()
+    return {f"cast {name}": array for name, array in arrays_of(tried).items()}
+
+
+def watched(effect, before, changed):
+    """``rays`` and ``apply`` of an effect that note which arrays change outside its rays."""
+    rays_of, apply = type(effect).rays, type(effect).apply
+
+    def state(sweep):
+        arrays = arrays_of(sweep) | {f"solids.{i}": a for i, a in enumerate(sweep.solids[:-1])}
+        return arrays | (cast_arrays_of(sweep) if effect.stage is Stage.RAYS else {})
+
+    def watched_rays(self, sweep):
+        before.clear()
+        before.update(state(sweep))
+        return rays_of(self, sweep)
+
+    def watched_apply(self, sweep, rays, draws):
+        apply(self, sweep, rays, draws)
+        outside = np.ones(sweep.num_rays, dtype=bool)
+        outside[rays] = False
+        if not isinstance(rays, slice):
+            assert rays.dtype == np.int64
+            assert (~outside).sum() == len(rays)
+        after = state(sweep)
+        for name, old in before.items():
+            untouched = (..., slice(None) if name.startswith("solids") else outside)
+            if old[untouched].tobytes() != after[name][untouched].tobytes():
+                changed.append((effect_name(self), name))
+        # Before the cast an effect may bring arrays of its own.
+        assert effect.stage is Stage.RAYS or before.keys() == after.keys()
+
+    return {"rays": watched_rays, "apply": watched_apply}
+
+
+@each_scene
+def test_locality(seed, monkeypatch):
+    """Outside the rays of an effect nothing changes, not even what the cast finds."""
+    changed = []
+    for effect in EFFECTS:
+        for method, watching in watched(effect, {}, changed).items():
+            monkeypatch.setattr(type(effect), method, watching)
+    watched_scan = scanned(seed)
+    assert changed == []
+    assert not differs(watched_scan, auto(seed))
+
+
+class TestDraws:
+    @pytest.mark.parametrize("seed", SEEDS[::4])
+    def test_same_key_same_bytes(self, seed):
+        """Whatever was scanned in between."""
+        auto(seed)
+        scanned(seed + 1)
+        assert not differs(scanned(seed), auto(seed))
+
+    @each_scene
+    def test_without_an_effect_the_others_draw_the_same(self, seed, monkeypatch):
+        """In the random scenes for one effect each, with points that stay finite without it."""
+        name = NAMES[seed % len(NAMES)]
+        case = *random_case(seed), ("property", seed)
+        log, _ = drawn(monkeypatch, case, {})
+        without, poorer = drawn(monkeypatch, case, {name: "off"})
+        assert different_draws(log, without) == []
+        assert np.isfinite(poorer.points).all()
+
+    @each_effect
+    def test_independence_of_every_pair(self, name, monkeypatch):
+        for number in range(2):
+            case = BUSY_SCENES[number], SENSORS[number], ("busy", number)
+            log, _ = drawn(monkeypatch, case, {})
+            without, _ = drawn(monkeypatch, case, {name: "off"})
+            assert name not in without
+            assert different_draws(log, without) == []
+
+    def test_every_effect_that_draws_does_so_in_the_busy_scenes(self, monkeypatch):
+        busy = [
+            drawn(monkeypatch, (scene, sensor, ("busy",)), {})[0]
+            for scene, sensor in zip(BUSY_SCENES, SENSORS, strict=True)
+        ]
+        drawing = {name for log in busy for name in log if len(log[name]) > 1}
+        for seed in SEEDS[:100]:
+            log, _ = drawn(monkeypatch, (*random_case(seed), ("property", seed)), {})
+            assert {name for name, calls in log.items() if len(calls) > 1} <= drawing
+        assert len(drawing) >= 9
+
+    def test_the_number_of_a_ray_does_not_depend_on_the_other_rays(self):
+        some = np.array([3, 90, 17])
+        for kind in ("uniform", "normal", "exponential"):
+            one, other = (getattr(Draws(100, "key", 1), kind) for _ in range(2))
+            assert one(some).tobytes() == other(slice(None))[some].tobytes()
+            assert one(some).tobytes() == other(np.arange(100))[some].tobytes()
+
+    def test_another_key_is_another_scan(self):
+        scans = [simulate_scan(BUSY_SCENES[1], SENSOR, ("busy", n)) for n in range(2)]
+        assert differs(*scans)
+
+
+def drawn(monkeypatch, case, switches):
+    """Key and random numbers of each effect, in the order of its calls; and the scan."""
+    log = {}
+
+    class Recorded(Draws):
+        def __init__(self, num_rays, *key):
+            super().__init__(num_rays, *key)
+            self.calls = log.setdefault(key[-1], [key])
+
+        def _record(self, draw, rays):
+            numbers = draw(slice(None))
+            self.calls.append(numbers.tobytes())
+            return numbers[rays]
+
+        def uniform(self, rays):
+            return self._record(super().uniform, rays)
+
+        def normal(self, rays):
+            return self._record(super().normal, rays)
+
+        def exponential(self, rays):
+            return self._record(super().exponential, rays)
+
+    with monkeypatch.context() as context:
+        context.setattr(scan, "Draws", Recorded)
+        return log, simulate_scan(*case, switches)
+
+
+def different_draws(log, other):
+    """Effects whose draws differ; how many they need may depend on the other effects."""
+    return [
+        name
+        for name in log.keys() & other.keys()
+        if any(one != two for one, two in zip(log[name], other[name], strict=False))
+    ]
+
+
+# Cases of each effect by a parameter x: at 1 it matters, as x falls it vanishes, at 0 it is gone.
+# A case is scene, sensor and an effect to be used instead of the one of its class, or None.
+LIMITS = {}
+
+
+def limit(case):
+    LIMITS[case.__name__] = case
+    return case
+
+
+@limit
+def dual_return(x):
+    """No parameter of its own: second echoes vanish with the width of the beam that finds them."""
+    return Scene((WALL, POLE, CAR)), replace(SENSORS[0], divergence_rad=0.01 * x), None
+
+
+@limit
+def rolling_shutter(x):
+    return Scene((WALL, CAR), motion=EgoMotion(15.0 * x, 0.8 * x)), SENSOR, None
+
+
+@limit
+def moving_actors(x):
+    return Scene((WALL, replace(CAR, velocity_m_s=(5.0 * x, -30.0 * x)))), SENSOR, None
+
+
+@limit
+def foliage_occlusion(x):
+    """As leaves grow dense the crown becomes a surface, its range; leaves have no incidence."""
+    crown = replace(CROWN, extinction_per_m=1 / x if x else 0.0)
+    return Scene((WALL, crown)), replace(SENSOR, min_power=1e-20, divergence_rad=0.0), None
+
+
+@limit
+def ego_occlusion(x):
+    roof = replace(ROOF, half_size=tuple(x * half for half in ROOF.half_size)) if x else None
+    return Scene((WALL,), ego_body=(roof,) if x else ()), SENSOR, None
+
+
+@limit
+def diffuse_reflection(x):
+    """Base: it cannot vanish, but where everything is detected it leaves the ranges alone."""
+    sensor = replace(SENSOR, min_power=1e-2 * x or 1e-30, divergence_rad=0.0)
+    return Scene((WALL, POLE)), sensor, None
+
+
+@limit
+def surface_texture(x):
+    return Scene((WALL, CROWN)), SENSOR, SurfaceTexture(0.36 * x, 0.86 * x)
+
+
+@limit
+def wet_ground(x):
+    return Scene((WALL,), weather=Weather(water_film_mm=x), puddles=PUDDLES), SENSOR, None
+
+
+@limit
+def retro_reflection(x):
+    return Scene((SHEET,)), SENSOR, RetroReflection(retroreflection=70 * x)
+
+
+@limit
+def glass(x):
+    """What a pane shows or mirrors is dark: one sees the pane, as without the effect."""
+    wall = replace(WALL, reflectivity=0.5 * x or 1e-6)
+    scene = Scene((wall, PANE), ground_reflectivity=0.5 * x or 1e-6)
+    return scene, replace(SENSOR, min_power=1e-20), None
+
+
+@limit
+def polished_metal(x):
+    return Scene((WALL, METAL, CAR)), SENSOR, PolishedMetal(reflectance=0.9 * x)
+
+
+@limit
+def mixed_pixels(x):
+    return Scene((WALL, POLE, CAR)), replace(SENSOR, divergence_rad=0.01 * x), None
+
+
+def only_weather(x, **values):
+    return Scene((WALL, CAR), weather=Weather(**values)), SENSOR, None
+
+
+@limit
+def fog(x):
+    return only_weather(x, visibility_m=40 / x if x else math.inf)
+
+
+@limit
+def rain(x):
+    return only_weather(x, rain_mm_h=50 * x)
+
+
+@limit
+def snow(x):
+    return only_weather(x, snow_mm_h=5 * x)
+
+
+@limit
+def spray(x):
+    scene = Scene((WALL, CAR), weather=Weather(water_film_mm=1.0))
+    return scene, SENSOR, Spray(max_extinction_per_m=0.2 * x)
+
+
+@limit
+def sun_glare(x):
+    return Scene((WALL,), weather=SUNNY), SENSOR, SunGlare(rise=3e3 * x, noise=x)
+
+
+@limit
+def blooming(x):
+    return Scene((SHEET,)), SENSOR, Blooming(halo_deg=1.0, spill=0.5 * x)
+
+
+@limit
+def soft_raydrop(x):
+    return Scene((WALL, CAR)), replace(SENSOR, threshold_spread=0.5 * x, min_power=1e-4), None
+
+
+@limit
+def detection_limit(x):
+    sensor = replace(SENSOR, min_power=1e-2 * x or 1e-30, min_range_m=5 * x, threshold_spread=0.0)
+    return Scene((WALL, POLE)), sensor, None
+
+
+@limit
+def range_noise(x):
+    sensor = replace(SENSOR, range_sigma_m=0.1 * x, weak_range_sigma_m=x, range_step_m=0.1 * x)
+    return Scene((WALL, CAR)), sensor, None
+
+
+@limit
+def laser_calibration(x):
+    lasers = SENSOR.lasers
+    bias = tuple(x * value for value in lasers.range_bias_m)
+    gain = tuple(value**x for value in lasers.intensity_gain)
+    sensor = replace(SENSOR, lasers=replace(lasers, range_bias_m=bias, intensity_gain=gain))
+    return Scene((WALL, CAR)), sensor, None
+
+
+# Where powers differ even in the limit, see there.
+RANGES_ALONE = ("foliage_occlusion", "diffuse_reflection")
+
+
+class TestLimit:
+    @each_effect
+    def test_an_effect_that_grows_weak_tends_to_none(self, name, monkeypatch):
+        shares = [self.changed_share(name, x, monkeypatch) for x in (1, 1e-3, 1e-6)]
+        assert shares[0] > 0.001
+        assert shares[0] >= shares[1] >= shares[2]
+        assert shares[2] < 0.02 * shares[0]
+
+    @each_effect
+    def test_an_effect_without_strength_changes_no_bit(self, name, monkeypatch):
+        with_it, without = self.scans(name, 0, monkeypatch, [])
+        if name == "diffuse_reflection":
+            assert with_it.points[:, :3].tobytes() == without.points[:, :3].tobytes()
+        else:
+            assert not differs(with_it, without)
+
+    def scans(self, name, x, monkeypatch, sweeps):
+        """The scan with the effect on and the one with it off; their sweeps go to ``sweeps``."""
+
+        class Kept(Sweep):
+            def __init__(self, scene, sensor):
+                super().__init__(scene, sensor)
+                sweeps.append(self)
+
+        scene, sensor, instead = LIMITS[name](x)
+        effects = [instead if type(effect) is type(instead) else effect for effect in EFFECTS]
+        with monkeypatch.context() as context:
+            context.setattr(scan, "EFFECTS", tuple(effects))
+            context.setattr(scan, "Sweep", Kept)
+            return [
+                simulate_scan(scene, sensor, ("limit",), {name: switch}) for switch in ("on", "off")
+            ]
+
+    def changed_share(self, name, x, monkeypatch):
+        """Share of the shots whose echoes change their range by 1 cm or their power by 2 %."""
+        sweeps = []
+        self.scans(name, x, monkeypatch, sweeps)
+        (range_m, power), (range_off_m, power_off) = map(recorded, sweeps)
+        same = np.isclose(range_m, range_off_m, rtol=0, atol=0.01)
+        if name not in RANGES_ALONE:
+            same &= np.isclose(power, power_off, rtol=0.02, atol=0)
+        return 1 - same.all(axis=0).mean()
+
+
+def recorded(sweep):
+    """Ranges and powers of both echoes, each ``(2, R)``, infinite where there is none."""
+    second = sweep.second or Echoes.none(sweep.num_rays)
+    range_m = np.stack([sweep.first.range_m, second.range_m])
+    power = np.stack([sweep.first.power, second.power])
+    return range_m, np.where(np.isfinite(range_m), power, np.inf)
+
+
+class TestTable:
+    def test_names_differ_and_stages_follow_one_another(self):
+        assert len(set(NAMES)) == len(NAMES)
+        assert [effect.stage for effect in EFFECTS] == sorted(effect.stage for effect in EFFECTS)
+        assert all(isinstance(effect.stage, Stage) for effect in EFFECTS)
+
+    @pytest.mark.parametrize("effect", EFFECTS, ids=NAMES)
+    def test_every_effect_states_its_equation(self, effect):
+        """A block of its own or of a class that it names, or a formula in the text."""
+        documents = [inspect.getdoc(kind) or "" for kind in type(effect).__mro__[:-1]]
+        assert any(re.search(r"::\n\n    |``[^`]* [-+*/=<] [^`]*``", text) for text in documents)
