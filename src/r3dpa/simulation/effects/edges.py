@@ -376,14 +376,18 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
             off = np.where(part > 0, part * (range_m - at_m), np.float32(0)).sum(axis=0) / power
         peak = _Peak(at_m + off, power, met[brightest, columns], (part > 0).sum(axis=0) > 1)
         wins, follows = power > first.power, power > second.power
-        second = _Peak(
-            *(
-                np.where(wins, old, np.where(follows, new, kept))
-                for old, new, kept in zip(first, peak, second, strict=True)
-            )
-        )
-        first = _Peak(*(np.where(wins, new, old) for new, old in zip(peak, first, strict=True)))
+        second = _either(wins, first, _either(follows, peak, second))
+        first = _either(wins, peak, first)
     return first, second
+
+
+def _either(chosen: NDArray[np.bool_], one: _Peak, other: _Peak) -> _Peak:
+    return _Peak(
+        np.where(chosen, one.range_m, other.range_m),
+        np.where(chosen, one.power, other.power),
+        np.where(chosen, one.target, other.target),
+        np.where(chosen, one.mixed, other.mixed),
+    )
 
 
 def _record(

@@ -1,0 +1,194 @@
+"""A scan made ready for WaffleIron: voxels, neighbours, cells, and the way back to all points.
+
+Letters: P points of a scan, M of them kept, N kept points of all B scans of a batch, K neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+#: Axes that span the planes, x y z = 0 1 2: the first is the row of the cell, the second the column
+PLANES = ((0, 1), (0, 2), (1, 2))
+NUM_FEATURES = 5
+# Points this close to the border of the field of view are dropped, as in the official code.
+_BORDER_M = 1e-4
+
+
+@dataclass(frozen=True)
+class ScanGrid:
+    """How a scan is thinned, cropped and cut into cells; the defaults are those of ScaLR.
+
+    Args:
+        minimum_m: Lowest x, y, z of the field of view, metres in the sensor frame.
+        maximum_m: Highest x, y, z.
+        cell_m: Edge of the square cells of the planes, a divisor of the field of view.
+        voxel_m: Edge of the voxels, of which each keeps one point.
+        num_neighbors: Neighbours K of a point, itself not counted.
+        intensity_mean: Mean of the intensity (0..1), which is subtracted.
+        intensity_std: Its standard deviation, by which is divided.
+
+    Raises:
+        ValueError: If a length, a count or the deviation is not positive, or the field of view not
+            a whole number of cells along each axis.
+    """
+
+    minimum_m: tuple[float, float, float] = (-64.0, -64.0, -8.0)
+    maximum_m: tuple[float, float, float] = (64.0, 64.0, 8.0)
+    cell_m: float = 0.5
+    voxel_m: float = 0.1
+    num_neighbors: int = 16
+    intensity_mean: float = 0.294584
+    intensity_std: float = 0.147190
+
+    def __post_init__(self) -> None:
+        """Check that sizes are positive and that cells fill the field of view."""
+        for name in ("cell_m", "voxel_m", "num_neighbors", "intensity_std"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        extent = np.subtract(self.maximum_m, self.minimum_m)
+        if (extent <= 0).any() or not np.allclose(extent, np.multiply(self.cells, self.cell_m)):
+            raise ValueError(
+                f"the field of view {self.minimum_m} to {self.maximum_m} m must be a whole number "
+                f"of cells of {self.cell_m} m along each axis."
+            )
+
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        """Number of cells along x, y, z."""
+        extent = np.subtract(self.maximum_m, self.minimum_m) / self.cell_m
+        x, y, z = np.rint(extent).astype(int).tolist()
+        return x, y, z
+
+
+class PreparedScan(NamedTuple):
+    """One scan as WaffleIron sees it; what depends on its points alone, computed once.
+
+    Attributes:
+        features: ``(M, 5)`` float32: intensity (standardised), x, y, z, distance to the sensor
+            (metres) of the kept points.
+        neighbors: ``(M, K)`` int64 nearest kept points, nearest first, without the point itself.
+            With fewer than K others the farthest is repeated; a single point is its own neighbour.
+        cells: ``(3, M)`` int64 cell of each point on the planes xy, xz, yz, row-major.
+        kept: ``(M,)`` int64 row of each kept point in the original scan.
+        upsample: ``(P,)`` int64 nearest kept point of each original point; M, which is no valid
+            index, where no point was kept.
+    """
+
+    features: Tensor
+    neighbors: Tensor
+    cells: Tensor
+    kept: Tensor
+    upsample: Tensor
+
+
+class PointCloudBatch(NamedTuple):
+    """Kept points of B scans of any length, one after another and without padding.
+
+    Attributes:
+        features: ``(N, 5)`` as in :class:`PreparedScan`.
+        neighbors: ``(N, K)`` int64, rows of this batch.
+        cells: ``(3, N)`` int64, counted anew in each scan.
+        num_points: ``(B,)`` int64 points of each scan; their sum is N.
+    """
+
+    features: Tensor
+    neighbors: Tensor
+    cells: Tensor
+    num_points: Tensor
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same batch on another device."""
+        return type(self)(*(values.to(device, non_blocking=True) for values in self))
+
+
+def prepare_scan(
+    points: np.ndarray, grid: ScanGrid | None = None, *, workers: int = 1
+) -> PreparedScan:
+    """Thin, crop and index one scan.
+
+    Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
+    scan and sorted by (x, y, z). Of these, the points within the field of view are kept, in that
+    order. All of it is float32 arithmetic: in double precision other points would be kept, as
+    coordinates are often multiples of a millimetre that lie on the border of a voxel.
+
+    Source: Puy et al., "Using a Waffle Iron for Automotive Point Cloud Semantic Segmentation"
+    (ICCV 2023); settings of ScaLR (Puy et al., CVPR 2024).
+
+    Args:
+        points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
+        grid: Settings; those of ScaLR where None.
+        workers: Threads of the neighbour search, -1 for all cores.
+
+    Raises:
+        ValueError: If ``points`` has another shape, or holds NaN or infinite values.
+    """
+    grid = grid or ScanGrid()
+    points = np.asarray(points, dtype=np.float32)
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise ValueError(f"points must be (P, 4) x, y, z, intensity, got {points.shape}.")
+    if not np.isfinite(points).all():
+        raise ValueError(
+            f"{(~np.isfinite(points).all(axis=1)).sum()} of {len(points)} points are NaN or "
+            "infinite: drop them first."
+        )
+    minimum, maximum = np.array([grid.minimum_m, grid.maximum_m], dtype=np.float32)
+    kept = _one_per_voxel(points[:, :3], grid.voxel_m)
+    xyz = points[kept, :3]
+    border = np.float32(_BORDER_M)
+    inside = ((xyz > minimum + border) & (xyz < maximum - border)).all(axis=1)
+    kept, xyz = kept[inside], xyz[inside]
+
+    intensity = (points[kept, 3] - np.float32(grid.intensity_mean)) / np.float32(grid.intensity_std)
+    radius = np.linalg.norm(xyz, axis=1)
+    place = np.floor((xyz - minimum) / np.float32(grid.cell_m)).astype(np.int64)
+    cells = np.stack([place[:, row] * grid.cells[col] + place[:, col] for row, col in PLANES])
+
+    tree = cKDTree(xyz)
+    nearest = np.arange(1, min(grid.num_neighbors + 1, max(len(xyz), 1)) + 1)
+    _, neighbors = tree.query(xyz, k=nearest, workers=workers)
+    neighbors = np.pad(neighbors, ((0, 0), (0, grid.num_neighbors + 1 - len(nearest))), mode="edge")
+    _, upsample = tree.query(points[:, :3], workers=workers)
+    return PreparedScan(
+        features=torch.from_numpy(np.column_stack([intensity, xyz, radius])),
+        neighbors=torch.from_numpy(neighbors[:, 1:].astype(np.int64)),
+        cells=torch.from_numpy(cells),
+        kept=torch.from_numpy(kept),
+        upsample=torch.from_numpy(upsample.astype(np.int64)),
+    )
+
+
+def collate_scans(scans: Sequence[PreparedScan]) -> PointCloudBatch:
+    """Batch of scans, in the given order; ``torch.split`` by ``num_points`` takes it apart.
+
+    Raises:
+        ValueError: If ``scans`` is empty.
+    """
+    if not scans:
+        raise ValueError("a batch needs at least one scan, got none.")
+    num_points = torch.tensor([len(scan.features) for scan in scans])
+    starts = (num_points.cumsum(0) - num_points).tolist()
+    return PointCloudBatch(
+        features=torch.cat([scan.features for scan in scans]),
+        neighbors=torch.cat(
+            [scan.neighbors + start for scan, start in zip(scans, starts, strict=True)]
+        ),
+        cells=torch.cat([scan.cells for scan in scans], dim=1),
+        num_points=num_points,
+    )
+
+
+def _one_per_voxel(xyz: np.ndarray, voxel_m: float) -> np.ndarray:
+    """Rows ``(M,)`` of the points of lowest index in each voxel, by voxel."""
+    if not len(xyz):
+        return np.empty(0, dtype=np.int64)
+    voxels = np.floor((xyz - xyz.min(axis=0)) / np.float32(voxel_m)).astype(np.int64)
+    order = np.lexsort(voxels.T[::-1])  # stable: points of a voxel stay in their order
+    changes = (np.diff(voxels[order], axis=0) != 0).any(axis=1)
+    return order[np.concatenate([[True], changes])]

@@ -1,0 +1,192 @@
+"""WaffleIron: a network on points that mixes tokens on the planes xy, xz and yz by dense 2D layers.
+
+Source: Puy, Boulch and Marlet, "Using a Waffle Iron for Automotive Point Cloud Semantic
+Segmentation" (ICCV 2023); same numbers as valeoai/WaffleIron v0.3.1 (``tests/parity``).
+Letters: N points of all B scans of a batch, K neighbours, F width of the tokens.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.nn.backbones.voxels import NUM_FEATURES, PLANES, PointCloudBatch
+from r3dpa.nn.layers import at_least_float32
+
+# Added to the number of points of a cell, as in the official code.
+_COUNT_EPS = 1e-6
+# Starting value of the layer scales: Touvron et al., "Going deeper with Image Transformers" (2021).
+_SCALE = 0.1
+
+
+class WaffleIron(nn.Module):
+    """Tokens of all points from their features, neighbours and cells.
+
+    ``depth`` layers, each a spatial mixing on one plane (xy, xz, yz, xy, ...) and a channel mixing
+    of each token by itself. The default sizes are WI-48-768, the backbone of ScaLR.
+
+    Batch norms (in the embedding) see the points of all scans and nothing else; in training, a
+    batch therefore needs two points. Under ``torch.autocast`` coordinates, statistics, means over
+    cells and the running sum of the tokens stay float32.
+
+    Args:
+        width: Width F of the tokens.
+        depth: Number of layers.
+        cells: Number of cells along x, y, z, see :attr:`ScanGrid.cells`.
+        head_dim: Outputs of the linear layer ``head``, which the forward pass leaves out; without
+            one ``head`` is the identity.
+
+    Raises:
+        ValueError: If ``width`` or ``depth`` is not positive.
+    """
+
+    def __init__(
+        self,
+        width: int = 768,
+        depth: int = 48,
+        cells: tuple[int, int, int] = (256, 256, 32),
+        head_dim: int | None = None,
+    ) -> None:
+        super().__init__()
+        if width < 1 or depth < 1:
+            raise ValueError(f"width and depth must be positive, got {width} and {depth}.")
+        self.width, self.depth, self.cells = width, depth, cells
+        self.plane_sizes = [(cells[row], cells[column]) for row, column in PLANES]
+        self.embedding = Embedding(width)
+        self.spatial = nn.ModuleList(SpatialMixing(width) for _ in range(depth))
+        self.channel = nn.ModuleList(ChannelMixing(width) for _ in range(depth))
+        self.head = nn.Identity() if head_dim is None else nn.Linear(width, head_dim)
+
+    def forward(self, batch: PointCloudBatch) -> Tensor:
+        """Tokens ``(N, F)`` of the last layer, which ScaLR takes as features."""
+        planes = self._planes(batch)
+        tokens = self.embedding(batch.features, batch.neighbors)
+        for layer, (spatial, channel) in enumerate(zip(self.spatial, self.channel, strict=True)):
+            tokens = channel(spatial(tokens, planes[layer % len(planes)]))
+        return tokens
+
+    def _planes(self, batch: PointCloudBatch) -> list[Plane]:
+        num_scans, num_points = len(batch.num_points), len(batch.features)
+        scan = torch.repeat_interleave(batch.num_points, output_size=num_points)
+        planes = []
+        for cells, (rows, columns) in zip(batch.cells, self.plane_sizes, strict=True):
+            own = cells + scan * (rows * columns)
+            count = batch.features.new_zeros(num_scans * rows * columns)
+            count.index_add_(0, own, torch.ones_like(own, dtype=count.dtype))
+            share = (count + _COUNT_EPS).reciprocal()[:, None]
+            planes.append(Plane(own, share, (num_scans, rows, columns)))
+        return planes
+
+
+class Plane(NamedTuple):
+    """Where the points of a batch lie on one plane.
+
+    Attributes:
+        cells: ``(N,)`` int64 cell of each point, ``(scan * rows + row) * columns + column``.
+        share: ``(B * rows * columns, 1)`` float32 one over the number of points of each cell.
+        size: B, rows, columns.
+    """
+
+    cells: Tensor
+    share: Tensor
+    size: tuple[int, int, int]
+
+
+class Embedding(nn.Module):
+    """Token of each point from its features and from how its neighbours differ from it.
+
+    Args:
+        width: Width F of the tokens.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(NUM_FEATURES)
+        self.point = nn.Linear(NUM_FEATURES, width)
+        self.offset = nn.Sequential(
+            nn.BatchNorm1d(NUM_FEATURES),
+            nn.Linear(NUM_FEATURES, width, bias=False),
+            nn.BatchNorm1d(width),
+            nn.ReLU(inplace=True),
+        )
+        self.neighbor = nn.Linear(width, width, bias=False)
+        self.merge = nn.Linear(2 * width, width)
+
+    def forward(self, features: Tensor, neighbors: Tensor) -> Tensor:
+        """Tokens.
+
+        Args:
+            features: ``(N, 5)`` float32.
+            neighbors: ``(N, K)`` int64 rows of ``features``.
+
+        Returns:
+            ``(N, F)``.
+        """
+        # Coordinates in bfloat16 would move a point at 60 m by up to 12 cm.
+        with torch.autocast(features.device.type, enabled=False):
+            features = self.norm(features)
+        if self.training:  # the batch norms need all neighbours at once
+            offsets = features[neighbors] - features[:, None]
+            around = self._around(offsets.flatten(0, 1)).unflatten(0, neighbors.shape).amax(dim=1)
+        else:  # one after the other: a K-th of the memory
+            each = (self._around(features[index] - features) for index in neighbors.unbind(dim=1))
+            around = reduce(torch.maximum, each)
+        with torch.autocast(features.device.type, enabled=False):
+            own = self.point(features)
+            return self.merge(torch.cat([own, around.to(own.dtype)], dim=1))
+
+    def _around(self, offsets: Tensor) -> Tensor:
+        with torch.autocast(offsets.device.type, enabled=False):
+            hidden = self.offset(offsets)
+        return self.neighbor(hidden)  # most of the work: in half precision if asked for
+
+
+class SpatialMixing(nn.Module):
+    """Exchange between the points of a plane: mean over each cell, 2D convolutions, and back.
+
+    Args:
+        width: Width F of the tokens.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.convs = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1, groups=width),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(width, width, 3, padding=1, groups=width),
+        )
+        self.scale = nn.Parameter(torch.full((width,), _SCALE))
+
+    def forward(self, tokens: Tensor, plane: Plane) -> Tensor:
+        """Tokens ``(N, F)`` plus what they learn from the cells around theirs."""
+        normed = at_least_float32(self.norm(tokens))
+        sums = normed.new_zeros(len(plane.share), normed.shape[1])
+        means = sums.index_add_(0, plane.cells, normed).mul_(plane.share)
+        # Channels stay last in memory, so that neither permutation copies the image.
+        image = means.unflatten(0, plane.size).permute(0, 3, 1, 2)
+        mixed = self.convs(image).permute(0, 2, 3, 1).flatten(0, 2)
+        return torch.addcmul(tokens, self.scale, mixed[plane.cells])
+
+
+class ChannelMixing(nn.Module):
+    """Two linear layers on each token by itself.
+
+    Args:
+        width: Width F of the tokens.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, width), nn.ReLU(inplace=True), nn.Linear(width, width)
+        )
+        self.scale = nn.Parameter(torch.full((width,), _SCALE))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens ``(N, F)`` plus what the layers make of each."""
+        return torch.addcmul(tokens, self.scale, self.mlp(self.norm(tokens)))
