@@ -158,6 +158,26 @@ class TestErrorsOnTheTerminal:
             main()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["simulate", "--ablate", "--out", "file/below"], "file is a file; give another --out"),
+        (["view", "scans", "--out", "file"], "file is a file; give another --out"),
+        (["realism", "--scans", "scans", "--reference", "scans", "--out", "scans"], "is a folder"),
+        (["bench", "simulation", "--out", "scans"], "scans is a folder; give --out the name"),
+        (["bench", "training", "--out", "file/costs.json"], "file is a file; give another --out"),
+    ],
+)
+def test_an_out_that_cannot_be_written_is_refused_before_the_work(
+    words, message, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "scans").mkdir()  # empty: whatever read it first would say so
+    with pytest.raises(ValueError, match=message):
+        main(words)
+
+
 @pytest.fixture
 def simulated(tmp_path):
     main(["simulate", "--out", str(tmp_path), "--scans", "3", "--drives", "['0000', '0003']"])
@@ -231,6 +251,7 @@ class TestSimulate:
             (["--effects.fogg", "off"], "there is no effect 'fogg'; there are dual_return, "),
             (["--effects.range_noise", "of"], "range_noise must be auto, on or off, got 'of'"),
             (["--sensor", "hdl65e"], "there is no sensor 'hdl65e': give hdl64e, "),
+            (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
         ],
     )
     def test_wrong_words_are_named(self, simulate, words, message, tmp_path):

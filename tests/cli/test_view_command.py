@@ -142,6 +142,19 @@ def test_refuses_what_it_cannot_show(tmp_path):
         view(tmp_path, tmp_path / "out", 0, None)
 
 
+def test_a_npz_file_of_something_else_is_named(tmp_path):
+    path = tmp_path / "some.npz"
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"some\.npz: is no \.npz file of scans"):
+        view(path, tmp_path / "out", 8, None)
+    np.savez(path, counts=np.zeros(3))
+    with pytest.raises(ValueError, match=r"some\.npz: counts must be points .*, got shape \(3,\)"):
+        view(path, tmp_path / "out", 8, None)
+    np.savez(path)
+    with pytest.raises(ValueError, match=r"some\.npz: holds no scan"):
+        view(path, tmp_path / "out", 8, None)
+
+
 @pytest.mark.data
 def test_real_scans(real_scans_dir, tmp_path):
     view(real_scans_dir, tmp_path / "out", 3, None)

@@ -126,14 +126,14 @@ def _weather(dice):
     def some(*values):
         return 0.0 if clear_air or dice.chance(0.4) else dice.among(*values)
 
-    visibility_m = dice.among(math.inf, 0.1, 1e5, 1e30, dice.magnitude(5, 2e3))
+    visibility_m = dice.among(math.inf, 0.1, 1e5, 1e60, dice.magnitude(5, 2e3))
     return Weather(
         math.inf if clear_air else visibility_m,
         some(1e-6, 100.0, dice.magnitude(0.1, 50)),
         some(1e-6, 100.0, dice.magnitude(0.1, 10)),
         dice.among(0.0, 0.0, 0.0, 1e-9, 5.0, dice.even(0.05, 2)),
         dice.chance(0.8),
-        dice.among(-90.0, -1e-6, 0.0, 1e-6, 90.0, *(dice.even(0, 30) for _ in range(5))),
+        dice.among(-90.0, -1e-6, 0.0, 1e-6, 90.0, *(dice.even(0, 15) for _ in range(5))),
         dice.even(-400, 400),
     )
 
@@ -146,9 +146,9 @@ def _primitive(dice, pose, materials, moving, leafy):
         (dice.magnitude(1e-3, 0.2), dice.magnitude(1e-3, 0.2), dice.even(0.5, 4)),
         (dice.even(5, 60), dice.even(5, 60), dice.magnitude(1e-3, 0.5)),
     )
-    speed = dice.among(0.0, 1e-9, 10.0, dice.even(0, 60)) if moving else 0.0
+    speed = dice.among(0.0, 1e-9, 10.0, 200.0, dice.even(0, 60)) if moving else 0.0
     heading = dice.even(-math.pi, math.pi)
-    extinction = dice.among(0.0, dice.magnitude(0.2, 3), 1e-3, 1e3) if leafy else 0.0
+    extinction = dice.among(0.0, 0.0, dice.magnitude(0.2, 3), 1e-3, 1e3) if leafy else 0.0
     return Primitive(
         Shape(int(dice.generator.integers(len(Shape)))),
         (

@@ -28,7 +28,8 @@ from r3dpa.simulation.effects import (
     MovingActors,
     RollingShutter,
 )
-from r3dpa.simulation.raycast import EGO_BODY, GROUND, NO_SURFACE, cast
+from r3dpa.simulation.raycast import cast
+from r3dpa.simulation.solids import EGO_BODY, GROUND, NO_SURFACE
 
 SENSOR = hdl64e()
 LEVEL = 5  # a beam within 0.3 degrees of the horizon

@@ -14,10 +14,10 @@ from r3dpa.simulation.effects import (
     Spray,
 )
 from r3dpa.simulation.effects.medium import soft_waveform
-from r3dpa.simulation.raycast import NO_SURFACE
 from r3dpa.simulation.scan import effect_name, simulate_scan
 from r3dpa.simulation.scene import Material, Pose, Primitive, Scene, Semantic, Shape, Weather
 from r3dpa.simulation.sensor import Lasers, hdl64e
+from r3dpa.simulation.solids import NO_SURFACE
 from r3dpa.simulation.sweep import Origin, Sweep
 
 # Fixed here, so that the numbers below do not depend on the fit of the default instrument.

@@ -25,7 +25,7 @@ from r3dpa.simulation.effects import (
     MovingActors,
     RollingShutter,
 )
-from r3dpa.simulation.raycast import EGO_BODY
+from r3dpa.simulation.solids import EGO_BODY
 
 SENSOR = replace(hdl64e(), range_sigma_m=0.0, weak_range_sigma_m=0.0, range_step_m=0.0)
 PLAIN = {"laser_calibration": "off"}
@@ -175,6 +175,8 @@ def test_the_recording_car_hides_the_same_rays_in_every_scene():
         effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
         mask.append(rays)
         assert (sweep.first.surface[rays] == EGO_BODY).all()
+        assert (sweep.reflectivity[rays] == np.float32(0.3)).all()
+        assert (sweep.material[rays] == Material.CONCRETE).all()
         outside = np.setdiff1d(np.arange(sweep.num_rays), rays)
         np.testing.assert_array_equal(sweep.first.range_m[outside], before[outside])
         # Nothing nearer than the instrument's limit is reported: the roof leaves a hole.

@@ -68,8 +68,8 @@ def test_no_surface_gives_no_power():
 def test_last_ground_return(smooth):
     """Asphalt of 10 %, 1.73 m below the shot's start, vanishes at 50.0 m.
 
-    A smooth floor obeys Lambert and vanishes at (rho h / P_min)^(1/3) under the limit that the
-    plan derives for it, 1.38e-6; where P = rho h / R^3.
+    A smooth floor obeys Lambert, P = rho h / R^3, and vanishes at (rho h / P_min)^(1/3) under the
+    limit that gives 50 m there, 1.38e-6.
     """
     # Raised, so that the shots of a beam of each height start 1.73 m above it.
     lasers = replace(SENSOR.lasers, height_m=(0.0,) * 64)

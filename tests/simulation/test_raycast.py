@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 
 from r3dpa.simulation import Pose, Primitive, Scene, Semantic, Shape, Weather, hdl64e, raycast
-from r3dpa.simulation.raycast import (
-    GROUND,
-    NO_SURFACE,
-    cast,
-    cast_single,
-    level,
-    normals,
-    scene_solids,
-    surface_distance,
-)
+from r3dpa.simulation.raycast import cast, cast_single, normals, surface_distance
 from r3dpa.simulation.sensor import Rays
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, level, scene_solids
+from r3dpa.simulation.windows import Windows
 
 REACH_M = 120.0
 
@@ -280,7 +273,7 @@ def test_windows_never_cut_a_solid(monkeypatch, seed, moving):
     def everything(solids, origin, direction, max_range_m, actor_time_s=None):
         num, beams_shots = len(solids.shape), np.array([[0, 0], origin.shape[1:]])
         beams, shots = (np.tile(column, (num, 1)) for column in beams_shots.T)
-        return raycast.Windows(beams, shots, np.zeros(num), np.arange(num))
+        return Windows(beams, shots, np.zeros(num), np.arange(num))
 
     monkeypatch.setattr(raycast, "windows_of", everything)
     whole = Hits(scene, rays, **motion)

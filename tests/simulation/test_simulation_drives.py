@@ -34,7 +34,7 @@ from r3dpa.simulation import (
     split_scans,
 )
 from r3dpa.simulation.drive_files import velodyne_to_world
-from r3dpa.simulation.raycast import level
+from r3dpa.simulation.solids import level
 
 SMALL = {"sensor": hdl64e(32)}
 MEASURED = {"timings.csv", "report.json"}  # the files that are no function of the request
@@ -352,7 +352,7 @@ class TestProgress:
         for path in list(tmp_path.rglob("data/*.bin"))[:18]:
             path.unlink()
         shown = io.StringIO()
-        forced = {"file": shown, "disable": False, "mininterval": 0}
+        forced = {"file": shown, "disable": False, "mininterval": 0, "miniters": 1}
         monkeypatch.setattr(drives, "tqdm", lambda **options: tqdm(**options | forced))
         simulate(tmp_path, 24, drives=["0003"], workers=workers, **SMALL)
         states = shown.getvalue().split("\r")

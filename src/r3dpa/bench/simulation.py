@@ -48,7 +48,7 @@ WEATHERS = {
     "low sun": Weather(sun_elevation_deg=3.0),
 }
 
-#: Largest medians of a plain street in milliseconds, see the simulator's plan.
+#: Largest medians of a plain street on one core, milliseconds.
 _CAST_BUDGET_MS, _SCAN_BUDGET_MS = 60.0, 100.0
 #: Largest share of effects that are not called, and of time that no part accounts for.
 _IDLE_BUDGET, _GAP_BUDGET = 0.01, 0.10

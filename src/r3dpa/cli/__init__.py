@@ -35,11 +35,11 @@ def simulate(
     effects: dict[str, str | bool] | None = None,
     weather: Weather | None = None,
 ) -> None:
-    """Write simulated scans of a street in the KITTI-360 layout.
+    """Write simulated scans in the KITTI-360 layout, or with --ablate what each effect buys.
 
     The same command completes what was interrupted. Prints what each effect did and cost, which
     stays in ``report.json``; ``sim/*.json`` tells it for each scan. ``r3dpa simulate --ablate``
-    writes no data set but what each effect buys and costs; it has options of its own.
+    writes no data set and has options of its own: :func:`ablate`.
 
     Args:
         out: Root of the data set to write.
@@ -77,7 +77,7 @@ def ablate(
     """Switch off one effect at a time: what each buys in realism, and what it costs.
 
     Prints the table, which stays in ``ablation.md``; ``ablation.csv`` and ``ablation.json`` hold
-    every measure and time. Takes ten seconds a scan.
+    every measure and time. Takes about ten seconds a scan.
 
     Args:
         out: Folder for the three files.
@@ -91,6 +91,7 @@ def ablate(
     from r3dpa.cli.ablation import ablate as run
     from r3dpa.simulation import load_sensor
 
+    _check_folder(out)
     _print(run(out, load_sensor(sensor), scans, seed, weather, reference))
 
 
@@ -121,6 +122,8 @@ def view(
     """
     from r3dpa.cli.view import view as draw
 
+    if out is not None:
+        _check_folder(out)
     _print(draw(source, out, num, reference))
 
 
@@ -129,11 +132,12 @@ def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
 
     Args:
         scans: Folder of ``.bin`` scans (A); one drive per folder.
-        reference: Folder of real scans (B), of two or more drives.
+        reference: Folder of real scans (B), of two or more drives; a single one is halved.
         out: JSON file for the table and the curves behind it.
     """
     from r3dpa.cli.realism import realism as compare
 
+    _check_file(out)
     _print(compare(scans, reference, out))
 
 
@@ -240,6 +244,7 @@ def bench_training(
     """
     from r3dpa.bench.training import StepSettings, training
 
+    _check_file(out)
     _print(training(conf, stages, StepSettings(batch_size, steps, precision, device), out))
 
 
@@ -254,6 +259,7 @@ def bench_simulation(quick: bool = False, out: Path | None = None) -> None:
     """
     from r3dpa.bench.simulation import simulation
 
+    _check_file(out)
     _print(simulation(quick, out))
 
 
@@ -269,6 +275,21 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 
 def _print(text: Any) -> None:
     sys.stdout.write(f"{text}\n")
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse what could not be a folder, before minutes of work are lost with it."""
+    for folder in (out, *out.parents):
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is a file; give another --out")
+
+
+def _check_file(out: Path | None) -> None:
+    """The same for a file that is written at the end, if any."""
+    if out is not None:
+        if out.is_dir():
+            raise ValueError(f"{out} is a folder; give --out the name of a file")
+        _check_folder(out.parent)
 
 
 def _help() -> str:
@@ -292,7 +313,14 @@ def _run_function(
 
     from r3dpa.cli.parser import FlagParser
 
-    auto_cli(function, words, as_positional=as_positional, parser_class=FlagParser, prog=prog)
+    try:
+        auto_cli(function, words, as_positional=as_positional, parser_class=FlagParser, prog=prog)
+    except ValueError as error:
+        # Where None would do, too, the parser lists every type that it tried; its cause is what
+        # the value's own class found wrong.
+        if "Union subtypes" in str(error) and isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise
 
 
 def _run(args: list[str]) -> None:

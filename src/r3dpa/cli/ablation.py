@@ -22,8 +22,9 @@ from r3dpa.atomic import atomic_path
 from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.bench.simulation import DRIVES, WEATHERS
 from r3dpa.cli.ablation_report import NOTHING, Ablation, EffectAblation
-from r3dpa.data.scans import ScanError, find_scans, read_scan
-from r3dpa.metrics import ScanStatistics, scan_statistics
+from r3dpa.cli.realism import pooled
+from r3dpa.data.scans import find_scans
+from r3dpa.metrics import scan_statistics
 from r3dpa.simulation import (
     EFFECTS,
     SimulatedScan,
@@ -76,7 +77,9 @@ def ablate(
     """
     if scans < 1:
         raise ValueError(f"scans must be 1 or greater, got {scans}")
-    real = None if reference is None else _read(reference)
+    real = None
+    if reference is not None:
+        real = pooled(tqdm(find_scans(reference), unit="scan", desc="reference", disable=None))
     effects = {name: EffectAblation() for name in (NOTHING, *map(effect_name, EFFECTS))}
     places = list(_places(scans, seed, weather))
     # Without a terminal there is no bar.
@@ -148,16 +151,6 @@ def _ablate_scene(
         effect.scans += 1
         effect.with_all += with_all
         effect.without += scan_statistics(less.points)
-
-
-def _read(reference: Path) -> ScanStatistics:
-    total = ScanStatistics()
-    for scan in tqdm(find_scans(reference), unit="scan", desc="reference", disable=None):
-        try:
-            total += scan_statistics(read_scan(scan.path))
-        except ValueError as error:
-            raise ScanError(f"{scan.path}: {error}") from error
-    return total
 
 
 def _write(out: Path, ablation: Ablation) -> None:

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 from statistics import median, quantiles
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from r3dpa.bench.provenance import one_line
-from r3dpa.metrics import MEASURES, Measure, ScanStatistics
+from r3dpa.metrics import MEASURES, Measure, ScanStatistics, known
 
 #: Row in which nothing is switched off: how far two timings of one scan are apart.
 NOTHING = "(nothing)"
@@ -91,8 +89,8 @@ class EffectAblation:
             Change(
                 measure.name,
                 measure.unit,
-                _value(measure, self.with_all),
-                _value(measure, self.without),
+                known(measure.value_in(self.with_all)),
+                known(measure.value_in(self.without)),
                 _distance(measure, self.with_all, self.without),
                 _distance(measure, self.with_all, reference),
                 _distance(measure, self.without, reference),
@@ -189,18 +187,8 @@ class Ablation:
                     yield about | change._asdict()
 
 
-def _value(measure: Measure, statistics: ScanStatistics) -> float | None:
-    if measure.value is None or measure.missing_in(statistics):
-        return None
-    return _known(measure.value(statistics))
-
-
 def _distance(measure: Measure, a: ScanStatistics, b: ScanStatistics | None) -> float | None:
-    return None if b is None else _known(measure.between(a, b))
-
-
-def _known(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
+    return None if b is None else known(measure.between(a, b))
 
 
 def _change_cells(changes: Iterable[Change]) -> list[str]:

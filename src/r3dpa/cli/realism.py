@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 
@@ -65,10 +65,21 @@ def _halves(drives: dict[str, list[Scan]]) -> tuple[dict[str, list[Scan]], str]:
 
 
 def _statistics(drives: dict[str, list[Scan]], progress: tqdm) -> dict[str, ScanStatistics]:
-    return {drive: _pooled(scans, progress) for drive, scans in drives.items()}
+    return {drive: pooled(_counted(scans, progress)) for drive, scans in drives.items()}
 
 
-def _pooled(scans: Sequence[Scan], progress: tqdm) -> ScanStatistics:
+def _counted(scans: Iterable[Scan], progress: tqdm) -> Iterator[Scan]:
+    for scan in scans:
+        yield scan
+        progress.update()
+
+
+def pooled(scans: Iterable[Scan]) -> ScanStatistics:
+    """Statistics of all these scans together.
+
+    Raises:
+        ScanError: If a scan cannot be used; the message names the file.
+    """
     total = ScanStatistics()
     for scan in scans:
         points = read_scan(scan.path)
@@ -76,5 +87,4 @@ def _pooled(scans: Sequence[Scan], progress: tqdm) -> ScanStatistics:
             total += scan_statistics(points)
         except ValueError as error:
             raise ScanError(f"{scan.path}: {error}") from error
-        progress.update()
     return total

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,11 @@ _DATA = ("velodyne_points", "data")  # of a scan in the KITTI-360 layout, beside
 
 
 class _Source(NamedTuple):
-    """A scan still to be read: a file, or a member of a ``.npz`` file."""
+    """A scan: a file still to be read, or the points of a member of a ``.npz`` file."""
 
     name: str
     path: Path
-    member: str | None = None
+    points: NDArray | None = None
 
 
 def view(source: Path, out: Path | None, num: int, reference: Path | None) -> str:
@@ -91,7 +92,8 @@ def view(source: Path, out: Path | None, num: int, reference: Path | None) -> st
 def _sources(source: Path) -> list[_Source]:
     """Scans of a folder or file, in order."""
     if source.suffix == ".npz" and source.is_file():
-        return [_Source(f"{source.stem}/{name}", source, name) for name in read_npz(source)]
+        members = _members(source).items()
+        return [_Source(f"{source.stem}/{name}", source, points) for name, points in members]
     scans = find_scans(source)
     if source.is_file():
         path = scans[0].path
@@ -102,6 +104,22 @@ def _sources(source: Path) -> list[_Source]:
     return [_Source(scan.name, scan.path) for scan in scans]
 
 
+def _members(path: Path) -> dict[str, NDArray]:
+    """Scans of a ``.npz`` file by name."""
+    try:
+        members = read_npz(path)
+    except (EOFError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path}: is no .npz file of scans ({error})") from error
+    if not members:
+        raise ValueError(f"{path}: holds no scan")
+    for name, points in members.items():
+        if points.ndim != 2 or points.shape[1] not in (3, 4):
+            raise ValueError(
+                f"{path}: {name} must be points (P, 3) or (P, 4), got shape {points.shape}"
+            )
+    return members
+
+
 def _spread(count: int, num: int) -> list[int]:
     """Up to ``num`` places out of ``count``, evenly spread, the first one among them."""
     num = min(num, count)
@@ -110,9 +128,9 @@ def _spread(count: int, num: int) -> list[int]:
 
 def _read(source: _Source) -> viz.PageScan:
     """A scan with its labels and origins where there are files of them."""
-    name, path, member = source
-    if member is not None:
-        return viz.PageScan(name, read_npz(path)[member])
+    name, path, points = source
+    if points is not None:
+        return viz.PageScan(name, points)
     if path.suffix == ".ply":
         return viz.PageScan(name, read_ply(path))
     points = read_scan(path)

@@ -6,6 +6,7 @@ from r3dpa.metrics.measures import (
     Measure,
     curve_rmse,
     jensen_shannon,
+    known,
     wasserstein_1,
 )
 from r3dpa.metrics.realism import RealismRow, RealismTable, realism_table
@@ -20,6 +21,7 @@ __all__ = [
     "curve_rmse",
     "curves",
     "jensen_shannon",
+    "known",
     "realism_table",
     "scan_statistics",
     "wasserstein_1",

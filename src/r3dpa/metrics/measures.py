@@ -1,7 +1,7 @@
 """The realism measures: what is compared, in which unit, and by which distance.
 
-Source: plan of the simulator, section 7; JSD and W1 of histograms as in LiDARGen (ECCV 2022) and
-LiDM (CVPR 2024), but the divergence itself in nats, not its root.
+Source: JSD and W1 of histograms as in LiDARGen (ECCV 2022) and LiDM (CVPR 2024), but the divergence
+itself in nats, not its root.
 """
 
 from __future__ import annotations
@@ -87,6 +87,11 @@ def curve_rmse(curve_a: Floats, curve_b: Floats) -> float:
     return float(np.sqrt(np.mean((curve_a[both] - curve_b[both]) ** 2))) if both.any() else np.nan
 
 
+def known(number: float) -> float | None:
+    """The number, or None where it is NaN: where it cannot be told."""
+    return None if np.isnan(number) else float(number)
+
+
 def difference(value_a: float, value_b: float) -> float:
     """Absolute difference of two numbers."""
     return abs(value_a - value_b)
@@ -117,6 +122,12 @@ class Measure:
         if self.missing_in(a) or self.missing_in(b):
             return float("nan")
         return self.distance(self.feature(a), self.feature(b))
+
+    def value_in(self, statistics: ScanStatistics) -> float:
+        """The one number of a set of scans; NaN where there is none."""
+        if self.value is None or self.missing_in(statistics):
+            return float("nan")
+        return float(self.value(statistics))
 
     def missing_in(self, statistics: ScanStatistics) -> str:
         """Why a set of scans cannot give this measure; empty where it can."""

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from r3dpa.metrics.features import curves
-from r3dpa.metrics.measures import MEASURES, Measure
+from r3dpa.metrics.measures import MEASURES, Measure, known
 from r3dpa.metrics.scan_statistics import ScanStatistics
 
 _MAX_RATIO = 3.0
@@ -143,8 +143,10 @@ _Pairs = list[tuple[ScanStatistics, ScanStatistics]]
 def _row(
     measure: Measure, a: ScanStatistics, b: ScanStatistics, pairs: _Pairs, real_pairs: _Pairs
 ) -> RealismRow:
-    distances = [known for pair in pairs if (known := _known(measure.between(*pair))) is not None]
-    floors = [known for pair in real_pairs if (known := _known(measure.between(*pair))) is not None]
+    distances, floors = (
+        [far for pair in some if not math.isnan(far := measure.between(*pair))]
+        for some in (pairs, real_pairs)
+    )
     distance = float(np.median(distances)) if distances else None
     floor = float(np.median(floors)) if floors else None
     absent = [
@@ -164,25 +166,15 @@ def _row(
     return RealismRow(
         measure.name,
         measure.unit,
-        _value(measure, a),
-        _value(measure, b),
+        known(measure.value_in(a)),
+        known(measure.value_in(b)),
         distance,
         floor,
         max(floors, default=None),
-        _known(measure.between(a, b)),
+        known(measure.between(a, b)),
         ratio,
         reason,
     )
-
-
-def _value(measure: Measure, statistics: ScanStatistics) -> float | None:
-    if measure.value is None or measure.missing_in(statistics):
-        return None
-    return _known(measure.value(statistics))
-
-
-def _known(number: float) -> float | None:
-    return None if math.isnan(number) else float(number)
 
 
 def _cells(row: RealismRow) -> tuple[str, ...]:
@@ -202,7 +194,7 @@ def _number(value: float | None) -> str:
 
 def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics) -> str:
     counts = [statistics.num_scans for statistics in drives.values()]
-    total = f"{name}: {pooled.num_scans} scans of {len(drives)} drives, "
+    total = f"{name}: {pooled.num_scans} scans of {len(drives)} drive{'s' * (len(drives) > 1)}, "
     total += f"{min(counts)} to {max(counts)} each"
     parts = {
         "not in ring order": pooled.num_scans - pooled.num_ring_scans,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
 from r3dpa.metrics.sweep import (
     GROUND_BAND_M,
+    GROUND_DISTANCES_M,
     MAX_GAP_SHOTS,
     Ground,
     Surfaces,
@@ -243,7 +244,7 @@ def _bev_counts(xyz: Floats) -> dict[str, Any]:
 
 def _ground_counts(xyz: Floats, ground: Ground) -> dict[str, Any]:
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    near = (distance > 3) & (distance < 20)
+    near = (distance > GROUND_DISTANCES_M[0]) & (distance < GROUND_DISTANCES_M[1])
     residual = (ground.height_m(xyz[near]) + GROUND_BAND_M) / GROUND_RESIDUAL_BIN_M
     turn = (np.arctan2(xyz[:, 1], xyz[:, 0]) + math.pi) / (2 * math.pi)
     sector = _bins(turn * _NUM_REACH_SECTORS, _NUM_REACH_SECTORS)

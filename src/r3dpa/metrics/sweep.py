@@ -24,7 +24,7 @@ MAX_GAP_SHOTS = 10  # a longer gap says nothing about the surface on both sides 
 
 _MOUNT_HEIGHT_M = 1.73  # KITTI and KITTI-360
 _GROUND_BANDS_M = (0.5, 0.3, GROUND_BAND_M, GROUND_BAND_M, GROUND_BAND_M)
-_GROUND_DISTANCES_M = (3.0, 20.0)  # nearer is the car, farther the road bends away from a plane
+GROUND_DISTANCES_M = (3.0, 20.0)  # nearer is the car, farther the road bends away from a plane
 _MIN_GROUND_RETURNS = 500
 _MAX_GROUND_SLOPE = 0.2
 _JITTER_RAD = 0.1  # the azimuth of a real ring may step back by some milliradians
@@ -149,7 +149,7 @@ def fit_ground(points: Floats) -> Ground | None:
         it is steeper than 20 %.
     """
     distance = np.hypot(points[:, 0], points[:, 1])
-    near = points[(distance > _GROUND_DISTANCES_M[0]) & (distance < _GROUND_DISTANCES_M[1])]
+    near = points[(distance > GROUND_DISTANCES_M[0]) & (distance < GROUND_DISTANCES_M[1])]
     ground = Ground(0.0, 0.0, -_MOUNT_HEIGHT_M)
     for band_m in _GROUND_BANDS_M:
         close = near[np.abs(ground.height_m(near)) < band_m]

@@ -105,7 +105,7 @@ class DriveFiles:
         return [self._summary(self._path("sim", number)) for number in range(count)]
 
     def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
-        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` unless they are there.
+        """Write ``timestamps.txt`` and ``velodyne_to_world.txt``; equal ones are left alone.
 
         Args:
             summaries: Of all scans of the drive, in order.

@@ -46,8 +46,8 @@ def _building(
     if draw.random() < 0.6:
         at = (centre_s + draw.uniform(-0.35, 0.35) * width, side * (front_m - 0.03))
         door = (Semantic.BUILDING, Material.PAINT, coat(draw), instance)
-        size = (draw.uniform(1.0, 3.2), 0.1, draw.uniform(2.0, 2.6))
-        builder.solid(Shape.BOX, at, size, *door, detail=True)
+        door_m = (draw.uniform(1.0, 3.2), 0.1, draw.uniform(2.0, 2.6))
+        builder.solid(Shape.BOX, at, door_m, *door, detail=True)
     if draw.random() < 0.6:
         at = (centre_s + draw.choice((-0.5, 0.5)) * (width - 0.4), side * (front_m - 0.06))
         pipe = (Semantic.BUILDING, Material.CONCRETE, 0.15, instance, -FOOTING_M)

@@ -81,14 +81,14 @@ class Primitive:
         centre: ``(x, y, z)`` in the world frame in the middle of the sweep, metres, z up.
         half_size: ``(a, b, c)``: half edges, radii and half height, or semi-axes, metres.
         semantic: Class of the surface.
-        reflectivity: Lambertian reflectivity in (0, 1].
+        reflectivity: Diffuse reflectivity in (0, 1], see ``effects.surface_power``.
         yaw_rad: Turn about the upright axis, counter-clockwise seen from above.
         instance: Number of the object it belongs to, 0 where the class has no objects.
         material: What the surface is made of.
         velocity_m_s: ``(x, y)`` in the world frame, metres per second.
         grade: Rise per metre along the turned x and y axis; upright walls stay upright.
-        extinction_per_m: Foliage is a medium rather than a surface: chance of a hit per metre
-            inside the solid; 0 for a closed surface.
+        extinction_per_m: Of leaves, grass and wire mesh, which are media rather than surfaces:
+            chance of a hit per metre inside the solid; 0 for a closed surface.
 
     Raises:
         ValueError: If a size is not positive, the reflectivity lies outside (0, 1], the instance
@@ -228,7 +228,7 @@ class Scene:
         puddles: Where water stands on the ground, if the road is wet.
         ego_body: Parts of the recording car in the sensor frame; they move with the sensor.
         ground_m: Height of the level ground that lies under everything.
-        ground_reflectivity: Lambertian reflectivity of that ground: asphalt, labelled as road.
+        ground_reflectivity: Diffuse reflectivity of that ground: asphalt, labelled as road.
 
     Raises:
         ValueError: If the reflectivity lies outside (0, 1] or the sensor is not above the ground.

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+_LIGHT_M_S = 299_792_458.0
 _BLOCK_BEAMS = 32
 # HDL-64E as fitted to scans of KITTI (z = height + r tan(elevation) for each laser, residual below
 # 1 mm): (highest, lowest, standard deviation of the step) of each block's elevations in degrees,
@@ -102,7 +103,7 @@ class SpinningLidar:
             nothing below 1.45 m.
         max_range_m: Farthest range that is reported.
         divergence_rad: Full angle of the beam; 0 for a line.
-        pulse_s: Length of the pulse; echoes nearer to each other than ``c * pulse_s / 2`` merge.
+        pulse_s: Length of the pulse; echoes nearer to each other than ``pulse_depth_m`` merge.
         overlap_range_m: From here on the receiver sees the whole beam.
         threshold_spread: Standard deviation of the logarithm of the detection threshold.
         range_sigma_m: Range noise of a strong return.
@@ -159,6 +160,11 @@ class SpinningLidar:
     def num_beams(self) -> int:
         """Number of lasers."""
         return len(self.lasers.inclination_rad)
+
+    @property
+    def pulse_depth_m(self) -> float:
+        """Ranges that a pulse lights at a time: ``c * pulse_s / 2``."""
+        return _LIGHT_M_S * self.pulse_s / 2
 
     @property
     def rays(self) -> Rays:
@@ -248,12 +254,6 @@ def load_sensor(model: str, **changes: Any) -> SpinningLidar:
             f"there is no sensor {model!r}: give {', '.join(PRESETS)} or a calibration YAML"
         )
     return SpinningLidar(_read_calibration(path), **changes)
-
-
-def sensor_from_dict(values: dict[str, Any]) -> SpinningLidar:
-    """The sensor whose ``dataclasses.asdict`` was stored."""
-    lasers = Lasers(**{name: tuple(column) for name, column in values["lasers"].items()})
-    return SpinningLidar(**values | {"lasers": lasers})
 
 
 def sensor_to_dict(sensor: SpinningLidar) -> dict[str, Any]:

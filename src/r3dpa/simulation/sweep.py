@@ -12,23 +12,17 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.raycast import (
-    GROUND,
-    NO_SURFACE,
-    Floats,
-    Solids,
-    cast,
-    level,
-    normals,
-    pieces,
-    scene_solids,
-    windows_of,
-)
+from r3dpa.simulation.raycast import cast, normals
 from r3dpa.simulation.scene import GROUND_MATERIALS, Material, Scene, Semantic
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, level, scene_solids
+from r3dpa.simulation.windows import pieces, windows_of
 
 #: Rays that an effect touches: indices ``(M,)``, or ``slice(None)`` for all.
 RayIndex = NDArray[np.int64] | slice
+
+#: Whether water can lie on each ``Material``: road, pavement, soil.
+IS_GROUND = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
 
 # Leaves are turned every way: mean of |cos| over a sphere.
 _FOLIAGE_COS = 0.5
@@ -236,12 +230,11 @@ class Sweep:
 
     def on_ground(self) -> NDArray[np.int64]:
         """Rays that hit ground on which water can lie: road, pavement, soil."""
-        lies = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
-        return np.flatnonzero(lies[self.material] & (self.first.surface != NO_SURFACE))
+        return np.flatnonzero(IS_GROUND[self.material] & (self.first.surface >= GROUND))
 
     def of_material(self, material: Material) -> NDArray[np.int64]:
-        """Rays that hit a material."""
-        return np.flatnonzero((self.material == material) & (self.first.surface != NO_SURFACE))
+        """Rays that hit a material of the scene; the recording car is matt, whatever it is of."""
+        return np.flatnonzero((self.material == material) & (self.first.surface >= GROUND))
 
     def echoes(self) -> Iterator[Echoes]:
         """The recorded echoes: the first, and the second where there is one."""

@@ -12,8 +12,8 @@ from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.sweep import RayIndex, Sweep
 
-# Echoes whose power lies farther from the limit than this many spreads are decided without a draw.
-_WIDE = 4.0
+#: No threshold is farther from its middle than this many spreads.
+MAX_SPREADS = 4.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class SoftRaydrop:
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those with an echo near the threshold."""
-        reach = np.exp(np.float32(_WIDE * sweep.sensor.threshold_spread))
+        reach = np.exp(np.float32(MAX_SPREADS * sweep.sensor.threshold_spread))
         near = np.zeros(sweep.num_rays, dtype=bool)
         for echoes in sweep.echoes():
             near |= (echoes.power * reach >= sweep.min_power) & (
@@ -46,7 +46,7 @@ class SoftRaydrop:
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Scale the thresholds of these rays."""
-        drawn = draws.normal(rays).clip(-_WIDE, _WIDE)
+        drawn = draws.normal(rays).clip(-MAX_SPREADS, MAX_SPREADS)
         sweep.min_power[rays] *= np.exp(np.float32(sweep.sensor.threshold_spread) * drawn)
 
 
@@ -54,9 +54,12 @@ class SoftRaydrop:
 class DetectionLimit:
     """Echoes that are too weak, too near or too far give no return.
 
-    The default power makes asphalt of reflectivity 0.1, seen from 1.73 m above, vanish at 50 m::
+    ::
 
-        reflectivity * height / range^3 = min_power
+        power < min_power    or    not min_range_m <= range <= max_range_m
+
+    The default power makes asphalt of reflectivity 0.1, seen from 1.73 m above, vanish at 50 m, see
+    ``surface_power``.
     """
 
     stage: ClassVar[Stage] = Stage.DETECTION

@@ -5,7 +5,6 @@ Letters: M chosen rays, K pairs of a ray and a surface that its rim may meet.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -13,24 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.effects.footprint import (
+    EDGE_M,
+    RING_LEFT,
+    RING_UP,
+    Indices,
+    Surfaces,
+    at_edges,
+    beside_thin_solids,
+    rim_ranges,
+    turned_aside,
+)
 from r3dpa.simulation.effects.surface import surface_power
-from r3dpa.simulation.raycast import EGO_BODY, GROUND, Floats, normals, surface_distance
-from r3dpa.simulation.scene import GROUND_MATERIALS, Material, Scene
+from r3dpa.simulation.raycast import normals
+from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
-from r3dpa.simulation.sweep import Echoes, Origin, RayIndex, Sweep
+from r3dpa.simulation.solids import EGO_BODY, GROUND, Floats
+from r3dpa.simulation.sweep import IS_GROUND, Echoes, Origin, RayIndex, Sweep
 
-Indices = NDArray[np.int64]
-Surfaces = NDArray[np.int32]
-
-_LIGHT_M_S = 299_792_458.0
-_EDGE_M = 0.3
-# Seven points that integrate polynomials up to the fifth degree over a disk of radius 1 exactly
-# (Radon 1948): the axis, and six on a ring.
-_RING_RADIUS = math.sqrt(2 / 3)
-_RING = _RING_RADIUS * np.exp(1j * np.pi / 3 * np.arange(6))
-_RING_LEFT, _RING_UP = _RING.real.astype(np.float32), _RING.imag.astype(np.float32)
+# Of the power of a beam: its axis, and each point of its rim; see ``footprint``.
 _SHARES = np.array([2, 1, 1, 1, 1, 1, 1], dtype=np.float32)[:, None] / 8
-_IS_GROUND = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
 
 
 class _Targets(NamedTuple):
@@ -63,7 +64,7 @@ class MixedPixels:
     axis stands for 1/4 and each of the ring for 1/8, which integrates over a uniform disk. A
     surface that fills a share of the footprint returns that share of its power.
 
-    Echoes nearer to each other than ``c * pulse_s / 2`` (0.75 m at 5 ns) merge to one at their
+    Echoes nearer to each other than ``pulse_depth_m`` (0.75 m at 5 ns) merge to one at their
     energy-weighted range. The strongest becomes the first echo, the next is offered as second.
     A pole of width w is met by ``(w + sqrt(2/3) * footprint) / pitch`` shots of a beam, some of
     them too weak to be detected.
@@ -93,8 +94,8 @@ class MixedPixels:
         """Those whose rim reaches over an edge, and those beside a thin solid."""
         chosen = np.zeros(sweep.num_rays, dtype=bool)
         if sweep.sensor.divergence_rad and sweep.scene.primitives:
-            chosen[_at_edges(sweep)] = True
-            chosen[_beside_thin_solids(sweep)[0]] = True
+            chosen[at_edges(sweep)] = True
+            chosen[beside_thin_solids(sweep)[0]] = True
         found = np.flatnonzero(chosen)
         origin, surface = sweep.first.origin[found], sweep.first.surface[found]
         straight = (origin == Origin.SURFACE) | (origin == Origin.FOLIAGE)
@@ -110,134 +111,13 @@ class MixedPixels:
         axis_m = sweep.first.range_m[chosen]
         axis = np.where(np.isfinite(axis_m), np.arange(len(chosen)), -1)
         with np.errstate(invalid="ignore"):
-            edge = (met != axis) & ~(np.abs(rim_m - axis_m) <= _EDGE_M)
+            edge = (met != axis) & ~(np.abs(rim_m - axis_m) <= EDGE_M)
         at = np.flatnonzero(edge.any(axis=0))
         # What the axis meets is measured there: its own slope makes no edge.
         range_m = np.vstack([axis_m, np.where(met == axis, axis_m, rim_m)])[:, at]
-        merge_m = _LIGHT_M_S * sweep.sensor.pulse_s / 2
-        first, second = _peaks(targets, np.vstack([axis, met])[:, at], range_m, merge_m)
+        met = np.vstack([axis, met])[:, at]
+        first, second = _peaks(targets, met, range_m, sweep.sensor.pulse_depth_m)
         _record(sweep, chosen[at], at, targets, first, second)
-
-
-def _jumps(sweep: Sweep) -> tuple[Indices, Indices, Floats, Floats]:
-    """Pairs of neighbouring rays that differ in range, and the way from one to the other.
-
-    Returns:
-        The nearer rays, the farther ones, and how far the rim of the nearer one reaches towards
-        the farther, to the left and up, in radii of the beam; each ``(K,)``.
-    """
-    rays = sweep.grid(np.arange(sweep.num_rays))
-    range_m = sweep.grid(sweep.first.range_m)
-    closed_m = np.hstack([range_m, range_m[:, :1]])
-    with np.errstate(invalid="ignore"):
-        sides = (
-            (np.diff(closed_m), rays, np.roll(rays, -1, axis=1), _RING_LEFT.max(), 0),
-            (np.diff(range_m, axis=0), rays[:-1], rays[1:], 0, _RING_UP.min()),
-        )
-    found = []
-    for rise_m, here, there, left, up in sides:
-        jump = np.abs(rise_m) > _EDGE_M
-        rises, here, there = rise_m[jump] > 0, here[jump], there[jump]
-        sign = np.where(rises, np.float32(1), np.float32(-1))
-        near, far = np.where(rises, here, there), np.where(rises, there, here)
-        found.append((near, far, sign * left, sign * up))
-    near, far, left, up = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    return near, far, left, up
-
-
-def _at_edges(sweep: Sweep) -> Indices:
-    """Rays beside a jump whose rim reaches over the edge of the nearer surface."""
-    first = sweep.first
-    near, far, left, up = _jumps(sweep)
-    surface = first.surface[near]
-    edge = (surface >= 0) & (surface != first.surface[far])
-    edge &= (first.origin[near] == Origin.SURFACE) & ~_IS_GROUND[sweep.material[near]]
-    near, far, surface = near[edge], far[edge], surface[edge]
-    radius = np.float32(sweep.sensor.divergence_rad / 2)
-    left, up = radius * left[edge], radius * up[edge]
-    both = np.concatenate([near, far])
-    direction = _aside(sweep, both, np.concatenate([left, -left]), np.concatenate([up, -up]))
-    met_m = _range_to(sweep, both, np.tile(surface, 2), direction)
-    missed = np.isinf(met_m[: len(near)])
-    reached = met_m[len(near) :] < first.range_m[far] - _EDGE_M
-    return np.concatenate([near[missed], far[reached]])
-
-
-def _beside_thin_solids(sweep: Sweep) -> tuple[Indices, Indices]:
-    """Rays (K,) and the solids (K,), narrower than the pitch of the shots, that they may touch."""
-    solids, (num_beams, num_shots) = sweep.solids, sweep.shape
-    pitch = 2 * np.pi / num_shots
-    centre_x, centre_y, _ = solids.centre.T
-    half_x, half_y, _ = solids.half_size.T
-    distance = np.hypot(centre_x, centre_y)
-    ahead = centre_x * solids.cos_yaw + centre_y * solids.sin_yaw
-    aside = centre_y * solids.cos_yaw - centre_x * solids.sin_yaw
-    half_length = np.hypot(half_x, half_y)
-    # Half the width seen from here, times the distance.
-    half_width = half_x * np.abs(aside) + half_y * np.abs(ahead)
-    thin = 2 * half_width < pitch * (distance - half_length) * distance
-    if sweep.optical_depth is not None:
-        thin &= solids.extinction == 0
-    thin = np.flatnonzero(thin & (distance - half_length < sweep.sensor.max_range_m))
-
-    # The shot of each beam that passes nearest; it starts where the sensor is when it is fired.
-    beam, solid = (axis.ravel() for axis in np.meshgrid(np.arange(num_beams), thin, indexing="ij"))
-    shot = np.rint(np.arctan2(centre_y, centre_x)[solid] / pitch).astype(np.int64)
-    for _ in range(3):
-        ahead, left = _seen_from(sweep, beam * num_shots + shot % num_shots, solid)
-        shot += np.rint(np.arctan2(left, ahead) / pitch).astype(np.int64)
-    rays = beam * num_shots + shot % num_shots
-    radius = np.float32(sweep.sensor.divergence_rad / 2)
-    x, y, z = sweep.direction[:, rays]
-    slope = z / np.sqrt(x * x + y * y)
-    off = np.abs(sweep.start[2, rays] + slope * ahead - solids.centre[solid, 2])
-    slack = np.abs(slope) + np.abs(solids.grade[solid]).sum(axis=1)
-    level = off <= solids.half_size[solid, 2] + slack * half_length[solid] + radius * ahead
-    beam, shot, solid = beam[level], shot[level], solid[level]
-
-    # Half a pitch to the nearest shot, half for the width, and the rim.
-    around = math.ceil(0.5 + radius / pitch)
-    offsets = np.arange(-around, around + 1)
-    rays = (beam[:, None] * num_shots + (shot[:, None] + offsets) % num_shots).ravel()
-    solid = np.repeat(solid, len(offsets))
-    ahead, left = _seen_from(sweep, rays, solid)
-    touched = np.abs(left) <= half_width[solid] / distance[solid] + radius * ahead
-    return rays[touched & (ahead > 0)], solid[touched & (ahead > 0)]
-
-
-def _seen_from(sweep: Sweep, rays: Indices, solid: Indices) -> tuple[Floats, Floats]:
-    """How far the centres of solids lie ahead of rays and to their left, seen from above."""
-    x, y = sweep.solids.centre[solid, :2].T - sweep.start[:2, rays]
-    if sweep.actor_time_s is not None:
-        velocity, time_s = sweep.solids.velocity[solid].T, sweep.actor_time_s[rays]
-        x, y = x + velocity[0] * time_s, y + velocity[1] * time_s
-    along, across = sweep.direction[:2, rays]
-    length = np.sqrt(along * along + across * across)
-    return (along * x + across * y) / length, (along * y - across * x) / length
-
-
-def _aside(sweep: Sweep, rays: Indices, left: Floats, up: Floats) -> Floats:
-    """Directions ``(3, M)`` at small angles to the left of rays and above them, radians."""
-    x, y, z = sweep.direction[:, rays]
-    level = np.sqrt(x * x + y * y)
-    left, up = left / level, up / level
-    # Their length is 1 to within the square of the angle: less than the step of a float32.
-    return np.stack([x - left * y - up * z * x, y + left * x - up * z * y, z + up * level * level])
-
-
-def _range_to(sweep: Sweep, rays: Indices, surface: Surfaces, direction: Floats) -> Floats:
-    """Where rays ``(M,)`` in other directions meet given surfaces; infinite where they miss."""
-    start = sweep.start[:, rays]
-    solid = np.flatnonzero(surface >= 0)
-    index = surface[solid]
-    seen_from = start[:, solid]
-    if sweep.actor_time_s is not None:
-        seen_from[:2] -= sweep.solids.velocity[index].T * sweep.actor_time_s[rays[solid]]
-    range_m = np.full(len(rays), np.inf, dtype=np.float32)
-    range_m[solid], _ = surface_distance(sweep.solids, index, seen_from, direction[:, solid])
-    ground = np.flatnonzero((surface == GROUND) & (direction[2] < 0))
-    range_m[ground] = (np.float32(sweep.solids.ground_m) - start[2, ground]) / direction[2, ground]
-    return np.where(range_m > 0, range_m, np.float32(np.inf))
 
 
 def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
@@ -256,14 +136,14 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     own, own_m = first.surface[rays], first.range_m[rays]
     other, other_m = first.surface[beside], first.range_m[beside]
     # Only a solid that ends before something else is missed by the rim of the ray that meets it.
-    ends = (own >= 0) & ((other != own) & (other_m > own_m + _EDGE_M)).any(axis=0)
-    ends &= (first.origin[rays] == Origin.SURFACE) & ~_IS_GROUND[sweep.material[rays]]
+    ends = (own >= 0) & ((other != own) & (other_m > own_m + EDGE_M)).any(axis=0)
+    ends &= (first.origin[rays] == Origin.SURFACE) & ~IS_GROUND[sweep.material[rays]]
     wanted = (other >= GROUND) & (first.origin[beside] == Origin.SURFACE) & (other != own)
-    wanted &= ends | (other_m < own_m - _EDGE_M)
+    wanted &= ends | (other_m < own_m - EDGE_M)
     for later in range(1, len(beside)):
         wanted[later] &= ~(wanted[:later] & (other[:later] == other[later])).any(axis=0)
 
-    thin_ray, thin = _beside_thin_solids(sweep)
+    thin_ray, thin = beside_thin_solids(sweep)
     row = np.searchsorted(rays, thin_ray).clip(max=len(rays) - 1)
     new = (rays[row] == thin_ray) & (own[row] != thin)
     new &= ~(wanted[:, row] & (other[:, row] == thin)).any(axis=0)
@@ -284,9 +164,9 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     bounds = np.cumsum([0, *(len(layer[0]) for layer in layers)])
     row, surface, seen_by = (np.concatenate(columns) for columns in zip(*layers, strict=True))
     # Whatever has no end fills the beam of the ray whose axis meets it.
-    range_m = np.repeat(own_m[row][None], len(_RING), axis=0)
+    range_m = np.repeat(own_m[row][None], len(RING_LEFT), axis=0)
     tested = np.append(np.flatnonzero(ends), np.arange(len(rays), len(row)))
-    range_m[:, tested] = _rim_ranges(sweep, rays[row[tested]], surface[tested])
+    range_m[:, tested] = rim_ranges(sweep, rays[row[tested]], surface[tested])
     seen_m = first.range_m[seen_by]
     brightness = first.power[seen_by] * np.where(np.isfinite(seen_m), seen_m, 0) ** 2
     cosine = sweep.cos_incidence[seen_by]
@@ -295,15 +175,6 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
         sweep, rays[row[unseen]], surface[unseen], range_m[:, unseen]
     )
     return _Targets(row, surface, range_m, brightness, cosine, bounds)
-
-
-def _rim_ranges(sweep: Sweep, rays: Indices, surface: Surfaces) -> Floats:
-    """Where the points of the rims of rays ``(K,)`` meet their surfaces, ``(6, K)``."""
-    radius = np.float32(sweep.sensor.divergence_rad / 2)
-    six = np.tile(rays, len(_RING))
-    left, up = (np.repeat(radius * side, len(rays)) for side in (_RING_LEFT, _RING_UP))
-    range_m = _range_to(sweep, six, np.tile(surface, len(_RING)), _aside(sweep, six, left, up))
-    return range_m.reshape(len(_RING), -1)
 
 
 def _brightness_of_solids(
@@ -315,7 +186,7 @@ def _brightness_of_solids(
     hit = np.flatnonzero(np.isfinite(nearest_m))
     rays, solid, point = rays[hit], solid[hit], point[hit]
     radius = np.float32(sweep.sensor.divergence_rad / 2)
-    direction = _aside(sweep, rays, radius * _RING_LEFT[point], radius * _RING_UP[point])
+    direction = turned_aside(sweep, rays, radius * RING_LEFT[point], radius * RING_UP[point])
     position = sweep.start[:, rays] + nearest_m[hit] * direction
     time_s = None if sweep.actor_time_s is None else sweep.actor_time_s[rays]
     cosine[hit] = np.abs((normals(sweep.solids, solid, position, time_s) * direction).sum(axis=0))
@@ -330,7 +201,7 @@ def _brightness_of_solids(
 
 def _nearest(targets: _Targets, num_rays: int) -> tuple[Indices, Floats]:
     """Pair that each point of the rims meets first, -1 for none, and where; each ``(6, M)``."""
-    met = np.full((len(_RING), num_rays), -1)
+    met = np.full((len(RING_LEFT), num_rays), -1)
     nearest_m = np.full(met.shape, np.inf, dtype=np.float32)
     for first, last in zip(targets.bounds[:-1], targets.bounds[1:], strict=True):
         row, there_m = targets.row[first:last], targets.range_m[:, first:last]

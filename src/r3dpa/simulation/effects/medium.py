@@ -21,18 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.raycast import (
-    NO_SURFACE,
-    Floats,
-    Solids,
-    solids_of,
-    surface_distance,
-)
+from r3dpa.simulation.raycast import surface_distance
 from r3dpa.simulation.scene import Primitive, Scene, Semantic, Shape
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import NO_SURFACE, Floats, Solids, solids_of
 from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
-_LIGHT_M_S = 299_792_458.0
 # Backscatter over extinction of clouds of water droplets, see Fog.
 _BACKSCATTER = 0.046 / math.log(20)
 _FOG_STEP_M = 0.05
@@ -137,7 +131,7 @@ def soft_waveform(
         Ranges ``(K,)`` from the nearest to the farthest that is reported, metres, and the power
         ``(K,)`` received from there, m^-2.
     """
-    extinction, half_pulse_m = math.log(20) / visibility_m, _LIGHT_M_S * sensor.pulse_s / 4
+    extinction, half_pulse_m = math.log(20) / visibility_m, sensor.pulse_depth_m / 2
     edges = range_edges(sensor, _FOG_STEP_M)
     everywhere = np.arange(0.0, sensor.max_range_m + half_pulse_m + _FOG_STEP_M, _FOG_STEP_M)
     density = np.exp(-2 * extinction * everywhere) * overlap_by_square(everywhere, sensor)
@@ -216,7 +210,7 @@ class Spray:
                 path = np.minimum(leave, echoes.range_m[chosen]) - enter
                 echoes.power[chosen] *= np.exp(-twice * path.clip(0))
             path = (np.minimum(leave, sweep.first.range_m[chosen]) - enter).clip(0)
-            within_pulse = path.clip(max=_LIGHT_M_S * sensor.pulse_s / 2)
+            within_pulse = path.clip(max=sensor.pulse_depth_m)
             power = np.float32(_BACKSCATTER) * twice / 2 * within_pulse
             power *= overlap_by_square(enter, sensor)
             if twice:

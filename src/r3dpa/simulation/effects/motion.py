@@ -10,21 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.raycast import (
-    EGO_BODY,
-    NO_SURFACE,
-    Floats,
-    cast,
-    level,
-    normals,
-    solids_of,
-    subset,
-)
-from r3dpa.simulation.scene import Material, Pose, Primitive, Scene
+from r3dpa.simulation.raycast import cast, normals
+from r3dpa.simulation.scene import Pose, Primitive, Scene
 from r3dpa.simulation.sensor import SpinningLidar
-from r3dpa.simulation.sweep import RayIndex, Sweep
-
-_EGO_REFLECTIVITY = 0.3
+from r3dpa.simulation.solids import EGO_BODY, NO_SURFACE, Floats, level, solids_of, subset
+from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
 
 @dataclass(frozen=True)
@@ -106,22 +96,23 @@ class MovingActors:
 
 @dataclass(frozen=True)
 class FoliageOcclusion:
-    """A crown is a medium of leaves: a ray gets into it, and sometimes through it.
+    """Crowns, meadows and wire mesh are media: a ray gets into them, and sometimes through them.
 
-    With the extinction k per metre, the depth s at which a leaf is hit has the density::
+    With the extinction k per metre, the depth s at which a leaf, a blade or a wire is hit has the
+    density::
 
         p(s) = k exp(-k s)        mean depth 1 / k
 
-    and a ray that leaves the crown first goes on. Successive crowns are independent, as a process
+    and a ray that leaves the solid first goes on. Successive solids are independent, as a process
     without memory asks for.
     """
 
     stage: ClassVar[Stage] = Stage.RAYS
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids that are foliage."""
+        """Solids with an extinction."""
         count = sum(p.extinction_per_m > 0 for p in scene.primitives)
-        return f"{count} crowns, bushes and hedges" if count else None
+        return f"{count} solids of leaves, grass or mesh" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those whose window meets foliage, where it is when they are fired."""
@@ -159,22 +150,26 @@ class EgoOcclusion:
         sweep.first.range_m[hit] = mask.range_m[nearer]
         sweep.first.surface[hit] = EGO_BODY
         sweep.first.power[hit] = 1
-        sweep.first.origin[hit] = 0
+        sweep.first.origin[hit] = Origin.SURFACE
         sweep.cos_incidence[hit] = mask.cos_incidence[nearer]
-        sweep.reflectivity[hit] = _EGO_REFLECTIVITY
-        sweep.material[hit] = Material.PAINT
+        sweep.reflectivity[hit] = mask.reflectivity[nearer]
+        sweep.material[hit] = mask.material[nearer]
 
 
 @dataclass(frozen=True)
 class _EgoMask:
+    """The M rays that meet the car, and what they meet; all arrays are ``(M,)``."""
+
     rays: NDArray[np.int64]
     range_m: Floats
     cos_incidence: Floats
+    reflectivity: Floats
+    material: NDArray[np.uint8]
 
 
 @lru_cache(maxsize=8)
 def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMask:
-    """Rays that meet the car, where, and how; once per rig."""
+    """Made once per rig."""
     body = solids_of(ego_body, Pose(z_m=0.0), ground_m=-1e6)
     origin, direction = sensor.rays
     range_m, surface = cast(body, origin, direction, sensor.max_range_m)
@@ -182,7 +177,14 @@ def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMas
     position = origin[:, hit] + range_m[hit] * direction[:, hit]
     normal = normals(body, surface[hit], position, None)
     cosine = np.abs((normal * direction[:, hit]).sum(axis=0))
-    return _EgoMask(np.flatnonzero(hit), range_m[hit], cosine)
+    part = surface[hit]
+    return _EgoMask(
+        np.flatnonzero(hit),
+        range_m[hit],
+        cosine,
+        np.array([p.reflectivity for p in ego_body], dtype=np.float32)[part],
+        np.array([p.material for p in ego_body], dtype=np.uint8)[part],
+    )
 
 
 def _rays_near(sweep: Sweep, chosen: NDArray, actor_time_s: Floats | None) -> NDArray[np.int64]:

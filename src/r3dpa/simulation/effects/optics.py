@@ -13,20 +13,15 @@ from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
 from r3dpa.simulation.effects.surface import surface_power
-from r3dpa.simulation.raycast import (
-    NO_SURFACE,
-    Floats,
-    cast_single,
-    normals,
-    surface_distance,
-)
+from r3dpa.simulation.raycast import cast_single, normals, surface_distance
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import NO_SURFACE, Floats
 from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
 # A pane belongs to the wall that it is this close to.
 _FASTENED_M = 0.25
-# Water stands where the ground is steeper than this nowhere.
+# Water stands only where the normal of the ground is this close to upright.
 _LEVEL_COS = 0.9
 
 
@@ -210,7 +205,7 @@ class WetGround:
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Water on the ground."""
         film_mm = scene.weather.water_film_mm
-        return f"{film_mm:g} mm of water, {len(scene.puddles)} puddles" if film_mm > 0 else None
+        return f"{film_mm:.2g} mm of water, {len(scene.puddles)} puddles" if film_mm > 0 else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those that hit the ground."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.effects.detection import MAX_SPREADS
 from r3dpa.simulation.effects.medium import (
     all_rays,
     attenuate,
@@ -19,15 +20,13 @@ from r3dpa.simulation.effects.medium import (
     range_edges,
     steps_before_target,
 )
-from r3dpa.simulation.raycast import NO_SURFACE
 from r3dpa.simulation.scene import Scene, Weather
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import NO_SURFACE
 from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
 _STEP_M = 0.2
 _POWERS = 64
-# SoftRaydrop lowers no threshold by more spreads than this.
-_WIDE = 4.0
 
 
 class DropTable(NamedTuple):
@@ -154,7 +153,7 @@ class _Hydrometeors(ABC):
         middle = (edges[1:] + edges[:-1]) / 2
         through = np.exp(-2 * self.extinction_per_m(rate_mm_h) * middle)
         filling = self.reflectivity * through * overlap_by_square(middle, sensor)
-        weakest = sensor.min_power * math.exp(-_WIDE * sensor.threshold_spread)
+        weakest = sensor.min_power * math.exp(-MAX_SPREADS * sensor.threshold_spread)
         if not (sensor.divergence_rad > 0 and filling.max() > weakest):
             return None
         powers = np.geomspace(weakest, filling.max(), _POWERS + 1)

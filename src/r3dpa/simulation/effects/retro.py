@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.raycast import Floats
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import Floats
 from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
 # How the coefficient of retroreflection falls with incidence, as a power of its cosine.

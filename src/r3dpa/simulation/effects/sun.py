@@ -9,9 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.raycast import NO_SURFACE, cast_single
+from r3dpa.simulation.raycast import cast_single
 from r3dpa.simulation.scene import Scene, Weather
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import NO_SURFACE
 from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
 
 _REACH_DEG = 10.0

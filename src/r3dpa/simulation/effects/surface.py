@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.raycast import Floats
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.solids import Floats
 from r3dpa.simulation.sweep import RayIndex, Sweep
 
 # Oren-Nayar coefficients of each material by the standard deviation of its facets' slope: fitted
