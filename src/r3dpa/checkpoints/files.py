@@ -39,6 +39,7 @@ _ABOUT = (
     "stage",
     "step",
     "geometry",
+    "augmentation",
     "interpolant",
     "version",
     "commit",
@@ -166,6 +167,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
             for name, state in checkpoint.networks.items()
         },
         "geometry": checkpoint.geometry,
+        "augmentation": checkpoint.augmentation,
         "interpolant": checkpoint.interpolant,
         "official_args": dict(checkpoint.official_args),
         "left_out": dict(checkpoint.left_out),
@@ -258,6 +260,7 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
         networks=networks,
         step=content.get("global_step"),
         geometry=about.get("geometry"),
+        augmentation=about.get("augmentation"),
         interpolant=about.get("interpolant", "linear"),
         version=about.get("version"),
         commit=about.get("commit"),
@@ -275,6 +278,7 @@ def _read_ours(path: Path) -> Checkpoint:
         raise ValueError(f"{description.name} is damaged: {error}") from error
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         raise ValueError(f"{description.name} does not describe a {_FORMAT}")
+    about.setdefault("augmentation", None)  # as files written before there was any
     missing = {*_ABOUT, "networks", "sha256"} - set(about)
     if missing:
         raise ValueError(f"{description.name} lacks {', '.join(sorted(missing))}")

@@ -167,6 +167,7 @@ class Checkpoint:
         networks: Networks by name, see :data:`NETWORK_NAMES`.
         step: Optimiser steps taken, None if the file does not tell.
         geometry: Plain values of the ``ScanGeometry`` it was trained for, None if unknown.
+        augmentation: Plain values of the ``Augmentation`` of its training, None if unknown.
         interpolant: Path between latents and noise that its SiT was trained on.
         version: Version of r3dpa that wrote it, None for official files.
         commit: Commit of r3dpa that wrote it, if known.
@@ -179,6 +180,7 @@ class Checkpoint:
     networks: Mapping[str, NetworkState]
     step: int | None = None
     geometry: Mapping[str, Any] | None = None
+    augmentation: Mapping[str, Any] | None = None
     interpolant: Literal["linear", "cosine"] = "linear"
     version: str | None = None
     commit: str | None = None

@@ -6,6 +6,7 @@ The data modules need Lightning, which takes seconds to import: they are loaded 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from r3dpa.data.augmentation import Augmentation, View
 from r3dpa.data.datasets import LidarBatch, LidarDataset, LidarSample
 from r3dpa.data.feature_grids import (
     Extractor,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KITTI360_DRIVES",
+    "Augmentation",
     "CheckReport",
     "Extractor",
     "FeatureGridError",
@@ -47,6 +49,7 @@ __all__ = [
     "Scan",
     "ScanError",
     "SimulatedDataModule",
+    "View",
     "check",
     "default_features_dir",
     "find_scans",

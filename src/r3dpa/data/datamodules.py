@@ -13,6 +13,7 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
 from torch.utils.data import DataLoader
 
+from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import LidarDataset
 from r3dpa.data.feature_grids import (
     Extractor,
@@ -36,6 +37,7 @@ from r3dpa.simulation import Weather, simulate
 
 _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
+_AUGMENTATION = Augmentation()
 _SCALR_DIM = 768  # width of the published feature grids
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
 _EMPTY_SPLIT = (
@@ -47,9 +49,9 @@ _EMPTY_SPLIT = (
 class LidarDataModule(LightningDataModule):
     """Scans of a folder, file, glob, or list of these.
 
-    Validation and test use the held-out scans, prediction all scans in order. No augmentation.
-    The order of training scans depends on ``seed`` and the epoch alone; a resumed run goes on
-    with the very next batch.
+    Validation and test use the held-out scans, prediction all scans in order. Training scans alone
+    are augmented, where asked for, and not under ``overfit_batches``. Their order and augmentation
+    depend on ``seed`` and the epoch alone; a resumed run goes on with the very next batch.
 
     Args:
         scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
@@ -67,21 +69,25 @@ class LidarDataModule(LightningDataModule):
         batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
             processes x ``accumulate_grad_batches`` scans.
         num_workers: Loader processes per training process; also extract features on the CPU.
-        seed: Seed of the order of training scans.
+        seed: Seed of the order of training scans and of their augmentation.
         val_every: Every this many scans, one is held out; None for none. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
         val_drives: Folders, relative to the root, that are held out whole; replaces ``val_every``.
         limit: Use this many scans of each split at most, spread evenly over it.
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
+        augmentation: Rotation and mirroring of training scans; none by default.
 
     Attributes:
         feature_dim: Width D of the feature grids; 768, that of ScaLR, where none are used.
         projection_kind: The argument ``projection``.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        ValueError: If an argument is out of its range, or the features do not follow the
+            augmentation.
     """
+
+    augmentation = _AUGMENTATION  # also of subclasses that make their batches without __init__
 
     def __init__(
         self,
@@ -100,6 +106,7 @@ class LidarDataModule(LightningDataModule):
         val_drives: list[str] | None = None,
         limit: int | None = None,
         prepare_data_per_node: bool = False,
+        augmentation: Augmentation = _AUGMENTATION,
     ) -> None:
         super().__init__()
         self.prepare_data_per_node = prepare_data_per_node
@@ -128,6 +135,9 @@ class LidarDataModule(LightningDataModule):
         self.val_every = val_every
         self.val_drives = val_drives
         self.limit = limit
+        self.augmentation = augmentation
+        if self.features_dir is not None:
+            augmentation.check_extractor(extractor, self.grid_size[1])
         self.train_set: LidarDataset | None = None
         self.val_set: LidarDataset | None = None
         self.all_set: LidarDataset | None = None
@@ -217,8 +227,11 @@ class LidarDataModule(LightningDataModule):
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self._ordered_loader(dataset)
         num_replicas, rank = self._place()
+        augmented = self.augmentation.active
         return training_loader(
-            dataset,
+            AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
+            if augmented
+            else dataset,
             self.batch_size,
             num_workers=self.num_workers,
             seed=self.seed,
@@ -226,6 +239,7 @@ class LidarDataModule(LightningDataModule):
             rank=rank,
             limit_batches=1.0 if self.trainer is None else self.trainer.limit_train_batches,
             pin_memory=torch.cuda.is_available(),
+            with_epoch=augmented,
         )
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:

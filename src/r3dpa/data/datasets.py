@@ -41,7 +41,7 @@ class LidarBatch(TypedDict):
 
 
 class LidarDataset(Dataset[LidarSample]):
-    """Range image, mask and feature grid of each scan; nothing random.
+    """Range image, mask and feature grid of each scan as it is; nothing random.
 
     Args:
         scans: The scans, in the order of the indices.

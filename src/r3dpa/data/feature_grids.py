@@ -40,6 +40,10 @@ class Extractor(Protocol):
     ``lift((N, K)) -> (N, dim)``, of which its forward pass is the composition: the mean of a cell
     commutes with a linear step, so the writer then pools the K values and lifts the cells only.
 
+    It may also say which augmentation its features follow: ``num_headings``, if rotating a scan by
+    any multiple of ``2 * pi / num_headings`` about the vertical axis leaves the features of its
+    points alone, and ``mirror_invariant``, if swapping left and right does.
+
     Attributes:
         name: Short name, part of the default folder name.
         dim: Width D of the features.

@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 
-class EpochSampler(DistributedSampler[int]):
+class EpochSampler(DistributedSampler[Any]):
     """Seeded shuffle of each epoch, dealt out to the processes in turn.
 
     Position p of an epoch goes to process ``p % processes``, so that a batch over all processes
@@ -23,6 +23,7 @@ class EpochSampler(DistributedSampler[int]):
         seed: Seed of the order, not negative.
         num_replicas: Number of processes.
         rank: This process, in ``[0, num_replicas)``.
+        with_epoch: Ask the data set for ``(epoch, index)`` and not for ``index``.
 
     Attributes:
         start: Samples of this process that the next pass skips; nothing of them is read.
@@ -30,18 +31,25 @@ class EpochSampler(DistributedSampler[int]):
     """
 
     def __init__(
-        self, dataset: Dataset[Any], seed: int = 0, num_replicas: int = 1, rank: int = 0
+        self,
+        dataset: Dataset[Any],
+        seed: int = 0,
+        num_replicas: int = 1,
+        rank: int = 0,
+        with_epoch: bool = False,
     ) -> None:
         super().__init__(dataset, num_replicas, rank, shuffle=True, seed=seed, drop_last=True)
+        self.with_epoch = with_epoch
         self.start = 0
         self.epoch_shift = 0
 
-    def __iter__(self) -> Iterator[int]:
+    def __iter__(self) -> Iterator[Any]:
         """Indices of this process in the current epoch, from ``start`` on."""
-        generator = np.random.default_rng((self.seed, self.epoch + self.epoch_shift))
+        epoch = self.epoch + self.epoch_shift
+        generator = np.random.default_rng((self.seed, epoch))
         order = generator.permutation(len(cast(Sized, self.dataset)))
-        own = order[self.rank : self.total_size : self.num_replicas]
-        return iter(own[self.start :].tolist())
+        own = order[self.rank : self.total_size : self.num_replicas][self.start :].tolist()
+        return iter([(epoch, index) for index in own] if self.with_epoch else own)
 
 
 class ResumableLoader(DataLoader[Any]):
@@ -134,11 +142,12 @@ def training_loader(
     rank: int = 0,
     limit_batches: float = 1.0,
     pin_memory: bool = False,
+    with_epoch: bool = False,
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches.
 
     Args:
-        dataset: Map-style data set without randomness of its own.
+        dataset: Map-style data set, a function of what it is asked for alone.
         batch_size: Samples per batch and process.
         num_workers: Loader processes; the order of the batches does not depend on it.
         seed: Seed of the order.
@@ -147,6 +156,8 @@ def training_loader(
         limit_batches: ``limit_train_batches`` of the trainer: an int is a number of batches of each
             epoch, a float a share of them.
         pin_memory: Copy batches to page-locked memory for a GPU.
+        with_epoch: Ask the data set for ``(epoch, index)``, where samples change from epoch to
+            epoch.
 
     Raises:
         ValueError: If the data set is smaller than one batch over all processes.
@@ -160,7 +171,7 @@ def training_loader(
     loader = ResumableLoader(
         dataset,
         batch_size=batch_size,
-        sampler=EpochSampler(dataset, seed, num_replicas, rank),
+        sampler=EpochSampler(dataset, seed, num_replicas, rank, with_epoch),
         num_workers=num_workers,
         drop_last=True,
         pin_memory=pin_memory,

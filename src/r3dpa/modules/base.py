@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from r3dpa import __version__, losses
 from r3dpa.checkpoints import load_into, read_checkpoint, source_commit, transfer_rgb
+from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant, sample_time
@@ -133,6 +134,7 @@ class GenerativeModule(L.LightningModule):
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.geometry: ScanGeometry | None = None
+        self.augmentation: Augmentation | None = None
         self.loaded_step = 0
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
@@ -157,7 +159,7 @@ class GenerativeModule(L.LightningModule):
             raise ValueError(
                 f"{type(self).__name__} needs a LidarDataModule, got {type(datamodule).__name__}"
             )
-        self.geometry = datamodule.geometry
+        self.geometry, self.augmentation = datamodule.geometry, datamodule.augmentation
         self._check_sizes(self.geometry)
         if self.needs_features() and stage != "predict":
             self._check_features(self.geometry, datamodule)
@@ -482,10 +484,11 @@ class GenerativeModule(L.LightningModule):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage and scan geometry, so that a checkpoint is enough to sample from."""
+        """Adds stage and scan geometry, enough to sample from, and what it was trained with."""
         checkpoint["r3dpa"] = {
             "stage": self.stage,
             "geometry": self.scan_geometry.to_dict(),
+            "augmentation": None if self.augmentation is None else asdict(self.augmentation),
             "interpolant": self.interpolant.path,
             "version": __version__,
             "commit": source_commit(),

@@ -51,9 +51,12 @@ class GeometricFeatures(nn.Module):
     Args:
         dim: Width D of the features, even.
         seed: Seed of W and Q.
+        mirror_invariant: Give a scan and its mirror image the same features, as augmentation by
+            flips needs: value 4 is then without its sign.
 
     Attributes:
-        name: ``"geometric"``.
+        name: ``"geometric"``, or ``"geometric_mirror_invariant"``.
+        num_headings: Rotations by multiples of this part of a turn keep the features.
         settings: What determines the features, see :class:`r3dpa.data.Extractor`.
 
     Raises:
@@ -63,12 +66,15 @@ class GeometricFeatures(nn.Module):
     frequencies: Tensor
     basis: Tensor
 
-    def __init__(self, dim: int = 768, seed: int = 0) -> None:
+    num_headings = _IMAGE.columns
+
+    def __init__(self, dim: int = 768, seed: int = 0, mirror_invariant: bool = False) -> None:
         super().__init__()
         if dim < 2 or dim % 2:
             raise ValueError(f"dim must be even and at least 2, got {dim}.")
-        self.name = "geometric"
+        self.name = "geometric_mirror_invariant" if mirror_invariant else "geometric"
         self.dim = dim
+        self.mirror_invariant = mirror_invariant
         self.settings: dict[str, Any] = {"seed": seed, "version": 1}
         width = min(dim, _KERNEL_WIDTH)
         generator = torch.Generator().manual_seed(seed)
@@ -109,7 +115,8 @@ class GeometricFeatures(nn.Module):
         0. linearity 1 - s2/s1 (1 where the neighbours lie on a line),
         1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane however sampled),
         2. sphericity s3/s1,
-        3. n along the horizontal viewing direction, 4. n across it, 5. n upwards,
+        3. n along the horizontal viewing direction, 4. n across it (its absolute value where
+        ``mirror_invariant``), 5. n upwards,
         6. height above the ground for a sensor 1.73 m up, metres,
         7. natural logarithm of the range in metres,
         8. intensity.
@@ -131,6 +138,8 @@ class GeometricFeatures(nn.Module):
         cos, sin = azimuth.cos(), azimuth.sin()
         along = normal[:, 0] * cos + normal[:, 1] * sin
         across = normal[:, 1] * cos - normal[:, 0] * sin
+        if self.mirror_invariant:
+            across = across.abs()
         height = xyz[:, 2] + _SENSOR_HEIGHT_M
         log_range = radius.clamp_min(0.1).log()
         own = [along, across, normal[:, 2], height, log_range, points[:, 3].float()]

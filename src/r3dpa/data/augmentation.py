@@ -1,0 +1,181 @@
+"""Augmentation that a scan, its range image and its feature grid undergo together.
+
+Mirroring left and right, and rotating about the vertical axis by whole grid columns, move whole
+pixels and whole cells: image and stored grid are reordered, nothing is projected or extracted
+again. Of any projection, for columns are the same in all.
+Letters: H beams, W columns, h x w cells, D feature width, P points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from r3dpa.data.datasets import LidarDataset, LidarSample
+
+_STREAM = 1  # separates these draws from those of the order, which have the same seed
+
+
+@dataclass(frozen=True)
+class View:
+    """A scan seen otherwise: mirrored or not, then rotated by whole grid columns.
+
+    Args:
+        columns: Grid columns by which everything moves to the right, that is clockwise seen from
+            above, each ``2 * pi / grid_columns``.
+        mirrored: Swap left and right, before the rotation.
+        grid_columns: Columns w of the feature grid.
+    """
+
+    columns: int
+    mirrored: bool
+    grid_columns: int
+
+    def points(self, points: Tensor) -> Tensor:
+        """Points seen this way, computed in float64.
+
+        :meth:`image` equals projecting these, but for points at the border of two pixels: a pixel
+        holds its left border only, which mirroring makes the right one.
+
+        Args:
+            points: ``(P, F)`` x, y, z in metres and anything else, which stays.
+
+        Returns:
+            ``(P, F)``, a copy, in the same order and dtype.
+        """
+        angle = -2 * math.pi * self.columns / self.grid_columns
+        x, y = points[:, 0].double(), points[:, 1].double()
+        if self.mirrored:
+            y = -y
+        result = points.clone()
+        result[:, 0] = math.cos(angle) * x - math.sin(angle) * y
+        result[:, 1] = math.sin(angle) * x + math.cos(angle) * y
+        return result
+
+    def image(self, image: Tensor) -> Tensor:
+        """Image ``(..., W)`` seen this way, W a multiple of w; exact."""
+        return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
+
+    def grid(self, grid: Tensor) -> Tensor:
+        """Feature grid ``(h * w, D)`` seen this way.
+
+        As exact as the features: see :meth:`Augmentation.check_extractor`.
+        """
+        return self._reordered(grid.unflatten(0, (-1, self.grid_columns)), 1, 1).flatten(0, 1)
+
+    def sample(self, sample: LidarSample) -> LidarSample:
+        """Training sample seen this way; index and name stay."""
+        seen = sample.copy()
+        seen["range_image"] = self.image(sample["range_image"])
+        seen["valid_mask"] = self.image(sample["valid_mask"])
+        if "feature_grid" in sample:
+            seen["feature_grid"] = self.grid(sample["feature_grid"])
+        return seen
+
+    def _reordered(self, values: Tensor, axis: int, cell_columns: int) -> Tensor:
+        if self.mirrored:
+            values = values.flip(axis)
+        return torch.roll(values, self.columns * cell_columns, axis)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Which views of the training scans are drawn, anew for each scan and epoch.
+
+    Args:
+        rotate: Rotate by a whole number of grid columns, each equally likely: with a grid of 8 x
+            64 to one of 64 headings, 5.6 degrees apart.
+        flip: Mirror left and right in half of the cases.
+        approximate_grids: Reorder also grids whose features do not follow the scan exactly, or
+            are not known to.
+    """
+
+    rotate: bool = False
+    flip: bool = False
+    approximate_grids: bool = False
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is drawn at all."""
+        return self.rotate or self.flip
+
+    def draw(self, seed: int, epoch: int, index: int, grid_columns: int) -> View:
+        """View of one scan in one epoch: a function of the arguments alone.
+
+        Args:
+            seed: Seed of the data module, not negative.
+            epoch: Passes over the data before this one.
+            index: Place of the scan in the training set.
+            grid_columns: Columns w of the feature grid.
+        """
+        generator = np.random.default_rng((seed, epoch, index, _STREAM))
+        columns = int(generator.integers(grid_columns))
+        mirrored = bool(generator.random() < 0.5)
+        return View(columns if self.rotate else 0, self.flip and mirrored, grid_columns)
+
+    def check_extractor(self, extractor: Any, grid_columns: int) -> None:
+        """Refuse stored grids that are not those of the scan seen otherwise.
+
+        An extractor says by ``num_headings`` and ``mirror_invariant`` how its features follow the
+        scan, see :class:`r3dpa.data.Extractor`.
+
+        Args:
+            extractor: What made the grids, None if unknown.
+            grid_columns: Columns w of the feature grid.
+
+        Raises:
+            ValueError: If a stored grid, reordered, may differ from that of the reordered scan.
+        """
+        if self.approximate_grids:
+            return
+        wrong = []
+        if self.rotate and (getattr(extractor, "num_headings", 0) or 1) % grid_columns:
+            wrong.append(("rotate", f"rotate with the scan by a {grid_columns}th of a turn"))
+        if self.flip and not getattr(extractor, "mirror_invariant", False):
+            wrong.append(("flip", "stay the same when the scan is mirrored"))
+        if wrong:
+            options = " and ".join(option for option, _ in wrong)
+            name = "of an unknown extractor" if extractor is None else f"of {extractor.name!r}"
+            raise ValueError(
+                f"augmentation.{options}: the features {name} are not known to "
+                f"{' or to '.join(what for _, what in wrong)}, so that reordered grids would not "
+                f"be those of the augmented scan. Switch {options} off, give an extractor whose "
+                "features do (GeometricFeatures with mirror_invariant: true does both), or set "
+                "augmentation.approximate_grids: true to train on the approximation."
+            )
+
+
+class AugmentedDataset(Dataset[LidarSample]):
+    """Training samples seen otherwise in each epoch.
+
+    Args:
+        dataset: The scans as they are.
+        augmentation: Which views are drawn.
+        seed: Seed of the draws.
+        grid_columns: Columns w of the feature grid, a divisor of W.
+    """
+
+    def __init__(
+        self, dataset: LidarDataset, augmentation: Augmentation, seed: int, grid_columns: int
+    ) -> None:
+        self.dataset, self.augmentation = dataset, augmentation
+        self.seed, self.grid_columns = seed, grid_columns
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.dataset)
+
+    def __getitem__(self, key: tuple[int, int]) -> LidarSample:
+        """Sample of ``(epoch, index)``.
+
+        Loader processes live longer than an epoch, so that each sample asked for names its own.
+        """
+        epoch, index = key
+        view = self.augmentation.draw(self.seed, epoch, index, self.grid_columns)
+        return view.sample(self.dataset[index])

@@ -1,0 +1,334 @@
+from dataclasses import asdict
+from itertools import chain
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from r3dpa.checkpoints import read_checkpoint, save_checkpoint
+from r3dpa.cli import main
+from r3dpa.data import Augmentation, LidarDataModule, View, find_scans, read_scan
+from r3dpa.geometry import (
+    LidarSensor,
+    RingProjection,
+    SphericalProjection,
+    pool_cells,
+    range_image,
+)
+from r3dpa.nn.backbones import GeometricFeatures
+from r3dpa.simulation import simulate
+
+GRID = (8, 64)
+PROJECTION = SphericalProjection(LidarSensor())
+VIEWS = [View(8, False, 64), View(0, True, 64), View(8, True, 64)]
+FEW_PIXELS = 40  # of 65,536: whose return lies at the border of two columns; up to 32 in real scans
+
+
+@pytest.fixture(scope="module")
+def simulated_scans(tmp_path_factory):
+    root = tmp_path_factory.mktemp("simulated")
+    simulate(root, scans=2)
+    return [torch.from_numpy(read_scan(scan.path)) for scan in find_scans(root)]
+
+
+@pytest.fixture(scope="module")
+def real_scans(real_scans_dir):
+    return [torch.from_numpy(read_scan(scan.path)) for scan in find_scans(real_scans_dir)[::12]]
+
+
+SOURCES = [
+    pytest.param("simulated_scans"),
+    pytest.param("real_scans", marks=pytest.mark.data),
+]
+
+
+@pytest.fixture(scope="module")
+def extractor():
+    return GeometricFeatures(dim=64, mirror_invariant=True)
+
+
+def grid_of(points, extractor, projection=PROJECTION):
+    return pool_cells(points[:, :3], extractor(points), projection, GRID)[0]
+
+
+def far_from_borders(points):
+    """Points that rounding moves to no other pixel, neither of the images nor of the extractor."""
+    x, y, z = points[:, :3].double().T
+    column = torch.atan2(y, x) * (1024 / (2 * np.pi))
+    inclination_deg = torch.atan2(z, torch.hypot(x, y)).rad2deg()
+    places = [column, (3 - inclination_deg) * 64 / 28, (15 - inclination_deg) * 96 / 40]
+    return points[torch.stack([(p - p.round()).abs() > 1e-4 for p in places]).all(0)]
+
+
+def test_points_by_hand():
+    points = torch.tensor([[10.0, 0.0, -1.0, 0.5], [3.0, 4.0, 2.0, 0.25]])
+    quarter = View(16, False, 64).points(points)  # clockwise: what was ahead is on the right
+    assert torch.allclose(quarter, torch.tensor([[0, -10, -1, 0.5], [4, -3, 2, 0.25]]), atol=1e-6)
+    mirrored = View(0, True, 64).points(points)
+    assert mirrored.tolist() == [[10, 0, -1, 0.5], [3, -4, 2, 0.25]]
+    both = View(16, True, 64).points(points)  # mirrored first
+    assert torch.allclose(both[1], torch.tensor([-4.0, -3, 2, 0.25]), atol=1e-6)
+    assert points[0, 0] == 10  # a copy
+
+
+def test_images_and_grids_by_hand():
+    image = torch.arange(8)[None]  # 2 pixels to a cell
+    assert View(1, False, 4).image(image).tolist() == [[6, 7, 0, 1, 2, 3, 4, 5]]
+    assert View(1, True, 4).image(image).tolist() == [[1, 0, 7, 6, 5, 4, 3, 2]]
+    grid = torch.arange(8)[:, None]  # 2 x 4 cells of width 1
+    assert View(1, False, 4).grid(grid).flatten().tolist() == [3, 0, 1, 2, 7, 4, 5, 6]
+    assert View(1, True, 4).grid(grid).flatten().tolist() == [0, 3, 2, 1, 4, 7, 6, 5]
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+def test_reordering_equals_projecting_anew(source, view, request):
+    for points in request.getfixturevalue(source):
+        image = view.image(range_image(points[:, :3], PROJECTION)[0])
+        expected, _ = range_image(view.points(points)[:, :3], PROJECTION)
+        assert ((image - expected).abs() > 1e-4).sum() <= FEW_PIXELS
+        inner = far_from_borders(points)
+        assert len(inner) > 0.998 * len(points)
+        image = view.image(range_image(inner[:, :3], PROJECTION)[0])
+        expected, _ = range_image(view.points(inner)[:, :3], PROJECTION)
+        assert (image - expected).abs().max() < 1e-5  # rounding of coordinates up to 56 m
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+def test_reordering_equals_extracting_anew(source, view, extractor, request):
+    """Features have unit norm.
+
+    Where neighbours lie on a line their normal is undefined, and rounding decides. In a simulated
+    scan such neighbours are frequent: rotating it there and back, which moves points by 4 um,
+    changes features by 3e-3 too.
+    """
+    tolerance = {"simulated_scans": 1e-2, "real_scans": 1e-3}[source]
+    for points in map(far_from_borders, request.getfixturevalue(source)):
+        reordered = view.grid(grid_of(points, extractor))
+        expected = grid_of(view.points(points), extractor)
+        error = (reordered - expected).abs()
+        assert error.max() < tolerance
+        assert error.median() < 1e-4
+        filled = expected.norm(dim=1) > 0
+        assert torch.cosine_similarity(reordered[filled], expected[filled]).min() > 0.999
+
+
+def test_default_geometric_features_rotate_but_tell_left_from_right(simulated_scans):
+    handed, points = GeometricFeatures(dim=64), simulated_scans[0]
+    rotated, mirrored = VIEWS[:2]
+    error = rotated.grid(grid_of(points, handed)) - grid_of(rotated.points(points), handed)
+    assert error.abs().max() < 1e-2
+    error = mirrored.grid(grid_of(points, handed)) - grid_of(mirrored.points(points), handed)
+    assert error.abs().max() > 0.1
+    Augmentation(rotate=True).check_extractor(handed, 64)
+    with pytest.raises(ValueError, match=r"flip.*mirror_invariant: true"):
+        Augmentation(rotate=True, flip=True).check_extractor(handed, 64)
+
+
+def test_only_what_follows_the_normal_across_the_ray_changes_with_mirror_invariant(extractor):
+    points = torch.randn(400, 4, generator=torch.Generator().manual_seed(0)) * 5
+    handed = GeometricFeatures(dim=64).descriptors(points)
+    invariant = extractor.descriptors(points)
+    assert (handed[:, 4] < 0).any()
+    assert torch.equal(invariant[:, 4], handed[:, 4].abs())
+    others = [0, 1, 2, 3, 5, 6, 7, 8]
+    assert torch.equal(invariant[:, others], handed[:, others])
+    assert extractor.name != GeometricFeatures(dim=64).name  # so that their grids never mix
+
+
+def in_ring_order(points, row):
+    """Points ring after ring, azimuth rising from 0, as a scan of them would be stored."""
+    azimuth = torch.atan2(points[:, 1].double(), points[:, 0].double()) % (2 * np.pi)
+    return points[np.lexsort((azimuth.numpy(), row.numpy()))]
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+def test_ring_images_are_reordered_alike(source, view, request):
+    scans = request.getfixturevalue(source)
+    projection = RingProjection.fit([points[:, :3] for points in scans], LidarSensor())
+    for points in scans:
+        row, _ = projection.pixel_of(points[:, :3])
+        image, _ = range_image(in_ring_order(points, row)[:, :3], projection)
+        stored = in_ring_order(view.points(points), row)
+        expected, _ = range_image(stored[:, :3], projection)
+        assert ((view.image(image) - expected).abs() > 1e-4).sum() <= FEW_PIXELS
+
+
+class Recorder(LightningModule):
+    """Keeps the images and grids that it is trained and validated on."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.trained, self.validated = [], []
+
+    def training_step(self, batch, batch_idx):
+        self.trained.append(batch)
+        return self.weight**2
+
+    def validation_step(self, batch, batch_idx):
+        self.validated.append(batch)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+BOTH = Augmentation(rotate=True, flip=True, approximate_grids=True)
+
+
+@pytest.fixture
+def data(tmp_path, make_scans, sensor, scaled_points):
+    folder = make_scans(tmp_path / "scans", 11)
+
+    def build(augmentation=BOTH, **options):
+        defaults = {"batch_size": 2, "val_every": 11, "grid_size": (2, 4)}
+        defaults |= {"extractor": scaled_points(), "augmentation": augmentation}
+        return LidarDataModule(str(folder), sensor=sensor, **defaults | options)
+
+    return build
+
+
+def fit(tmp_path, data, max_steps, *callbacks, ckpt_path=None, **options):
+    module = Recorder()
+    trainer = Trainer(
+        default_root_dir=tmp_path,
+        max_steps=max_steps,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=bool(callbacks),
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=list(callbacks),
+        **options,
+    )
+    trainer.fit(module, data, ckpt_path=ckpt_path)
+    return module
+
+
+def assert_same_batches(actual, expected):
+    assert len(actual) == len(expected) > 0
+    for one, other in zip(actual, expected, strict=True):
+        assert one["name"] == other["name"]
+        for key in ("range_image", "valid_mask", "feature_grid", "index"):
+            assert torch.equal(one[key], other[key])
+
+
+def test_image_mask_and_grid_of_a_sample_get_the_view_that_was_drawn(tmp_path, data):
+    module = data(seed=5)
+    batches = fit(tmp_path, module, 15).trained  # 3 epochs of 5 batches
+    views = set()
+    for number, batch in enumerate(batches):
+        for place, index in enumerate(batch["index"].tolist()):
+            view = BOTH.draw(5, number // 5, index, 4)
+            views.add(view)
+            plain = module.train_set[index]
+            for key, seen in (("range_image", view.image), ("valid_mask", view.image)):
+                assert torch.equal(batch[key][place], seen(plain[key]))
+            assert torch.equal(batch["feature_grid"][place], view.grid(plain["feature_grid"]))
+    assert views == {View(k, mirrored, 4) for k in range(4) for mirrored in (False, True)}
+
+
+def test_off_by_default_and_then_nothing_changes(tmp_path, data):
+    assert Augmentation() == LidarDataModule("*.bin").augmentation
+    assert not Augmentation().active
+    module = data(Augmentation())
+    batches = fit(tmp_path, module, 10).trained
+    assert module.train_dataloader().dataset is module.train_set
+    orders = [np.random.default_rng((0, epoch)).permutation(10) for epoch in (0, 1)]
+    assert [i for batch in batches for i in batch["index"].tolist()] == list(chain(*orders))
+    for batch in batches:
+        for place, index in enumerate(batch["index"].tolist()):
+            plain = module.train_set[index]
+            for key in ("range_image", "valid_mask", "feature_grid"):
+                assert torch.equal(batch[key][place], plain[key])
+
+
+def test_draws_do_not_depend_on_workers_but_on_seed_epoch_and_scan(tmp_path, data):
+    runs = [fit(tmp_path, data(num_workers=workers), 7).trained for workers in (0, 2)]
+    assert_same_batches(*runs)
+    drawn = {
+        BOTH.draw(seed, epoch, index, 10**6)
+        for seed in range(2)
+        for epoch in range(2)
+        for index in range(50)
+    }
+    assert len(drawn) == 200
+    views = [BOTH.draw(0, 0, index, 64) for index in range(6400)]
+    counts = np.bincount([view.columns for view in views], minlength=64)
+    assert 60 < counts.min() <= counts.max() < 140  # 100 each, deviation 10
+    assert sum(view.mirrored for view in views) == pytest.approx(3200, abs=160)  # 4 deviations
+
+
+@pytest.mark.parametrize("augmentation", [Augmentation(rotate=True), Augmentation(flip=True)])
+def test_one_without_the_other_draws_the_same(augmentation):
+    for index in range(20):
+        both, one = BOTH.draw(0, 0, index, 64), augmentation.draw(0, 0, index, 64)
+        assert one.columns == (both.columns if augmentation.rotate else 0)
+        assert one.mirrored == (both.mirrored and augmentation.flip)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("stop", [3, 7])
+def test_resume_within_an_epoch_goes_on_with_the_same_draws(tmp_path, data, workers, stop):
+    whole = fit(tmp_path, data(num_workers=workers), 9).trained
+    saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
+    fit(tmp_path, data(num_workers=workers), stop, saver)
+    path = tmp_path / f"c/step={stop}.ckpt"
+    second = fit(tmp_path, data(num_workers=workers), 9, ckpt_path=path).trained
+    assert_same_batches(second, whole[stop:])
+
+
+def test_resume_from_a_checkpoint_saved_after_the_fit(tmp_path, data):
+    """Lightning then counts the epoch as complete; the rest of it keeps its draws."""
+    whole = fit(tmp_path, data(), 9).trained
+    fit(tmp_path, data(), 3).trainer.save_checkpoint(tmp_path / "after.ckpt")
+    second = fit(tmp_path, data(), 9, ckpt_path=tmp_path / "after.ckpt").trained
+    assert_same_batches(second, whole[3:])
+
+
+def test_held_out_and_predicted_scans_are_never_augmented(tmp_path, data):
+    module, plain = data(), data(Augmentation())
+    seen = fit(tmp_path, module, 5).validated
+    assert_same_batches(seen, fit(tmp_path, plain, 5).validated)
+    for loader in ("val_dataloader", "test_dataloader", "predict_dataloader"):
+        assert_same_batches(list(getattr(module, loader)()), list(getattr(plain, loader)()))
+
+
+def test_overfitting_takes_the_scans_as_they_are(tmp_path, data):
+    module = data()
+    batch = fit(tmp_path, module, 1, overfit_batches=1).trained[0]
+    assert torch.equal(batch["range_image"][0], module.train_set[0]["range_image"])
+
+
+def test_grids_that_do_not_follow_are_refused(tmp_path, data):
+    for augmentation in (Augmentation(rotate=True), Augmentation(flip=True)):
+        with pytest.raises(ValueError, match=r"features of 'scaled' are not known to"):
+            data(augmentation)
+        with pytest.raises(ValueError, match="of an unknown extractor"):
+            data(augmentation, extractor=None, features_dir=str(tmp_path / "grids"))
+        data(augmentation, extractor=None)  # no grids, nothing to differ
+    geometric = GeometricFeatures(dim=16, mirror_invariant=True)
+    data(Augmentation(rotate=True, flip=True), extractor=geometric)
+    wide = LidarSensor(beams=8, columns=36)  # a sixth of a turn is no whole column of 1024
+    options = {"sensor": wide, "grid_size": (2, 6), "extractor": geometric}
+    with pytest.raises(ValueError, match=r"augmentation\.rotate: .* by a 6th of a turn"):
+        LidarDataModule(str(tmp_path), augmentation=Augmentation(rotate=True), **options)
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_checkpoints_tell_the_augmentation(asked, smoke_args, tmp_path):
+    more = ["--data.init_args.augmentation.rotate", "true"] if asked else []
+    main(smoke_args("vae_alignment", tmp_path / "run", "--trainer.logger=false", *more))
+    found = read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")
+    assert found.augmentation == asdict(Augmentation(rotate=asked))
+    ours = save_checkpoint(found, tmp_path / "ours.safetensors")
+    assert read_checkpoint(ours).augmentation == found.augmentation
+    about = yaml.safe_load(ours.with_suffix(".yaml").read_text())
+    del about["augmentation"]  # as in files of earlier versions
+    ours.with_suffix(".yaml").write_text(yaml.safe_dump(about))
+    assert read_checkpoint(ours).augmentation is None
