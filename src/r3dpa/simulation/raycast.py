@@ -18,9 +18,10 @@ from r3dpa.simulation.windows import pieces, windows_of
 # A secondary ray starts on a surface; nearer hits are that surface.
 _START_M = 1e-3
 # Slack of the heights that choose which solids are tested against a secondary ray.
+_SLACK_RAD = 1e-3
 _SLACK_M = 1e-2
 # Secondary rays whose table of distances to all solids stays in the cache of a core.
-_BLOCK_RAYS = 512
+_BLOCK_RAYS = 256
 # How single foliage draws are told apart from solid to solid; any odd numbers do.
 _BEAM_STRIDE, _SHOT_STRIDE = 17, 641
 
@@ -127,7 +128,7 @@ def cast_single(
         to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
         to_ground[(direction[2] >= 0) | (excluded == GROUND)] = np.nan
         _keep_nearer(to_ground, GROUND, nearest, surface)
-        ray, index = _close_pairs(solids, origin, direction, nearest, time_s)
+        ray, index = _close_pairs(solids, origin, direction, nearest, time_s, excluded)
         keep = excluded[ray] != index
         ray, index = ray[keep], index[keep]
         velocity = solids.velocity.T.take(index, axis=1)
@@ -211,9 +212,17 @@ def _draws_of(index: int, window: tuple[slice, slice], drawn: Floats) -> Floats:
 
 
 def _close_pairs(
-    solids: Solids, origin: Floats, direction: Floats, reach_m: Floats, time_s: Floats
+    solids: Solids,
+    origin: Floats,
+    direction: Floats,
+    reach_m: Floats,
+    time_s: Floats,
+    group: NDArray[np.int32],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rays and solids (each (K,), sorted by ray) whose upright bounding cylinders they cross."""
+    """Rays and solids (each (K,)) whose upright bounding cylinders they cross.
+
+    ``group`` (M,) says which rays start near each other; of a ray the solids come in order.
+    """
     level_length = np.hypot(direction[0], direction[1])
     along = direction[:2] / level_length
     speed = np.hypot(*solids.velocity.T)
@@ -225,15 +234,18 @@ def _close_pairs(
     lines = np.stack([along[1], -along[0], -offset], axis=1)
     start = np.stack([*along, -(origin[0] * along[0] + origin[1] * along[1])], axis=1)
     reach_m = reach_m * level_length
+    # Rays from one surface in similar directions make narrow blocks, which few solids come near.
+    order = np.lexsort((np.arctan2(along[1], along[0]), group))
     found = []
-    for some in range(0, len(lines), _BLOCK_RAYS):
-        block = slice(some, some + _BLOCK_RAYS)
-        ahead = start[block] @ centre
-        close = np.abs(lines[block] @ centre) <= radius
-        close &= ahead >= -radius
-        close &= ahead <= reach_m[block, None] + radius
+    for first in range(0, len(order), _BLOCK_RAYS):
+        block = order[first : first + _BLOCK_RAYS]
+        some = _near_block(centre[:2], radius, origin[:2, block], along[:, block])
+        ahead = start[block] @ centre[:, some]
+        close = np.abs(lines[block] @ centre[:, some]) <= radius[some]
+        close &= ahead >= -radius[some]
+        close &= ahead <= reach_m[block, None] + radius[some]
         ray, index = np.nonzero(close)
-        found.append((ray + some, index, ahead[ray, index]))
+        found.append((block[ray], some[index], ahead[ray, index]))
     if not found:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     ray, index, ahead_m = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -246,6 +258,31 @@ def _close_pairs(
     top, bottom = solids.centre[:, 2] + half_height, solids.centre[:, 2] - half_height
     meets = (np.minimum(enter, leave) <= top[index]) & (np.maximum(enter, leave) >= bottom[index])
     return ray[meets], index[meets]
+
+
+def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -> NDArray[np.int64]:
+    """Circles (of N) that some of a block's rays may cross, seen from above.
+
+    They lie within the cone around all the rays: from the middle of the origins, as wide as the
+    directions spread, widened by the radius and by how far the origins are apart.
+    """
+    middle = (origin.min(axis=1) + origin.max(axis=1)) / 2
+    apart_m = np.hypot(*(origin - middle[:, None])).max()
+    axis = along.sum(axis=1)
+    length = np.hypot(*axis)
+    if length < len(along[0]) / 2:  # the rays go every way
+        return np.arange(len(radius))
+    axis /= length
+    spread_rad = np.arccos((axis @ along).min().clip(-1, 1)) + _SLACK_RAD
+    x, y = centre - middle[:, None]
+    distance = np.hypot(x, y)
+    reach_m = radius + apart_m
+    around = distance <= reach_m
+    distance[around] = 1  # avoids dividing by 0; these are taken anyway
+    off_axis = np.abs(np.arctan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
+    return np.flatnonzero(
+        around | (off_axis <= spread_rad + np.arcsin((reach_m / distance).clip(max=1)))
+    )
 
 
 def _gather(solids: Solids, index: NDArray[np.integer]) -> _Solid:
