@@ -19,6 +19,8 @@ from r3dpa.cli import main
 from r3dpa.data.feature_grids import stored_feature_dim
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range
+from r3dpa.nn.backbones import WaffleIron
+from r3dpa.nn.backbones.scalr import _official_name
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
@@ -527,3 +529,14 @@ class TestFeatures:
         times = {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}
         main(["features", *map(str, words)])
         assert times == {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}
+
+    def test_scalr_is_given_by_its_checkpoint(self, simulated, tmp_path):
+        network = WaffleIron(width=4, depth=1, head_dim=5)
+        weights = {f"module.{_official_name(k)}": v for k, v in network.state_dict().items()}
+        torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
+        words = ["--data", "r3dpa.data.LidarDataModule", "--data.init_args.scans", simulated]
+        words += ["--data.init_args.features_dir", tmp_path / "grids"]
+        words += ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
+        words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
+        main(["features", *map(str, words)])
+        assert stored_feature_dim(tmp_path / "grids") == 4

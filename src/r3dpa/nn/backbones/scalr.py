@@ -79,7 +79,7 @@ class ScaLR(nn.Module):
     @classmethod
     def from_checkpoint(
         cls, path: str | Path, grid: ScanGrid | None = None, *, workers: int = 1
-    ) -> Self:
+    ) -> ScaLR:
         """Extractor with the weights of a ScaLR checkpoint; width and depth are those it has.
 
         Args:
