@@ -31,7 +31,7 @@ class Character(NamedTuple):
 
     ``lanes``: possible numbers of lanes ahead and towards us. ``districts``: weights of town,
     houses, green and yard. ``parked``: share of taken places at a kerb with parking. The rest:
-    kerbs with parking, pavements, street trees per block, gaps between cars and between people in
+    kerbs with parking, pavements, gaps between cars and between people in
     metres, blocks between side streets, largest slope of the road.
     """
 
@@ -40,7 +40,6 @@ class Character(NamedTuple):
     parked: tuple[float, float]
     parking: float
     pavement: float
-    trees: tuple[float, float]
     car_gap_m: tuple[float, float]
     people_gap_m: tuple[float, float]
     crossing_every: tuple[int, int]
@@ -55,7 +54,6 @@ CHARACTERS = (
         parked=(0.35, 0.75),
         parking=0.8,
         pavement=1.0,
-        trees=(0.15, 0.65),
         car_gap_m=(40, 90),
         people_gap_m=(50, 110),
         crossing_every=(3, 6),
@@ -67,7 +65,6 @@ CHARACTERS = (
         parked=(0.35, 0.75),
         parking=0.75,
         pavement=0.95,
-        trees=(0.15, 0.65),
         car_gap_m=(60, 140),
         people_gap_m=(60, 160),
         crossing_every=(4, 8),
@@ -79,7 +76,6 @@ CHARACTERS = (
         parked=(0.3, 0.7),
         parking=0.4,
         pavement=0.6,
-        trees=(0.15, 0.65),
         car_gap_m=(60, 140),
         people_gap_m=(80, 200),
         crossing_every=(6, 10),
@@ -91,7 +87,6 @@ CHARACTERS = (
         parked=(0.3, 0.7),
         parking=0.5,
         pavement=0.8,
-        trees=(0.15, 0.65),
         car_gap_m=(40, 70),
         people_gap_m=(60, 160),
         crossing_every=(5, 9),

@@ -17,10 +17,10 @@ from r3dpa.simulation.windows import pieces, windows_of
 
 # A secondary ray starts on a surface; nearer hits are that surface.
 _START_M = 1e-3
-# Slack of the heights that choose which solids are tested against a secondary ray.
+# Slack of the cones and heights that choose which solids are tested against a secondary ray.
 _SLACK_RAD = 1e-3
 _SLACK_M = 1e-2
-# Secondary rays whose table of distances to all solids stays in the cache of a core.
+# Secondary rays in one cone: more would widen it, fewer cost a cone each.
 _BLOCK_RAYS = 256
 # How single foliage draws are told apart from solid to solid; any odd numbers do.
 _BEAM_STRIDE, _SHOT_STRIDE = 17, 641

@@ -16,6 +16,9 @@ from r3dpa.simulation.greenery import bush, grass, row, tree, wood
 from r3dpa.simulation.scene import Material, Semantic, Shape
 from r3dpa.simulation.vehicles import DIRT, bicycle, coat, parked_vehicle, person
 
+# Limits of a district's chance of a tree at each place along the kerb.
+_STREET_TREES = (0.15, 0.65)
+
 
 def _building(
     builder: Builder,
@@ -195,7 +198,7 @@ def _build_kerbside(
     """Parked cars, lamps, signs, street trees, bicycles and waiting people along the kerb."""
     kerb, character = builder.course.kerb(side), builder.course.character
     parked_share = district.uniform(*character.parked)
-    tree_share = district.uniform(*character.trees)
+    tree_share = district.uniform(*_STREET_TREES)
     if kerb.parking:
         # Places every 5.5 to 7 m; in the rows here 6 m.
         for place in range(4):
