@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
 
-import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa import viz
 from r3dpa.atomic import atomic_path
-from r3dpa.data.scans import find_scans, read_npz, read_ply, read_scan
+from r3dpa.data.scans import find_scans, read_beside, read_npz, read_ply, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.simulation import Origin, Semantic
 
@@ -134,26 +133,7 @@ def _read(source: _Source) -> viz.PageScan:
     if path.suffix == ".ply":
         return viz.PageScan(name, read_ply(path))
     points = read_scan(path)
-    if path.parts[-3:-1] != _DATA:
-        return viz.PageScan(name, points)
-    beside = path.parents[1]
-    labels = _column(beside / "labels" / f"{path.stem}.label", "<u4", path, len(points))
-    origins = _column(beside / "origins" / f"{path.stem}.origin", "u1", path, len(points))
-    return viz.PageScan(name, points, labels, origins)
-
-
-def _column(path: Path, dtype: str, scan: Path, num_points: int) -> NDArray[np.integer] | None:
-    """A number for each point of a scan; None where the file is missing."""
-    if not path.exists():
-        return None
-    data = path.read_bytes()
-    size = np.dtype(dtype).itemsize
-    if len(data) != num_points * size:
-        raise ValueError(
-            f"{path} holds {len(data) / size:g} numbers but {scan} {num_points} points; "
-            "simulate both again, or delete the one that does not belong"
-        )
-    return np.frombuffer(data, dtype=dtype)
+    return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
 
 
 def _categories(names: type[IntEnum]) -> dict[int, viz.Category]:

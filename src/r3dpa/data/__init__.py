@@ -15,6 +15,7 @@ from r3dpa.data.feature_grids import (
     default_features_dir,
     write_feature_grids,
 )
+from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     CheckReport,
@@ -23,6 +24,7 @@ from r3dpa.data.scans import (
     check,
     find_scans,
     kitti360_scans,
+    read_beside,
     read_npz,
     read_ply,
     read_scan,
@@ -46,6 +48,8 @@ __all__ = [
     "LidarDataModule",
     "LidarDataset",
     "LidarSample",
+    "PointDataset",
+    "PointSample",
     "Scan",
     "ScanError",
     "SimulatedDataModule",
@@ -54,6 +58,8 @@ __all__ = [
     "default_features_dir",
     "find_scans",
     "kitti360_scans",
+    "list_collate",
+    "read_beside",
     "read_npz",
     "read_ply",
     "read_scan",

@@ -150,6 +150,34 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     return points
 
 
+def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndarray | None:
+    """What the simulator knows of each point of one of its scans.
+
+    Args:
+        scan: The scan's ``data/<frame>.bin``.
+        kind: ``"labels"``: uint32, KITTI-360 class in the lower 16 bits and instance in the upper;
+            ``"origins"``: uint8, what made the point, see :class:`r3dpa.simulation.Origin`.
+
+    Returns:
+        ``(P,)``; None where there is no such file, as for real scans.
+
+    Raises:
+        ScanError: If the file is unreadable or of another length than the scan; it is named.
+    """
+    scan = Path(scan)
+    suffix, dtype = {"labels": (".label", "<u4"), "origins": (".origin", "u1")}[kind]
+    path = scan.parents[1] / kind / f"{scan.stem}{suffix}"
+    if scan.parts[-3:-1] != ("velodyne_points", "data") or not path.exists():
+        return None
+    data, num_points = _read_bytes(path), scan.stat().st_size // _BYTES_PER_POINT
+    if len(data) != num_points * np.dtype(dtype).itemsize:
+        raise ScanError(
+            f"{path} holds {len(data) / np.dtype(dtype).itemsize:g} numbers but {scan} "
+            f"{num_points} points: simulate both again, or delete the one that does not belong"
+        )
+    return np.frombuffer(data, dtype=dtype)
+
+
 def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
     """Write one scan as a KITTI ``.bin`` file, atomically.
 
