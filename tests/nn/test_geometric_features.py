@@ -1,10 +1,12 @@
 import math
+import pickle
 
 import pytest
 import torch
 
 from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.nn.backbones.geometric import _symmetric_eigen
+from r3dpa.nn.backbones.geometric import CENTRES, SPREADS, _symmetric_eigen
+from r3dpa.nn.backbones.kernel import _BANDWIDTH
 
 LINEARITY, PLANARITY, SPHERICITY, ALONG, ACROSS, UP, HEIGHT, LOG_RANGE, INTENSITY = range(9)
 
@@ -73,9 +75,10 @@ def test_wall_is_a_plane_facing_the_sensor(extractor):
     values = extractor.descriptors(points)
     assert inner(values[:, PLANARITY]).min() > 0.8
     assert inner(values[:, UP].abs()).max() < 0.05
-    # The normal is -x: against the ray in front, aside of it by its azimuth elsewhere.
+    # The normal is -x: against the ray in front, aside of it by its azimuth elsewhere. To which
+    # side is not told.
     azimuth = torch.atan2(points[:, 1], points[:, 0])
-    expected = torch.stack([-azimuth.cos(), azimuth.sin()], dim=1)
+    expected = torch.stack([-azimuth.cos(), azimuth.sin().abs()], dim=1)
     error = (values[:, [ALONG, ACROSS]] - expected).abs().amax(dim=1)
     assert inner(error).max() < 0.05
 
@@ -127,6 +130,18 @@ def test_rotating_the_scan_about_z_keeps_the_features(extractor):
     assert similarity.quantile(0.02) > 0.99
 
 
+def test_a_mirror_image_has_the_same_features(extractor):
+    # A wall at 40 degrees to the viewing direction: without the absolute value the normal across
+    # the ray would be about 0.6 here and -0.6 in the mirror.
+    points = torch.cat([wall(9.0, azimuth_deg=40)[::3], ground()])
+    mirrored = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
+    similarity = (extractor(points) * extractor(mirrored)).sum(dim=1)
+    assert similarity.quantile(0.02) > 0.99
+    assert extractor.descriptors(points)[:, ACROSS].min() >= 0
+    assert extractor.mirror_invariant
+    assert extractor.settings["version"] == 2  # grids of version 1 told left from right
+
+
 def test_features_have_unit_norm_and_follow_the_kernel():
     # Inner products are a Gaussian kernel of the standardised descriptors, up to the error of 32
     # random frequencies (standard deviation below 1 / sqrt(2 * 32) = 0.125).
@@ -135,9 +150,7 @@ def test_features_have_unit_norm_and_follow_the_kernel():
     points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:300]]
     features = extractor(points)
     assert torch.allclose(features.norm(dim=1), torch.ones(300), atol=1e-5)
-    from r3dpa.nn.backbones.geometric import _BANDWIDTH, _CENTRES, _SPREADS
-
-    standard = (extractor.descriptors(points) - torch.tensor(_CENTRES)) / torch.tensor(_SPREADS)
+    standard = (extractor.descriptors(points) - torch.tensor(CENTRES)) / torch.tensor(SPREADS)
     expected = torch.exp(-(torch.cdist(standard, standard) ** 2) / (2 * _BANDWIDTH**2))
     error = features @ features.T - expected
     assert error.square().mean().sqrt() < 0.125
@@ -162,12 +175,22 @@ def test_lift_is_linear_and_the_seed_decides():
     assert torch.equal(one(points), same(points))
     assert not torch.allclose(one(points), other(points), atol=0.01)
     assert one.settings != other.settings
-    pooled = one.lift(one.point_features(points).mean(dim=0, keepdim=True))
+    (point_features,) = one.point_features([one.prepare(points)])
+    pooled = one.lift(point_features.mean(dim=0, keepdim=True))
     assert torch.allclose(pooled, one(points).mean(dim=0, keepdim=True), atol=1e-5)
     assert not list(one.parameters())
     assert not one.state_dict()
     with pytest.raises(ValueError, match="dim must be even and at least 2, got 3"):
         GeometricFeatures(3)
+
+
+def test_scans_of_a_batch_and_preparation_elsewhere(extractor):
+    scans = [wall(), ground(), pole()[:0]]
+    # As for a loader process.
+    prepare = pickle.loads(pickle.dumps(extractor.prepare))  # noqa: S301
+    together = extractor.point_features([prepare(points) for points in scans])
+    for points, features in zip(scans, together, strict=True):
+        assert torch.equal(extractor.lift(features), extractor(points))
 
 
 def test_closed_form_agrees_with_lapack():

@@ -1,3 +1,5 @@
+import pickle
+
 import pytest
 import torch
 
@@ -221,8 +223,34 @@ def test_checkpoint_round_trip(tmp_path):
     assert again.settings == scalr.settings
     assert ScaLR(WaffleIron(width=4, depth=3)).settings != scalr.settings
     points = cloud(20)
-    assert scalr.point_features(points).dtype == torch.float32
+    assert scalr(points).dtype == torch.float32
     torch.testing.assert_close(scalr(points).norm(dim=1), torch.ones(20))
+
+
+@torch.no_grad()
+def test_features_of_a_batch_are_those_of_its_scans(network):
+    extractor = ScaLR(network, GRID)
+    scans = [cloud(200), cloud(5) + 20, cloud(90, 1), cloud(0)]
+    passes = []
+    network.register_forward_hook(lambda *_: passes.append(1))
+    together = extractor.point_features([extractor.prepare(points) for points in scans])
+    assert len(passes) == 1
+    assert [len(features) for features in together] == [200, 5, 90, 0]
+    for points, features in zip(scans, together, strict=True):
+        torch.testing.assert_close(features, extractor(points), atol=1e-5, rtol=1e-5)
+    assert not together[1].any()
+    nowhere = extractor.point_features([extractor.prepare(points) for points in scans[1::2]])
+    assert [tuple(features.shape) for features in nowhere] == [(5, 12), (0, 12)]
+
+
+def test_preparation_goes_to_other_processes_without_weights():
+    extractor = ScaLR(WaffleIron(width=64, depth=3, cells=GRID.cells), GRID)
+    packed = pickle.dumps(extractor.prepare)
+    assert len(packed) < 1000
+    points = cloud(30)
+    again = pickle.loads(packed)(points)  # noqa: S301 - made above
+    for actual, expected in zip(again, prepare(points), strict=True):
+        assert torch.equal(actual, expected)
 
 
 def test_refused_checkpoints(tmp_path):

@@ -135,6 +135,8 @@ def test_point_features(case, grid, tmp_path, close):
     scalr = ScaLR.from_checkpoint(tmp_path / "ckpt_last.pth", grid)
     assert (scalr.dim, scalr.network.depth) == (case.config["nb_channels"], case.config["depth"])
     close(scalr(case["in/cloud0"]), case["out/eval/point_features0"])
+    batch = scalr.point_features([scalr.prepare(case[f"in/cloud{index}"]) for index in (1, 0)])
+    close(batch[1], case["out/eval/point_features0"])
 
 
 def test_released_sizes(official_listing):

@@ -1,7 +1,16 @@
-"""Frozen point-feature extractors, and the network of one of them."""
+"""Frozen extractors: point features to align with, and the networks of the published metrics."""
 
 from r3dpa.nn.backbones.geometric import GeometricFeatures
+from r3dpa.nn.backbones.liploc import LIPLoc
+from r3dpa.nn.backbones.masking import MaskedScan, Masking
+from r3dpa.nn.backbones.minkowski import MinkowskiNet
+from r3dpa.nn.backbones.oracle import OracleFeatures
+from r3dpa.nn.backbones.pretrained import WaffleIronS
+from r3dpa.nn.backbones.rangevit import RangeViT
 from r3dpa.nn.backbones.scalr import ScaLR
+from r3dpa.nn.backbones.sources import SOURCES, feature_source
+from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
+from r3dpa.nn.backbones.spvcnn import SPVCNN
 from r3dpa.nn.backbones.voxels import (
     PointCloudBatch,
     PreparedScan,
@@ -12,12 +21,24 @@ from r3dpa.nn.backbones.voxels import (
 from r3dpa.nn.backbones.waffleiron import WaffleIron
 
 __all__ = [
+    "SOURCES",
+    "SPVCNN",
     "GeometricFeatures",
+    "LIPLoc",
+    "MaskedScan",
+    "Masking",
+    "MinkowskiNet",
+    "OracleFeatures",
     "PointCloudBatch",
     "PreparedScan",
+    "RangeViT",
     "ScaLR",
     "ScanGrid",
     "WaffleIron",
+    "WaffleIronS",
     "collate_scans",
+    "feature_source",
+    "pool_voxels",
     "prepare_scan",
+    "voxelize",
 ]

@@ -6,9 +6,10 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
+from r3dpa.nn.backbones.kernel import KernelFeatures
 
 # Neighbourhood in pixels: wider than high, as a spinning sensor samples more densely in azimuth.
 _ROW_OFFSETS = (-2, -1, 0, 1, 2)
@@ -29,84 +30,45 @@ _GATE_M, _GATE_SHARE = 0.3, 0.05
 # Spread below which a direction counts as not covered: the noise of a range measurement.
 _NOISE_M = 0.01
 _SENSOR_HEIGHT_M = 1.73
-# Mean and standard deviation of the nine `descriptors` over points of real HDL-64E scans.
-_CENTRES = (0.47, 0.64, 0.13, -0.27, 0.0, 0.54, 0.61, 2.3, 0.26)
-_SPREADS = (0.18, 0.23, 0.13, 0.34, 0.36, 0.63, 0.85, 0.63, 0.15)
-_BANDWIDTH = 2.0  # of the Gaussian kernel, in standard deviations
-_KERNEL_WIDTH = 64
+#: Mean and standard deviation of the nine `GeometricFeatures.descriptors` over points of real
+#: HDL-64E scans.
+CENTRES = (0.47, 0.67, 0.13, -0.28, 0.23, 0.52, 0.63, 2.3, 0.26)
+SPREADS = (0.18, 0.24, 0.13, 0.34, 0.28, 0.63, 0.86, 0.65, 0.15)
 
 
-class GeometricFeatures(nn.Module):
+class GeometricFeatures(KernelFeatures):
     """Frozen, label-free feature extractor: what a point's surroundings look like.
 
-    Nine values per point (see :meth:`descriptors`) are standardised with fixed constants and
-    lifted to ``dim`` values of unit norm, whose inner product is a Gaussian kernel of the nine::
+    Nine values per point (see :meth:`descriptors`), lifted as :class:`KernelFeatures` says. A scan
+    and its mirror image have the same features, as have a scan and the same scan rotated.
 
-        phi(x) = [cos(W x), sin(W x)] / sqrt(K / 2),    features = Q phi(x),    Q^T Q = I
-
-    Source of the lift: Rahimi and Recht, "Random Features for Large-Scale Kernel Machines"
-    (NeurIPS 2007); of the shape values: eigenvalue features as in Demantké et al.,
-    "Dimensionality based scale selection in 3D LiDAR point clouds" (2011).
+    Source of the shape values: eigenvalue features as in Demantké et al., "Dimensionality based
+    scale selection in 3D LiDAR point clouds" (2011).
 
     Args:
         dim: Width D of the features, even.
-        seed: Seed of W and Q.
-        mirror_invariant: Give a scan and its mirror image the same features, as augmentation by
-            flips needs: value 4 is then without its sign.
+        seed: Seed of the lift.
 
     Attributes:
-        name: ``"geometric"``, or ``"geometric_mirror_invariant"``.
+        name: ``"geometric"``.
         num_headings: Rotations by multiples of this part of a turn keep the features.
+        mirror_invariant: Swapping left and right keeps the features.
         settings: What determines the features, see :class:`r3dpa.data.Extractor`.
 
     Raises:
         ValueError: If ``dim`` is odd or below 2.
     """
 
-    frequencies: Tensor
-    basis: Tensor
-
+    name = "geometric"
     num_headings = _IMAGE.columns
+    mirror_invariant = True
 
-    def __init__(self, dim: int = 768, seed: int = 0, mirror_invariant: bool = False) -> None:
-        super().__init__()
-        if dim < 2 or dim % 2:
-            raise ValueError(f"dim must be even and at least 2, got {dim}.")
-        self.name = "geometric_mirror_invariant" if mirror_invariant else "geometric"
-        self.dim = dim
-        self.mirror_invariant = mirror_invariant
-        self.settings: dict[str, Any] = {"seed": seed, "version": 1}
-        width = min(dim, _KERNEL_WIDTH)
-        generator = torch.Generator().manual_seed(seed)
-        frequencies = torch.randn(len(_CENTRES), width // 2, generator=generator) / _BANDWIDTH
-        q, r = torch.linalg.qr(torch.randn(dim, width, generator=generator, dtype=torch.float64))
-        basis = q * r.diagonal().sign()  # LAPACK libraries differ in the signs of Q
-        self.register_buffer("frequencies", frequencies, persistent=False)
-        self.register_buffer("basis", basis.float(), persistent=False)
+    def __init__(self, dim: int = 768, seed: int = 0) -> None:
+        super().__init__(dim, seed, CENTRES, SPREADS)
+        self.settings: dict[str, Any] = {"seed": seed, "version": 2}
 
-    def forward(self, points: Tensor) -> Tensor:
-        """Features of unit norm.
-
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-
-        Returns:
-            ``(P, dim)`` float32.
-        """
-        return self.lift(self.point_features(points))
-
-    def point_features(self, points: Tensor) -> Tensor:
-        """Kernel features ``phi`` of unit norm, ``(P, min(dim, 64))``, before the linear lift."""
-        descriptors = self.descriptors(points)
-        centre, spread = descriptors.new_tensor(_CENTRES), descriptors.new_tensor(_SPREADS)
-        phase = ((descriptors - centre) / spread) @ self.frequencies
-        return torch.cat([phase.cos(), phase.sin()], dim=1) / math.sqrt(phase.shape[1])
-
-    def lift(self, features: Tensor) -> Tensor:
-        """Linear, norm-preserving map of ``point_features``, or of means of them, to ``dim``."""
-        return features @ self.basis.T
-
-    def descriptors(self, points: Tensor) -> Tensor:
+    @staticmethod
+    def descriptors(points: Tensor) -> Tensor:
         """Nine values per point that describe its surroundings.
 
         With the standard deviations s1 >= s2 >= s3 of the neighbours along their principal axes
@@ -115,8 +77,8 @@ class GeometricFeatures(nn.Module):
         0. linearity 1 - s2/s1 (1 where the neighbours lie on a line),
         1. planarity (s2 - s3)/(s2 + 1 cm) (near 1 where they lie on a plane however sampled),
         2. sphericity s3/s1,
-        3. n along the horizontal viewing direction, 4. n across it (its absolute value where
-        ``mirror_invariant``), 5. n upwards,
+        3. n along the horizontal viewing direction, 4. n across it without its sign, which a mirror
+        would turn, 5. n upwards,
         6. height above the ground for a sensor 1.73 m up, metres,
         7. natural logarithm of the range in metres,
         8. intensity.
@@ -137,13 +99,13 @@ class GeometricFeatures(nn.Module):
         azimuth = torch.atan2(xyz[:, 1], xyz[:, 0])
         cos, sin = azimuth.cos(), azimuth.sin()
         along = normal[:, 0] * cos + normal[:, 1] * sin
-        across = normal[:, 1] * cos - normal[:, 0] * sin
-        if self.mirror_invariant:
-            across = across.abs()
+        across = (normal[:, 1] * cos - normal[:, 0] * sin).abs()
         height = xyz[:, 2] + _SENSOR_HEIGHT_M
         log_range = radius.clamp_min(0.1).log()
         own = [along, across, normal[:, 2], height, log_range, points[:, 3].float()]
         return torch.cat([shape, torch.stack(own, dim=1)], dim=1)
+
+    prepare = descriptors
 
 
 def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:

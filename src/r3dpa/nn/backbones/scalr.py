@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from r3dpa.nn.backbones.voxels import ScanGrid, collate_scans, prepare_scan
+from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.tokens import TokenFeatures
+from r3dpa.nn.backbones.voxels import ScanGrid
 from r3dpa.nn.backbones.waffleiron import WaffleIron
 
 _RELEASED = "ckpt_last.pth of WI_768-DINOv2_ViT_L_14-NS_KI_PD"
@@ -38,12 +35,8 @@ _NAMES = {
 }
 
 
-class ScaLR(nn.Module):
-    """Frozen feature extractor: tokens of a WaffleIron on the points of a scan, of unit norm.
-
-    A point has the token of the nearest point that the network saw, so points beyond the field of
-    view have features too. Always in evaluation mode. Computes in float32; on a GPU
-    ``torch.autocast`` around the call is what the official code does.
+class ScaLR(TokenFeatures):
+    """ScaLR: features distilled from images, of the width of the network.
 
     Source: Puy et al., "Three Pillars Improving Vision Foundation Model Distillation for Lidar"
     (CVPR 2024); as used by R3DPA.
@@ -53,28 +46,16 @@ class ScaLR(nn.Module):
         grid: How scans are prepared, as in its training; that of the release where None.
         workers: Threads of the neighbour search, -1 for all cores.
 
-    Attributes:
-        name: ``"scalr"``.
-        dim: Width of the features.
-        settings: What determines the features, see :class:`r3dpa.data.Extractor`.
-
     Raises:
         ValueError: If ``network`` has other planes than ``grid``.
     """
 
+    name = "scalr"
+
     def __init__(
         self, network: WaffleIron, grid: ScanGrid | None = None, *, workers: int = 1
     ) -> None:
-        super().__init__()
-        grid = grid or ScanGrid()
-        if network.cells != grid.cells:
-            raise ValueError(f"network has cells {network.cells}, but grid has {grid.cells}.")
-        network.head = nn.Identity()
-        self.network = network.requires_grad_(False)
-        self.grid, self.workers = grid, workers
-        self.name, self.dim = "scalr", network.width
-        self.settings: dict[str, Any] = {"weights": _sha256(network), "version": 1}
-        self.eval()
+        super().__init__(network, grid or ScanGrid(), workers)
 
     @classmethod
     def from_checkpoint(
@@ -93,40 +74,12 @@ class ScaLR(nn.Module):
         """
         path, grid = Path(path), grid or ScanGrid()
         try:
-            weights = _weights(_read(path))
+            weights = _weights(read_released(path, _RELEASED))
             network = _network_like(weights, grid)
             load_official(network, weights)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         return cls(network, grid, workers=workers)
-
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: statistics of the batch would change the features."""
-        return super().train(False)
-
-    def forward(self, points: Tensor) -> Tensor:
-        """Features of all points, see :meth:`point_features`."""
-        return self.point_features(points)
-
-    def point_features(self, points: Tensor) -> Tensor:
-        """Features of unit norm.
-
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-
-        Returns:
-            ``(P, dim)`` float32 on the device of the network; zeros where no point lies in the
-            field of view.
-
-        Raises:
-            ValueError: If ``points`` has another shape, or holds NaN or infinite values.
-        """
-        device = self.network.embedding.merge.weight.device
-        scan = prepare_scan(points.detach().cpu().numpy(), self.grid, workers=self.workers)
-        if not len(scan.features):
-            return torch.zeros(len(points), self.dim, device=device)
-        tokens = self.network(collate_scans([scan]).to(device))
-        return F.normalize(tokens.float(), dim=1)[scan.upsample.to(device)]
 
 
 def load_official(network: WaffleIron, weights: Mapping[str, Tensor]) -> None:
@@ -139,23 +92,7 @@ def load_official(network: WaffleIron, weights: Mapping[str, Tensor]) -> None:
     Raises:
         ValueError: If a weight is missing, left over or of another shape, by official name.
     """
-    own = network.state_dict()
-    names = {_official_name(key): key for key in own}
-    missing = [name for name in names if name not in weights]
-    unexpected = [name for name in weights if name not in names]
-    if missing or unexpected:
-        raise ValueError(
-            f"the weights are not those of this WaffleIron: {len(missing)} missing {missing[:5]}, "
-            f"{len(unexpected)} unexpected {unexpected[:5]}."
-        )
-    loaded = {}
-    for name, key in names.items():
-        shape, expected = tuple(weights[name].shape), tuple(own[key].shape)
-        # Official layers are convolutions, whose weights have kernel axes of size 1 at the end.
-        if shape[: len(expected)] != expected or any(size != 1 for size in shape[len(expected) :]):
-            raise ValueError(f"weight {name} has shape {shape}, but {expected} is expected.")
-        loaded[key] = weights[name].reshape(expected)
-    network.load_state_dict(loaded)
+    load_strictly(network, weights, _official_name)
 
 
 def _official_name(key: str) -> str:
@@ -184,26 +121,3 @@ def _weights(content: Any) -> dict[str, Tensor]:
     if found is None or not isinstance(content[found], Mapping):
         raise ValueError(f"has neither {' nor '.join(_MODEL_KEYS)}; give {_RELEASED}.")
     return {key.removeprefix(_PREFIX): value for key, value in content[found].items()}
-
-
-def _read(path: Path) -> Any:
-    if not path.is_file():
-        raise ValueError(f"no such file; give {_RELEASED}.")
-    try:
-        # Memory-mapped, so that the optimiser beside the weights is not read.
-        return torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
-    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError) as error:
-        reason = str(error).partition("\n")[0]
-        raise ValueError(
-            f"is damaged, or holds more than tensors and plain values ({reason}); give {_RELEASED}."
-        ) from error
-
-
-def _sha256(network: nn.Module) -> str:
-    digest = hashlib.sha256()
-    for key, value in network.state_dict().items():
-        digest.update(key.encode())
-        digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()

@@ -62,22 +62,37 @@ class WaffleIron(nn.Module):
 
     def forward(self, batch: PointCloudBatch) -> Tensor:
         """Tokens ``(N, F)`` of the last layer, which ScaLR takes as features."""
-        planes = self._planes(batch)
-        tokens = self.embedding(batch.features, batch.neighbors)
+        return self.mix(self.embedding(batch.features, batch.neighbors), batch)
+
+    def mix(self, tokens: Tensor, batch: PointCloudBatch, visible: Tensor | None = None) -> Tensor:
+        """Pass embedded points through all layers.
+
+        Args:
+            tokens: ``(N, F)`` at the entrance of the first layer.
+            batch: Their cells.
+            visible: ``(N,)`` bool: the other points read the planes and write nothing there, so
+                that no point learns anything of them. All points are visible where None.
+
+        Returns:
+            Tokens ``(N, F)`` of the last layer.
+        """
+        planes = self._planes(batch, visible)
         for layer, (spatial, channel) in enumerate(zip(self.spatial, self.channel, strict=True)):
             tokens = channel(spatial(tokens, planes[layer % len(planes)]))
         return tokens
 
-    def _planes(self, batch: PointCloudBatch) -> list[Plane]:
+    def _planes(self, batch: PointCloudBatch, visible: Tensor | None = None) -> list[Plane]:
         num_scans, num_points = len(batch.num_points), len(batch.features)
         scan = torch.repeat_interleave(batch.num_points, output_size=num_points)
+        weight = None if visible is None else visible.to(batch.features.dtype)
         planes = []
         for cells, (rows, columns) in zip(batch.cells, self.plane_sizes, strict=True):
             own = cells + scan * (rows * columns)
             count = batch.features.new_zeros(num_scans * rows * columns)
-            count.index_add_(0, own, torch.ones_like(own, dtype=count.dtype))
+            count.index_add_(0, own, count.new_ones(num_points) if weight is None else weight)
             share = (count + _COUNT_EPS).reciprocal()[:, None]
-            planes.append(Plane(own, share, (num_scans, rows, columns)))
+            column = None if weight is None else weight[:, None]
+            planes.append(Plane(own, share, (num_scans, rows, columns), column))
         return planes
 
 
@@ -86,13 +101,17 @@ class Plane(NamedTuple):
 
     Attributes:
         cells: ``(N,)`` int64 cell of each point, ``(scan * rows + row) * columns + column``.
-        share: ``(B * rows * columns, 1)`` float32 one over the number of points of each cell.
+        share: ``(B * rows * columns, 1)`` float32 one over the number of points that write to each
+            cell.
         size: B, rows, columns.
+        weight: ``(N, 1)`` float32, 1 where a point writes to its cell and 0 where it only reads;
+            all write where None.
     """
 
     cells: Tensor
     share: Tensor
     size: tuple[int, int, int]
+    weight: Tensor | None
 
 
 class Embedding(nn.Module):
@@ -164,6 +183,8 @@ class SpatialMixing(nn.Module):
     def forward(self, tokens: Tensor, plane: Plane) -> Tensor:
         """Tokens ``(N, F)`` plus what they learn from the cells around theirs."""
         normed = at_least_float32(self.norm(tokens))
+        if plane.weight is not None:
+            normed = normed * plane.weight
         sums = normed.new_zeros(len(plane.share), normed.shape[1])
         means = sums.index_add_(0, plane.cells, normed).mul_(plane.share)
         # Channels stay last in memory, so that neither permutation copies the image.

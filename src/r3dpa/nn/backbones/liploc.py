@@ -1,0 +1,216 @@
+"""LIP-Loc's encoder of range images, whose features FLD compares.
+
+Letters: B batch, H x W range image, D token width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r3dpa.nn.backbones.official import load_strictly, read_state_dict, renamed
+from r3dpa.nn.backbones.vit import TransformerTrunk, trunk_depth, usual_heads
+
+_NORM_EPS = 1e-6
+GREY_LEVELS_PER_M = 5.1
+# Mean and deviation of red, green and blue on ImageNet.
+_MEAN = (0.485, 0.456, 0.406)
+_DEVIATION = (0.229, 0.224, 0.225)
+_ENCODER = "encoder_lidar.model."
+# Beginning of our names -> of the official ones.
+_NAMES = {"embedding.": "patch_embed.proj.", "encoder.": "", "norm.": "fc_norm."}
+
+
+class LIPLoc(nn.Module):
+    """Features of range images for FLD: mean of the patch tokens of a ViT, normalised.
+
+    Range images become grey pictures as in the published numbers, see :func:`wrapped_picture`.
+    The defaults are the sizes of ViT-S/16. Always in evaluation mode.
+
+    Source: LIP-Loc (Puligilla et al. 2024) as ``eval/models/liploc`` of valeoai/R3DPA uses it.
+
+    Args:
+        picture_side: Rows and columns of the square pictures.
+        patch_side: Rows and columns of a patch.
+        width: Token width D.
+        depth: Number of transformer blocks.
+        num_heads: Attention heads.
+
+    Attributes:
+        dim: Width of the features, that of the tokens.
+
+    Raises:
+        ValueError: If sizes do not divide.
+    """
+
+    def __init__(
+        self,
+        picture_side: int = 224,
+        patch_side: int = 16,
+        width: int = 384,
+        depth: int = 12,
+        num_heads: int = 6,
+    ) -> None:
+        super().__init__()
+        if picture_side % patch_side:
+            raise ValueError(
+                f"pictures of {picture_side} pixels do not divide into patches of {patch_side}"
+            )
+        self.picture_side, self.dim = picture_side, width
+        self.embedding = nn.Conv2d(3, width, patch_side, patch_side)
+        grid_side = picture_side // patch_side
+        self.encoder = TransformerTrunk(width, depth, num_heads, (grid_side, grid_side), _NORM_EPS)
+        self.norm = nn.LayerNorm(width, _NORM_EPS)
+        self.requires_grad_(False).eval()
+
+    @classmethod
+    def from_checkpoint(cls, path: str | Path, *, num_heads: int | None = None) -> Self:
+        """Network with the weights of an official checkpoint; other sizes are those it has.
+
+        Of the whole model only ``encoder_lidar`` is read.
+
+        Args:
+            path: ``model.ckpt`` of the release; nothing in it is executed.
+            num_heads: Attention heads; those of the ViT of this width where None.
+
+        Raises:
+            ValueError: If the file is missing or unreadable, holds no such encoder, or if a weight
+                of it is missing, left over or of another shape; the message names the file.
+        """
+        try:
+            weights = {
+                name.removeprefix(_ENCODER): value
+                for name, value in read_state_dict(Path(path)).items()
+                if name.startswith(_ENCODER)
+            }
+            sizes = _sizes(weights)
+            heads = usual_heads(sizes["width"]) if num_heads is None else num_heads
+            network = cls(**sizes, num_heads=heads)
+            load_official(network, weights)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        return network
+
+    def train(self, mode: bool = True) -> Self:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    def forward(self, range_m: Tensor) -> Tensor:
+        """Features of range images of any size.
+
+        Args:
+            range_m: ``(B, H, W)`` metres, -1 without a return.
+
+        Returns:
+            ``(B, dim)``.
+
+        Raises:
+            ValueError: If there is no such batch, or a value is not finite.
+        """
+        return self.encode(wrapped_picture(range_m, (self.picture_side, self.picture_side)))
+
+    def encode(self, pictures: Tensor) -> Tensor:
+        """Features of pictures.
+
+        Args:
+            pictures: ``(B, 3, picture_side, picture_side)``, normalised as on ImageNet.
+
+        Returns:
+            ``(B, dim)``.
+
+        Raises:
+            ValueError: If the pictures are of another size.
+        """
+        side = self.picture_side
+        if pictures.shape[1:] != (3, side, side):
+            raise ValueError(
+                f"pictures must be (B, 3, {side}, {side}), got shape {tuple(pictures.shape)}"
+            )
+        tokens = self.encoder(self.embedding(pictures))
+        return self.norm(tokens[:, 1:].mean(dim=1))
+
+
+def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tensor:
+    """Range images as the pictures that LIP-Loc's published numbers were computed with.
+
+    Grey levels are bytes, see :func:`wrapped_grey_levels`; the picture is resized bilinearly with
+    antialiasing, repeated for three colours, and normalised with the constants of ImageNet.
+
+    Source: ``createRangeImage`` and ``Model.preprocess`` of valeoai/R3DPA.
+
+    Args:
+        range_m: ``(B, H, W)`` metres, -1 without a return.
+        size: Rows and columns of the pictures.
+
+    Returns:
+        ``(B, 3, *size)`` float32.
+
+    Raises:
+        ValueError: If there is no such batch, or a value is not finite.
+    """
+    if range_m.ndim != 3 or not range_m.numel():
+        raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
+    grey = wrapped_grey_levels(range_m).float()[:, None] / 255
+    grey = F.interpolate(grey, size, mode="bilinear", align_corners=False, antialias=True)
+    mean, deviation = (grey.new_tensor(values).view(3, 1, 1) for values in (_MEAN, _DEVIATION))
+    return (grey - mean) / deviation
+
+
+def wrapped_grey_levels(range_m: Tensor) -> Tensor:
+    """Range in bytes: 5.1 levels a metre, cut to whole ones, modulo 256.
+
+    Empty pixels (-1) become 251, nearly white, and ranges from 256 / 5.1 = 50.2 m on start from
+    black again. The official code leaves this to a C cast, which is undefined outside of
+    0..255 and does the same on x86.
+
+    Formula: ``trunc(5.1 * range_m) mod 256`` in float32.
+
+    Args:
+        range_m: Any shape, metres, finite.
+
+    Returns:
+        Same shape, uint8.
+
+    Raises:
+        ValueError: If a value is not finite.
+    """
+    if not range_m.isfinite().all():
+        raise ValueError("range images must be finite, got NaN or infinite values; drop these")
+    levels = torch.trunc(range_m.float() * GREY_LEVELS_PER_M)
+    return torch.remainder(levels, 256).to(torch.uint8)
+
+
+def load_official(network: LIPLoc, weights: Mapping[str, Tensor]) -> None:
+    """Load the official state dict of the encoder, every key of it.
+
+    Args:
+        network: Network of the same sizes.
+        weights: Tensors by official name, without ``encoder_lidar.model.``.
+
+    Raises:
+        ValueError: If a weight is missing, left over or of another shape, by official name.
+    """
+    load_strictly(network, weights, renamed(_NAMES))
+
+
+def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:
+    """Sizes of the network that the weights are of, but for its number of heads."""
+    patches, positions = weights.get("patch_embed.proj.weight"), weights.get("pos_embed")
+    if patches is None or positions is None or patches.ndim != 4 or positions.ndim != 3:
+        raise ValueError(
+            f"holds no LIP-Loc with a ViT: no {_ENCODER}patch_embed.proj.weight or "
+            f"{_ENCODER}pos_embed."
+        )
+    patch_side = patches.shape[-1]
+    return {
+        "picture_side": math.isqrt(positions.shape[1] - 1) * patch_side,
+        "patch_side": patch_side,
+        "width": patches.shape[0],
+        "depth": trunk_depth(weights),
+    }

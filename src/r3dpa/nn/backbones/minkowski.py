@@ -1,0 +1,265 @@
+"""MinkowskiNet: a U-Net of sparse convolutions over voxels, and its official checkpoint.
+
+Source: Choy, Gwak and Savarese, "4D Spatio-Temporal ConvNets" (CVPR 2019), in the form of Tang et
+al., "Searching Efficient 3D Architectures with Sparse Point-Voxel Convolution" (ECCV 2020); same
+numbers as the networks of FSVD and FPVD in valeoai/R3DPA (``tests/parity``).
+Letters: P voxels given, N voxels of one stride, C input channels, F channels of the features.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.sparse import KernelMap, SparseConv, Voxels
+
+#: Widths of the stem, the four encoder stages and the four decoder stages at channel rate 1.
+WIDTHS = (32, 32, 64, 128, 256, 256, 128, 96, 96)
+_DEPTH = 4
+# Convolutions of a residual block: official list of layers, and place of the convolution there.
+_BRANCHES = {"first": ("net", 0), "second": ("net", 3), "skip": ("downsample", 0)}
+_STEM = "stem.0.kernel"  # official name of the first weight
+_RELEASED = "model.ckpt of the released MinkowskiNet or SPVCNN"
+
+
+def scaled_widths(rate: float, widths: Sequence[int] = WIDTHS) -> tuple[int, ...]:
+    """Widths at a channel rate, cut off to integers as the official networks do."""
+    return tuple(int(rate * width) for width in widths)
+
+
+class ConvNorm(nn.Module):
+    """Sparse convolution and batch norm.
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels.
+        kernel_size: 1, 2 or 3, see :class:`SparseConv`.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: int) -> None:
+        super().__init__()
+        self.conv = SparseConv(in_channels, out_channels, kernel_size)
+        self.norm = nn.BatchNorm1d(out_channels)
+
+    def forward(self, features: Tensor, kernel_map: KernelMap | None = None) -> Tensor:
+        """Features ``(N', out_channels)``, not rectified."""
+        return self.norm(self.conv(features, kernel_map))
+
+
+class Residual(nn.Module):
+    """Two convolutions of size 3 beside a shortcut, which has weights where the width changes.
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.first = ConvNorm(in_channels, out_channels, 3)
+        self.second = ConvNorm(out_channels, out_channels, 3)
+        same = in_channels == out_channels
+        self.skip = nn.Identity() if same else ConvNorm(in_channels, out_channels, 1)
+
+    def forward(self, features: Tensor, kernel_map: KernelMap) -> Tensor:
+        """Features ``(N, out_channels)`` at the same voxels."""
+        inner = functional.relu(self.first(features, kernel_map), inplace=True)
+        return functional.relu(self.second(inner, kernel_map) + self.skip(features), inplace=True)
+
+
+class Stage(nn.Module):
+    """Change of the stride, then two residual blocks at the new one.
+
+    Args:
+        in_channels: Input channels.
+        resampled: Channels behind the change of the stride.
+        joined: Channels that the encoder adds there.
+        out_channels: Output channels.
+    """
+
+    def __init__(self, in_channels: int, resampled: int, joined: int, out_channels: int) -> None:
+        super().__init__()
+        self.resample = ConvNorm(in_channels, resampled, 2)
+        self.blocks = nn.ModuleList(
+            [Residual(resampled + joined, out_channels), Residual(out_channels, out_channels)]
+        )
+
+    def forward(
+        self, features: Tensor, change: KernelMap, voxels: Voxels, joined: Tensor | None = None
+    ) -> Tensor:
+        """Features ``(N', out_channels)`` at ``voxels``, to which the map ``change`` leads."""
+        features = functional.relu(self.resample(features, change), inplace=True)
+        if joined is not None:
+            features = torch.cat([features, joined], dim=1)
+        for block in self.blocks:
+            features = block(features, voxels.neighbors)
+        return features
+
+
+class MinkowskiNet(nn.Module):
+    """Features of voxels: a U-Net over strides 1, 2, 4, 8 and 16.
+
+    Args:
+        widths: Channels of the stem, four encoder and four decoder stages; the default is the
+            network of FSVD, whose pooled feature has 768 = 16 rings x 48 numbers.
+        in_channels: Input channels C.
+        num_classes: Outputs of the linear layer ``head``, which the forward pass leaves out.
+
+    Raises:
+        ValueError: If there are not nine widths, or one is not positive.
+    """
+
+    def __init__(
+        self,
+        widths: Sequence[int] = scaled_widths(0.5),
+        in_channels: int = 4,
+        num_classes: int = 20,
+    ) -> None:
+        super().__init__()
+        if len(widths) != len(WIDTHS) or min(widths) < 1:
+            raise ValueError(f"widths must be {len(WIDTHS)} positive numbers, got {widths}.")
+        self.widths, self.in_channels = tuple(widths), in_channels
+        stem = self.widths[0]
+        self.stem = nn.ModuleList([ConvNorm(in_channels, stem, 3), ConvNorm(stem, stem, 3)])
+        self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
+        for index in range(_DEPTH):
+            before, width = self.widths[index : index + 2]
+            self.encoder.append(Stage(before, before, 0, width))
+        for index in range(_DEPTH):
+            before, width = self.widths[_DEPTH + index : _DEPTH + index + 2]
+            self.decoder.append(Stage(before, width, self.widths[_DEPTH - 1 - index], width))
+        self.head = nn.Linear(self.widths[-1], num_classes)
+
+    @classmethod
+    def from_checkpoint(cls, path: str | Path) -> Self:
+        """Network with the weights of an official checkpoint; its widths are those it has.
+
+        Args:
+            path: ``model.ckpt`` of the release, a state dict below ``state_dict`` or a bare one.
+                Nothing in it is executed. Where the network is one module of several, its prefix
+                is taken off and the weights of the others are not used.
+
+        Raises:
+            ValueError: If the file is missing or unreadable, holds no such network, or if a
+                weight is missing, left over or of another shape; the message names the file.
+        """
+        path = Path(path)
+        try:
+            weights = _network_weights(read_released(path, _RELEASED))
+            network = cls(*_sizes(weights))
+            network.load_official(weights)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        return network
+
+    def load_official(self, weights: Mapping[str, Tensor]) -> None:
+        """Load an official state dict, every key of it.
+
+        Raises:
+            ValueError: If a weight is missing, left over or of another shape, by official name.
+        """
+        load_strictly(self, weights, official_name)
+
+    def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
+        """Features ``(P, F)`` before the head, in the order of the input.
+
+        Args:
+            coordinates: ``(P, 4)`` integers x, y, z, batch, each voxel once.
+            features: ``(P, C)``.
+
+        Raises:
+            ValueError: If a voxel is given twice or is out of bounds, or shapes do not fit.
+        """
+        self._check(coordinates, features)
+        voxels, rows = Voxels.from_coordinates(coordinates)
+        if len(voxels) != len(coordinates):
+            raise ValueError(
+                f"each voxel must be given once, but {len(coordinates)} rows are only "
+                f"{len(voxels)} voxels: keep one point per voxel."
+            )
+        features = torch.empty_like(features).index_copy(0, rows, features)
+        levels = self._encode(self._stem(features, voxels), voxels)
+        features = levels[-1][1]
+        for index in range(_DEPTH):
+            features = self._up(index, features, levels)
+        return features[rows]
+
+    def _check(self, coordinates: Tensor, features: Tensor) -> None:
+        if features.shape != (len(coordinates), self.in_channels):
+            raise ValueError(
+                f"features must be (P, {self.in_channels}) for the {len(coordinates)} rows of "
+                f"coordinates, got {tuple(features.shape)}."
+            )
+
+    def _stem(self, features: Tensor, voxels: Voxels) -> Tensor:
+        for layer in self.stem:
+            features = functional.relu(layer(features, voxels.neighbors), inplace=True)
+        return features
+
+    def _encode(self, features: Tensor, voxels: Voxels) -> list[tuple[Voxels, Tensor]]:
+        """Voxels and features of strides 1, 2, 4, 8, 16, from those of the stem."""
+        levels = [(voxels, features)]
+        for stage in self.encoder:
+            change, voxels = voxels.to_coarser, voxels.coarser
+            features = stage(features, change, voxels)
+            levels.append((voxels, features))
+        return levels
+
+    def _up(self, index: int, features: Tensor, levels: list[tuple[Voxels, Tensor]]) -> Tensor:
+        """Decoder stage ``index``: from the stride of its input to half of it."""
+        voxels, joined = levels[_DEPTH - 1 - index]
+        return self.decoder[index](features, voxels.to_coarser.transposed(), voxels, joined)
+
+
+def official_name(key: str) -> str:
+    """Official name of a weight of MinkowskiNet or SPVCNN."""
+    if key.startswith("head."):
+        return key.replace("head", "classifier.0")
+    area, *place, layer, weight = key.split(".")
+    after = int(layer == "norm")  # the norm follows its convolution or linear layer
+    if area == "points":
+        return f"point_transforms.{place[0]}.{after}.{weight}"
+    if area == "stem":
+        return f"stem.{3 * int(place[0]) + after}.{weight}"
+    index, part, *block = place
+    stage = f"stage{int(index) + 1}" if area == "encoder" else f"up{int(index) + 1}"
+    if part == "resample":
+        return f"{stage}.0.net.{after}.{weight}"
+    # The encoder keeps its blocks behind the change of the stride, the decoder in a list beside it.
+    row = f"{int(block[0]) + 1}" if area == "encoder" else f"1.{block[0]}"
+    layers, start = _BRANCHES[block[1]]
+    return f"{stage}.{row}.{layers}.{start + after}.{weight}"
+
+
+def _sizes(weights: Mapping[str, Tensor]) -> tuple[list[int], int, int]:
+    """Widths, input channels and classes of the network that has these weights."""
+    stages = [f"stage{index + 1}.1.net.0.kernel" for index in range(_DEPTH)]
+    ups = [f"up{index + 1}.0.net.0.kernel" for index in range(_DEPTH)]
+    try:
+        widths = [weights[name].shape[-1] for name in (_STEM, *stages, *ups)]
+        return widths, weights[_STEM].shape[1], len(weights["classifier.0.weight"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(
+            f"holds no such U-Net ({type(error).__name__}: {error}); give {_RELEASED}."
+        ) from error
+
+
+def _network_weights(content: Any) -> dict[str, Tensor]:
+    """Official state dict of the one network in the content of a checkpoint."""
+    weights = content.get("state_dict", content) if isinstance(content, Mapping) else None
+    keys = [key for key in weights or () if isinstance(key, str)]
+    prefixes = [key.removesuffix(_STEM) for key in keys if re.search(rf"(^|\.){_STEM}$", key)]
+    if weights is None or len(prefixes) != 1:
+        raise ValueError(
+            f"must hold one network, but {len(prefixes)} weights are named {_STEM}; "
+            f"give {_RELEASED}."
+        )
+    prefix = prefixes[0]
+    return {key.removeprefix(prefix): weights[key] for key in keys if key.startswith(prefix)}

@@ -1,0 +1,104 @@
+"""Weights of published networks: read without running code, loaded key by key."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+_MODEL = "the model.ckpt of the released weights"
+
+
+def read_released(path: Path, released: str = _MODEL) -> Any:
+    """Content of a file of ``torch.save``, tensors on the CPU; nothing in it is executed.
+
+    Args:
+        path: The file.
+        released: What to give instead, for the message.
+
+    Raises:
+        ValueError: If the file is missing, damaged, or holds more than tensors and plain values.
+    """
+    if not path.is_file():
+        raise ValueError(f"no such file; give {released}.")
+    try:
+        # Memory-mapped, so that an optimiser beside the weights is not read.
+        return torch.load(
+            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
+        )
+    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(
+            f"is damaged, or holds more than tensors and plain values ({reason}); give {released}, "
+            "or save its weights alone."
+        ) from error
+
+
+def read_state_dict(path: Path) -> dict[str, Tensor]:
+    """The ``state_dict`` of a training checkpoint, see :func:`read_released`.
+
+    Args:
+        path: File written by ``torch.save``: a dictionary with the entry ``state_dict``.
+
+    Returns:
+        Tensors by official name, on the CPU.
+
+    Raises:
+        ValueError: If the file is missing, damaged, or holds something else.
+    """
+    content = read_released(path)
+    weights = content.get("state_dict") if isinstance(content, Mapping) else None
+    if not isinstance(weights, Mapping) or not all(
+        isinstance(value, Tensor) for value in weights.values()
+    ):
+        raise ValueError(f"holds no entry state_dict with tensors; give {_MODEL}.")
+    return dict(weights)
+
+
+def load_strictly(
+    network: nn.Module, weights: Mapping[str, Tensor], official_name: Callable[[str], str]
+) -> None:
+    """Load an official state dict, every key of it.
+
+    Args:
+        network: Network of the same sizes.
+        weights: Tensors by official name. Axes of size 1 at the end may be more than ours: linear
+            layers are convolutions in some official networks.
+        official_name: Official name of each of our keys.
+
+    Raises:
+        ValueError: If a weight is missing, left over or of another shape, by official name.
+    """
+    own = network.state_dict()
+    keys = {official_name(key): key for key in own}
+    missing = [name for name in keys if name not in weights]
+    unexpected = [name for name in weights if name not in keys]
+    if missing or unexpected:
+        raise ValueError(
+            f"the weights are not those of this {type(network).__name__}: {len(missing)} missing "
+            f"{missing[:5]}, {len(unexpected)} unexpected {unexpected[:5]}."
+        )
+    loaded = {}
+    for name, key in keys.items():
+        shape, expected = tuple(weights[name].shape), tuple(own[key].shape)
+        if shape[: len(expected)] != expected or any(size != 1 for size in shape[len(expected) :]):
+            raise ValueError(f"weight {name} has shape {shape}, but {expected} is expected.")
+        loaded[key] = weights[name].reshape(expected)
+    network.load_state_dict(loaded)
+
+
+def renamed(names: Mapping[str, str]) -> Callable[[str], str]:
+    """Function of a key that replaces its beginning by the table's first entry that fits."""
+
+    def official_name(key: str) -> str:
+        for ours, official in names.items():
+            if key.startswith(ours):
+                return official + key.removeprefix(ours)
+        raise KeyError(key)
+
+    return official_name

@@ -1,0 +1,274 @@
+"""Sparse 3D convolution in plain PyTorch: occupied voxels, kernel maps, and the layer.
+
+A voxel is one int64 key; the keys of a stride are sorted, so that neighbours are found by
+bisection. A convolution gathers the rows that an offset pairs, multiplies them by the matrix of the
+offset and adds them to the rows of the result. Runs on every device, and autograd gives the
+gradients.
+
+Source: Choy, Gwak and Savarese, "4D Spatio-Temporal ConvNets" (CVPR 2019); same numbers as
+torchsparse 1.4.0 (``tests/parity``).
+Letters: N voxels of all B clouds of a batch, P rows of coordinates given, K offsets of a kernel.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.nn.layers import at_least_float32
+
+# A key is batch, x, y, z from the highest bits to the lowest, x, y, z of 16 bits each and shifted
+# so that they are not negative; it grows with (batch, x, y, z).
+_BITS = 16
+_SHIFT = 1 << (_BITS - 1)
+_PLACES = (2 * _BITS, _BITS, 0)  # lowest bit of x, y, z
+_UNITS = tuple(1 << bits for bits in _PLACES)  # what one step along x, y, z adds to a key
+#: Largest stride: a neighbour at this stride cannot run over into the next axis of a key.
+MAX_STRIDE = 512
+#: Coordinates lie in ``[-MAX_COORDINATE, MAX_COORDINATE)``: 1.5 km at voxels of 5 cm.
+MAX_COORDINATE = _SHIFT - 2 * MAX_STRIDE
+#: Clouds in a batch.
+MAX_CLOUDS = 1 << 15
+# Columns of a 3 x 3 x 3 kernel on one side of its middle column; the other side mirrors them.
+_COLUMNS = ((1, -1), (0, 1), (1, 0), (1, 1))
+
+
+def kernel_offsets(size: int) -> list[tuple[int, int, int]]:
+    """Offsets x, y, z of a kernel in units of the stride, in the order of its matrices.
+
+    Size 3 is -1..1 with x fastest, size 2 is 0..1 with z fastest, as in torchsparse.
+    """
+    if size == 2:
+        return [(x, y, z) for x, y, z in product(range(2), repeat=3)]
+    around = range(-(size // 2), size // 2 + 1)
+    return [(x, y, z) for z, y, x in product(around, repeat=3)]
+
+
+class KernelMap(NamedTuple):
+    """Which rows of the input are added to which rows of the result, for each offset of a kernel.
+
+    Attributes:
+        pairs: For each of the K offsets ``(inputs, outputs)``, int64 of equal length; no row of
+            the result appears twice at an offset. None where all rows pair with themselves.
+        num_inputs: Rows of the input.
+        num_outputs: Rows of the result.
+    """
+
+    pairs: list[tuple[Tensor, Tensor] | None]
+    num_inputs: int
+    num_outputs: int
+
+    def transposed(self) -> KernelMap:
+        """The same pairs with exchanged roles, as a transposed convolution needs them."""
+        swapped = [pair and (pair[1], pair[0]) for pair in self.pairs]
+        return KernelMap(swapped, self.num_outputs, self.num_inputs)
+
+
+class Voxels:
+    """Occupied voxels of B clouds at one stride, each once, sorted by (batch, x, y, z).
+
+    Kernel maps and the coarser voxels are computed at their first use and kept.
+
+    Args:
+        keys: ``(N,)`` int64, sorted; :meth:`from_coordinates` makes them.
+        stride: Edge of a voxel in units of the coordinates, a power of two.
+    """
+
+    def __init__(self, keys: Tensor, stride: int = 1) -> None:
+        if stride > MAX_STRIDE:
+            raise ValueError(f"the stride is at most {MAX_STRIDE}, got {stride}.")
+        self.keys, self.stride = keys, stride
+
+    @classmethod
+    def from_coordinates(cls, coordinates: Tensor) -> tuple[Voxels, Tensor]:
+        """Voxels of stride 1 from rows in any order, and the voxel ``(P,)`` int64 of each row.
+
+        Args:
+            coordinates: ``(P, 4)`` integers x, y, z, batch; rows may repeat.
+
+        Raises:
+            ValueError: As :func:`voxel_keys`.
+        """
+        keys, rows = torch.unique(voxel_keys(coordinates), return_inverse=True)
+        return cls(keys), rows
+
+    def __len__(self) -> int:
+        """Number N of voxels."""
+        return len(self.keys)
+
+    @property
+    def coordinates(self) -> Tensor:
+        """``(N, 4)`` int64 lowest corner x, y, z of each voxel, and its batch index."""
+        fields = [((self.keys >> bits) & (1 << _BITS) - 1) - _SHIFT for bits in _PLACES]
+        return torch.stack([*fields, self.keys >> 3 * _BITS], dim=1)
+
+    def find(self, keys: Tensor) -> tuple[Tensor, Tensor]:
+        """Row of each key, and whether it is occupied; rows of the others mean nothing.
+
+        Args:
+            keys: Any shape, int64.
+        """
+        rows = torch.searchsorted(self.keys, keys)
+        return rows, self._padded[rows] == keys
+
+    def corners(self, keys: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`find`, ``(P, 8)`` for the voxels at the offsets of size 2 from each key."""
+        offsets = keys.new_tensor(kernel_offsets(2))
+        steps = (offsets * offsets.new_tensor(_UNITS)).sum(dim=1) * self.stride
+        return self.find(keys[:, None] + steps)
+
+    @cached_property
+    def _padded(self) -> Tensor:
+        # A search may end one row behind the last one, and looks at up to two rows beyond it.
+        beyond = self.keys.new_full((3,), torch.iinfo(torch.int64).max)
+        return torch.cat([self.keys, beyond])
+
+    @cached_property
+    def neighbors(self) -> KernelMap:
+        """Map of a convolution of size 3 from these voxels to themselves."""
+        offsets = kernel_offsets(3)
+        pairs: list[tuple[Tensor, Tensor] | None] = [None] * len(offsets)
+
+        def keep(offset: tuple[int, int, int], found: Tensor, rows: Tensor) -> None:
+            outputs = found.nonzero().squeeze(1)
+            inputs, index = rows[outputs], offsets.index(offset)
+            pairs[index] = (inputs, outputs)
+            # A neighbour sees this voxel at the opposite offset, which is as far from the end.
+            pairs[-1 - index] = (outputs, inputs)
+
+        rows = torch.arange(1, len(self) + 1, device=self.keys.device)
+        keep((0, 0, 1), self._padded[rows] == self.keys + self.stride, rows)
+        for x, y in _COLUMNS:
+            # z is fastest in the keys: of three voxels on top of each other, those that are
+            # occupied lie in adjacent rows, and one search finds them all.
+            keys = self.keys + self.stride * (x * _UNITS[0] + y * _UNITS[1] - _UNITS[2])
+            rows = torch.searchsorted(self.keys, keys)
+            for z in (-1, 0, 1):
+                found = self._padded[rows] == keys
+                keep((x, y, z), found, rows)
+                rows, keys = rows + found, keys + self.stride
+        return KernelMap(pairs, len(self), len(self))
+
+    @cached_property
+    def _halved(self) -> tuple[Voxels, KernelMap]:
+        """Voxels of twice the stride, and the map of a convolution of size 2 to them."""
+        dropped = (2 * self.stride - 1) * sum(_UNITS)  # bits that the coarser grid has not
+        keys, parents = torch.unique(self.keys & ~dropped, return_inverse=True)
+        lowest_bit = self.stride.bit_length() - 1
+        x, y, z = ((self.keys >> bits + lowest_bit) & 1 for bits in _PLACES)
+        offset = 4 * x + 2 * y + z
+        children = [(offset == index).nonzero().squeeze(1) for index in range(8)]
+        pairs = [(rows, parents[rows]) for rows in children]
+        return Voxels(keys, 2 * self.stride), KernelMap([*pairs], len(self), len(keys))
+
+    @property
+    def coarser(self) -> Voxels:
+        """Voxels of twice the stride that hold one of these."""
+        return self._halved[0]
+
+    @property
+    def to_coarser(self) -> KernelMap:
+        """Map of a convolution of size 2 and stride 2, from these voxels to :attr:`coarser`."""
+        return self._halved[1]
+
+
+def voxel_keys(coordinates: Tensor) -> Tensor:
+    """Keys ``(P,)`` int64 of voxels, which grow with (batch, x, y, z).
+
+    Args:
+        coordinates: ``(P, 4)`` integers x, y, z in ``[-MAX_COORDINATE, MAX_COORDINATE)`` and batch
+            in ``[0, MAX_CLOUDS)``.
+
+    Raises:
+        ValueError: If they have another shape or type, or lie outside, where keys would collide.
+    """
+    if coordinates.ndim != 2 or coordinates.shape[1] != 4 or coordinates.is_floating_point():
+        raise ValueError(
+            "coordinates must be (P, 4) integers x, y, z, batch, got "
+            f"{tuple(coordinates.shape)} {coordinates.dtype}."
+        )
+    coordinates = coordinates.long()
+    xyz, batch = coordinates[:, :3], coordinates[:, 3]
+    outside = (xyz < -MAX_COORDINATE) | (xyz >= MAX_COORDINATE)
+    outside = outside.any(dim=1) | (batch < 0) | (batch >= MAX_CLOUDS)
+    if outside.any():
+        first = int(outside.nonzero()[0])
+        raise ValueError(
+            f"{int(outside.sum())} of {len(coordinates)} voxels are out of bounds, the first is "
+            f"row {first}: {coordinates[first].tolist()}; x, y, z must be in [-{MAX_COORDINATE}, "
+            f"{MAX_COORDINATE}), batch in [0, {MAX_CLOUDS}): crop the cloud or use larger voxels."
+        )
+    shifted = (xyz + _SHIFT) * xyz.new_tensor(_UNITS)
+    return shifted.sum(dim=1) + (batch << 3 * _BITS)
+
+
+class SparseConv(nn.Module):
+    """Convolution over occupied voxels; which one is up to the map given to it.
+
+    ``voxels.neighbors`` for size 3, ``voxels.to_coarser`` for size 2 and stride 2, its
+    ``transposed()`` for the way back, none for size 1::
+
+        result[p] = sum over offsets k of features[p + offset k] @ kernel[k]
+
+    Products are summed in float32 also where features have half precision.
+
+    Args:
+        in_channels: Input channels.
+        out_channels: Output channels.
+        kernel_size: 1, 2 or 3.
+        bias: Whether a learnt offset is added to each channel.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, kernel_size: int, *, bias: bool = False
+    ) -> None:
+        super().__init__()
+        size = (in_channels, out_channels)
+        shape = size if kernel_size == 1 else (kernel_size**3, *size)
+        # Unit variance of the result where all offsets are occupied, as for dense layers.
+        bound = (in_channels * kernel_size**3) ** -0.5
+        self.kernel = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+
+    def forward(self, features: Tensor, kernel_map: KernelMap | None = None) -> Tensor:
+        """Features ``(N', out_channels)`` at the voxels that the map leads to.
+
+        Args:
+            features: ``(N, in_channels)``, one row for each input voxel of the map.
+            kernel_map: Map of a kernel of this size; None for size 1.
+
+        Raises:
+            ValueError: If the map is of another kernel size or number of voxels.
+        """
+        if kernel_map is None:
+            result = features @ self.kernel
+        else:
+            result = self._convolve(features, kernel_map)
+        return result if self.bias is None else result + self.bias.to(result.dtype)
+
+    def _convolve(self, features: Tensor, kernel_map: KernelMap) -> Tensor:
+        given = (len(features), len(self.kernel))
+        if given != (kernel_map.num_inputs, len(kernel_map.pairs)):
+            raise ValueError(
+                f"features of {given[0]} voxels and a kernel of {given[1]} offsets do not fit a "
+                f"map of {kernel_map.num_inputs} voxels and {len(kernel_map.pairs)} offsets."
+            )
+        matrices = list(zip(kernel_map.pairs, self.kernel, strict=True))
+        own = [features @ matrix for pair, matrix in matrices if pair is None]
+        if own:
+            dtype, result = own[0].dtype, at_least_float32(own[0])
+        else:
+            dtype = (features[:0] @ self.kernel[0]).dtype  # autocast may change it
+            wide = torch.promote_types(dtype, torch.float32)
+            shape = (kernel_map.num_outputs, self.kernel.shape[-1])
+            result = torch.zeros(shape, dtype=wide, device=features.device)
+        for pair, matrix in matrices:
+            if pair is not None and len(pair[0]):
+                inputs, outputs = pair
+                rows = features.index_select(0, inputs) @ matrix
+                result = result.index_add_(0, outputs, rows.to(result.dtype))
+        return result.to(dtype)

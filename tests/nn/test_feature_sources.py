@@ -1,0 +1,64 @@
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from r3dpa.nn.backbones import (
+    SOURCES,
+    GeometricFeatures,
+    OracleFeatures,
+    ScaLR,
+    WaffleIron,
+    feature_source,
+)
+from r3dpa.nn.backbones.scalr import _official_name
+
+
+@pytest.fixture
+def scalr_file(tmp_path):
+    """Checkpoint as the distillation writes it, of width 4."""
+    weights = WaffleIron(width=4, depth=1, head_dim=5).state_dict()
+    weights = {_official_name(key): value for key, value in weights.items()}
+    torch.save({"model_point": weights}, tmp_path / "ckpt_last.pth")
+    return tmp_path / "ckpt_last.pth"
+
+
+def test_each_name_gives_its_extractor(scalr_file):
+    assert SOURCES == ("scalr", "waffleiron-s", "geometric", "oracle")
+    for name, ckpt, kind in (
+        ("scalr", scalr_file, ScaLR),
+        ("geometric", None, GeometricFeatures),
+        ("oracle", None, OracleFeatures),
+    ):
+        source = feature_source(name, ckpt, dim=4)
+        assert type(source) is kind
+        assert (source.name, source.dim) == (name, 4)
+    assert feature_source("geometric").dim == 768
+    assert feature_source("scalr", str(scalr_file), 4).settings["weights"]
+
+
+def test_waffleiron_s_takes_weights_or_has_its_own(monkeypatch):
+    """With a stand-in for the network, whose weights are not part of this test."""
+    module = ModuleType("r3dpa.nn.backbones.pretrained")
+    module.WaffleIronS = lambda weights, dim: (weights, dim)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    assert feature_source("waffleiron-s") == (None, 768)
+    assert feature_source("waffleiron-s", "a.safetensors", 64) == (Path("a.safetensors"), 64)
+
+
+def test_refused_names_and_checkpoints(scalr_file):
+    with pytest.raises(
+        ValueError, match="no feature source 'dino'; there are scalr, waffleiron-s, geometric, ora"
+    ):
+        feature_source("dino")
+    with pytest.raises(ValueError, match=r"scalr needs ckpt.*one of waffleiron-s, geometric"):
+        feature_source("scalr")
+    with pytest.raises(ValueError, match=r"ckpt_last.pth has features of width 4, but dim is 768"):
+        feature_source("scalr", scalr_file)
+    for name in ("geometric", "oracle"):
+        with pytest.raises(ValueError, match=rf"{name} has no weights: leave ckpt \(a.pth\) out"):
+            feature_source(name, "a.pth")
+    with pytest.raises(ValueError, match="dim must be even and at least 2, got 5"):
+        feature_source("oracle", dim=5)

@@ -1,0 +1,424 @@
+import math
+import pickle
+
+import pytest
+import torch
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.nn.backbones import liploc
+from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
+from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
+from r3dpa.nn.backbones.vit import TransformerTrunk
+
+SENSOR = LidarSensor(beams=16, columns=64)
+# Batches of other sizes are added up in another order; features are of size 1.
+FLOAT32 = {"atol": 1e-5, "rtol": 0.0}
+
+
+def randomise(network):
+    """Random norms and positions too, so that no layer is close to doing nothing."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if value.is_floating_point() and not name.startswith("image_"):
+                values = torch.randn(value.shape, generator=generator)
+                if name.endswith("running_var"):
+                    value.copy_(0.5 + values.abs())
+                elif name.endswith("weight") and value.ndim == 1:
+                    value.copy_(1 + 0.3 * values)
+                else:
+                    value.copy_(values * (value[0].numel() ** -0.5 if value.ndim > 1 else 0.3))
+    return network
+
+
+def rangevit(**settings):
+    sizes = {"width": 24, "depth": 2, "num_heads": 3, "stem_channels": 4, "skip_channels": 6}
+    sizes |= {"decoder_channels": 5, "trained_size": (16, 32)} | settings
+    return randomise(RangeViT(SENSOR, **sizes))
+
+
+def small_liploc():
+    return randomise(LIPLoc(picture_side=32, patch_side=8, width=24, depth=2, num_heads=3))
+
+
+def scans(count, seed=1):
+    """Range images with a quarter of empty pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, SENSOR.beams, SENSOR.columns)
+    range_m = 2.0 + 50.0 * torch.rand(shape, generator=generator)
+    return torch.where(torch.rand(shape, generator=generator) < 0.25, -1.0, range_m)
+
+
+# --- input of RangeViT ---
+
+
+def test_points_lie_on_the_corners_of_their_pixels():
+    """Row 0 starts at 3 degrees, column 0 at the back, column W / 4 on the left."""
+    range_m = torch.full((1, 16, 64), 10.0)
+    distance, x, y, z = range_channels(range_m, SENSOR)[0]
+    up, flat = 10 * math.sin(math.radians(3)), 10 * math.cos(math.radians(3))
+    assert (distance == 10.0).all()
+    assert z[0].tolist() == pytest.approx([up] * 64, rel=1e-6)
+    assert (x[0, 0].item(), x[0, 32].item()) == pytest.approx((-flat, flat), rel=1e-6)
+    assert (y[0, 16].item(), y[0, 48].item()) == pytest.approx((flat, -flat), rel=1e-6)
+    assert z[8, 0].item() == pytest.approx(10 * math.sin(math.radians(3 - 28 / 2)), rel=1e-6)
+
+
+def test_pixels_out_of_range_have_no_point():
+    """Both limits, 1 and 56 m, are out of range; what the pixel holds is left as it is."""
+    values = [-1.0, 0.0, 0.5, 1.0, 1.001, 55.999, 56.0, 80.0]
+    range_m = torch.full((1, 16, 64), 10.0)
+    range_m[0, 3, :8] = torch.tensor(values)
+    distance, *xyz = range_channels(range_m, SENSOR)[0, :, 3, :8]
+    assert distance.tolist() == pytest.approx(values)
+    no_point = [all(value == -1.0 for value in point) for point in zip(*xyz, strict=True)]
+    assert no_point == [True, True, True, True, False, False, True, True]
+
+
+def test_intensity_is_the_last_channel():
+    range_m, intensity = scans(2), torch.rand(2, 16, 64)
+    channels = range_channels(range_m, SENSOR, intensity)
+    assert torch.equal(channels[:, 4], intensity)
+    assert torch.equal(channels[:, :4], range_channels(range_m, SENSOR))
+
+
+# --- transformer ---
+
+
+def test_trunk_without_positions_does_not_know_where_patches_are():
+    """Rotating the columns of the patches then rotates those of the tokens, seam included."""
+    trunk = randomise(TransformerTrunk(24, 2, 3, (4, 6), 1e-6))
+    patches = torch.randn(1, 24, 4, 6)
+    assert (rotated(trunk, patches) - trunk(patches)[:, 1:]).abs().max() > 0.1
+    trunk.pos_embed.data.zero_()
+    torch.testing.assert_close(rotated(trunk, patches), trunk(patches)[:, 1:], **FLOAT32)
+
+
+def rotated(trunk, patches):
+    """Tokens of rotated patches, rotated back."""
+    tokens = trunk(patches.roll(2, dims=3))[:, 1:].unflatten(1, (4, 6))
+    return tokens.roll(-2, dims=2).flatten(1, 2)
+
+
+def test_positions_are_resized_bilinearly_between_cell_centres():
+    """Blocks are left out: the trunk is then the sum of patches and positions."""
+    trunk = TransformerTrunk(1, 0, 1, (1, 2), 1e-6)
+    trunk.pos_embed.data[0, :, 0] = torch.tensor([7.0, 0.0, 4.0])
+    doubled = trunk(torch.zeros(1, 1, 1, 4))[0, :, 0]
+    assert doubled.tolist() == [7.0, 0.0, 1.0, 3.0, 4.0]
+    same = trunk(torch.full((1, 1, 1, 2), 10.0))[0, :, 0]
+    assert same.tolist() == [7.0, 10.0, 14.0]
+
+
+def test_attention_by_hand():
+    """One block against softmax(q k / sqrt(d)) v and an MLP with the exact GELU in float64."""
+    block = randomise(TransformerTrunk(6, 1, 2, (1, 3), 1e-6)).double().blocks[0]
+    tokens = torch.randn(1, 4, 6, dtype=torch.float64)
+
+    def normed(values, layer):
+        centred = values - values.mean(-1, keepdim=True)
+        scale = (centred.square().mean(-1, keepdim=True) + 1e-6).sqrt()
+        return centred / scale * layer.weight + layer.bias
+
+    qkv = normed(tokens, block.norm1) @ block.attn.qkv.weight.T + block.attn.qkv.bias
+    mixed = torch.zeros_like(tokens)
+    for head in (slice(0, 3), slice(3, 6)):
+        query, key, value = (part[0, :, head] for part in qkv.split(6, dim=-1))
+        weights = (query @ key.T / math.sqrt(3)).exp()
+        mixed[0, :, head] = weights / weights.sum(1, keepdim=True) @ value
+    hidden = tokens + mixed @ block.attn.proj.weight.T + block.attn.proj.bias
+    inner = normed(hidden, block.norm2) @ block.mlp.fc1.weight.T + block.mlp.fc1.bias
+    inner = inner * 0.5 * (1 + torch.erf(inner / math.sqrt(2)))
+    expected = hidden + inner @ block.mlp.fc2.weight.T + block.mlp.fc2.bias
+    torch.testing.assert_close(block(tokens), expected)
+
+
+# --- RangeViT ---
+
+
+def test_features_are_means_of_bands_channel_by_channel(monkeypatch):
+    network = rangevit()
+    rows = torch.arange(16.0)[:, None].expand(16, 64)
+    map_ = torch.stack([rows, 100 + rows])[None]
+    monkeypatch.setattr(network, "feature_map", lambda range_m, intensity: map_)
+    assert network(scans(1)).tolist() == [[3.5, 11.5, 103.5, 111.5]]
+    assert (network.dim, rangevit(band_rows=4).dim) == (5 * 2, 5 * 4)
+
+
+def test_patch_is_the_mean_over_one_pixel_more_than_its_size():
+    """Patches of 2 x 8 average 3 x 9 pixels, of which zeros beyond the border are part."""
+    network = rangevit(skip_channels=1, width=3)
+    network.embedding.weight.data.fill_(1.0)
+    network.embedding.bias.data.zero_()
+    patches = network.embed(torch.ones(1, 1, 16, 64))[0, 0]
+    assert patches.shape == (8, 8)
+    assert patches[1:, 1:].unique().tolist() == pytest.approx([1.0])
+    assert patches[0, 1:].unique().tolist() == pytest.approx([2 / 3])
+    assert patches[1:, 0].unique().tolist() == pytest.approx([5 / 9])
+    assert patches[0, 0].item() == pytest.approx(2 / 3 * 5 / 9)
+
+
+def test_token_becomes_the_pixels_of_its_patch_row_by_row():
+    """Channel c of the pixel in row r and column k of a patch is value c * 16 + r * 8 + k."""
+    network = rangevit()
+    network.upsample.weight.data.zero_()
+    network.upsample.bias.data.copy_(torch.arange(5.0 * 16))
+    network.merge = network.output = torch.nn.Identity()
+    pixels = network.feature_map(scans(1))[0, :5]
+    row, column = torch.arange(16)[:, None] % 2, torch.arange(64) % 8
+    for channel in range(5):
+        assert torch.equal(pixels[channel], (channel * 16 + row * 8 + column).float())
+
+
+def test_stem_sees_13_pixels_around():
+    """3 of each of three blocks and 4 of the last: so far the zeros beyond the border reach."""
+    stem = rangevit().stem.double()
+    # A path over all weights carries little: only float64 tells it from rounding.
+    result = stem(torch.full((1, 4, 40, 40), 0.7, dtype=torch.float64))
+    inner, wider = result[..., 13:-13, 13:-13], result[..., 12:-12, 12:-12]
+    assert (inner - inner[..., :1, :1]).abs().max() < 1e-13
+    assert (wider - inner[..., :1, :1]).abs().max() > 1e-10
+
+
+def test_stem_moves_with_the_image_away_from_the_border():
+    stem, image = rangevit().stem, torch.randn(1, 4, 16, 64)
+    moved, still = stem(image.roll(5, dims=3)), stem(image)
+    inner = slice(13 + 5, -13 - 5)
+    torch.testing.assert_close(moved.roll(-5, dims=3)[..., inner], still[..., inner], **FLOAT32)
+
+
+def test_scans_of_a_batch_do_not_see_each_other():
+    range_m = scans(3)
+    for network in (rangevit(), small_liploc()):
+        # A metric inside of a module in training is switched to training mode with it.
+        network.train()
+        together = network(range_m)
+        assert not network.training
+        assert together.shape == (3, network.dim)
+        assert (together[0] - together[1]).abs().max() > 1e-3
+        for index in range(3):
+            alone = network(range_m[index : index + 1])[0]
+            torch.testing.assert_close(alone, together[index], **FLOAT32)
+
+
+def test_network_without_intensity_ignores_it():
+    range_m, intensity = scans(2), torch.rand(2, 16, 64)
+    network = rangevit()
+    assert torch.equal(network(range_m, intensity), network(range_m))
+    with_intensity = rangevit(in_channels=5)
+    change = with_intensity(range_m, intensity) - with_intensity(range_m, 1 - intensity)
+    assert change.abs().max() > 1e-3
+    with pytest.raises(ValueError, match="reads the intensity"):
+        with_intensity(range_m)
+
+
+# --- pictures of LIP-Loc ---
+
+
+def test_bytes_wrap():
+    """5.1 * 50.2 = 256.02 is black again; -5.1 is cut to -5, which is 251 modulo 256."""
+    range_m = torch.tensor([-1.0, -0.1, 0.0, 0.19, 0.2, 50.1, 50.2, 56.0, 100.4])
+    levels = wrapped_grey_levels(range_m)
+    assert levels.dtype == torch.uint8
+    assert levels.tolist() == [251, 0, 0, 0, 1, 255, 0, 285 - 256, 0]
+
+
+def test_picture_of_a_constant_image():
+    """10 m are 51 grey levels, a fifth of white; so are 60.2 m, which wrap (307 - 256)."""
+    for value in (10.0, 60.2):
+        picture = wrapped_picture(torch.full((2, 16, 64), value), (5, 7))
+        assert picture.shape == (2, 3, 5, 7)
+        expected = [(0.2 - mean) / std for mean, std in COLOURS]
+        assert picture[0, :, 0, 0].tolist() == pytest.approx(expected, rel=1e-5)
+        assert (picture - picture[:1, :, :1, :1]).abs().max() < 1e-6
+
+
+COLOURS = [(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)]
+
+
+def test_picture_moves_with_the_image():
+    """32 of 1024 columns are 7 of 224; but for the border, where the picture does not wrap."""
+    range_m = torch.rand(1, 4, 1024) * 50
+    size = (4, 224)
+    moved = wrapped_picture(range_m.roll(32, dims=2), size).roll(-7, dims=3)
+    still = wrapped_picture(range_m, size)
+    # Weights of the resampling are rounded at other positions.
+    torch.testing.assert_close(moved[..., 8:-8], still[..., 8:-8], atol=1e-4, rtol=0)
+    assert (moved - still).abs().max() > 0.01
+
+
+def test_picture_is_antialiased():
+    """Halving: triangle of 4 pixels with weights 1 3 3 1, where bilinear alone takes 1 1."""
+    range_m = torch.zeros(1, 2, 16)
+    range_m[:, :, 7] = 50.0  # white, 255 levels
+    red = wrapped_picture(range_m, (2, 8))[0, 0] * 0.229 + 0.485
+    assert red[0].tolist() == pytest.approx([0, 0, 0, 3 / 8, 1 / 8, 0, 0, 0], abs=1e-6)
+
+
+# --- LIP-Loc ---
+
+
+def test_feature_is_the_mean_of_the_patch_tokens_normalised():
+    """Without blocks a token is its patch plus its position; the class token has no part."""
+    network = LIPLoc(picture_side=4, patch_side=2, width=2, depth=0, num_heads=1)
+    network.embedding.weight.data.zero_()
+    network.embedding.bias.data.copy_(torch.tensor([1.0, 2.0]))
+    network.encoder.cls_token.data.fill_(1e3)
+    positions = torch.tensor([[1e3, -1e3], [4.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    network.encoder.pos_embed.data.copy_(positions[None])
+    network.norm.weight.data.copy_(torch.tensor([1.0, 10.0]))
+    # Mean (1 + 4 / 4, 2) has no variance: all of it is the bias of the norm.
+    network.norm.bias.data.copy_(torch.tensor([0.5, 0.25]))
+    assert network(torch.full((1, 3, 5), 10.0))[0].tolist() == [0.5, 0.25]
+    network.encoder.pos_embed.data[0, 2, 0] = 8.0  # mean (4, 2): normalised to 1, -1
+    feature = network(torch.full((1, 3, 5), 10.0))[0]
+    assert feature.tolist() == pytest.approx([1.5, -9.75], rel=1e-5)
+
+
+def test_equal_images_have_equal_features():
+    """Range images that differ by a turn of the byte, 256 / 5.1 m, are the same to LIP-Loc."""
+    network, range_m = small_liploc(), scans(1).clamp(min=0.1).mul(5.1).floor().add(0.5).div(5.1)
+    assert torch.equal(network(range_m + 256 / 5.1), network(range_m))
+    assert (network(range_m + 1.0) - network(range_m)).abs().max() > 1e-3
+
+
+# --- refusals ---
+
+
+@pytest.mark.parametrize("shape", [(16, 64), (2, 16, 32), (2, 1, 16, 64)])
+def test_rangevit_refuses_images_of_another_size(shape):
+    with pytest.raises(ValueError, match=r"range image.* must be .* got shape"):
+        rangevit()(torch.ones(shape))
+
+
+def test_rangevit_refuses_an_intensity_of_another_size():
+    with pytest.raises(ValueError, match=r"intensity must have the shape .*\(1, 16, 64\)"):
+        range_channels(scans(1), SENSOR, torch.ones(16, 64))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"in_channels": 6}, "in_channels must be in 1..5, got 6"),
+        ({"patch_size": (3, 8)}, "even numbers"),
+        ({"trained_size": (16, 30)}, "do not divide"),
+        ({"band_rows": 5}, "bands of 5 rows"),
+        ({"num_heads": 5}, "num_heads must divide the width 24, got 5"),
+    ],
+)
+def test_rangevit_refuses_sizes(settings, message):
+    with pytest.raises(ValueError, match=message):
+        rangevit(**settings)
+
+
+def test_liploc_refuses_what_is_no_picture():
+    network = small_liploc()
+    with pytest.raises(ValueError, match=r"\(B, H, W\), got shape \(16, 64\)"):
+        network(torch.ones(16, 64))
+    with pytest.raises(ValueError, match=r"\(B, H, W\), got shape \(0, 16, 64\)"):
+        network(torch.ones(0, 16, 64))
+    with pytest.raises(ValueError, match="finite"):
+        network(torch.full((1, 16, 64), float("nan")))
+    with pytest.raises(ValueError, match=r"\(B, 3, 32, 32\), got shape \(1, 3, 16, 64\)"):
+        network.encode(torch.ones(1, 3, 16, 64))
+    with pytest.raises(ValueError, match="patches of 7"):
+        LIPLoc(picture_side=32, patch_side=7)
+
+
+# --- files ---
+
+
+def official(network, module):
+    """State dict of a network by official names, as in the released file."""
+    names = module._NAMES
+    prefix = module._ENCODER if module is liploc else ""
+    state = {}
+    for key, value in network.state_dict().items():
+        ours = next(name for name in names if key.startswith(name))
+        state[prefix + names[ours] + key.removeprefix(ours)] = value.clone()
+    return state
+
+
+def released(tmp_path, change=None):
+    """Files of both networks after ``change``, each with a function that loads it."""
+    from r3dpa.nn.backbones import rangevit as module
+
+    first, second = rangevit(), small_liploc()
+    first_path, second_path = tmp_path / "rangevit.ckpt", tmp_path / "liploc.ckpt"
+    for path, state in (
+        (first_path, official(first, module)),
+        (second_path, official(second, liploc)),
+    ):
+        if change:
+            change(state)
+        torch.save({"state_dict": state}, path)
+
+    def load_first():
+        return RangeViT.from_checkpoint(first_path, SENSOR, num_heads=3, trained_size=(16, 32))
+
+    def load_second():
+        return LIPLoc.from_checkpoint(second_path, num_heads=3)
+
+    return [(first, first_path, load_first), (second, second_path, load_second)]
+
+
+def test_networks_come_back_from_files(tmp_path):
+    range_m = scans(2)
+    for network, _, load in released(tmp_path):
+        assert torch.equal(load()(range_m), network(range_m))
+
+
+def test_constants_may_be_absent_from_the_file_of_rangevit(tmp_path):
+    def without_constants(state):
+        for key in ("image_mean", "image_std"):
+            state.pop(key, None)
+
+    network, _, load = released(tmp_path, without_constants)[0]
+    assert torch.equal(load()(scans(1)), network(scans(1)))
+    assert load().image_mean.flatten().tolist() == pytest.approx(
+        [11.274, 0.076, 0.246, -1.041, 0.215]
+    )
+
+
+def test_files_are_named_in_errors(tmp_path):
+    def drop_norm(state):
+        del state[next(key for key in state if key.endswith("blocks.1.norm2.bias"))]
+
+    for _, path, load in released(tmp_path, drop_norm):
+        with pytest.raises(ValueError, match=rf"{path.name}: .* 1 missing .*norm2.bias"):
+            load()
+
+    def cut_mlp(state):
+        key = next(key for key in state if key.endswith("blocks.0.mlp.fc1.bias"))
+        state[key] = state[key][:-1]
+
+    for _, path, load in released(tmp_path, cut_mlp):
+        with pytest.raises(ValueError, match=rf"{path.name}: .*fc1.bias has shape \(95,\)"):
+            load()
+
+    def keep_nothing(state):
+        state.clear()
+
+    for _, path, load in released(tmp_path, keep_nothing):
+        with pytest.raises(ValueError, match=rf"{path.name}: holds no"):
+            load()
+        torch.save({"model": {}}, path)
+        with pytest.raises(ValueError, match=rf"{path.name}: holds no entry state_dict"):
+            load()
+        path.write_bytes(pickle.dumps(print, protocol=2))  # would be imported by a plain torch.load
+        with pytest.raises(ValueError, match=rf"{path.name}: is damaged, or holds more"):
+            load()
+        path.unlink()
+        with pytest.raises(ValueError, match=rf"{path.name}: no such file"):
+            load()
+
+
+def test_number_of_heads_is_that_of_released_networks(tmp_path):
+    """Heads are 64 wide in every released ViT; other widths need to be told."""
+    network = LIPLoc(picture_side=16, patch_side=8, width=128, depth=1, num_heads=2)
+    torch.save({"state_dict": official(network, liploc)}, tmp_path / "model.ckpt")
+    loaded = LIPLoc.from_checkpoint(tmp_path / "model.ckpt")
+    assert loaded.encoder.blocks[0].attn.num_heads == 2
+    _, path, _ = released(tmp_path)[1]
+    with pytest.raises(ValueError, match="width 24 do not divide into heads of 64"):
+        LIPLoc.from_checkpoint(path)

@@ -1,0 +1,232 @@
+"""MinkowskiNet and SPVCNN: batches, order, precision, checkpoints; voxels and pooling of a scan."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name, scaled_widths
+from r3dpa.nn.backbones.sparse import Voxels
+from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
+from r3dpa.nn.backbones.spvcnn import SPVCNN, Points, corners, to_points, to_voxels
+
+WIDTHS = scaled_widths(0.125)
+
+
+@pytest.fixture(scope="module", params=[MinkowskiNet, SPVCNN])
+def network(request):
+    """Small network whose batch norms are not the identity."""
+    torch.manual_seed(0)
+    network = request.param(WIDTHS)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            torch.nn.init.normal_(module.running_mean, std=0.1)
+            torch.nn.init.uniform_(module.running_var, 0.05, 0.2)
+            torch.nn.init.normal_(module.bias, std=0.1)
+    return network.eval()
+
+
+def cloud(batch, num_voxels=400, seed=0):
+    """Distinct voxels ``(N, 4)`` near each other, and their inputs ``(N, 4)``."""
+    generator = torch.Generator().manual_seed(seed)
+    xyz = torch.randint(0, 24, (num_voxels, 3), generator=generator).unique(dim=0)
+    xyz = xyz[torch.randperm(len(xyz), generator=generator)]
+    features = torch.randn(len(xyz), 4, generator=generator)
+    return torch.nn.functional.pad(xyz, (0, 1), value=batch), features
+
+
+@torch.no_grad()
+def test_batch_is_as_its_clouds(network):
+    """Also where a cloud in between is empty, and where rows of the clouds are mixed."""
+    clouds = [cloud(0), cloud(3, seed=1)]
+    single = torch.cat([network(*each) for each in clouds])
+    coordinates, features = (torch.cat(parts) for parts in zip(*clouds, strict=True))
+    torch.testing.assert_close(network(coordinates, features), single, atol=1e-5, rtol=1e-5)
+    order = torch.randperm(len(features), generator=torch.Generator().manual_seed(2))
+    shuffled = network(coordinates[order], features[order])
+    torch.testing.assert_close(shuffled, single[order], atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_steps_of_the_coarsest_stride_change_nothing(network):
+    """A cloud moved by multiples of 16 falls into the same coarser voxels, also below zero."""
+    coordinates, features = cloud(0)
+    moved = coordinates + torch.tensor([-48, 16, 160, 1])
+    expected = network(coordinates, features)
+    # SPVCNN takes coordinates through metres in float32, off by 1e-5 of a voxel here.
+    torch.testing.assert_close(network(moved, features), expected, atol=1e-3, rtol=0)
+
+
+@torch.no_grad()
+def test_small_clouds(network):
+    assert network(torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, 4)).shape == (0, WIDTHS[-1])
+    one = network(torch.tensor([[7, 8, 9, 0]]), torch.ones(1, 4))
+    assert one.shape == (1, WIDTHS[-1])
+    assert one.isfinite().all()
+
+
+@torch.no_grad()
+def test_bfloat16_is_close(network):
+    coordinates, features = cloud(0)
+    expected = network(coordinates, features)
+    with torch.autocast("cpu", torch.bfloat16):
+        actual = network(coordinates, features)
+    error = (actual.float() - expected).square().mean().sqrt() / expected.std()
+    assert 0 < error < 0.05  # 2^-9 per rounding, over 42 layers in a row
+
+
+def test_gradients_reach_every_weight_and_input(network):
+    coordinates, features = cloud(0)
+    features.requires_grad_()
+    network.head(network(coordinates, features)).square().sum().backward()
+    missing = [name for name, weight in network.named_parameters() if not weight.grad.any()]
+    network.zero_grad()
+    assert not missing
+    assert features.grad.any(dim=1).float().mean() > 0.9  # a ReLU may close for a voxel
+
+
+def test_what_a_voxel_may_hold():
+    coordinates, features = cloud(0)
+    twice = torch.cat([coordinates, coordinates[:1]]), torch.cat([features, features[:1]])
+    with pytest.raises(ValueError, match=f"{len(features) + 1} rows are only {len(features)}"):
+        MinkowskiNet(WIDTHS)(*twice)
+    torch.manual_seed(0)
+    network = SPVCNN(WIDTHS).eval()
+    with torch.no_grad():  # the mean of two equal rows is that row
+        torch.testing.assert_close(
+            network(*twice)[:-1], network(coordinates, features), atol=1e-5, rtol=1e-5
+        )
+
+
+def test_inputs_that_do_not_fit_are_refused(network):
+    coordinates, features = cloud(0)
+    with pytest.raises(ValueError, match=r"features must be \(P, 4\)"):
+        network(coordinates, features[:, :3])
+    with pytest.raises(ValueError, match="rows of coordinates"):
+        network(coordinates[1:], features)
+    with pytest.raises(ValueError, match="9 positive numbers"):
+        type(network)(WIDTHS[:-1])
+
+
+def test_points_between_voxels():
+    """By hand: means, weights of a corner each, and voxels that are not there."""
+    voxels, _ = Voxels.from_coordinates(torch.tensor([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 2, 1]]))
+    points = Points(
+        torch.tensor([[0.25, 0, 0], [0.75, 0, 0], [0.5, 0.5, 0], [9, 9, 9]]), torch.zeros(4).long()
+    )
+    values = torch.tensor([[1.0], [3], [5], [100]])
+    assert to_voxels(values, points, voxels).tolist() == [[3.0], [0], [0]]
+    rows, weights = corners(points, voxels)
+    assert rows[0].tolist() == [0, 3, 3, 3, 1, 3, 3, 3]
+    torch.testing.assert_close(weights[:3, 0], torch.tensor([0.75, 0.25, 0.5]))
+    torch.testing.assert_close(weights[:3, 4], torch.tensor([0.25, 0.75, 0.5]))
+    result = to_points(torch.tensor([[10.0], [20], [7]]), points, voxels)
+    torch.testing.assert_close(result, torch.tensor([[12.5], [17.5], [15], [0]]))
+
+
+def test_interpolation_of_a_plane_is_exact():
+    """Trilinear weights give back a linear function where all corners are occupied."""
+    axis = torch.arange(-4, 5, 2)
+    lattice = torch.cartesian_prod(axis, axis, axis, torch.tensor([0]))
+    voxels = Voxels.from_coordinates(lattice)[0].coarser
+    slope = torch.tensor([[1.0], [-2], [3]])
+    points = Points(torch.rand(50, 3) * 7.9 - 4, torch.zeros(50).long())
+    values = (voxels.coordinates[:, :3] @ slope.long()).float()
+    torch.testing.assert_close(to_points(values, points, voxels), points.xyz @ slope)
+    features = torch.randn(len(voxels), 2, dtype=torch.float64, requires_grad=True)
+    exact = Points(points.xyz[:5].double(), points.batch[:5])
+    assert torch.autograd.gradcheck(lambda given: to_points(given, exact, voxels), features)
+    at_points = torch.randn(5, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda given: to_voxels(given, exact, voxels), at_points)
+
+
+@pytest.fixture
+def official(network):
+    return {official_name(key): value for key, value in network.state_dict().items()}
+
+
+@torch.no_grad()
+def test_checkpoint_of_several_modules(network, official, tmp_path):
+    """A prefix is taken off; sizes follow from the weights."""
+    wrapped = {f"model.{key}": value for key, value in official.items()}
+    torch.save({"state_dict": wrapped | {"loss.weight": torch.ones(2)}}, tmp_path / "model.ckpt")
+    loaded = type(network).from_checkpoint(tmp_path / "model.ckpt").eval()
+    assert loaded.widths == network.widths
+    assert torch.equal(loaded(*cloud(0)), network(*cloud(0)))
+
+
+def test_files_that_are_no_checkpoint(network, official, tmp_path):
+    path, kind = tmp_path / "model.ckpt", type(network)
+
+    def refused(content, message):
+        torch.save(content, path)
+        with pytest.raises(ValueError, match=rf"model\.ckpt: .*{message}"):
+            kind.from_checkpoint(path)
+
+    with pytest.raises(ValueError, match=r"model\.ckpt: no such file"):
+        kind.from_checkpoint(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"model\.ckpt: is damaged"):
+        kind.from_checkpoint(path)
+    refused([1, 2], "0 weights are named stem.0.kernel")
+    refused({"state_dict": {}}, "0 weights are named stem.0.kernel")
+    refused({"stem.0.kernel": torch.ones(27, 4, 4)}, "holds no such U-Net")
+    refused(official | {"ema.stem.0.kernel": torch.ones(1)}, "2 weights are named")
+    refused(official | {"extra": torch.ones(1)}, r"1 unexpected \['extra'\]")
+    bias = {"stem.1.bias": torch.ones(7)}
+    refused(official | bias, r"weight stem.1.bias has shape \(7,\), but \(4,\)")
+    del official["stem.1.bias"]
+    refused(official, r"1 missing \['stem.1.bias'\]")
+
+
+def test_networks_are_told_apart(tmp_path):
+    weights = {
+        official_name(key): value for key, value in MinkowskiNet(WIDTHS).state_dict().items()
+    }
+    torch.save(weights, tmp_path / "model.ckpt")
+    with pytest.raises(ValueError, match=r"not those of this SPVCNN: 21 missing \['point_trans"):
+        SPVCNN.from_checkpoint(tmp_path / "model.ckpt")
+
+
+def test_voxelize():
+    points = torch.tensor(
+        [
+            [2.0, 0, 0, 9],  # voxel 40, 0, 0
+            [1.0, -1, 0.5, 9],  # 20, -20, 10
+            [2.02, 0.01, 0, 9],  # as the first one
+            [0.5, 0, 0, 9],  # too near
+            [56.1, 0, 0, 9],  # too far
+        ]
+    )
+    coordinates, features = voxelize(points)
+    assert coordinates.tolist() == [[0, 0, 10], [20, 20, 0]]
+    assert features.tolist() == [[1, -1, 0.5, -1], [2, 0, 0, -1]]
+    assert [len(part) for part in voxelize(points[:0])] == [0, 0]
+    with pytest.raises(ValueError, match=r"points must be \(P, 3\)"):
+        voxelize(points[0])
+    points[1, 2] = math.nan
+    with pytest.raises(ValueError, match="1 of 5 points are NaN or infinite"):
+        voxelize(points)
+
+
+def test_pooling_by_hand():
+    """Four voxels around their mean, 3 m and 10 m away; cloud 1 has none."""
+    near, far = 60, 200
+    coordinates = torch.tensor(
+        [[near, 0, 0, 0], [-near, 0, 0, 0], [-5, far, 0, 2], [5, -far, 0, 2]]
+    )
+    features = torch.tensor([[1.0, 10], [3, 30], [5, 50], [9, 70]])
+    rings = pool_voxels(features, coordinates, 3).view(3, 16, 2)
+    assert rings[0, 0].tolist() == [2, 20]
+    assert rings[2, 1].tolist() == [7, 60]  # 7.25 <= 10 < 10.5
+    assert rings.count_nonzero() == 4
+    sectors = pool_voxels(features, coordinates, 3, "sectors").view(3, 16, 2)
+    assert sectors[0, 8].tolist() == [1, 10]  # azimuth 0 opens the ninth sector
+    assert sectors[2, [4, 12], 0].tolist() == [9, 5]  # azimuths -89 and +91 degrees
+    assert pool_voxels(features, coordinates, 3, "all").tolist() == [[2, 20], [0, 0], [7, 60]]
+    beyond = torch.tensor([[1200, 0, 0, 0], [-1200, 0, 0, 0]])  # 60 m
+    assert not pool_voxels(features[:2], beyond, 1).any()
+    with pytest.raises(ValueError, match="rings, sectors or all, got 'depth'"):
+        pool_voxels(features, coordinates, 3, "depth")
