@@ -125,6 +125,16 @@ class TestOurFiles:
             sit.velocity(latents, time), checkpoint.network("sit").build().velocity(latents, time)
         )
 
+    def test_feature_source_of_new_and_earlier_files(self, checkpoint, tmp_path):
+        known = replace(checkpoint, feature_source="oracle")
+        path = save_checkpoint(known, tmp_path / "a.safetensors")
+        assert read_checkpoint(path).feature_source == "oracle"
+        description = path.with_suffix(".yaml")
+        about = yaml.safe_load(description.read_text())
+        del about["feature_source"]
+        description.write_text(yaml.safe_dump(about))
+        assert read_checkpoint(path).feature_source is None
+
     def test_tensors_that_share_memory(self, checkpoint, tmp_path):
         shared = {**checkpoint.networks, "ema": checkpoint.network("sit")}
         shared = replace(checkpoint, networks=shared)
@@ -210,6 +220,10 @@ class TestLightning:
         read = read_checkpoint(tmp_path / "last.ckpt")
         assert_same_networks(read, checkpoint)
         assert (read.stage, read.step, set(read.left_out)) == ("joint", 30, {"metric"})
+        assert read.feature_source is None  # as in files written before it was recorded
+        lightning_content["r3dpa"]["feature_source"] = "scalr"
+        torch.save(lightning_content, tmp_path / "last.ckpt")
+        assert read_checkpoint(tmp_path / "last.ckpt").feature_source == "scalr"
         assert ScanGeometry.from_dict(read.geometry) == GEOMETRY
 
     def test_no_discriminator_and_a_default_latent_norm(self, lightning_content, tmp_path):

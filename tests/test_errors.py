@@ -129,15 +129,15 @@ class TestFeatureGrids:
         assert f"No feature grid for scan {folder / '000009.bin'}" in message
         assert "r3dpa features" in message
 
-    @pytest.mark.parametrize("extractor", [[], ["--data.init_args.extractor=null"]])
-    def test_grids_of_another_size(self, extractor, folder, tmp_path, refused):
+    def test_grids_of_another_size(self, folder, tmp_path, refused):
         """Grids of 2 x 8, and a SiT with patches of 1 that wants 4 x 16."""
         features = write_grids(folder, tmp_path / "grids")
         other = [
             "--data.init_args.grid_size=[4, 16]",
             "--model.init_args.sit.init_args.patch_size=1",
         ]
-        message = refused("joint", *data_args(folder), *extractor, *features, *other)
+        no_extractor = "--data.init_args.extractor=null"
+        message = refused("joint", *data_args(folder), no_extractor, *features, *other)
         assert "grid_size [2, 8]" in message
         assert "grid_size [4, 16]" in message
         assert str(tmp_path / "grids") in message

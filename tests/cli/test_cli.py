@@ -16,17 +16,14 @@ from PIL import Image
 
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.cli import main
-from r3dpa.data.feature_grids import stored_feature_dim
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range
-from r3dpa.nn.backbones import WaffleIron
-from r3dpa.nn.backbones.scalr import _official_name
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
 COMMANDS = {
     *("fit", "validate", "test", "predict", "features"),
-    *("simulate", "check", "view", "realism", "sample", "convert", "report", "bench"),
+    *("simulate", "check", "view", "realism", "sample", "convert", "report", "bench", "probe"),
 }
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
@@ -511,32 +508,3 @@ class TestReport:
     def test_missing_run_is_an_error(self, tmp_path):
         with pytest.raises(ValueError, match=r"nowhere holds no version_\*/metrics.csv"):
             main(["report", str(tmp_path / "nowhere")])
-
-
-class TestFeatures:
-    def test_writes_the_grids_of_a_data_configuration(self, simulated, capsys):
-        words = ["--config", CONF / "data" / "folder.yaml", "--data.init_args.scans", simulated]
-        words += ["--data.init_args.num_workers", 0]
-        main(["features", *map(str, words)])
-        folder = simulated / "feature_grids" / "geometric_8x64"
-        grids = {path.parent.name: np.load(path) for path in folder.rglob("grids.npy")}
-        assert {drive: grid.shape for drive, grid in grids.items()} == {
-            "2013_05_28_drive_0000_sync": (1, 512, 768),
-            "2013_05_28_drive_0003_sync": (2, 512, 768),
-        }
-        assert all(np.abs(grid).sum() > 0 for grid in grids.values())
-        assert stored_feature_dim(folder) == 768
-        times = {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}
-        main(["features", *map(str, words)])
-        assert times == {path: path.stat().st_mtime_ns for path in folder.rglob("grids.npy")}
-
-    def test_scalr_is_given_by_its_checkpoint(self, simulated, tmp_path):
-        network = WaffleIron(width=4, depth=1, head_dim=5)
-        weights = {f"module.{_official_name(k)}": v for k, v in network.state_dict().items()}
-        torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
-        words = ["--data", "r3dpa.data.LidarDataModule", "--data.init_args.scans", simulated]
-        words += ["--data.init_args.features_dir", tmp_path / "grids"]
-        words += ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
-        words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
-        main(["features", *map(str, words)])
-        assert stored_feature_dim(tmp_path / "grids") == 4

@@ -10,11 +10,16 @@ from torch import nn
 from r3dpa.geometry import LidarSensor
 
 
+def unchanged(points):
+    return points
+
+
 class ScaledPoints(nn.Module):
-    """Extractor whose features are the points times a gain."""
+    """Extractor whose features are the points times a gain; counts the scans it is given."""
 
     name = "scaled"
     dim = 4
+    prepare = staticmethod(unchanged)
 
     def __init__(self, gain=1.0, fail_after=None):
         super().__init__()
@@ -22,11 +27,17 @@ class ScaledPoints(nn.Module):
         self.fail_after = fail_after
         self.calls = 0
 
+    def point_features(self, prepared):
+        features = []
+        for points in prepared:
+            self.calls += 1
+            if self.fail_after is not None and self.calls > self.fail_after:
+                raise RuntimeError("interrupted")
+            features.append(points * self.settings["gain"])
+        return features
+
     def forward(self, points):
-        self.calls += 1
-        if self.fail_after is not None and self.calls > self.fail_after:
-            raise RuntimeError("interrupted")
-        return points * self.settings["gain"]
+        return self.point_features([self.prepare(points)])[0]
 
 
 def random_points(seed, count=300):
@@ -60,6 +71,27 @@ def make_scans():
 def scaled_points():
     """The extractor class."""
     return ScaledPoints
+
+
+@pytest.fixture
+def read_grid():
+    """Function that reads the grid of a scan as it is on disk."""
+
+    def read(grids, scan):
+        return grids.read(scan, scan.path.stat().st_size)
+
+    return read
+
+
+@pytest.fixture
+def files_of():
+    """Function that gives the bytes of each file below a folder, but of locks."""
+
+    def files(folder):
+        paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+        return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+    return files
 
 
 @pytest.fixture(autouse=True)

@@ -7,12 +7,16 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from r3dpa.data import (
     FeatureGridError,
+    FeatureGridWriter,
     KITTI360DataModule,
     LidarDataModule,
+    PointDataset,
     SimulatedDataModule,
     check,
+    pooled_grids,
     write_bin,
 )
+from r3dpa.data.feature_grids import plan
 from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor
 
@@ -162,11 +166,52 @@ def test_missing_grids_are_made_once_and_need_their_extractor(tmp_path, data, sc
     assert module.feature_dim == 4
     batch = next(iter(module.train_dataloader()))
     assert batch["feature_grid"].shape == (2, 8, 4)
-    folder = tmp_path / "scans/feature_grids/scaled_2x4"
-    assert data(features_dir=str(folder)).feature_dim == 4
+    folder = tmp_path / "scans/feature_grids/scaled"
+    stored = data(features_dir=str(folder))
+    assert (stored.feature_dim, stored.feature_source) == (4, "scaled")
     with pytest.raises(FeatureGridError, match="No feature grid"):
         data(features_dir=str(tmp_path / "none")).setup("fit")
     data(features_dir=str(tmp_path / "none")).setup("predict")
+
+
+def test_grid_sizes_share_a_folder_and_its_source(tmp_path, data, scaled_points):
+    assert data().feature_source is None
+    for size, cells in (((2, 4), 8), ((4, 8), 32)):
+        module = data(extractor=scaled_points(), grid_size=size)
+        assert module.feature_source == "scaled"
+        module.prepare_data()
+        module.setup("fit")
+        assert module.train_set[0]["feature_grid"].shape == (cells, 4)
+    folder = tmp_path / "scans/feature_grids/scaled"
+    assert {path.name for path in folder.iterdir()} == {".lock", "2x4", "4x8"}
+    with pytest.raises(FeatureGridError, match="No feature grids in"):
+        _ = data(features_dir=str(tmp_path / "none")).feature_source
+
+
+def test_stored_grids_need_not_be_made_as_they_would_be_here(tmp_path, data, scaled_points):
+    """Complete int8 grids of another precision, as `r3dpa features` may have made them."""
+    module, extractor = data(extractor=scaled_points()), scaled_points()
+    module.setup("predict")
+    scans, projection = module.all_set.scans, module.projection
+    arguments = scans, extractor, projection, [(2, 4)], module.features_dir, "int8", "bf16-mixed"
+    todo = plan(*arguments)
+    samples = PointDataset(todo.missing, module.sensor, extractor.prepare)
+    grids = pooled_grids(extractor, [*samples], projection, [(2, 4)])
+    with FeatureGridWriter(module.features_dir, todo.settings[2, 4]) as writer:
+        writer.add([(sample.scan, sample.num_bytes) for sample in samples], grids[2, 4])
+    module.prepare_data()
+    module.setup("fit")
+    assert module.extractor.calls == 0
+    read = module.all_set[3]["feature_grid"]
+    assert torch.allclose(read, grids[2, 4][3], atol=50 / 254)
+
+
+def test_the_log_tells_the_disk_space(data, scaled_points, caplog):
+    """11 grids of 2 x 4 cells, 4 wide: 64 bytes each."""
+    with caplog.at_level("INFO"):
+        data(extractor=scaled_points()).prepare_data()
+    assert "feature grids: 11 of 11, 7.04e-07 of 7.04e-07 GB" in caplog.text
+    assert "feature grids: 11 made, 0 kept, in " in caplog.text
 
 
 def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):

@@ -4,7 +4,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from r3dpa.data import LidarDataset, find_scans
-from r3dpa.data.feature_grids import FeatureGrids, write_feature_grids
+from r3dpa.data.feature_grids import write_feature_grids
+from r3dpa.data.feature_store import FeatureGrids
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
 
@@ -33,7 +34,7 @@ def test_one_point_falls_into_its_pixel_with_its_range(tmp_path, projection):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_batches_with_grids(tmp_path, make_scans, projection, scaled_points, workers):
     scans = find_scans(make_scans(tmp_path / "scans", 5))
-    write_feature_grids(scans, scaled_points(), projection, (2, 4), tmp_path / "grids")
+    write_feature_grids(scans, scaled_points(), projection, [(2, 4)], tmp_path / "grids")
     grids = FeatureGrids(tmp_path / "grids", scans, projection, (2, 4))
     dataset = LidarDataset(scans, projection, RangeCodec("log2"), grids)
     single = [dataset[index] for index in range(5)]

@@ -1,24 +1,34 @@
-import json
-import pickle
+import multiprocessing
+import os
+import random
 import re
+import shutil
+import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from threading import Event
 
 import numpy as np
 import pytest
 import torch
 
-from r3dpa.data.feature_grids import FeatureGridError, FeatureGrids, write_feature_grids
-from r3dpa.data.scans import ScanError, find_scans, read_scan
+from r3dpa.data import (
+    FeatureGridError,
+    FeatureGrids,
+    PointDataset,
+    default_features_dir,
+    features_lock,
+    find_scans,
+    pooled_grids,
+    read_scan,
+    write_feature_grids,
+)
+from r3dpa.data.feature_grids import plan
+from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
 GRID = (2, 4)
-FILES = ("a/grids.npy", "a/index.json", "town/b/grids.npy", "town/b/index.json")
-
-
-def read(grids, scan):
-    return grids.read(scan, scan.path.stat().st_size)
 
 
 @pytest.fixture
@@ -36,92 +46,204 @@ def folder(tmp_path, make_scans):
 @pytest.fixture
 def made(folder, tmp_path, projection, scaled_points):
     scans = find_scans(folder)
-    write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "grids")
+    write_feature_grids(scans, scaled_points(), projection, [GRID], tmp_path / "grids")
     return scans, tmp_path / "grids"
 
 
-def test_grid_is_the_cell_mean_in_half_precision(made, projection, scaled_points):
+def cell_means(scan, projection, grid_size=GRID):
+    """The grid of the extractor of the fixtures."""
+    points = torch.from_numpy(read_scan(scan.path))
+    return pool_cells(points[:, :3], points, projection, grid_size)[0]
+
+
+def test_grid_is_the_cell_mean_in_half_precision(made, projection, scaled_points, read_grid):
     scans, root = made
     grids = FeatureGrids(root, scans, projection, GRID, scaled_points())
     assert grids.dim == 4
     for scan in scans:
-        points = torch.from_numpy(read_scan(scan.path))
-        expected, counts = pool_cells(points[:, :3], points, projection, GRID)
-        grid = read(grids, scan)
+        grid = read_grid(grids, scan)
         assert grid.dtype == torch.float32
-        assert torch.equal(grid, expected.half().float())
-        assert counts.sum() == len(points)
-    assert np.load(root / "town/b/grids.npy", mmap_mode="r").dtype == np.float16
+        assert torch.equal(grid, cell_means(scan, projection).half().float())
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_workers_give_the_same_files(tmp_path, made, projection, scaled_points, workers):
+@pytest.mark.parametrize(("workers", "batch_size"), [(0, 1), (2, 1), (0, 3), (1, 2)])
+def test_workers_and_batches_give_the_same_files(
+    tmp_path, made, projection, scaled_points, files_of, workers, batch_size
+):
     scans, root = made
     calls = []
     count = write_feature_grids(
-        scans,
+        scans[::-1],
         scaled_points(),
         projection,
-        GRID,
+        [GRID],
         tmp_path / "again",
         workers=workers,
+        batch_size=batch_size,
         progress=lambda done, total: calls.append((done, total)),
     )
     assert count == 5
     assert calls == [(i, 5) for i in range(1, 6)]
-    for name in FILES:
-        assert (tmp_path / "again" / name).read_bytes() == (root / name).read_bytes()
+    assert files_of(tmp_path / "again") == files_of(root)
+    assert files_of(root).keys() == {
+        f"2x4/{name}" for name in ("settings.json", "shard_00000.jsonl", "shard_00000.rows")
+    }
+
+
+def test_preparation_runs_in_loader_processes(tmp_path, folder, projection, scaled_points):
+    class Counting(scaled_points):
+        @staticmethod
+        def prepare(points):
+            return points, os.getpid()
+
+        def point_features(self, prepared):
+            processes.update(process for _, process in prepared)
+            return super().point_features([points for points, _ in prepared])
+
+    processes = set()
+    write_feature_grids(
+        find_scans(folder), Counting(), projection, [GRID], tmp_path / "g", workers=2
+    )
+    assert len(processes) == 2
+    assert os.getpid() not in processes
+
+
+def test_labels_are_given_to_those_who_need_them(tmp_path, make_scans, projection, scaled_points):
+    class Labelled(scaled_points):
+        needs_labels = True
+
+        @staticmethod
+        def prepare(points, labels):
+            return torch.cat([points[:, :3], labels[:, None].float()], dim=1)
+
+    drive = tmp_path / "s/velodyne_points"
+    make_scans(drive / "data", 2)
+    scans = find_scans(tmp_path / "s")
+    with pytest.raises(ScanError, match=r"0000000000\.bin has no labels"):
+        write_feature_grids(scans, Labelled(), projection, [GRID], tmp_path / "g")
+    (drive / "labels").mkdir()
+    for scan in scans:
+        np.full(300, 7, np.uint32).tofile(drive / "labels" / f"{scan.frame}.label")
+    write_feature_grids(scans, Labelled(), projection, [GRID], tmp_path / "g")
+    grid = FeatureGrids(tmp_path / "g", scans, projection, GRID).read(scans[1], 4800)
+    assert set(grid[:, 3].tolist()) <= {0, 7}
+    assert 7 in grid[:, 3]
 
 
 def test_linear_last_step_is_taken_after_pooling(tmp_path, folder, projection, scaled_points):
+    """And in float32, whatever the precision of the network."""
+
     class Lifted(scaled_points):
-        def point_features(self, points):
-            return points * 0.5
+        def point_features(self, prepared):
+            return [points[:, :3].bfloat16() for points in prepared]
 
         def lift(self, features):
-            return features * 2
+            sizes.add(len(features))
+            return features @ matrix
 
-    scans, extractor = find_scans(folder), Lifted()
-    write_feature_grids(scans, extractor, projection, GRID, tmp_path / "lifted")
-    write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "plain")
-    assert extractor.calls == 0
-    one, two = (np.load(tmp_path / kind / "a/grids.npy") for kind in ("lifted", "plain"))
-    assert np.array_equal(one, two)
+    sizes, matrix = set(), torch.arange(12.0).reshape(3, 4) / 7
+    (sample, *_) = PointDataset(find_scans(folder), projection.sensor, Lifted.prepare)
+    with torch.autocast("cpu", torch.bfloat16):
+        grid = pooled_grids(Lifted(), [sample], projection, [GRID])[GRID][0]
+    points = sample.points[:, :3]
+    means, _ = pool_cells(points, points.bfloat16().float(), projection, GRID)
+    assert sizes == {8}
+    assert torch.allclose(grid, means @ matrix, rtol=1e-6, atol=1e-6)
 
 
-def refused(made, projection, grid_size, extractor, words):
+def test_several_sizes_from_one_pass_equal_single_passes(
+    tmp_path, folder, projection, scaled_points, files_of
+):
+    scans, sizes = find_scans(folder), [(2, 4), (8, 32), (1, 1)]
+    extractor = scaled_points()
+    together, single = tmp_path / "together", tmp_path / "single"
+    assert write_feature_grids(scans, extractor, projection, sizes, together) == 5
+    assert extractor.calls == 5
+    for size in sizes:
+        write_feature_grids(scans, scaled_points(), projection, [size], single)
+        grids = FeatureGrids(together, scans, projection, size)
+        assert torch.equal(
+            grids.read(scans[4], 4800), cell_means(scans[4], projection, size).half().float()
+        )
+    assert files_of(together) == files_of(single)
+
+
+def test_a_size_is_completed_without_the_others_growing(
+    tmp_path, folder, projection, scaled_points
+):
+    scans, root = find_scans(folder), tmp_path / "g"
+    write_feature_grids(scans[:3], scaled_points(), projection, [GRID], root)
+    todo = plan(scans, scaled_points(), projection, [GRID, (4, 4)], root)
+    assert (list(todo.missing), todo.num_kept) == (scans, 0)
+    assert todo.num_bytes == 2 * 8 * 4 * 2 + 5 * 16 * 4 * 2
+    assert write_feature_grids(scans, scaled_points(), projection, [GRID, (4, 4)], root) == 5
+    rows = {path.parent.name: path.stat().st_size for path in root.glob("*/*.rows")}
+    assert rows == {"2x4": 5 * 64, "4x4": 5 * 128}
+
+
+def refused(made, projection, extractor, words):
     scans, root = made
     for attempt in (
-        lambda: FeatureGrids(root, scans, projection, grid_size, extractor),
-        lambda: write_feature_grids(scans, extractor, projection, grid_size, root),
+        lambda: FeatureGrids(root, scans, projection, GRID, extractor),
+        lambda: write_feature_grids(scans, extractor, projection, [GRID], root),
     ):
         with pytest.raises(FeatureGridError) as caught:
             attempt()
-        for word in [*words, "features_dir", "r3dpa features"]:
+        for word in [*words, "features_dir", "r3dpa features --data"]:
             assert word in str(caught.value)
 
 
 def test_other_sensor_is_refused(made, scaled_points):
     other = SphericalProjection(LidarSensor(beams=8, columns=32, range_max_m=40.0))
-    refused(made, other, GRID, scaled_points(), ["56.0", "40.0"])
+    refused(made, other, scaled_points(), ["56.0", "40.0"])
 
 
 def test_other_projection_is_refused(made, sensor, scaled_points):
     rings = RingProjection(sensor, tuple(float(-row) for row in range(8)))
-    refused(made, rings, GRID, scaled_points(), ["'spherical'", "'rings'"])
-
-
-def test_other_grid_size_is_refused(made, projection, scaled_points):
-    refused(made, projection, (4, 4), scaled_points(), ["[2, 4]", "[4, 4]"])
+    refused(made, rings, scaled_points(), ["'spherical'", "'rings'"])
 
 
 def test_other_extractor_is_refused(made, projection, scaled_points):
-    refused(made, projection, GRID, scaled_points(gain=3.0), ["'gain': 1.0", "'gain': 3.0"])
+    refused(made, projection, scaled_points(gain=3.0), ["'gain': 1.0", "'gain': 3.0"])
     other = scaled_points()
     other.name = "scalr"
-    refused(made, projection, GRID, other, ["'scaled'", "'scalr'"])
+    refused(made, projection, other, ["'scaled'", "'scalr'"])
     scans, root = made
     assert FeatureGrids(root, scans, projection, GRID).dim == 4  # any extractor, if none is named
+    with pytest.raises(FeatureGridError, match=r"'scaled'.*'scalr'"):
+        write_feature_grids(scans, other, projection, [(4, 4)], root)  # one folder, one extractor
+
+
+def test_other_grid_size_is_named_by_the_reader(made, projection, scaled_points):
+    scans, root = made
+    write_feature_grids(scans, scaled_points(), projection, [(1, 1)], root)
+    with pytest.raises(FeatureGridError) as caught:
+        FeatureGrids(root, scans, projection, (4, 4))
+    for words in ("grid_size [1, 1], [2, 4]", "grid_size [4, 4]", "r3dpa features --data"):
+        assert words in str(caught.value)
+
+
+def test_dtype_and_precision_matter_where_grids_are_missing(
+    made, projection, scaled_points, make_scans, folder
+):
+    scans, root = made
+    other = {"dtype": "int8", "precision": "bf16-mixed"}
+    assert not plan(scans, scaled_points(), projection, [GRID], root, **other).missing
+    make_scans(folder / "a", 4)
+    for key, value in other.items():
+        with pytest.raises(FeatureGridError, match=rf"{key} \S+, but {key} {value}"):
+            plan(find_scans(folder), scaled_points(), projection, [GRID], root, **{key: value})
+
+
+def test_int8_grids_feed_a_reader(tmp_path, made, projection, scaled_points):
+    scans, _ = made
+    write_feature_grids(scans, scaled_points(), projection, [GRID], tmp_path / "i", dtype="int8")
+    grids = FeatureGrids(tmp_path / "i", scans, projection, GRID, scaled_points())
+    exact = cell_means(scans[0], projection)
+    bound = exact.abs().amax(dim=1, keepdim=True) / 254 * 1.001
+    difference = (grids.read(scans[0], 4800) - exact).abs()
+    assert (difference <= bound).all()
+    assert difference.any()
 
 
 def test_missing_grid_names_the_scan_and_the_command(made, projection, make_scans, folder):
@@ -133,40 +255,44 @@ def test_missing_grid_names_the_scan_and_the_command(made, projection, make_scan
     make_scans(folder / "c", 1)
     with pytest.raises(FeatureGridError, match=r"c/0000000000\.bin.*r3dpa features"):
         FeatureGrids(root, find_scans(folder), projection, GRID)
+    with pytest.raises(FeatureGridError, match=r"No feature grid for scan .*r3dpa features"):
+        FeatureGrids(root / "none", find_scans(folder), projection, GRID)
 
 
 def test_new_scans_are_added_and_old_grids_kept(
-    made, projection, make_scans, folder, scaled_points
+    made, projection, make_scans, folder, scaled_points, files_of, read_grid
 ):
     _, root = made
-    before = np.load(root / "a/grids.npy")
+    before = files_of(root)
     make_scans(folder / "a", 4)
     extractor = scaled_points()
-    assert write_feature_grids(find_scans(folder), extractor, projection, GRID, root) == 1
+    scans = find_scans(folder)
+    todo = plan(scans, extractor, projection, [GRID], root)
+    assert (list(todo.missing), todo.num_kept) == ([scans[3]], 5)
+    assert write_feature_grids(scans, extractor, projection, [GRID], root) == 1
     assert extractor.calls == 1
-    after = np.load(root / "a/grids.npy")
-    assert np.array_equal(after[:3], before)
-    scan = find_scans(folder)[3]
-    points = torch.from_numpy(read_scan(scan.path))
-    expected, _ = pool_cells(points[:, :3], points, projection, GRID)
-    grids = FeatureGrids(root, find_scans(folder), projection, GRID)
-    assert torch.equal(read(grids, scan), expected.half().float())
+    after = files_of(root)
+    assert all(after[name].startswith(data) for name, data in before.items())
+    grids = FeatureGrids(root, scans, projection, GRID)
+    assert torch.equal(read_grid(grids, scans[3]), cell_means(scans[3], projection).half().float())
 
 
-def test_replaced_scan_is_noticed(made, projection, scaled_points):
+def test_replaced_scan_is_noticed(made, projection, scaled_points, read_grid):
     scans, root = made
-    before = [read(FeatureGrids(root, scans, projection, GRID), scan) for scan in scans]
+    before = [read_grid(FeatureGrids(root, scans, projection, GRID), scan) for scan in scans]
     scans[1].path.write_bytes(scans[3].path.read_bytes()[:-16])
     with pytest.raises(FeatureGridError, match=re.escape(str(scans[1].path)) + ".*replaced"):
-        read(FeatureGrids(root, scans, projection, GRID), scans[1])
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
+        read_grid(FeatureGrids(root, scans, projection, GRID), scans[1])
+    assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1
     grids = FeatureGrids(root, scans, projection, GRID)
-    same = [torch.equal(read(grids, scan), old) for scan, old in zip(scans, before, strict=True)]
+    same = [torch.equal(read_grid(grids, s), old) for s, old in zip(scans, before, strict=True)]
     assert same == [True, False, True, True, True]
 
 
 @pytest.mark.parametrize(("workers", "error"), [(0, RuntimeError), (0, ScanError), (2, ScanError)])
-def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points, workers, error):
+def test_an_error_keeps_what_was_made(
+    tmp_path, made, projection, scaled_points, files_of, workers, error
+):
     """At the last of five scans, an interruption or a damaged file."""
     (scans, complete), root = made, tmp_path / "again"
     extractor, data = scaled_points(), scans[4].path.read_bytes()
@@ -175,48 +301,85 @@ def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points,
     else:
         scans[4].path.write_bytes(data[:-3])
     with pytest.raises(error):
-        write_feature_grids(scans, extractor, projection, GRID, root, workers=workers)
+        write_feature_grids(scans, extractor, projection, [GRID], root, workers=workers)
     FeatureGrids(root, scans[:4], projection, GRID)
     with pytest.raises(FeatureGridError, match="No feature grid"):
         FeatureGrids(root, scans, projection, GRID)
     scans[4].path.write_bytes(data)
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
-    for name in FILES:
-        assert (root / name).read_bytes() == (complete / name).read_bytes()
+    assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1
+    assert files_of(root) == files_of(complete)
 
 
-def test_a_killed_writer_leaves_nothing_that_counts(folder, made, projection, scaled_points):
-    """Killed with a row half written: rows that the index does not name are made again."""
-    scans, root = made
-    whole = (root / "a/grids.npy").read_bytes()
-    index = json.loads((root / "a/index.json").read_text())
-    del index["scans"]["0000000002"]
-    (root / "a/index.json").write_text(json.dumps(index))
-    (root / "a/grids.npy").write_bytes(whole[:-30])
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 1
-    assert (root / "a/grids.npy").read_bytes() == whole
+def test_killed_three_times_and_resumed_is_as_undisturbed(
+    tmp_path, make_scans, projection, scaled_points, files_of
+):
+    class Slow(scaled_points):
+        def point_features(self, prepared):
+            time.sleep(0.005)
+            return super().point_features(prepared)
+
+    def write(root, extractor):
+        write_feature_grids(scans, extractor, projection, sizes, root, batch_size=3)
+
+    scans, sizes = find_scans(make_scans(tmp_path / "scans", 40)), [GRID, (8, 32)]
+    draws, root, left = random.Random(0), tmp_path / "g", [40]
+    for _ in range(3):
+        child = multiprocessing.get_context("fork").Process(target=write, args=[root, Slow()])
+        child.start()
+        lines, journal = 40 - left[-1] + draws.randrange(3, 9), root / "2x4/shard_00000.jsonl"
+        while not journal.exists() or journal.read_bytes().count(b"\n") < lines:
+            time.sleep(0.001)
+        time.sleep(draws.uniform(0, 0.01))
+        os.kill(child.pid, signal.SIGKILL)
+        child.join()
+        missing = plan(scans, scaled_points(), projection, sizes, root).missing
+        kept = [scan for scan in scans if scan not in missing]
+        left.append(len(missing))
+        for size in sizes:
+            grids = FeatureGrids(root, kept, projection, size)
+            for scan in kept:
+                exact = cell_means(scan, projection, size)
+                assert torch.equal(grids.read(scan, 4800), exact.half().float())
+    assert all(before - 3 >= after > 0 for before, after in pairwise(left))
+    write(root, scaled_points())
+    write(tmp_path / "undisturbed", scaled_points())
+    assert files_of(root) == files_of(tmp_path / "undisturbed")
 
 
-def test_two_writers_at_once_make_each_grid_once(tmp_path, made, projection, scaled_points):
+def test_two_jobs_at_once_make_each_grid_once(
+    tmp_path, made, projection, scaled_points, files_of, caplog
+):
     (scans, complete), root = made, tmp_path / "again"
     started = Event()
 
     class Slow(scaled_points):
-        def forward(self, points):
+        def point_features(self, prepared):
             started.set()
             time.sleep(0.05)
-            return super().forward(points)
+            return super().point_features(prepared)
 
     def write(extractor):
-        return write_feature_grids(scans, extractor, projection, GRID, root)
+        return write_feature_grids(scans, extractor, projection, [GRID], root)
 
     with ThreadPoolExecutor() as pool:
         first = pool.submit(write, Slow())
         started.wait()
         second = pool.submit(write, scaled_points())
         assert (first.result(), second.result()) == (5, 0)
-    for name in FILES:
-        assert (root / name).read_bytes() == (complete / name).read_bytes()
+    assert files_of(root) == files_of(complete)
+    assert "waiting for another process that makes feature grids in" in caplog.text
+
+
+def test_a_job_waits_for_the_lock(tmp_path, folder, projection, scaled_points):
+    with ThreadPoolExecutor() as pool:
+        with features_lock(tmp_path / "g"):
+            waiting = pool.submit(
+                write_feature_grids,
+                *(find_scans(folder), scaled_points(), projection, [GRID], tmp_path / "g"),
+            )
+            time.sleep(0.05)
+            assert not list((tmp_path / "g").glob("2x4/*"))
+        assert waiting.result() == 5
 
 
 def test_drives_within_drives(tmp_path, make_scans, projection, scaled_points):
@@ -225,73 +388,82 @@ def test_drives_within_drives(tmp_path, make_scans, projection, scaled_points):
     scans = find_scans(tmp_path / "s")
     assert [scan.drive for scan in scans] == ["seq", "seq", "seq/extra", "seq/extra"]
     root = tmp_path / "grids"
-    assert write_feature_grids(scans[2:], scaled_points(), projection, GRID, root) == 2
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, root) == 2
+    assert write_feature_grids(scans[2:], scaled_points(), projection, [GRID], root) == 2
+    assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 2
     FeatureGrids(root, scans, projection, GRID)
 
 
 def test_a_disk_without_space_is_refused_before_the_first_grid(
-    tmp_path, made, projection, scaled_points, monkeypatch
+    tmp_path, folder, projection, scaled_points, monkeypatch
 ):
-    scans, _ = made
-    extractor = scaled_points()
-    extractor.dim = 10**14
-    # 5 grids of 2 x 4 cells, 1e14 wide, 2 bytes each.
-    with pytest.raises(FeatureGridError, match=r"5 feature grids need 8000000\.0 GB, but .* free"):
-        write_feature_grids(scans, extractor, projection, GRID, tmp_path / "again")
+    """5 grids of 2 x 4 cells, a hundred million wide: 8 GB of float16, and 4 + 2 + ... of int8."""
+    scans, extractor, free = find_scans(folder), scaled_points(), 8_000_000_000
+    extractor.dim = 10**8
+
+    def usage(path):
+        assert path == tmp_path  # the first folder that exists
+        return shutil._ntuple_diskusage(1, 1, free)
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    root = tmp_path / "g" / "x"
+    todo = plan(scans, extractor, projection, [GRID], root)
+    assert (todo.num_bytes, todo.free_bytes) == (free, free)
+    todo = plan(scans, extractor, projection, [GRID], root, dtype="int8")
+    assert todo.num_bytes == 4_000_000_160
+    free -= 1
+    message = rf"grids of 5 scans need 8\.0 GB, but {root} has 8\.0 GB free: .*features_dir.*int8"
+    with pytest.raises(FeatureGridError, match=message):
+        write_feature_grids(scans, extractor, projection, [GRID], root)
     assert extractor.calls == 0
+    assert not (tmp_path / "g").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path, made, projection, scaled_points):
     scans, complete = made
     (tmp_path / "file").touch()
     with pytest.raises(FeatureGridError, match=r"file/grids .*give a features_dir"):
-        write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "file/grids")
+        write_feature_grids(scans, scaled_points(), projection, [GRID], tmp_path / "file/grids")
     (complete / ".lock").unlink()
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, complete) == 0
+    assert write_feature_grids(scans, scaled_points(), projection, [GRID], complete) == 0
     assert not (complete / ".lock").exists()  # complete grids may lie on a read-only disk
 
 
-@pytest.mark.parametrize("text", ["{", "{}", '{"settings": 3, "scans": {}}'])
-def test_a_damaged_index_is_named(made, projection, scaled_points, text):
-    scans, root = made
-    (root / "a/index.json").write_text(text)
-    with pytest.raises(FeatureGridError, match=r"a/index\.json is damaged"):
-        FeatureGrids(root, scans, projection, GRID)
-
-
 def test_bad_scan_and_bad_features_name_the_file(tmp_path, folder, projection, scaled_points):
+    class Constant(scaled_points):
+        def point_features(self, prepared):
+            return [torch.full_like(points, self.settings["gain"]) for points in prepared]
+
     scans = find_scans(folder)
-    with pytest.raises(FeatureGridError, match=r"a/0000000000\.bin.*NaN"):
-        write_feature_grids(
-            scans, scaled_points(gain=float("nan")), projection, GRID, tmp_path / "nan"
-        )
-    assert write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "nan") == 5
+    for gain in (float("nan"), float("inf")):
+        with pytest.raises(FeatureGridError, match=r"a/0000000000\.bin.*scaled gave NaN"):
+            write_feature_grids(scans, Constant(gain), projection, [GRID], tmp_path / str(gain))
     scans[1].path.write_bytes(b"123")
     with pytest.raises(ScanError, match=r"a/0000000001\.bin"):
-        write_feature_grids(scans, scaled_points(), projection, GRID, tmp_path / "g", workers=1)
+        write_feature_grids(scans, scaled_points(), projection, [GRID], tmp_path / "g")
 
 
-def test_large_features_stay_finite(tmp_path, folder, projection, scaled_points):
+@pytest.mark.parametrize(
+    ("sizes", "message"), [([], "grid_sizes is empty"), ([GRID, (3, 4)], "3 x 4 cells does not")]
+)
+def test_bad_grid_sizes(tmp_path, folder, projection, scaled_points, sizes, message):
+    with pytest.raises(ValueError, match=message):
+        write_feature_grids(find_scans(folder), scaled_points(), projection, sizes, tmp_path / "g")
+
+
+def test_large_features_stay_finite(tmp_path, folder, projection, scaled_points, read_grid):
     scans = find_scans(folder)
-    write_feature_grids(scans, scaled_points(gain=1e6), projection, GRID, tmp_path / "g")
+    write_feature_grids(scans, scaled_points(gain=1e6), projection, [GRID], tmp_path / "g")
     grids = FeatureGrids(tmp_path / "g", scans, projection, GRID)
-    assert all(torch.isfinite(read(grids, scan)).all() for scan in scans)
+    read = torch.stack([read_grid(grids, scan) for scan in scans])
+    assert read.abs().max() == 65504
 
 
-def test_grids_travel_to_other_processes_without_their_maps(made, projection):
-    scans, root = made
-    grids = FeatureGrids(root, scans, projection, GRID)
-    expected = read(grids, scans[0])
-    data = pickle.dumps(grids)
-    assert len(data) < 10_000
-    copy = pickle.loads(data)  # noqa: S301 - made two lines above
-    assert torch.equal(read(copy, scans[0]), expected)
-    assert json.loads((root / "a/index.json").read_text())["scans"]["0000000000"] == 4800
-
-
-def test_each_grid_belongs_to_its_scan(made, projection):
+def test_each_grid_belongs_to_its_scan(made, projection, read_grid):
     scans, root = made
     grids = FeatureGrids(root, scans[::-1], projection, GRID)
-    sums = {scan.name: read(grids, scan).sum().item() for scan in scans}
-    assert len(set(sums.values())) == 5
+    for scan in scans:
+        assert torch.equal(read_grid(grids, scan), cell_means(scan, projection).half().float())
+
+
+def test_default_folder():
+    assert str(default_features_dir("data/KITTI", "scalr")) == "data/KITTI/feature_grids/scalr"

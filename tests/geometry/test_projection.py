@@ -265,6 +265,7 @@ def test_cuda_equals_cpu():
     torch.testing.assert_close(
         means.cpu(), pool_cells(points, values, projection)[0], atol=1e-3, rtol=0
     )
+    assert torch.equal(pool_cells(points.cuda(), values.cuda(), projection)[0], means)
     again = range_image(points.cuda(), projection, values.cuda())
     assert torch.equal(again[0], cuda_range)
     assert torch.equal(again[1], cuda_image)
@@ -386,3 +387,58 @@ def test_pooling_many_points_in_one_cell():
     means, counts = pool_cells(points, values, SphericalProjection(SMALL), (1, 1))
     assert counts.tolist() == [count]
     torch.testing.assert_close(means, torch.full((1, 1), value), atol=1e-8, rtol=0)
+
+
+@pytest.mark.numerics
+def test_pooling_is_as_exact_as_float32_allows():
+    """Far from zero: a float32 mean, even one of partial sums of 64 points, loses digits."""
+    count, cells = 150_000, 4  # more than one chunk
+    generator = torch.Generator().manual_seed(5)
+    values = 1e4 + torch.randn(count, 4, generator=generator)
+    values[:, 1] = torch.randn(count, generator=generator) * 1e-3  # cancels
+    values[:, 2] = torch.where(torch.arange(count) % 2 == 0, 1e6, -1e6) + values[:, 1]
+    values[:, 3] = 0.1
+    azimuth = math.pi / 4 + math.pi / 2 * torch.randint(cells, (count,), generator=generator)
+    points = 10 * torch.stack([azimuth.cos(), azimuth.sin(), 0 * azimuth], dim=-1)
+    projection = SphericalProjection(SMALL)
+    means, counts = pool_cells(points, values, projection, (1, cells))
+    assert counts.min() > count / 5
+    cell = projection.pixel_of(points)[1] // 4
+    naive_off = {"one sum": 0.0, "partial sums": 0.0}
+    for index in range(cells):
+        members = values[cell == index]
+        for feature in range(4):
+            column = members[:, feature]
+            exact = math.fsum(column.tolist()) / len(column)
+            sizes = column.double().abs().mean().item()
+            bound = 2**-24 * abs(exact) + len(column) * 2**-53 * sizes
+            assert abs(means[index, feature].item() - exact) <= bound
+            for name, size in (("one sum", len(column)), ("partial sums", 64)):
+                sums = [part.numpy().cumsum()[-1].item() for part in column.split(size)]
+                error = abs(math.fsum(sums) / len(column) - exact)
+                naive_off[name] = max(naive_off[name], error / bound)
+    assert naive_off["one sum"] > 100
+    assert naive_off["partial sums"] > 2
+
+
+def test_values_of_points_that_do_not_count_are_not_seen():
+    points = torch.tensor([[10.0, 0, 0], [0.1, 0, 0], [90.0, 0, 0], [math.nan, 0, 0]])
+    values = torch.tensor([[3.0], [math.nan], [math.inf], [math.nan]])
+    means, counts = pool_cells(points, values, SphericalProjection(SMALL), (2, 4))
+    assert counts.sum() == counts[6] == 1
+    assert means[6].item() == 3
+    assert means.sum() == 3
+
+
+def test_pooling_does_not_depend_on_threads():
+    points, projection = random_points(30_000), SphericalProjection(LidarSensor())
+    values = torch.randn(30_000, 64, generator=torch.Generator().manual_seed(6))
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(pool_cells(points, values, projection)[0])
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])

@@ -27,6 +27,8 @@ FEATURE_DIM = 6
 class TinyData(LidarDataModule):
     """One random batch per step; where ``bad`` says so with a NaN in its features."""
 
+    feature_source = "random"
+
     def __init__(self, bad=(False,)):
         L.LightningDataModule.__init__(self)
         self.features_dir = "random"

@@ -2,6 +2,7 @@
 
 from r3dpa.checkpoints.convert import ConversionReport, convert
 from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint, source_commit
+from r3dpa.checkpoints.leaks import leaks_labels, refuse_leak
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
 from r3dpa.checkpoints.official import from_official, to_official
 from r3dpa.checkpoints.transfer import TransferReport, TransferRow, transfer_rgb
@@ -15,8 +16,10 @@ __all__ = [
     "TransferRow",
     "convert",
     "from_official",
+    "leaks_labels",
     "load_into",
     "read_checkpoint",
+    "refuse_leak",
     "save_checkpoint",
     "source_commit",
     "to_official",

@@ -40,6 +40,7 @@ _ABOUT = (
     "step",
     "geometry",
     "augmentation",
+    "feature_source",
     "interpolant",
     "version",
     "commit",
@@ -168,6 +169,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
         },
         "geometry": checkpoint.geometry,
         "augmentation": checkpoint.augmentation,
+        "feature_source": checkpoint.feature_source,
         "interpolant": checkpoint.interpolant,
         "official_args": dict(checkpoint.official_args),
         "left_out": dict(checkpoint.left_out),
@@ -261,6 +263,7 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
         step=content.get("global_step"),
         geometry=about.get("geometry"),
         augmentation=about.get("augmentation"),
+        feature_source=about.get("feature_source"),
         interpolant=about.get("interpolant", "linear"),
         version=about.get("version"),
         commit=about.get("commit"),
@@ -278,7 +281,8 @@ def _read_ours(path: Path) -> Checkpoint:
         raise ValueError(f"{description.name} is damaged: {error}") from error
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         raise ValueError(f"{description.name} does not describe a {_FORMAT}")
-    about.setdefault("augmentation", None)  # as files written before there was any
+    for key in ("augmentation", "feature_source"):
+        about.setdefault(key, None)  # as files written before there was any
     missing = {*_ABOUT, "networks", "sha256"} - set(about)
     if missing:
         raise ValueError(f"{description.name} lacks {', '.join(sorted(missing))}")

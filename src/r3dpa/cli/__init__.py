@@ -20,7 +20,6 @@ _STAGE_COMMANDS = {
     "validate": "evaluate a checkpoint on the validation split",
     "test": "evaluate a checkpoint on the test split",
     "predict": "reconstruct scans with a checkpoint",
-    "features": "write the feature grids that a data configuration asks for",
 }
 
 
@@ -139,6 +138,39 @@ def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
 
     _check_file(out)
     _print(compare(scans, reference, out))
+
+
+def probe(
+    data: Path,
+    sources: str = "geometric,waffleiron-s,random",
+    ckpt: Path | None = None,
+    train_scans: int = 40,
+    val_scans: int = 20,
+    device: str = "auto",
+    out: Path | None = None,
+) -> None:
+    """Tell what 3D features know of the classes of simulated scans, and what they cost.
+
+    Prints, for each source of features, the scores of a linear classifier of its point features,
+    fitted on the training drives and tested on all points of the validation drives; the share of
+    empty cells and the cosine between neighbouring ones; and the time per scan.
+
+    Args:
+        data: Root of a data set of ``r3dpa simulate``.
+        sources: Names, separated by commas: ``geometric``, ``waffleiron-s``, ``scalr``, ``oracle``
+            (made from the labels: an upper bound) and ``random`` (the network of ``waffleiron-s``
+            without training).
+        ckpt: Checkpoint of ``scalr``, or of ``waffleiron-s`` where that is not among the sources.
+        train_scans: Scans to fit the classifier on.
+        val_scans: Scans to test it on.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        out: JSON file for the same figures.
+    """
+    from r3dpa.cli.probe import probe as compare
+
+    _check_file(out)
+    names = [name.strip() for name in sources.split(",")]
+    _print(compare(data, names, ckpt, train_scans, val_scans, device, out))
 
 
 def sample(
@@ -263,13 +295,31 @@ def bench_simulation(quick: bool = False, out: Path | None = None) -> None:
     _print(simulation(quick, out))
 
 
+def bench_features(
+    scan: Path | None = None, out: Path | None = None, quick: bool = False, wi48: bool = False
+) -> None:
+    """Build feature grids, read them back and pass one scan through networks; print the cost.
+
+    Args:
+        scan: KITTI ``.bin`` file; a simulated scan where not given.
+        out: JSON file for the same figures.
+        quick: Small sizes, only to try it.
+        wi48: Measure one pass of WI-48-768, too: minutes on a CPU.
+    """
+    from r3dpa.bench.features import features
+
+    _check_file(out)
+    _print(features(scan, out, quick, wi48))
+
+
 _BENCHES: dict[str, Callable[..., None]] = {
     "training": bench_training,
     "simulation": bench_simulation,
+    "features": bench_features,
 }
 _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__: command
-    for command in (simulate, check, view, realism, sample, convert, report)
+    for command in (simulate, check, view, realism, probe, sample, convert, report)
 }
 
 
@@ -296,7 +346,8 @@ def _help() -> str:
     summaries = _STAGE_COMMANDS | {
         name: (command.__doc__ or "").splitlines()[0] for name, command in _COMMANDS.items()
     }
-    summaries["bench"] = "measure what training steps or simulated scans cost"
+    summaries["features"] = "write the feature grids of a data set, on any number of devices"
+    summaries["bench"] = "measure what training steps, simulated scans or feature grids cost"
     lines = [f"  {name:<10} {summary}" for name, summary in summaries.items()]
     head = ["usage: r3dpa COMMAND [options]", "", "Generate LiDAR scenes (R3DPA).", ""]
     return "\n".join([*head, *lines, "", "r3dpa COMMAND --help lists the options of a command."])
@@ -334,6 +385,10 @@ def _run(args: list[str]) -> None:
         from r3dpa.cli.stages import run
 
         run(args)
+    elif args[0] == "features":
+        from r3dpa.cli.features import features
+
+        features(args[1:])
     elif args[0] == "simulate" and "--ablate" in args:
         words = [word for word in args[1:] if word != "--ablate"]
         _run_function(ablate, words, "r3dpa simulate --ablate")

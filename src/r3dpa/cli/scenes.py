@@ -115,6 +115,7 @@ def sample(
         "checkpoint": str(ckpt),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
+        "feature_source": checkpoint.feature_source,
         "weights": weights,
         "num": num,
         "seed": seed,

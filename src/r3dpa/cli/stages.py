@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 import warnings
 from pathlib import Path
+from typing import Any, cast
 
-from lightning import LightningModule, Trainer
+from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from r3dpa.callbacks import RunCheckpoint
-from r3dpa.checkpoints import read_checkpoint
-from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.checkpoints import read_checkpoint, refuse_leak
 from r3dpa.modules import GenerativeModule
 
 __all__ = ["StageCLI", "run"]
@@ -34,10 +34,22 @@ class _SaveFitConfig(SaveConfigCallback):
             super().setup(trainer, pl_module, stage)
 
 
+class _RefuseLeaks(Callback):
+    """Refuses to evaluate weights that learned from labels, whatever file they came from."""
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if isinstance(pl_module, GenerativeModule):
+            refuse_leak(pl_module.feature_source, f"the model of {trainer.ckpt_path}")
+
+    on_test_start = on_validation_start
+
+
 class StageCLI(LightningCLI):
     """Wires a stage, a data module and a trainer from YAML files.
 
     ``run_dir`` is the one place a run writes to: checkpoints, loggers and pictures go below it.
+    A stage is a LightningModule; one whose batches only some data modules make names their class as
+    ``data_class``.
     """
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -52,6 +64,23 @@ class StageCLI(LightningCLI):
             "run_dir", "checkpoint.dirpath", compute_fn=lambda run_dir: f"{run_dir}/checkpoints"
         )
 
+    def _prepare_subcommand_parser(
+        self, klass: type, subcommand: str, **kwargs: Any
+    ) -> LightningArgumentParser:
+        """Adds ``allow_oracle`` to the commands that report metrics."""
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand in ("validate", "test"):
+            parser.add_argument(
+                "--allow_oracle",
+                "--allow-oracle",
+                type=bool,
+                nargs="?",
+                const=True,
+                default=False,
+                help="evaluate also what was made with features that read the labels",
+            )
+        return parser
+
     def _parse_ckpt_path(self) -> None:
         """Checks that the file can be read; the model stays the one of the configuration.
 
@@ -62,18 +91,45 @@ class StageCLI(LightningCLI):
         if path and Path(path).is_file():
             read_checkpoint(path)
 
+    def instantiate_classes(self) -> None:
+        """Builds stage, data module and trainer; checks that the first two belong together.
+
+        Raises:
+            ValueError: If the stage cannot use batches of the data module; both are named.
+        """
+        super().instantiate_classes()
+        expected = getattr(self.model, "data_class", LightningDataModule)
+        if not isinstance(self.datamodule, expected):
+            stage, data = type(self.model).__name__, type(self.datamodule).__name__
+            raise ValueError(
+                f"data.class_path: {stage} needs a {expected.__module__}.{expected.__name__} or a "
+                f"subclass of it, got {data}; give another data.class_path or model.class_path"
+            )
+
     def before_fit(self) -> None:
         """Loads the stage before: what does not fit is said before hours of data preparation."""
-        if self.config[self.subcommand].ckpt_path is None:
+        if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:
             self.model.load_previous_stage()
 
-    def before_validate(self) -> None:
-        """Refuses to evaluate random weights."""
-        if self.config[self.subcommand].ckpt_path is None:
+    def before_predict(self) -> None:
+        """Refuses to use random weights."""
+        if self._ckpt_path is None:
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
+    def before_validate(self) -> None:
+        """Refuses to evaluate random weights, and what was made with features that leak labels."""
+        self.before_predict()
+        if not self.config[self.subcommand].allow_oracle:
+            refuse_leak(
+                getattr(self.datamodule, "feature_source", None), "the feature grids of the data"
+            )
+            cast(Any, self.trainer).callbacks.append(_RefuseLeaks())
+
     before_test = before_validate
-    before_predict = before_validate
+
+    @property
+    def _ckpt_path(self) -> str | None:
+        return self.config[self.subcommand].ckpt_path
 
     def before_instantiate_classes(self) -> None:
         """Points every logger that has a ``save_dir`` at the run's folder."""
@@ -99,14 +155,11 @@ def run(args: list[str]) -> None:
     Args:
         args: Command line after ``r3dpa``, for example ``["fit", "--config", "x.yaml"]``.
     """
-    if args[0] == "features":
-        _write_features(args[1:])
-        return
     for message in _HARMLESS:
         warnings.filterwarnings("ignore", message=message)
     StageCLI(
-        GenerativeModule,
-        LidarDataModule,
+        LightningModule,
+        LightningDataModule,
         subclass_mode_model=True,
         subclass_mode_data=True,
         save_config_callback=_SaveFitConfig,
@@ -115,18 +168,3 @@ def run(args: list[str]) -> None:
         # Lightning warns where both the process's own command line and a list are given.
         args=None if args == sys.argv[1:] else args,
     )
-
-
-def _write_features(args: list[str]) -> None:
-    parser = LightningArgumentParser(
-        prog="r3dpa features", description="Write the feature grids that a data module asks for."
-    )
-    parser.add_argument("--config", action="config", help="YAML with a `data:` block")
-    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-    data = parser.instantiate_classes(parser.parse_args(args)).data
-    if data.extractor is None:
-        raise ValueError(
-            "the data configuration has no extractor, so there are no feature grids to write; "
-            "give one, for example --data.init_args.extractor r3dpa.nn.backbones.GeometricFeatures"
-        )
-    data.prepare_data()  # says how many grids it made, and where

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from r3dpa import viz
 from r3dpa.atomic import atomic_path
-from r3dpa.data.scans import find_scans, read_beside, read_npz, read_ply, read_scan
+from r3dpa.data.scans import evenly, find_scans, read_beside, read_npz, read_ply, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.simulation import Origin, Semantic
 
@@ -57,8 +57,7 @@ def view(source: Path, out: Path | None, num: int, reference: Path | None) -> st
     if num < 1:
         raise ValueError(f"num must be 1 or greater, got {num}")
     sources = _sources(source)
-    chosen = [sources[i] for i in _spread(len(sources), num)]
-    scans = [_read(entry) for entry in chosen]
+    scans = [_read(entry) for entry in evenly(sources, num)]
     beside = None
     if reference is not None:
         first = _sources(reference)[0]
@@ -117,12 +116,6 @@ def _members(path: Path) -> dict[str, NDArray]:
                 f"{path}: {name} must be points (P, 3) or (P, 4), got shape {points.shape}"
             )
     return members
-
-
-def _spread(count: int, num: int) -> list[int]:
-    """Up to ``num`` places out of ``count``, evenly spread, the first one among them."""
-    num = min(num, count)
-    return [place * count // num for place in range(num)]
 
 
 def _read(source: _Source) -> viz.PageScan:

@@ -10,11 +10,19 @@ from r3dpa.data.augmentation import Augmentation, View
 from r3dpa.data.datasets import LidarBatch, LidarDataset, LidarSample
 from r3dpa.data.feature_grids import (
     Extractor,
-    FeatureGridError,
-    FeatureGrids,
+    GridPlan,
     default_features_dir,
+    features_lock,
+    pooled_grids,
     write_feature_grids,
 )
+from r3dpa.data.feature_store import (
+    FeatureGrids,
+    FeatureGridWriter,
+    stored_feature_dim,
+    stored_source,
+)
+from r3dpa.data.grid_settings import FeatureGridError, GridSettings
 from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
@@ -35,6 +43,7 @@ from r3dpa.data.scans import (
 
 if TYPE_CHECKING:
     from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
+    from r3dpa.data.point_datamodule import PointDataModule
 
 __all__ = [
     "KITTI360_DRIVES",
@@ -42,12 +51,16 @@ __all__ = [
     "CheckReport",
     "Extractor",
     "FeatureGridError",
+    "FeatureGridWriter",
     "FeatureGrids",
+    "GridPlan",
+    "GridSettings",
     "KITTI360DataModule",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",
     "LidarSample",
+    "PointDataModule",
     "PointDataset",
     "PointSample",
     "Scan",
@@ -56,13 +69,17 @@ __all__ = [
     "View",
     "check",
     "default_features_dir",
+    "features_lock",
     "find_scans",
     "kitti360_scans",
     "list_collate",
+    "pooled_grids",
     "read_beside",
     "read_npz",
     "read_ply",
     "read_scan",
+    "stored_feature_dim",
+    "stored_source",
     "write_bin",
     "write_feature_grids",
     "write_npz",
@@ -74,4 +91,6 @@ def __getattr__(name: str) -> Any:
     """Load the data modules on first use."""
     if name in {"KITTI360DataModule", "LidarDataModule", "SimulatedDataModule"}:
         return getattr(import_module("r3dpa.data.datamodules"), name)
+    if name == "PointDataModule":
+        return import_module("r3dpa.data.point_datamodule").PointDataModule
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

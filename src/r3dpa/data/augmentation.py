@@ -146,8 +146,8 @@ class Augmentation:
                 f"augmentation.{options}: the features {name} are not known to "
                 f"{' or to '.join(what for _, what in wrong)}, so that reordered grids would not "
                 f"be those of the augmented scan. Switch {options} off, give an extractor whose "
-                "features do (GeometricFeatures with mirror_invariant: true does both), or set "
-                "augmentation.approximate_grids: true to train on the approximation."
+                "features do (GeometricFeatures does both), or set augmentation.approximate_grids: "
+                "true to train on the approximation."
             )
 
 

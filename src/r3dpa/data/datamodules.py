@@ -15,16 +15,11 @@ from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import LidarDataset
-from r3dpa.data.feature_grids import (
-    Extractor,
-    FeatureGrids,
-    default_features_dir,
-    grid_bytes,
-    stored_feature_dim,
-    write_feature_grids,
-)
+from r3dpa.data.feature_grids import Extractor, default_features_dir, write_feature_grids
+from r3dpa.data.feature_store import FeatureGrids, stored_feature_dim, stored_source
+from r3dpa.data.grid_settings import GridSettings
 from r3dpa.data.loaders import training_loader
-from r3dpa.data.scans import Scan, find_scans, kitti360_scans, read_scan
+from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.geometry import (
     LidarSensor,
     Projection,
@@ -64,11 +59,12 @@ class LidarDataModule(LightningDataModule):
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
             missing before training. Without it, ``features_dir`` must hold all of them.
-        features_dir: Folder of the feature grids; with an extractor and a single folder of scans,
-            ``<scans>/feature_grids/<extractor>_<h>x<w>`` if None. Without either, no grids.
+        features_dir: Folder of the feature grids of one extractor, of any grid sizes; with an
+            extractor and a single folder of scans, ``<scans>/feature_grids/<extractor>`` if None.
+            Without either, no grids.
         batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
             processes x ``accumulate_grad_batches`` scans.
-        num_workers: Loader processes per training process; also extract features on the CPU.
+        num_workers: Loader processes per training process; also prepare scans for the extractor.
         seed: Seed of the order of training scans and of their augmentation.
         val_every: Every this many scans, one is held out; None for none. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
@@ -154,6 +150,17 @@ class LidarDataModule(LightningDataModule):
         return _SCALR_DIM if self.features_dir is None else stored_feature_dim(self.features_dir)
 
     @property
+    def feature_source(self) -> str | None:
+        """Name of what makes, or made, the feature grids; None where none are used.
+
+        Raises:
+            FeatureGridError: If ``features_dir`` is given, is empty and there is no extractor.
+        """
+        if self.extractor is not None:
+            return cast(Extractor, self.extractor).name
+        return None if self.features_dir is None else stored_source(self.features_dir)
+
+    @property
     def geometry(self) -> ScanGeometry:
         """Projection, codec and grid size, known after ``setup``."""
         return ScanGeometry(self.projection, self.codec, self.grid_size)
@@ -176,6 +183,11 @@ class LidarDataModule(LightningDataModule):
             held_out = set(scans[:: self.val_every] if self.val_every else [])
         return [scan for scan in scans if scan not in held_out], sorted(held_out)
 
+    def limited_split(self) -> tuple[list[Scan], list[Scan]]:
+        """The same within ``limit``."""
+        train, val = self.split()
+        return evenly(train, self.limit), evenly(val, self.limit)
+
     def prepare_data(self) -> None:
         """Make the feature grids that are missing, if there is an extractor; none to predict."""
         predicting = self.trainer is not None and self.trainer.predicting
@@ -183,7 +195,7 @@ class LidarDataModule(LightningDataModule):
             return
         train, val, projection = self._scans_and_projection()
         extractor = cast(Extractor, self.extractor.eval())
-        gigabytes = grid_bytes(self.grid_size, extractor.dim) / 1e9
+        gigabytes = GridSettings.of(extractor, projection, self.grid_size).row.itemsize / 1e9
 
         def log(done: int, total: int) -> None:
             if done == 1 or done * 20 // total > (done - 1) * 20 // total:
@@ -194,7 +206,7 @@ class LidarDataModule(LightningDataModule):
             train + val,
             extractor,
             projection,
-            self.grid_size,
+            [self.grid_size],
             self.features_dir,
             workers=self.num_workers,
             progress=log,
@@ -270,13 +282,13 @@ class LidarDataModule(LightningDataModule):
                 f"features_dir is needed for scans given as {self.scans!r}: only a single folder "
                 "has a default place for its feature grids."
             )
-        return default_features_dir(scans, cast(Extractor, self.extractor).name, self.grid_size)
+        return default_features_dir(scans, cast(Extractor, self.extractor).name)
 
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
         projection = self._make_projection(train or val)
-        return _spread(train, self.limit), _spread(val, self.limit), projection
+        return evenly(train, self.limit), evenly(val, self.limit), projection
 
     def _make_projection(self, scans: list[Scan]) -> Projection:
         if self.projection_kind == "spherical":
@@ -388,9 +400,3 @@ def _ready(dataset: LidarDataset | None) -> LidarDataset:
     if dataset is None:
         raise ValueError("Call prepare_data() and setup('fit') before asking for a loader.")
     return dataset
-
-
-def _spread(scans: list[Scan], limit: int | None) -> list[Scan]:
-    if limit is None or limit >= len(scans):
-        return scans
-    return [scans[i * len(scans) // limit] for i in range(limit)]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r3dpa.data.feature_grids import FeatureGrids
+from r3dpa.data.feature_store import FeatureGrids
 from r3dpa.data.scans import Scan, ScanError, read_scan
 from r3dpa.geometry import Projection, RangeCodec, range_image
 

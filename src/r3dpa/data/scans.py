@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 
 Split = Literal["train", "val"]
+T = TypeVar("T")
 #: Drives of KITTI-360 by split, as in R2DM and RangeLDM (LiDAR-Diffusion validates on drive 3).
 KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
     "train": tuple(drive_name(number) for number in TRAIN_DRIVES),
@@ -116,6 +117,12 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
             f"{root}` names what is missing; use LidarDataModule for scans in other folders."
         )
     return sorted(scans[split])
+
+
+def evenly(items: Sequence[T], num: int | None) -> list[T]:
+    """Up to ``num`` items, evenly spread over the sequence, the first among them; all if None."""
+    num = len(items) if num is None else min(num, len(items))
+    return [items[place * len(items) // num] for place in range(num)]
 
 
 def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray:

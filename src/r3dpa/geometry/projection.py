@@ -28,7 +28,9 @@ from r3dpa.geometry.rays import (
 from r3dpa.geometry.rings import RingProjection
 from r3dpa.geometry.sensor import LidarSensor
 
-_POOL_CHUNK = 8192  # points whose values are held in float64 at a time
+# Values held in float64 at a time on a CPU, 8 MiB: they stay in its cache, and no fresh memory is
+# asked of the system, which costs more than all sums.
+_POOL_CHUNK = 2**20
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,10 @@ def pool_cells(
     """Mean of point values over the cells of a coarse grid laid over the range image.
 
     A cell is a block of pixels, so that an image and a grid of one projection never disagree.
-    Sums are formed in float64.
+
+    Sums are formed in float64: with n points in a cell, a float32 mean is off by its own rounding,
+    2^-24 of its size, and by at most n * 2^-53 of the mean absolute value in the cell. The result
+    is the same on every run. On a CPU the values are read from memory once and not copied.
 
     Args:
         points: ``(P, 3)`` metres.
@@ -264,14 +269,20 @@ def pool_cells(
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     kept = in_range(points, projection.sensor) if range_filter else points.isfinite().all(dim=-1)
     row, column = projection.pixel_of(points)
-    cell = row[kept] // cell_rows * grid_columns + column[kept] // cell_columns
-    values = values[kept]
+    cell = row // cell_rows * grid_columns + column // cell_columns
+    num_cells = grid_rows * grid_columns
+    # Points that do not count have a cell of their own: leaving them out would copy all values.
+    cell = torch.where(kept, cell, num_cells)
 
-    counts = torch.bincount(cell, minlength=grid_rows * grid_columns)
-    sums = values.new_zeros((len(counts), values.shape[1]), dtype=torch.float64)
-    for start in range(0, len(values), _POOL_CHUNK):
-        part = slice(start, start + _POOL_CHUNK)
-        sums.index_add_(0, cell[part], values[part].double())
+    counts = torch.bincount(cell, minlength=num_cells + 1)[:num_cells]
+    sums = values.new_zeros((num_cells + 1, values.shape[1]), dtype=torch.float64)
+    if values.is_cuda:  # sorts by cell: index_add_ would add in another order on every run
+        sums.index_put_((cell,), values.double(), accumulate=True)
+    else:
+        num_points = max(_POOL_CHUNK // max(values.shape[1], 1), 1)
+        for part, own in zip(values.split(num_points), cell.split(num_points), strict=True):
+            sums.index_add_(0, own, part.double())
+    sums = sums[:num_cells]
     means = sums / counts.clamp(min=1).unsqueeze(-1)
     return means.to(torch.promote_types(values.dtype, torch.float32)), counts
 

@@ -11,11 +11,17 @@ from typing import Any, Literal, NamedTuple
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.utilities import rank_zero_info
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from torch import Tensor, nn
 
 from r3dpa import __version__, losses
-from r3dpa.checkpoints import load_into, read_checkpoint, source_commit, transfer_rgb
+from r3dpa.checkpoints import (
+    leaks_labels,
+    load_into,
+    read_checkpoint,
+    source_commit,
+    transfer_rgb,
+)
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
@@ -88,6 +94,7 @@ class GenerativeModule(L.LightningModule):
     stage: str
     default_init: tuple[str, ...] = ()
     trains_velocity: bool = True
+    data_class: type[L.LightningDataModule] = LidarDataModule  # that it works with, see StageCLI
 
     def __init__(
         self,
@@ -136,6 +143,8 @@ class GenerativeModule(L.LightningModule):
         self.geometry: ScanGeometry | None = None
         self.augmentation: Augmentation | None = None
         self.loaded_step = 0
+        self._data_source: str | None = None
+        self._learned_from: list[str | None] = []  # sources of the weights that were loaded
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
         self._skipped_in_a_row = 0
@@ -161,6 +170,8 @@ class GenerativeModule(L.LightningModule):
             )
         self.geometry, self.augmentation = datamodule.geometry, datamodule.augmentation
         self._check_sizes(self.geometry)
+        if stage != "predict":
+            self._data_source = datamodule.feature_source
         if self.needs_features() and stage != "predict":
             self._check_features(self.geometry, datamodule)
 
@@ -170,6 +181,19 @@ class GenerativeModule(L.LightningModule):
             self.load_previous_stage()
         if self._previous_geometry is not None:
             self._check_geometry(self._previous_geometry, str(self.init_from))
+        if leaks_labels(self.feature_source):
+            rank_zero_warn(
+                f"Features of {self.feature_source!r} read the labels: the numbers of this run and "
+                "of all that starts from it must not be compared with others."
+            )
+
+    @property
+    def feature_source(self) -> str | None:
+        """Feature source of the data, but what loaded weights learned from if that leaks labels.
+
+        A later stage does not undo the leak.
+        """
+        return next(filter(leaks_labels, self._learned_from), self._data_source)
 
     def load_previous_stage(self) -> None:
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
@@ -180,8 +204,10 @@ class GenerativeModule(L.LightningModule):
             ValueError: Listing everything in the file that does not fit this stage.
         """
         if self.rgb_weights is not None:
+            rgb = read_checkpoint(self.rgb_weights)
+            self._learned_from.append(rgb.feature_source)
             report = transfer_rgb(
-                read_checkpoint(self.rgb_weights),
+                rgb,
                 self.sit,
                 self.latent_norm,
                 keep_projector=self.keep_projector,
@@ -192,6 +218,7 @@ class GenerativeModule(L.LightningModule):
             networks = {name: self.get_submodule(name) for name in self.init_networks}
             load_into(networks, before, stage=self.stage)
             self._previous_geometry = before.geometry
+            self._learned_from.append(before.feature_source)
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
         self._has_weights = True
@@ -489,6 +516,7 @@ class GenerativeModule(L.LightningModule):
             "stage": self.stage,
             "geometry": self.scan_geometry.to_dict(),
             "augmentation": None if self.augmentation is None else asdict(self.augmentation),
+            "feature_source": self.feature_source,
             "interpolant": self.interpolant.path,
             "version": __version__,
             "commit": source_commit(),
@@ -511,6 +539,7 @@ class GenerativeModule(L.LightningModule):
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
                 group.update(asdict(self.optimizer_config))  # those of this run, not the old ones
+        self._learned_from.append(checkpoint["r3dpa"].get("feature_source"))
         stored = checkpoint["r3dpa"]["geometry"]
         if self.geometry is None:
             self.geometry = ScanGeometry.from_dict(stored)

@@ -1,0 +1,176 @@
+"""Feature extraction: a frozen extractor over many scans, on any number of devices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from lightning.pytorch import LightningDataModule, LightningModule
+from torch.utils.data import DataLoader, DistributedSampler
+
+from r3dpa.data.feature_grids import Extractor, pooled_grids
+from r3dpa.data.feature_store import FeatureGridWriter
+from r3dpa.data.grid_settings import GridSettings
+from r3dpa.data.points import PointDataset, PointSample, list_collate
+from r3dpa.data.scans import Scan
+from r3dpa.geometry import LidarSensor, Projection
+
+
+class FeatureExtraction(LightningModule):
+    """Writes the feature grids of the scans that it is given, as ``trainer.predict`` runs it.
+
+    Each process appends to a shard of its own, so that what is made survives whatever ends the
+    run. Nothing is returned: the grids of KITTI-360 are 63 GB.
+
+    Args:
+        extractor: Frozen network, see :class:`r3dpa.data.Extractor`.
+        projection: That of the range images; only that of the first process counts, the others may
+            give None.
+        grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
+        features_dir: Folder of the grids of this extractor.
+        dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.FeatureGrids`.
+
+    Raises:
+        FeatureGridError: While it runs, if the store was made with other settings or cannot be
+            written, or features are not finite.
+    """
+
+    def __init__(
+        self,
+        extractor: Extractor,
+        projection: Projection | None,
+        grid_sizes: Sequence[tuple[int, int]],
+        features_dir: str | Path,
+        dtype: Literal["float16", "int8"] = "float16",
+    ) -> None:
+        super().__init__()
+        self.extractor = extractor
+        self.projection = projection
+        self.grid_sizes = list(grid_sizes)
+        self.features_dir = Path(features_dir)
+        self.storage = dtype
+        self._writers: dict[tuple[int, int], FeatureGridWriter] = {}
+
+    def setup(self, stage: str) -> None:
+        """Take the projection of the first process: the others may lack the scans it is fitted to.
+
+        Args:
+            stage: ``"predict"``.
+        """
+        self.projection = self.trainer.strategy.broadcast(self.projection)
+
+    def transfer_batch_to_device(
+        self, batch: list[PointSample], device: torch.device, dataloader_idx: int
+    ) -> list[PointSample]:
+        """Leave the batch where it is: what the extractor needs on its device, it moves there."""
+        return batch
+
+    def on_predict_start(self) -> None:
+        """Open a shard for each grid size; not called in a process that has nothing to do."""
+        extractor, projection = self._parts()
+        for size in self.grid_sizes:
+            precision = self.trainer.precision
+            settings = GridSettings.of(extractor, projection, size, self.storage, precision)
+            self._writers[size] = FeatureGridWriter(self.features_dir, settings, self.global_rank)
+
+    def predict_step(self, batch: list[PointSample]) -> None:
+        """Pool the features of the scans and write their grids.
+
+        Args:
+            batch: Scans, prepared by the extractor's ``prepare``.
+        """
+        extractor, projection = self._parts()
+        grids = pooled_grids(extractor, batch, projection, self.grid_sizes)
+        keys = [(sample.scan, sample.num_bytes) for sample in batch]
+        for size, writer in self._writers.items():
+            writer.add(keys, grids[size])
+
+    def teardown(self, stage: str) -> None:
+        """Wait until all processes have written all of their grids.
+
+        Args:
+            stage: ``"predict"``.
+        """
+        self.close()
+        self.trainer.strategy.barrier("feature grids")
+
+    def close(self) -> None:
+        """Give the shards free, after an error too."""
+        for writer in self._writers.values():
+            writer.close()
+        self._writers.clear()
+
+    def _parts(self) -> tuple[Extractor, Projection]:
+        if self.projection is None:
+            raise ValueError("projection is needed in the first process.")
+        return cast(Extractor, self.extractor), self.projection
+
+
+class MissingScans(LightningDataModule):
+    """Scans for :class:`FeatureExtraction`: each process gets its share, none is given twice.
+
+    Args:
+        scans: Scans to extract; only the list of the first process counts, as those of the others
+            may be younger.
+        extractor: Its ``prepare`` runs in the loader processes.
+        sensor: At least one point of a scan must lie within its range limits.
+        batch_size: Scans per batch and process.
+        num_workers: Loader processes per process.
+
+    Raises:
+        ValueError: If ``batch_size`` is below 1.
+    """
+
+    def __init__(
+        self,
+        scans: Sequence[Scan],
+        extractor: Extractor,
+        sensor: LidarSensor,
+        batch_size: int = 1,
+        num_workers: int = 0,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
+        self.allow_zero_length_dataloader_with_multiple_devices = True  # fewer scans than processes
+        self.scans = list(scans)
+        self.extractor, self.sensor = extractor, sensor
+        self.batch_size, self.num_workers = batch_size, num_workers
+
+    def setup(self, stage: str) -> None:
+        """Take the list of the first process.
+
+        Args:
+            stage: ``"predict"``.
+        """
+        assert self.trainer is not None
+        self.scans = self.trainer.strategy.broadcast(self.scans)
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """The share of this process, in order."""
+        assert self.trainer is not None
+        needs_labels = getattr(self.extractor, "needs_labels", False)
+        dataset = PointDataset(self.scans, self.sensor, self.extractor.prepare, needs_labels)
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            sampler=_Share(dataset, self.trainer.world_size, self.trainer.global_rank),
+            num_workers=self.num_workers,
+            collate_fn=list_collate,
+            generator=torch.Generator(),  # the default would draw from the global random state
+        )
+
+
+class _Share(DistributedSampler[int]):
+    """Each ``num_replicas``-th scan, none twice; unlike Lightning's own it may be empty."""
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._share())
+
+    def __len__(self) -> int:
+        return len(self._share())
+
+    def _share(self) -> range:
+        return range(self.rank, len(cast(PointDataset, self.dataset)), self.num_replicas)

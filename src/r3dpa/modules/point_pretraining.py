@@ -1,0 +1,165 @@
+"""Training of a point network without labels: masked prediction of quantised geometry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from r3dpa.data.point_datamodule import PointDataModule
+from r3dpa.data.scans import evenly
+from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
+from r3dpa.nn.backbones.masking import NUM_TARGETS, MaskedScan, Masking
+from r3dpa.nn.backbones.pretrained import save_weights
+
+_SCANS_TO_QUANTISE = 16
+
+
+class PointPretraining(LightningModule):
+    """WaffleIron trained to tell the geometry of whole scans from parts of them.
+
+    Blocks of rays are hidden; the hidden points are known by their cells alone. From the token of
+    every point, hidden or not, a linear layer predicts in which of ``num_bins`` quantiles each
+    descriptor of the point lies, see :meth:`r3dpa.nn.backbones.Masking.describe`; the loss is the
+    mean cross-entropy. What is predicted is fixed, so that nothing can collapse; quantiles have no
+    units to weigh; and as they are read linearly from the tokens, so is all of that geometry, and
+    of its surroundings, by a linear probe.
+
+    Source: masked prediction of quantised hand-made features, as in HuBERT (Hsu et al., 2021) and
+    BEST-RQ (Chiu et al., 2022) for speech and MaskFeat (Wei et al., 2022) for images.
+
+    Args:
+        network: Network to train; its ``cells`` are those of the scans' grid.
+        lr: Peak learning rate; rises over ``warmup`` steps and falls to 0 as a cosine until
+            ``max_steps`` of the trainer.
+        weight_decay: Of AdamW, on matrices only.
+        warmup: Steps.
+        num_bins: Quantiles of each descriptor.
+    """
+
+    data_class = PointDataModule
+    edges: Tensor
+
+    def __init__(
+        self,
+        network: WaffleIron,
+        lr: float = 2e-3,
+        weight_decay: float = 0.03,
+        warmup: int = 100,
+        num_bins: int = 8,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.lr, self.weight_decay, self.warmup = lr, weight_decay, warmup
+        self.hidden_token = nn.Parameter(torch.zeros(network.width))
+        self.norm = nn.BatchNorm1d(network.width, affine=False)
+        self.head = nn.Linear(network.width, NUM_TARGETS * num_bins)
+        self.register_buffer("edges", torch.full((NUM_TARGETS, num_bins - 1), torch.nan))
+        self.grid: ScanGrid | None = None
+
+    def setup(self, stage: str) -> None:
+        """Take the preparation of the scans from the data module.
+
+        Raises:
+            ValueError: If the trainer has no :class:`r3dpa.data.PointDataModule` whose ``prepare``
+                is a :class:`r3dpa.nn.backbones.Masking` with the cells of the network.
+        """
+        masking = getattr(getattr(self.trainer, "datamodule", None), "prepare", None)
+        if not isinstance(masking, Masking):
+            raise ValueError(
+                "PointPretraining needs r3dpa.data.PointDataModule with prepare "
+                f"r3dpa.nn.backbones.Masking, got {masking!r}."
+            )
+        if masking.grid.cells != self.network.cells:
+            raise ValueError(
+                f"model.init_args.network has cells {list(self.network.cells)}, but the grid of "
+                f"data.init_args.prepare has {list(masking.grid.cells)}: make them equal."
+            )
+        self.grid = masking.grid
+
+    def on_train_start(self) -> None:
+        """Measure the quantiles of the descriptors in some training scans, unless resumed."""
+        if not self.edges.isfinite().all():
+            scans = cast(Any, self.trainer).datamodule.train_set
+            chosen = evenly(range(len(scans)), _SCANS_TO_QUANTISE)
+            values = torch.cat([scans[index].targets for index in chosen]).numpy()
+            levels = np.linspace(0, 1, self.edges.shape[1] + 2)[1:-1]
+            edges = np.quantile(values, levels, axis=0).T
+            self.edges.copy_(torch.from_numpy(edges))
+
+    def tokens(self, batch: PointCloudBatch, hidden: Tensor) -> Tensor:
+        """Standardised tokens ``(N, F)`` of all points, of which those hidden are not seen."""
+        visible = ~hidden
+        index = torch.nonzero(visible)[:, 0]
+        place = visible.cumsum(0) - 1
+        neighbors = batch.neighbors[index]
+        # A neighbour that is not seen is left out: the point itself in its place says nothing new.
+        neighbors = torch.where(hidden[neighbors], index[:, None], neighbors)
+        seen = self.network.embedding(batch.features[index], place[neighbors])
+        start = self.hidden_token.to(seen.dtype).expand(len(hidden), -1).index_copy(0, index, seen)
+        return self.norm(self.network.mix(start, batch, visible).float())
+
+    def losses(self, scans: Sequence[MaskedScan]) -> dict[str, Tensor]:
+        """Mean cross-entropy of all points, of the visible and of the hidden ones (0 if none)."""
+        batch = collate_scans([masked.scan for masked in scans]).to(self.device)
+        hidden = torch.cat([masked.hidden for masked in scans]).to(self.device)
+        targets = torch.cat([masked.targets for masked in scans]).to(self.device)
+        bins = torch.searchsorted(self.edges, targets.T.contiguous()).T
+        logits = self.head(self.tokens(batch, hidden)).unflatten(1, (NUM_TARGETS, -1))
+        each = F.cross_entropy(logits.flatten(0, 1), bins.flatten(), reduction="none")
+        each = each.unflatten(0, bins.shape).mean(dim=1)
+        return {
+            "loss": each.mean(),
+            "visible": each[~hidden].mean(),
+            "hidden": each[hidden].sum() / hidden.sum().clamp_min(1),
+        }
+
+    def training_step(self, batch: Sequence[MaskedScan], batch_idx: int) -> Tensor:
+        """Loss of one batch."""
+        losses = self.losses(batch)
+        for name, value in losses.items():
+            self.log(f"train/{name}", value, prog_bar=name == "loss", batch_size=len(batch))
+        return losses["loss"]
+
+    def validation_step(self, batch: Sequence[MaskedScan], batch_idx: int) -> None:
+        """Losses of held-out scans."""
+        for name, value in self.losses(batch).items():
+            self.log(f"val/{name}", value, batch_size=len(batch), sync_dist=True)
+
+    def configure_optimizers(self) -> Any:
+        """AdamW with warm-up and cosine."""
+        matrices = [p for p in self.parameters() if p.ndim > 1]
+        others = [p for p in self.parameters() if p.ndim <= 1]
+        optimizer = torch.optim.AdamW(
+            [
+                {"params": matrices, "weight_decay": self.weight_decay},
+                {"params": others, "weight_decay": 0.0},
+            ],
+            lr=self.lr,
+        )
+        total = self.trainer.max_steps
+
+        def factor(step: int) -> float:
+            if step < self.warmup:
+                return (step + 1) / self.warmup
+            done = (step - self.warmup) / max(1, total - self.warmup)
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
+
+    def on_fit_end(self) -> None:
+        """Write ``waffleiron_s.safetensors`` for ``WaffleIronS`` into the run's folder."""
+        if self.trainer.is_global_zero and self.grid is not None:
+            path = Path(self.trainer.default_root_dir) / "waffleiron_s.safetensors"
+            save_weights(path, self.network, self.norm, self.grid)

@@ -1,0 +1,306 @@
+"""``r3dpa features`` from the outside: forms of the command, interrupts, kills, many processes."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from r3dpa.cli import main
+from r3dpa.data import FeatureGrids, features_lock, find_scans, stored_source
+from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.nn.backbones import WaffleIron
+from r3dpa.nn.backbones.scalr import _official_name
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+NUM = 30
+PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
+GEOMETRIC = {"class_path": "r3dpa.nn.backbones.GeometricFeatures", "init_args": {"dim": 16}}
+QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
+ROW = 2 * 8 * 16 * 2  # bytes of a 2 x 8 grid, 16 float16 a cell
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """So that processes may be forked."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def make_scans(folder, count):
+    folder.mkdir(parents=True)
+    generator = np.random.default_rng(0)
+    for frame in range(count):
+        points = generator.uniform((-20, -20, -2, 0), (20, 20, 1, 1), (200, 4))
+        (folder / f"{frame:010d}.bin").write_bytes(points.astype(np.float32).tobytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Data YAML of ``NUM`` scans."""
+    folder = tmp_path_factory.mktemp("features")
+    arguments = {
+        "scans": str(make_scans(folder / "scans", NUM)),
+        "sensor": {"beams": 16, "columns": 64},
+        "grid_size": [2, 8],
+        "extractor": GEOMETRIC,
+        "batch_size": 2,
+    }
+    config = {"data": {"class_path": "r3dpa.data.LidarDataModule", "init_args": arguments}}
+    path = folder / "data.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def features(*words):
+    main(["features", *map(str, words), *QUIET])
+
+
+def rows(out, scans=None, size=(2, 8)):
+    """Bytes of each grid by scan."""
+    scans = scans or find_scans(out.parent / "scans")
+    grids = FeatureGrids(out, scans, PROJECTION, size)
+    return {s.name: grids.read(s, s.path.stat().st_size).numpy().tobytes() for s in scans}
+
+
+@pytest.fixture(scope="module")
+def expected(data):
+    """Grids made by one process, undisturbed."""
+    features("--data", data, "--out", data.parent / "expected")
+    grids = rows(data.parent / "expected")
+    assert len(set(grids.values())) == NUM
+    return grids
+
+
+def num_written(out):
+    return sum(len(path.read_text().splitlines()) for path in out.rglob("shard_*.jsonl"))
+
+
+def start(log, *words):
+    """The command in a forked process: as on the command line, without the seconds of imports."""
+
+    def target():
+        with log.open("w") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+            sys.stdout, sys.stderr = (os.fdopen(fd, "w", buffering=1) for fd in (1, 2))
+            logging.basicConfig(force=True)  # not to the handlers of pytest
+            features(*words)
+
+    process = multiprocessing.get_context("fork").Process(target=target, daemon=True)
+    process.start()
+    return process
+
+
+def wait_for(condition, process):
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.is_alive()
+        assert time.monotonic() < end
+        time.sleep(0.0005)
+
+
+class TestForms:
+    def test_yaml_after_data_or_config_and_later_words_win(self, data, expected, capsys):
+        out = data.parent / "overridden"
+        words = ["--data", data, "--out", out, "--data.init_args.limit", 2]
+        features(*words)
+        first, last = capsys.readouterr().out.splitlines()
+        store = out / "2x8"
+        # A tenth of the scans is held out: two of each split.
+        assert first.startswith("feature grids of geometric: 4 scans to do, 0 done; ")
+        assert f"; {4 * ROW / 1e9:.3g} GB needed, " in first
+        assert first.endswith(f" GB free, in {store}")
+        assert last.startswith("feature grids: 4 made, 0 kept, ")
+        assert last.endswith(f" scans per second, in {store}")
+        features("--config", data, "--data.init_args.features_dir", out)
+        first, last = capsys.readouterr().out.splitlines()
+        assert first.startswith(f"feature grids of geometric: {NUM - 4} scans to do, 4 done; ")
+        assert last.startswith(f"feature grids: {NUM - 4} made, 4 kept, ")
+        assert rows(out) == expected
+        before = {path: path.stat().st_mtime_ns for path in store.iterdir()}
+        features(f"--data={data}", "--out", out)
+        assert f" 0 scans to do, {NUM} done; " in capsys.readouterr().out
+        assert before == {path: path.stat().st_mtime_ns for path in store.iterdir()}
+
+    def test_folders_and_a_shipped_yaml(self, tmp_path, capsys):
+        """Any folder of scans, and the KITTI-360 layout, of which both splits are made."""
+        for drive in ("0000", "0003"):
+            name = f"2013_05_28_drive_{drive}_sync"
+            make_scans(tmp_path / "layout" / "data_3d_raw" / name / "velodyne_points/data", 1)
+        make_scans(tmp_path / "scans", 2)
+        make_scans(tmp_path / "shipped", 2)
+        config = CONF / "data" / "folder.yaml"
+        forms = {
+            "layout": [tmp_path / "layout"],
+            "scans": [tmp_path / "scans"],
+            "shipped": [config, "--data.init_args.scans", tmp_path / "shipped"],
+        }
+        for folder, words in forms.items():
+            words += ["--extractor", "geometric", "--data.init_args.num_workers", 0]
+            features("--data", *words)
+            grids = tmp_path / folder / "feature_grids" / "geometric"
+            assert stored_source(grids) == "geometric"
+            assert num_written(grids / "8x64") == 2
+            assert capsys.readouterr().out.endswith(f" per second, in {grids / '8x64'}\n")
+
+    def test_several_sizes_and_int8_from_one_pass(self, data, expected):
+        out = data.parent / "int8"
+        sizes = "[[2, 8], [4, 16]]"
+        features("--data", data, "--out", out, "--grid_sizes", sizes, "--dtype", "int8")
+        for name, grid in rows(out).items():
+            exact = np.frombuffer(expected[name], np.float32).reshape(16, 16)
+            error = np.abs(np.frombuffer(grid, np.float32).reshape(16, 16) - exact).max(axis=1)
+            # Half a step of int8, and the rounding of float16, 2^-11 of values up to 1.
+            assert (error <= np.abs(exact).max(axis=1) / 127 / 2 + 2**-11).all()
+        assert len(set(rows(out, size=(4, 16)).values())) == NUM
+        settings = json.loads((out / "4x16" / "settings.json").read_text())
+        assert (settings["dtype"], settings["grid_size"]) == ("int8", [4, 16])
+
+    def test_scans_are_simulated_first(self, tmp_path):
+        (tmp_path / "lasers.yaml").write_text("lasers: [{vert_correction: -0.1}]")
+        arguments = {"root": str(tmp_path / "data"), "num_scans": 2, "extractor": GEOMETRIC}
+        arguments["simulation_sensor"] = str(tmp_path / "lasers.yaml")
+        block = {"class_path": "r3dpa.data.SimulatedDataModule", "init_args": arguments}
+        (tmp_path / "data.yaml").write_text(yaml.safe_dump({"data": block}))
+        features("--data", tmp_path / "data.yaml")
+        assert num_written(tmp_path / "data" / "feature_grids" / "geometric") == 2
+
+    def test_scalr_by_its_checkpoint_in_the_configuration(self, data, tmp_path):
+        network = WaffleIron(width=4, depth=1, head_dim=5)
+        weights = {f"module.{_official_name(k)}": v for k, v in network.state_dict().items()}
+        torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
+        words = ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
+        words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
+        words += ["--data.init_args.limit", 1, "--out", tmp_path / "grids"]
+        features("--data", data, *words)
+        assert stored_source(tmp_path / "grids") == "scalr"
+        assert num_written(tmp_path / "grids") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--data", "no/folder"], "--data no/folder: is no folder of scans and no data YAML"),
+        (["--data", "{scans}"], "there is no extractor: give --extractor, one of scalr, "),
+        (["--data", "{scans}", "--extractor", "scaler"], "no feature source 'scaler'; there are "),
+        (["--data", "{scans}", "--extractor", "scalr"], "scalr needs ckpt"),
+        (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
+        (["--data", "{yaml}", "--grid_sizes", "[]"], "grid_sizes is empty"),
+        (["--data", "{yaml}", "--grid_sizes", "[[3, 8]]"], "grid.*3"),
+        (["--data", "{yaml}", "--batch_size", "0"], "batch_size must be at least 1, got 0"),
+        (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
+        (
+            [
+                "--data",
+                "{yaml}",
+                "--trainer.num_nodes=2",
+                "--data.init_args.prepare_data_per_node=true",
+            ],
+            "data.init_args.prepare_data_per_node is for disks of the nodes' own",
+        ),
+        (
+            ["--data", "{yaml}", "--out", "{yaml}/below"],
+            "cannot be written to .*give a features_dir",
+        ),
+    ],
+)
+def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [word.format(scans=data.parent / "scans", yaml=data) for word in words]
+    out = [] if "--out" in words else ["--out", tmp_path / "grids"]
+    with pytest.raises(ValueError, match=message):
+        features(*words, *out)
+    assert not (tmp_path / "grids" / "2x8").exists()
+
+
+@pytest.mark.parametrize("words", [["--dtype", "int4"], ["--grid_sizes", "[[8]]"], ["--dat", "x"]])
+def test_usage_errors_name_the_option(words, data, capsys):
+    with pytest.raises(SystemExit) as stop:
+        features("--data", data, *words)
+    assert stop.value.code == 2
+    assert words[0].lstrip("-") in capsys.readouterr().err
+
+
+def test_killed_three_times_and_resumed_equals_undisturbed(data, expected, tmp_path):
+    """At random moments, after one more scan at least; no grid may be lost or damaged."""
+    draw, out = random.Random(0), data.parent / "killed"
+    words = ["--data", data, "--out", out, "--batch_size", 1]
+    counts = [0]
+    for _ in range(3):
+        process = start(tmp_path / "log", *words)
+        wait_for(lambda: num_written(out) > counts[-1], process)
+        time.sleep(draw.uniform(0, 0.02))
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        counts.append(num_written(out))
+    assert 0 < counts[1] < counts[2] < counts[3] < NUM
+    features(*words)
+    assert num_written(out) == NUM
+    assert rows(out) == expected
+
+
+def test_ctrl_c_keeps_what_was_made(data, expected, tmp_path):
+    out = data.parent / "interrupted"
+    words = ["--data", data, "--out", out, "--batch_size", 1]
+    process = start(tmp_path / "log", *words)
+    wait_for(lambda: num_written(out) >= 2, process)
+    os.kill(process.pid, signal.SIGINT)
+    process.join()
+    assert process.exitcode == 130
+    line = f"r3dpa features: stopped; the same command goes on in {out}\n"
+    log = (tmp_path / "log").read_text()
+    assert log.endswith(line)
+    assert "Traceback" not in log
+    assert 2 <= num_written(out) < NUM
+    features(*words)
+    assert rows(out) == expected
+
+
+def test_a_second_job_waits_and_then_makes_what_is_missing(data, expected, tmp_path):
+    """Not what the first job made while it waited."""
+    out, log = data.parent / "waited", tmp_path / "log"
+    log.touch()
+    with features_lock(out):
+        process = start(log, "--data", data, "--out", out)
+        wait_for(lambda: "waiting for another process" in log.read_text(), process)
+        assert num_written(out) == 0
+        shutil.copytree(data.parent / "expected" / "2x8", out / "2x8")
+    process.join()
+    assert process.exitcode == 0
+    assert f"feature grids: 0 made, {NUM} kept, " in log.read_text()
+    assert rows(out) == expected
+
+
+@pytest.mark.ddp
+def test_two_processes_write_what_one_does(data, expected):
+    """Also what a process finds that begins late: the list of the first one counts."""
+    out = data.parent / "two"
+    command = [Path(sys.executable).with_name("r3dpa"), "features", "--data", data, "--out", out]
+    command += ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
+    command += ["--data.init_args.num_workers=1", "--batch_size=1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    journals = [path.read_text().splitlines() for path in sorted(out.rglob("*.jsonl"))]
+    assert [len(lines) for lines in journals] == [NUM // 2, NUM // 2]
+    assert rows(out) == expected
+    assert done.stdout.count("scans to do") == 1
+    assert f"{NUM // 2}/{NUM // 2}" in done.stdout  # the bar counts the batches of its own process
+    assert f"feature grids: {NUM} made, 0 kept, " in done.stdout.splitlines()[-1]
+    assert "Warning" not in done.stderr
