@@ -19,7 +19,7 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation clean
+.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation bench-features clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
@@ -65,13 +65,16 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 	$(BIN)/r3dpa report $(OUT)/vae_alignment
 	$(BIN)/r3dpa report $(OUT)/joint
 
-bench: bench-training bench-simulation ## both of the following
+bench: bench-training bench-simulation bench-features ## all of the following
 
 bench-training: $(READY) ## one full-size training step of each stage: time and peak memory
 	$(BIN)/r3dpa bench training
 
 bench-simulation: $(READY) ## what a simulated scan costs on one core, by part and effect
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench simulation
+
+bench-features: $(READY) ## what feature grids cost: building, reading, one pass of a network
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench features
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from r3dpa import viz
-from r3dpa.geometry.projection import SphericalProjection
+from r3dpa.geometry.projection import SphericalProjection, pool_cells, range_image
 from r3dpa.geometry.sensor import LidarSensor
-from r3dpa.viz.features import DARKEST_FEATURE
+from r3dpa.viz.features import DARKEST_FEATURE, FRAME
 from r3dpa.viz.figures import ERROR_MAP, ONLY_INPUT, ONLY_RECONSTRUCTION
 from r3dpa.viz.pixels import BACKGROUND
 from r3dpa.viz.scans import CAMERA_EYE_M, CAMERA_TARGET_M
@@ -334,6 +334,80 @@ def test_feature_grid_picture_puts_cells_row_by_row():
     assert filled.sum() == 4
     with pytest.raises(ValueError, match="6 cells do not fill a grid of 3 x 3"):
         viz.feature_grid_picture(grid, (3, 3))
+
+
+def test_fitted_colours_are_those_of_equal_rows_in_another_set():
+    features = np.random.default_rng(0).normal(size=(400, 6)) * [5, 3, 2, 1, 1, 1] + 2
+    colours = viz.FeatureColours.fit(features)
+    expected = viz.pca_colours(features)
+    assert colours(features[100:200]) == pytest.approx(expected[100:200])
+    # Refitted to the part, the same rows would get other colours.
+    assert np.abs(viz.pca_colours(features[100:200]) - expected[100:200]).max() > 0.02
+    # Components are linear: between the colours of two rows lies that of their mean.
+    inside = ((expected > DARKEST_FEATURE) & (expected < 1)).all(axis=1)
+    one, other = np.flatnonzero(inside)[:2]
+    middle = colours(features[[one, other]].mean(axis=0, keepdims=True))[0]
+    assert middle == pytest.approx(expected[[one, other]].mean(axis=0))
+    assert (colours(np.zeros((1, 6))) == 0).all()
+
+
+def test_fitted_colours_clip_what_lies_beyond_and_refuse_other_widths():
+    features = np.random.default_rng(0).normal(size=(400, 3)) * [3.0, 2.0, 1.0]
+    colours = viz.FeatureColours.fit(features)
+    far = colours(np.diag([100.0, 100.0, -100.0]) + 0.001)
+    assert far.diagonal() == pytest.approx([1.0, 1.0, DARKEST_FEATURE])
+    with pytest.raises(ValueError, match="features are 4 wide but the components 3"):
+        colours(np.ones((2, 4)))
+
+
+def test_pca_colours_of_single_precision_agree_with_double():
+    features = np.random.default_rng(0).normal(size=(2000, 40)) * np.arange(1, 41) + 50
+    single = viz.pca_colours(torch.from_numpy(features).float())
+    assert single == pytest.approx(viz.pca_colours(features), abs=1e-3)
+    # A plane in 40 dimensions has no third component, however it is rounded.
+    plane = torch.from_numpy(features[:, :2] @ features[:2]).float()
+    assert np.ptp(viz.pca_colours(plane)[:, 2]) == 0
+
+
+def test_similarity_picture_is_bright_where_the_direction_is_that_of_the_cell():
+    grid = torch.tensor([[1.0, 0.0], [5.0, 0.0], [0.0, 1.0], [0.0, 0.0], [-1.0, 0.0], [1.0, 1.0]])
+    picture = viz.similarity_picture(grid, (2, 3), (0, 0), scale=4)
+    middles = picture[2::4, 2::4].reshape(6, 3)
+    same, across, opposed, between = middles[1], middles[2], middles[4], middles[5]
+    assert (middles[0] == same).all()  # the length of a feature does not count
+    assert (across == opposed).all()
+    assert same.sum() > between.sum() > across.sum()
+    assert (middles[3] == 0).all()
+    framed = (picture == FRAME).all(axis=-1)
+    assert framed.sum() == 4 * 3
+    assert framed[:4, :4].sum() == 4 * 3
+
+
+def test_similarity_picture_refuses_empty_and_missing_cells():
+    grid = torch.tensor([[1.0], [0.0]])
+    with pytest.raises(ValueError, match=r"cell \(0, 1\) is empty"):
+        viz.similarity_picture(grid, (1, 2), (0, 1))
+    with pytest.raises(ValueError, match=r"cell \(1, 0\) is none of a grid of 1 x 2"):
+        viz.similarity_picture(grid, (1, 2), (1, 0))
+
+
+def test_feature_figure_paints_points_pixels_and_cells_alike():
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-20, 20, (500, 4)) * [1, 1, 0.02, 0] - [0, 0, 2, 0]
+    features = generator.normal(size=(500, 4)) * [4, 3, 2, 1]
+    projection = SphericalProjection(SENSOR)
+    xyz = torch.from_numpy(points[:, :3])
+    grid, counts = pool_cells(xyz, torch.from_numpy(features), projection, (2, 8))
+    figure = viz.feature_figure(points, torch.from_numpy(features), grid, projection, (2, 8))
+    _, _, image, cells = (np.asarray(axes.images[0].get_array()) for axes in figure.axes)
+    colours = viz.FeatureColours.fit(features)
+    _, expected = range_image(xyz, projection, torch.from_numpy(colours(features)))
+    assert image == pytest.approx(expected.movedim(0, -1).numpy() * 255, abs=0.5)
+    assert cells == pytest.approx(colours(grid).reshape(2, 8, 3) * 255, abs=0.5)
+    assert (cells.reshape(-1, 3).any(axis=1) == (counts > 0).numpy()).all()
+    figure.draw_without_rendering()
+    with pytest.raises(ValueError, match="16 cells do not fill a grid of 8 x 64"):
+        viz.feature_figure(points, features, grid, projection)
 
 
 def test_latents_picture_separates_what_the_channels_separate():

@@ -1,1 +1,1 @@
-"""What training steps and simulated scans cost, measured on the machine at hand."""
+"""What training steps, simulated scans and feature grids cost, measured on the machine at hand."""

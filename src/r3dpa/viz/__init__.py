@@ -7,7 +7,14 @@ pictures of different scenes can be compared. Dark means that there is no return
 """
 
 from r3dpa.viz.curves import Series, loss_curves, read_metrics
-from r3dpa.viz.features import feature_grid_picture, latents_picture, pca_colours
+from r3dpa.viz.features import (
+    FeatureColours,
+    feature_figure,
+    feature_grid_picture,
+    latents_picture,
+    pca_colours,
+    similarity_picture,
+)
 from r3dpa.viz.figures import birds_eye_view, reconstruction_figure, scenes_sheet
 from r3dpa.viz.page import Category, PageScan, scan_page
 from r3dpa.viz.pixels import save
@@ -16,12 +23,14 @@ from r3dpa.viz.sheets import birds_eye_sheet, range_strips
 
 __all__ = [
     "Category",
+    "FeatureColours",
     "PageScan",
     "Series",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
     "encoded_picture",
+    "feature_figure",
     "feature_grid_picture",
     "latents_picture",
     "loss_curves",
@@ -34,4 +43,5 @@ __all__ = [
     "scan_page",
     "scene_3d",
     "scenes_sheet",
+    "similarity_picture",
 ]

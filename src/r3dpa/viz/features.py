@@ -1,30 +1,114 @@
 """Features and latents as colours.
 
-Letters: N tokens = feature-grid cells, D feature width, C latent channels, h w latent size.
+Letters: P points, N tokens = feature-grid cells, D feature width, F width of point features,
+C latent channels, h w latent size.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import torch
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy, enlarge
+from r3dpa.geometry import Projection, range_image
+from r3dpa.viz.figures import EGO_OUTLINE_M
+from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy, bright_part, enlarge, paint
+from r3dpa.viz.scans import birds_eye_picture, scene_3d
+
+Rows = NDArray[np.floating]
 
 DARKEST_FEATURE = 0.15  # keeps every filled cell brighter than an empty one
+SIMILARITY_MAP = bright_part("viridis", 0.1)
+FRAME = (255, 60, 60)  # a colour that the map does not hold
 
 
-def pca_colours(features: Array) -> NDArray[np.float64]:
-    """First three principal components of features as colours.
+@dataclass(frozen=True)
+class FeatureColours:
+    """Principal components of one set of features as colours of any set of that width.
 
     Rows of zeros are empty cells: they do not count for the components and are black. Of each
-    component the 1st to 99th percentile becomes 0.15 to 1; a component without variance is 0.575.
-    The sign makes the largest loading of a component positive. To compare several scenes, give
-    their rows together.
+    component the 1st to 99th percentile of the fitted rows becomes 0.15 to 1, and what lies beyond
+    takes the end colours; a component without variance is 0.575. The sign makes the largest
+    loading of a component positive.
 
     Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
 
+    Attributes:
+        mean: ``(D,)`` of the fitted rows.
+        loadings: ``(D, K)`` directions of the components, K = 3 at most.
+        low: ``(K,)`` component values that become 0.15.
+        high: ``(K,)`` component values that become 1.
+    """
+
+    mean: Rows
+    loadings: Rows
+    low: Rows
+    high: Rows
+
+    @classmethod
+    def fit(cls, features: Array) -> FeatureColours:
+        """Components of these features.
+
+        Args:
+            features: ``(N, D)``; taken as float32, or float64 where they are wider than that.
+
+        Raises:
+            ValueError: If ``features`` has other than two axes or holds a value that is not
+                finite.
+        """
+        rows = _checked_rows(features)
+        rows = rows[_filled(rows)]
+        if not len(rows):
+            width, none = rows.shape[1], np.zeros(0)
+            return cls(np.zeros(width), np.zeros((width, 0)), none, none)
+        mean = rows.mean(axis=0, dtype=np.float64).astype(rows.dtype)
+        centred = rows - mean
+        _, vectors = np.linalg.eigh((centred.T @ centred).astype(np.float64))
+        loadings = vectors[:, ::-1][:, :3]  # eigh sorts upwards
+        largest = np.take_along_axis(loadings, np.abs(loadings).argmax(axis=0)[None], axis=0)
+        loadings = (loadings * np.sign(largest)).astype(rows.dtype)
+        low, high = np.percentile(centred @ loadings, [1, 99], axis=0)
+        # Below the rounding of float32 a component holds no variance but noise.
+        flat = high - low <= 1e-6 * np.abs(rows).max()
+        loadings[:, flat], low[flat], high[flat] = 0.0, -1.0, 1.0
+        return cls(mean, loadings, low, high)
+
+    def __call__(self, features: Array) -> NDArray[np.float64]:
+        """Colours of features.
+
+        Args:
+            features: ``(N, D)`` of the width that was fitted.
+
+        Returns:
+            ``(N, 3)`` RGB in [0, 1].
+
+        Raises:
+            ValueError: If the width is another, or as for :meth:`fit`.
+        """
+        rows = _checked_rows(features)
+        if rows.shape[1] != len(self.mean):
+            raise ValueError(
+                f"features are {rows.shape[1]} wide but the components {len(self.mean)}; fit and "
+                "draw features of one extractor"
+            )
+        share = np.full((len(rows), 3), 0.5)
+        components = (rows - self.mean) @ self.loadings
+        share[:, : len(self.low)] = (components - self.low) / (self.high - self.low)
+        colours = DARKEST_FEATURE + (1 - DARKEST_FEATURE) * np.clip(share, 0, 1)
+        colours[~_filled(rows)] = 0.0
+        return colours
+
+
+def pca_colours(features: Array) -> NDArray[np.float64]:
+    """First three principal components of features as colours, see :class:`FeatureColours`.
+
     Args:
-        features: ``(N, D)``.
+        features: ``(N, D)``; rows of zeros are empty cells and are black.
 
     Returns:
         ``(N, 3)`` RGB in [0, 1].
@@ -32,36 +116,20 @@ def pca_colours(features: Array) -> NDArray[np.float64]:
     Raises:
         ValueError: If ``features`` has other than two axes or holds a value that is not finite.
     """
-    rows = as_numpy(features, ("N", "D"))
-    if not np.isfinite(rows).all():
-        raise ValueError(
-            f"{np.count_nonzero(~np.isfinite(rows))} of {rows.size} features are not finite; "
-            "find out where they come from before drawing them"
-        )
-    colours = np.zeros((len(rows), 3))
-    filled = np.any(rows != 0, axis=1)
-    if not filled.any():
-        return colours
-    centred = rows[filled] - rows[filled].mean(axis=0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    loadings = vectors[:, ::-1][:, :3]  # eigh sorts upwards
-    largest = np.take_along_axis(loadings, np.abs(loadings).argmax(axis=0)[None], axis=0)
-    components = np.zeros((len(centred), 3))
-    components[:, : loadings.shape[1]] = centred @ (loadings * np.sign(largest))
-    low, high = np.percentile(components, [1, 99], axis=0)
-    varies = high - low > 1e-9 * np.abs(rows).max()
-    share = np.where(varies, (components - low) / np.where(varies, high - low, 1.0), 0.5)
-    colours[filled] = DARKEST_FEATURE + (1 - DARKEST_FEATURE) * np.clip(share, 0, 1)
-    return colours
+    return FeatureColours.fit(features)(features)
 
 
-def feature_grid_picture(grid: Array, grid_size: tuple[int, int], scale: int = 12) -> Pixels:
+def feature_grid_picture(
+    grid: Array, grid_size: tuple[int, int], scale: int = 12, colours: FeatureColours | None = None
+) -> Pixels:
     """Feature grid as a picture: principal components as colours, empty cells black.
 
     Args:
         grid: ``(N, D)`` cells row by row, zeros where a cell is empty.
         grid_size: Rows and columns of the grid, with product N.
         scale: Side in pixels of the square drawn for one cell.
+        colours: Components fitted to other features, such as those of the points; by default
+            those of the grid.
 
     Returns:
         ``(rows * scale, columns * scale, 3)`` uint8.
@@ -69,13 +137,112 @@ def feature_grid_picture(grid: Array, grid_size: tuple[int, int], scale: int = 1
     Raises:
         ValueError: If ``grid`` does not have ``rows * columns`` cells.
     """
-    rows, columns = grid_size
-    if len(grid) != rows * columns:
-        raise ValueError(
-            f"{len(grid)} cells do not fill a grid of {rows} x {columns}; "
-            "give grid_size as (rows, columns) with product N"
-        )
-    return enlarge(as_bytes(pca_colours(grid)).reshape(rows, columns, 3), scale)
+    _check_grid(grid, grid_size)
+    colours = colours or FeatureColours.fit(grid)
+    return enlarge(as_bytes(colours(grid)).reshape(*grid_size, 3), scale)
+
+
+def similarity_picture(
+    grid: Array, grid_size: tuple[int, int], cell: tuple[int, int], scale: int = 12
+) -> Pixels:
+    """Cosine between one cell of a feature grid and every other one; empty cells are black.
+
+    Cosine 1 is bright, 0 and below dark; the cell itself has a red frame.
+
+    Args:
+        grid: ``(N, D)`` cells row by row, zeros where a cell is empty.
+        grid_size: Rows and columns of the grid, with product N.
+        cell: Row and column of the cell that all others are compared with.
+        scale: Side in pixels of the square drawn for one cell.
+
+    Returns:
+        ``(rows * scale, columns * scale, 3)`` uint8.
+
+    Raises:
+        ValueError: If ``grid`` does not have ``rows * columns`` cells, or the cell is empty or
+            none of the grid.
+    """
+    _check_grid(grid, grid_size)
+    (row, column), (rows, columns) = cell, grid_size
+    if not (0 <= row < rows and 0 <= column < columns):
+        raise ValueError(f"cell {cell} is none of a grid of {rows} x {columns}")
+    values = _checked_rows(grid)
+    filled = _filled(values)
+    chosen = row * columns + column
+    if not filled[chosen]:
+        raise ValueError(f"cell {cell} is empty; choose one that holds points")
+    lengths = np.where(filled, np.linalg.norm(values, axis=1), 1.0)
+    unit = values / lengths[:, None]
+    picture = paint(unit @ unit[chosen], SIMILARITY_MAP, Normalize(0.0, 1.0))
+    picture[~filled] = 0
+    picture = enlarge(picture.reshape(rows, columns, 3), scale)
+    frame = picture[row * scale : (row + 1) * scale, column * scale : (column + 1) * scale]
+    width = max(1, scale // 6)
+    inside = frame[width:-width, width:-width].copy()
+    frame[:] = FRAME
+    frame[width:-width, width:-width] = inside
+    return picture
+
+
+def feature_figure(
+    points: Array,
+    features: Array,
+    grid: Array,
+    projection: Projection,
+    grid_size: tuple[int, int] = (8, 64),
+    extent_m: float = 40.0,
+) -> Figure:
+    """Features of a scan on its points, on its range image and averaged over the grid.
+
+    All four pictures share the principal components of the points, so that one colour means one
+    feature in all of them; a cell that averages different features is duller than its points.
+
+    Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
+
+    Args:
+        points: ``(P, 3+)`` x forward, y left, z up, metres.
+        features: ``(P, F)`` of the points.
+        grid: ``(N, F)`` their means over the cells, row by row, zeros where a cell is empty.
+        projection: Projection of the range image below the grid.
+        grid_size: Rows and columns of the grid, with product N.
+        extent_m: Half side of the square shown from above.
+
+    Returns:
+        Figure of 13 x 7.6 inches: from behind and from above, range image, grid.
+
+    Raises:
+        ValueError: If the shapes are not as above, or a feature is not finite.
+    """
+    colours = FeatureColours.fit(features)
+    of_points = colours(features)
+    xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
+    _, nearest = range_image(xyz, projection, torch.from_numpy(of_points))
+    assert nearest is not None
+    figure = Figure(figsize=(13.0, 7.6), dpi=110, layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(4.5, 3.1))[:, 0]
+    behind, above = upper.subplots(1, 2, width_ratios=(8.6, 4.4))
+    image, cells = lower.subplots(2, 1)
+    behind.imshow(scene_3d(points, of_points, size=(480, 920)), aspect="auto")
+    above.imshow(
+        birds_eye_picture(points, extent_m, pixels=480, colours=of_points),
+        extent=(extent_m, -extent_m, -extent_m, extent_m),  # +y is to the left
+    )
+    above.add_patch(Polygon(EGO_OUTLINE_M, facecolor="tab:red", edgecolor="white", lw=0.5))
+    panorama = as_bytes(nearest.movedim(0, -1).numpy())
+    image.imshow(panorama, aspect="auto", interpolation="nearest")
+    cells.imshow(
+        feature_grid_picture(grid, grid_size, 1, colours), aspect="auto", interpolation="nearest"
+    )
+    beams, columns = panorama.shape[:2]
+    for axes, title in (
+        (behind, f"{len(xyz):,} points, from behind"),
+        (above, f"from above, {2 * extent_m:g} m wide"),
+        (image, f"range image, {beams} x {columns} pixels: feature of the nearest point"),
+        (cells, f"feature grid, {grid_size[0]} x {grid_size[1]} cells: mean of their points"),
+    ):
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, loc="left", fontsize=10)
+    return figure
 
 
 def latents_picture(latents: Array, scale: int = 8) -> Pixels:
@@ -97,3 +264,32 @@ def latents_picture(latents: Array, scale: int = 8) -> Pixels:
     count, *latent_size = channels.shape
     colours = pca_colours(channels.reshape(count, -1).T)
     return enlarge(as_bytes(colours).reshape(*latent_size, 3), scale)
+
+
+def _checked_rows(features: Array) -> Rows:
+    """The features as float32, or float64 where they are wider than that, all finite."""
+    if isinstance(features, torch.Tensor):
+        features = features.detach().cpu()
+        features = (features if features.dtype == torch.float64 else features.float()).numpy()
+    if features.ndim != 2:
+        raise ValueError(f"expected shape (N, D), got {tuple(features.shape)}")
+    rows: Rows = features.astype(np.result_type(features.dtype, np.float32), copy=False)
+    if not np.isfinite(rows).all():
+        raise ValueError(
+            f"{np.count_nonzero(~np.isfinite(rows))} of {rows.size} features are not finite; "
+            "find out where they come from before drawing them"
+        )
+    return rows
+
+
+def _filled(rows: Rows) -> NDArray[np.bool_]:
+    return np.any(rows != 0, axis=1)
+
+
+def _check_grid(grid: Array, grid_size: tuple[int, int]) -> None:
+    rows, columns = grid_size
+    if len(grid) != rows * columns:
+        raise ValueError(
+            f"{len(grid)} cells do not fill a grid of {rows} x {columns}; "
+            "give grid_size as (rows, columns) with product N"
+        )
