@@ -17,7 +17,7 @@ ALLOWED = {
     "simulation": {"geometry"},
     "nn": {"geometry"},
     "viz": {"geometry"},
-    "metrics": {"geometry"},
+    "metrics": {"geometry", "nn"},
     "data": {"geometry", "simulation"},
     "checkpoints": {"nn"},
     "generation": {"geometry", "nn", "flow"},

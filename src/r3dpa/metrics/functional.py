@@ -1,0 +1,400 @@
+"""Distances between two sets of feature vectors: pure functions, computed in float64.
+
+Every function refuses what it cannot judge (NaN, too few samples) with a ``ValueError``; nothing
+is left out in silence. Letters: N samples, F feature width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import reduce
+from typing import Self
+
+import torch
+from torch import Tensor
+
+_BLOCK = 1024  # rows of a distance matrix held at once
+_SMALLEST_SHARE = 4  # fd_infinity starts from a quarter of the samples
+
+
+def checked_features(features: Tensor, name: str = "features", at_least: int = 1) -> Tensor:
+    """Features as float64, after a check that they can be judged.
+
+    Args:
+        features: ``(N, F)`` floating point.
+        name: What they are called in an error.
+        at_least: Samples that are needed.
+
+    Returns:
+        ``(N, F)`` float64.
+
+    Raises:
+        ValueError: If the shape is another one, a value is NaN or infinite, or N is too small.
+    """
+    if features.ndim != 2:
+        raise ValueError(f"{name}: expected (N, F), got {tuple(features.shape)}; one row a sample")
+    if len(features) < at_least:
+        raise ValueError(f"{name}: {len(features)} samples, at least {at_least} are needed")
+    broken = ~torch.isfinite(features).all(dim=1)
+    if broken.any():
+        first = int(broken.nonzero()[0])
+        raise ValueError(
+            f"{name}: {int(broken.sum())} of {len(features)} rows hold NaN or infinity, the first "
+            f"is row {first}; check the scan it was extracted from"
+        )
+    return features.double()
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean and scatter of feature vectors; two of them merge without loss of digits.
+
+    The scatter is the sum of the outer products of the deviations from the mean, never a
+    difference of two large sums::
+
+        mean    = mean_a + (mean_b - mean_a) * n_b / n
+        scatter = scatter_a + scatter_b + outer(mean_b - mean_a) * n_a * n_b / n
+
+    Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing
+    sample variances", 1979.
+
+    Args:
+        count: ``()`` float64, number of samples N.
+        mean: ``(F,)`` float64.
+        scatter: ``(F, F)`` float64.
+    """
+
+    count: Tensor
+    mean: Tensor
+    scatter: Tensor
+
+    @classmethod
+    def of(cls, features: Tensor, name: str = "features") -> Self:
+        """Moments of ``(N, F)`` features; a ``ValueError`` names NaN rows."""
+        features = checked_features(features, name)
+        mean = features.mean(dim=0)
+        centred = features - mean
+        return cls(features.new_tensor(float(len(features))), mean, centred.T @ centred)
+
+    def merge(self, other: Self) -> Self:
+        """Moments of both sets together; either may hold no sample."""
+        count = self.count + other.count
+        share = other.count / count.clamp(min=1)
+        step = other.mean - self.mean
+        between = torch.outer(step, step) * (self.count * share)
+        return type(self)(count, self.mean + step * share, self.scatter + other.scatter + between)
+
+    def covariance(self, name: str = "features") -> Tensor:
+        """Covariance ``(F, F)`` with N - 1; a ``ValueError`` for fewer than two samples."""
+        if self.count < 2:
+            raise ValueError(f"{name}: {int(self.count)} samples, a covariance needs at least 2")
+        return self.scatter / (self.count - 1)
+
+    def pack(self) -> Tensor:
+        """All numbers in one vector ``(1 + F + F * F,)``, for states and exchange."""
+        return torch.cat([self.count.reshape(1), self.mean, self.scatter.flatten()])
+
+    @classmethod
+    def unpack(cls, packed: Tensor) -> Self:
+        """Moments from :meth:`pack`."""
+        width = (math.isqrt(4 * len(packed) - 3) - 1) // 2
+        return cls(packed[0], packed[1 : width + 1], packed[width + 1 :].view(width, width))
+
+
+def merge_packed(packed: Tensor) -> Tensor:
+    """One packed vector from ``(K, 1 + F + F * F)`` packed moments, merged in order."""
+    return reduce(Moments.merge, map(Moments.unpack, packed)).pack()
+
+
+def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
+    """Squared Fréchet (2-Wasserstein) distance of two normal distributions.
+
+    The trace of the root of a product is a sum of singular values, so nothing becomes complex and
+    singular covariances are exact::
+
+        |mean_a - mean_b|^2 + tr(cov_a) + tr(cov_b) - 2 * sum(svdvals(cov_a^1/2 cov_b^1/2))
+
+    The eigenvalues of ``cov_a^1/2 cov_b cov_a^1/2`` are the squares of these singular values:
+    their roots would turn a rounding error of 1e-16 into one of 1e-8 in each empty direction.
+
+    Source: Dowson and Landau, 1982; as FID of Heusel et al., 2017.
+
+    Args:
+        mean_a: ``(F,)``.
+        cov_a: ``(F, F)`` symmetric, positive semi-definite.
+        mean_b: ``(F,)``.
+        cov_b: ``(F, F)``.
+
+    Returns:
+        ``()`` float64, never negative.
+
+    Raises:
+        ValueError: If shapes do not fit or a number is NaN or infinite.
+    """
+    width = len(mean_a)
+    given = {"mean_a": mean_a, "cov_a": cov_a, "mean_b": mean_b, "cov_b": cov_b}
+    for name, values in given.items():
+        expected = (width,) if name.startswith("mean") else (width, width)
+        if values.shape != expected:
+            raise ValueError(f"{name}: expected shape {expected}, got {tuple(values.shape)}")
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{name} holds NaN or infinity; check the features behind it")
+    mean_a, cov_a, mean_b, cov_b = (values.double() for values in given.values())
+    common = torch.linalg.svdvals(_root(cov_a) @ _root(cov_b)).sum()
+    distance = (mean_a - mean_b).square().sum() + cov_a.trace() + cov_b.trace() - 2 * common
+    return distance.clamp(min=0)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """Symmetric root of a covariance; eigenvalues that are rounding errors count as zero."""
+    values, vectors = torch.linalg.eigh((covariance + covariance.T) / 2)
+    noise = len(values) * torch.finfo(values.dtype).eps * values[-1].clamp(min=0)
+    values = torch.where(values > noise, values, 0.0)
+    return (vectors * values.sqrt()) @ vectors.T
+
+
+def frechet_distance_of(real: Tensor, generated: Tensor) -> float:
+    """Fréchet distance of two sets of features ``(N, F)``, by their means and covariances."""
+    a, b = Moments.of(real, "real features"), Moments.of(generated, "generated features")
+    return frechet_distance(
+        a.mean, a.covariance("real features"), b.mean, b.covariance("generated features")
+    ).item()
+
+
+@dataclass(frozen=True)
+class FDInfinity:
+    """Fréchet distance for infinitely many samples.
+
+    Args:
+        value: Intercept of the line through the distances over 1/N; may be slightly negative.
+        standard_error: Of the intercept, from the scatter around the line. The subsets overlap,
+            so this is a lower limit of the true error.
+        sizes: Samples N of each set behind each distance.
+        distances: Fréchet distances.
+    """
+
+    value: float
+    standard_error: float
+    sizes: tuple[int, ...]
+    distances: tuple[float, ...]
+
+
+def fd_infinity(
+    real: Tensor, generated: Tensor, generator: torch.Generator, num_sizes: int = 8
+) -> FDInfinity:
+    """Fréchet distance extrapolated to infinitely many samples.
+
+    The distance of N samples is too large by about c / N. Both sets are subsampled without
+    replacement at equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all
+    of it, and a line over 1/N gives the intercept.
+
+    Source: Chong and Forsyth, "Effectively unbiased FID and Inception score", CVPR 2020.
+
+    Args:
+        real: ``(N, F)``; N may differ from that of ``generated``.
+        generated: ``(M, F)``.
+        generator: Source of the subsets, on the CPU.
+        num_sizes: Distances that are computed, at least 3.
+
+    Raises:
+        ValueError: If a quarter of the smaller set is less than F + 1 samples.
+    """
+    width = real.shape[-1]
+    real = checked_features(real, "real features")
+    generated = checked_features(generated, "generated features")
+    largest = min(len(real), len(generated))
+    smallest = largest // _SMALLEST_SHARE
+    if smallest <= width or num_sizes < 3:
+        raise ValueError(
+            f"fd_infinity: {largest} samples of {width} features and {num_sizes} sizes; give at "
+            f"least {_SMALLEST_SHARE * (width + 1)} samples in both sets and 3 sizes, or use "
+            "polynomial_mmd, which has no bias"
+        )
+    inverse = torch.linspace(1 / smallest, 1 / largest, num_sizes, dtype=torch.float64)
+    sizes = [round(1 / value) for value in inverse.tolist()]
+    distances = [
+        frechet_distance_of(
+            *(x[torch.randperm(len(x), generator=generator)[:size]] for x in (real, generated))
+        )
+        for size in sizes
+    ]
+    over, y = 1 / torch.tensor(sizes).double(), torch.tensor(distances).double()
+    spread = (over - over.mean()).square().sum()
+    slope = ((over - over.mean()) * y).sum() / spread
+    value = y.mean() - slope * over.mean()
+    noise = (y - value - slope * over).square().sum() / (num_sizes - 2)
+    error = (noise * (1 / num_sizes + over.mean().square() / spread)).sqrt()
+    return FDInfinity(value.item(), error.item(), tuple(sizes), tuple(distances))
+
+
+def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
+    """Unbiased squared maximum mean discrepancy under ``(x . y / F + 1) ** degree``.
+
+    Pairs of a sample with itself are left out, so the mean over samples of one distribution is
+    zero and single values may be negative.
+
+    Source: Gretton et al., JMLR 2012, eq. 3; kernel of Binkowski et al. (KID), ICLR 2018.
+
+    Args:
+        real: ``(N, F)``, N at least 2.
+        generated: ``(M, F)``, M at least 2.
+        degree: Of the polynomial.
+
+    Returns:
+        ``()`` float64.
+    """
+    x = checked_features(real, "real features", at_least=2)
+    y = checked_features(generated, "generated features", at_least=2)
+
+    def kernel(a: Tensor, b: Tensor) -> Tensor:
+        return (a @ b.T / a.shape[1] + 1) ** degree
+
+    def within(a: Tensor) -> Tensor:
+        values = kernel(a, a)
+        return (values.sum() - values.trace()) / (len(a) * (len(a) - 1))
+
+    return within(x) + within(y) - 2 * kernel(x, y).mean()
+
+
+def polynomial_mmd(
+    real: Tensor,
+    generated: Tensor,
+    generator: torch.Generator,
+    num_subsets: int = 100,
+    subset_size: int = 1000,
+) -> tuple[float, float]:
+    """Kernel distance (KID): mean and deviation of :func:`squared_mmd` over random subsets.
+
+    Args:
+        real: ``(N, F)``.
+        generated: ``(M, F)``.
+        generator: Source of the subsets, on the CPU.
+        num_subsets: How many.
+        subset_size: Samples of each set in a subset, drawn without replacement.
+
+    Returns:
+        ``(mean, std)``; the standard error of the mean is below ``std``, but not
+        ``std / sqrt(num_subsets)``, since subsets overlap.
+
+    Raises:
+        ValueError: If a set is smaller than a subset.
+    """
+    smaller = min(len(real), len(generated))
+    if not 2 <= subset_size <= smaller or num_subsets < 2:
+        raise ValueError(
+            f"polynomial_mmd: {num_subsets} subsets of {subset_size} out of {len(real)} real and "
+            f"{len(generated)} generated samples; give 2 subsets or more of 2 to {smaller} samples"
+        )
+    real = checked_features(real, "real features")
+    generated = checked_features(generated, "generated features")
+
+    def subset(features: Tensor) -> Tensor:
+        return features[torch.randperm(len(features), generator=generator)[:subset_size]]
+
+    values = [squared_mmd(subset(real), subset(generated)).item() for _ in range(num_subsets)]
+    std, mean = torch.std_mean(torch.tensor(values, dtype=torch.float64))
+    return mean.item(), std.item()
+
+
+@dataclass(frozen=True)
+class PRDC:
+    """How much of each set the other one covers.
+
+    Args:
+        precision: Share of generated samples inside the ball of some real sample.
+        recall: Share of real samples inside the ball of some generated sample.
+        density: Real balls around a generated sample, on average, divided by k; may exceed 1.
+        coverage: Share of real samples whose ball holds a generated sample.
+    """
+
+    precision: float
+    recall: float
+    density: float
+    coverage: float
+
+
+def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> PRDC:
+    """Precision, recall, density and coverage by balls up to the k-th neighbour in the own set.
+
+    A sample on the edge of a ball is outside. Distances are held 1024 rows at a time.
+
+    Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
+
+    Args:
+        real: ``(N, F)``.
+        generated: ``(M, F)``.
+        num_neighbors: k, below N and M.
+
+    Raises:
+        ValueError: If a set has k samples or fewer, or holds NaN.
+    """
+    real = checked_features(real, "real features", num_neighbors + 1)
+    generated = checked_features(generated, "generated features", num_neighbors + 1)
+    centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances
+    real, generated = real - centre, generated - centre
+    norms = torch.cat([real, generated]).square().sum(dim=1)
+    edge = 1e-12 * norms.max()  # as near to the edge as rounding is on it
+    real_radius = _kth_neighbor(real, num_neighbors) - edge
+    generated_radius = _kth_neighbor(generated, num_neighbors) - edge
+
+    precise, dense = [], []
+    recalled = torch.zeros(len(real), dtype=torch.bool, device=real.device)
+    covered = torch.zeros_like(recalled)
+    for rows, squared in _squared_distances(generated, real):
+        in_real = squared < real_radius
+        precise.append(in_real.any(dim=1))
+        dense.append(in_real.sum(dim=1))
+        covered |= in_real.any(dim=0)
+        recalled |= (squared < generated_radius[rows, None]).any(dim=0)
+    return PRDC(
+        precision=torch.cat(precise).double().mean().item(),
+        recall=recalled.double().mean().item(),
+        density=torch.cat(dense).double().mean().item() / num_neighbors,
+        coverage=covered.double().mean().item(),
+    )
+
+
+def _squared_distances(x: Tensor, y: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    norms = y.square().sum(dim=1)
+    for start in range(0, len(x), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        yield rows, x[rows].square().sum(dim=1, keepdim=True) + norms - 2 * x[rows] @ y.T
+
+
+def _kth_neighbor(x: Tensor, k: int) -> Tensor:
+    """Squared distance ``(N,)`` to the k-th neighbour, the sample itself not counted."""
+    radii = []
+    for rows, squared in _squared_distances(x, x):
+        squared[:, rows].fill_diagonal_(torch.inf)
+        radii.append(squared.kthvalue(k, dim=1).values)
+    return torch.cat(radii)
+
+
+def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
+    """Earth mover's distance of two sets of numbers, such as ranges in metres.
+
+    Exact for sets of unequal size: the area between the two quantile functions, which are steps,
+    is summed between all places where one of them steps. For counts in bins there is
+    :func:`r3dpa.metrics.wasserstein_1`.
+
+    Args:
+        values_a: ``(N,)``.
+        values_b: ``(M,)``.
+
+    Returns:
+        The distance in the unit of the values.
+
+    Raises:
+        ValueError: If a set is empty or holds NaN or infinity.
+    """
+    a = checked_features(values_a.reshape(-1, 1), "values_a")[:, 0].sort().values
+    b = checked_features(values_b.reshape(-1, 1), "values_b")[:, 0].sort().values
+    steps = len(a) * len(b)  # integers, so that equal places are equal
+    ends_a = torch.arange(1, len(a) + 1, device=a.device) * len(b)
+    ends_b = torch.arange(1, len(b) + 1, device=a.device) * len(a)
+    ends = torch.cat([ends_a, ends_b]).unique()
+    widths = ends.diff(prepend=ends.new_zeros(1))
+    apart = (a[torch.searchsorted(ends_a, ends)] - b[torch.searchsorted(ends_b, ends)]).abs()
+    return ((apart * widths).sum() / steps).item()

@@ -1,0 +1,465 @@
+"""Distances of feature sets and clouds, by hand and against plain loops."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import sqrtm
+from scipy.stats import wasserstein_distance
+
+from r3dpa.metrics.bootstrap import bootstrap_interval, real_vs_real_floor
+from r3dpa.metrics.functional import (
+    Moments,
+    fd_infinity,
+    frechet_distance,
+    frechet_distance_of,
+    merge_packed,
+    polynomial_mmd,
+    precision_recall,
+    squared_mmd,
+    wasserstein_1_of_values,
+)
+from r3dpa.metrics.functional_bev import (
+    BEVGrid,
+    chamfer_cells,
+    chamfer_squared,
+    histogram_distance,
+    minimum_matching,
+    timing_against_brute_force,
+)
+
+
+def draw(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def covariance_of(num_features, rank, seed=0):
+    factor = draw(num_features, rank, seed=seed)
+    return factor @ factor.T
+
+
+# Fréchet distance
+
+
+def test_frechet_of_diagonal_covariances():
+    """sum (m1 - m2)^2 + sum (s1 - s2)^2: 1 + 4 + (3 - 1)^2 + (2 - 5)^2 = 18."""
+    a = torch.tensor([1.0, 0.0]), torch.diag(torch.tensor([9.0, 4.0]))
+    b = torch.tensor([0.0, 2.0]), torch.diag(torch.tensor([1.0, 25.0]))
+    assert frechet_distance(*a, *b).item() == pytest.approx(18, rel=1e-14)
+
+
+@pytest.mark.parametrize("ranks", [(20, 20), (1, 20), (20, 5), (1, 1), (7, 9)])
+def test_frechet_is_symmetric_and_zero_to_itself(ranks):
+    a, b = ((draw(20, seed=r), covariance_of(20, r, seed=r + i)) for i, r in enumerate(ranks))
+    there, back = frechet_distance(*a, *b), frechet_distance(*b, *a)
+    assert there > 0
+    torch.testing.assert_close(there, back, rtol=1e-12, atol=0)
+    for one in (a, b):
+        assert frechet_distance(*one, *one) < 1e-8
+
+
+def test_frechet_against_the_root_of_the_product():
+    a, b = covariance_of(12, 30), covariance_of(12, 30, seed=1)
+    expected = (a.trace() + b.trace()).item() - 2 * np.trace(sqrtm((a @ b).numpy())).real
+    zero = torch.zeros(12)
+    assert frechet_distance(zero, a, zero, b).item() == pytest.approx(expected, rel=1e-10)
+
+
+def test_frechet_of_a_line_and_of_a_point():
+    """Rank one: roots are u u' |u|, so the common part is |u . v|; of a point it is nothing."""
+    u, v, zero = draw(6), draw(6, seed=1), torch.zeros(6, dtype=torch.float64)
+    line = frechet_distance(zero, torch.outer(u, u), zero, torch.outer(v, v))
+    expected = u.square().sum() + v.square().sum() - 2 * (u @ v).abs()
+    torch.testing.assert_close(line, expected)
+    point = frechet_distance(zero, torch.zeros(6, 6), zero, torch.outer(v, v))
+    torch.testing.assert_close(point, v.square().sum())
+    assert frechet_distance(zero, torch.zeros(6, 6), zero, torch.zeros(6, 6)) == 0
+
+
+@pytest.mark.numerics
+def test_empty_directions_add_no_error():
+    """Few samples for the width: roots of eigenvalues of the product lose half of the digits."""
+    moments = Moments.of(draw(20, 300))
+    covariance = moments.covariance()
+    distance = frechet_distance(moments.mean, covariance, moments.mean, covariance)
+    values, vectors = torch.linalg.eigh(covariance)
+    root = vectors * values.clamp(min=0).sqrt() @ vectors.T
+    naive = torch.linalg.eigvalsh(root @ covariance @ root).clamp(min=0).sqrt().sum()
+    assert distance < 1e-10
+    assert abs(2 * covariance.trace() - 2 * naive) > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ({"mean_a": torch.zeros(3)}, r"cov_a: expected shape \(3, 3\), got \(2, 2\)"),
+        ({"cov_b": torch.full((2, 2), torch.nan)}, "cov_b holds NaN"),
+    ],
+)
+def test_frechet_refuses(broken, message):
+    good = dict.fromkeys(("mean_a", "mean_b"), torch.zeros(2))
+    good |= dict.fromkeys(("cov_a", "cov_b"), torch.eye(2))
+    with pytest.raises(ValueError, match=message):
+        frechet_distance(**good | broken)
+
+
+# Moments
+
+
+def test_moments_against_numpy():
+    x = draw(50, 4)
+    moments = Moments.of(x)
+    np.testing.assert_allclose(moments.covariance(), np.cov(x.T), rtol=1e-12)
+    round_trip = vars(Moments.unpack(moments.pack()))
+    assert all(torch.equal(value, round_trip[name]) for name, value in vars(moments).items())
+
+
+def test_moments_merge_in_uneven_parts():
+    x = draw(50, 4)
+    empty = torch.zeros(1 + 4 + 16, dtype=torch.float64)
+    parts = [Moments.of(part).pack() for part in x.split([1, 30, 2, 17])]
+    merged = Moments.unpack(merge_packed(torch.stack([empty, *parts, empty])))
+    whole = Moments.of(x)
+    for name, value in vars(whole).items():
+        torch.testing.assert_close(getattr(merged, name), value, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.numerics
+def test_a_shift_leaves_the_covariance():
+    x = draw(500, 4)
+    shifted = [Moments.of(part).pack() for part in (x + 1e4).split(7)]
+    covariance = Moments.unpack(merge_packed(torch.stack(shifted))).covariance()
+    torch.testing.assert_close(covariance, Moments.of(x).covariance(), rtol=1e-9, atol=1e-10)
+    y = (x + 1e4).float()
+    naive = y.T @ y / 500 - torch.outer(y.mean(0), y.mean(0))
+    assert (naive - covariance).abs().max() > 0.5  # what sums of squares in float32 give
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (torch.zeros(3), r"x: expected \(N, F\), got \(3,\)"),
+        (torch.zeros(0, 3), "x: 0 samples, at least 1"),
+        (torch.tensor([[0.0], [torch.nan], [torch.inf]]), "x: 2 of 3 rows .* the first is row 1"),
+    ],
+)
+def test_features_that_cannot_be_judged(features, message):
+    with pytest.raises(ValueError, match=message):
+        Moments.of(features, "x")
+
+
+def test_one_sample_has_no_covariance():
+    with pytest.raises(ValueError, match="real features: 1 samples, a covariance needs"):
+        frechet_distance_of(torch.zeros(1, 2), torch.zeros(5, 2))
+
+
+# Extrapolation and kernel distance
+
+
+def test_fd_infinity_of_equal_distributions():
+    """At 400 samples of width 20 the distance is about tr S (F + 1) / (2 N) = 0.5, its limit 0."""
+    generator = torch.Generator().manual_seed(0)
+    result = fd_infinity(draw(500, 20), draw(400, 20, seed=1), generator)
+    assert result.sizes[0] == 100
+    assert result.sizes[-1] == 400
+    assert result.distances[-1] > 0.3
+    assert abs(result.value) < 0.2 * result.distances[-1]
+    again = fd_infinity(draw(500, 20), draw(400, 20, seed=1), generator.manual_seed(0))
+    assert again == result
+
+
+def test_fd_infinity_of_a_shift():
+    generator = torch.Generator().manual_seed(0)
+    result = fd_infinity(draw(400, 5), draw(400, 5, seed=1) + 2, generator)
+    assert result.value == pytest.approx(5 * 2**2, abs=1.0)
+    assert 0 < result.standard_error < 1
+
+
+def test_fd_infinity_refuses_few_samples():
+    with pytest.raises(ValueError, match=r"80 samples of 20 features .* at least 84"):
+        fd_infinity(draw(80, 20), draw(90, 20), torch.Generator())
+
+
+def test_mmd_has_no_bias():
+    """Over all splits of six samples into halves, pairs are alike within and across: mean 0."""
+    pool = draw(6, 3)
+    splits = list(combinations(range(6), 3))
+    rest = [[i for i in range(6) if i not in split] for split in splits]
+    values = [squared_mmd(pool[list(a)], pool[b]) for a, b in zip(splits, rest, strict=True)]
+    assert torch.stack(values).mean().abs() < 1e-12
+    assert torch.stack(values).std() > 1e-2
+
+
+def test_mmd_by_hand():
+    """F = 1, k(x, y) = (x y + 1)^3: k(0, 2) = 1 within, k(1, 3) = 64, across 1, 1, 27, 343."""
+    value = squared_mmd(torch.tensor([[0.0], [2.0]]), torch.tensor([[1.0], [3.0]]))
+    assert value.item() == 1 + 64 - 2 * (1 + 1 + 27 + 343) / 4
+
+
+def test_polynomial_mmd_over_subsets():
+    x, y, generator = draw(40, 3), draw(30, 3, seed=1) + 1, torch.Generator().manual_seed(0)
+    mean, std = polynomial_mmd(x, y, generator, num_subsets=200, subset_size=20)
+    assert std > 0
+    assert mean == pytest.approx(squared_mmd(x, y).item(), abs=4 * std / math.sqrt(200))
+    with pytest.raises(ValueError, match=r"40 real and 30 generated .* 2 to 30 samples"):
+        polynomial_mmd(x, y, generator, subset_size=31)
+
+
+# Precision, recall, density, coverage
+
+
+def prdc_by_loops(real, generated, k):
+    def radius(points, i):
+        return sorted((points[i] - points[j]).norm() for j in range(len(points)) if j != i)[k - 1]
+
+    real_radius = [radius(real, i) for i in range(len(real))]
+    generated_radius = [radius(generated, j) for j in range(len(generated))]
+    pairs = list(product(range(len(real)), range(len(generated))))
+    apart = {(i, j): (real[i] - generated[j]).norm() for i, j in pairs}
+    inside = [(i, j) for i, j in pairs if apart[i, j] < real_radius[i]]
+    return {
+        "precision": len({j for _, j in inside}) / len(generated),
+        "recall": len({i for i, j in pairs if apart[i, j] < generated_radius[j]}) / len(real),
+        "density": len(inside) / (k * len(generated)),
+        "coverage": len({i for i, _ in inside}) / len(real),
+    }
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e5])
+def test_prdc_against_loops(monkeypatch, offset):
+    monkeypatch.setattr("r3dpa.metrics.functional._BLOCK", 7)  # several blocks, the last one short
+    real, generated = draw(30, 3) + offset, 1.2 * draw(24, 3, seed=1) + 0.5 + offset
+    result = vars(precision_recall(real, generated, num_neighbors=3))
+    assert result == pytest.approx(prdc_by_loops(real, generated, 3))
+    assert 0 < result["precision"] < 1
+    assert 0 < result["coverage"] < 1
+
+
+def test_prdc_of_a_set_with_itself_and_of_far_sets():
+    x = draw(30, 3)
+    assert set(vars(precision_recall(x, x)).values()) == {1.0}  # density: itself and k - 1 others
+    assert set(vars(precision_recall(x, x + 100)).values()) == {0.0}
+    with pytest.raises(ValueError, match="generated features: 5 samples, at least 6"):
+        precision_recall(x, x[:5])
+
+
+# Numbers
+
+
+def test_wasserstein_by_hand():
+    """Half of the mass moves from 0 to 1, the other from 0 to 3."""
+    assert wasserstein_1_of_values(torch.zeros(5), torch.tensor([3.0, 1.0])) == 2
+    assert wasserstein_1_of_values(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 3, 1])) == 0
+    with pytest.raises(ValueError, match="values_b: 0 samples"):
+        wasserstein_1_of_values(torch.zeros(5), torch.zeros(0))
+
+
+@pytest.mark.parametrize("sizes", [(7, 7), (7, 12), (1, 30)])
+def test_wasserstein_against_scipy(sizes):
+    a, b = draw(sizes[0]), draw(sizes[1], seed=1) + 0.3
+    assert wasserstein_1_of_values(a, b) == pytest.approx(wasserstein_distance(a, b), rel=1e-12)
+
+
+# Bird's-eye view
+
+GRID = BEVGrid((-4.0, 4.0), (-4.0, 4.0), 1.0)
+
+
+def cloud(*xy):
+    return torch.tensor([[x, y, 0.0] for x, y in xy])
+
+
+def test_cells_of_a_grid():
+    """Index 0 is the lower limit, borders belong to the upper cell, limits are outside."""
+    points = cloud((-3.9, -3.9), (0.0, 0.5), (0.9, 0.0), (3.9, -1e-6), (4.0, 0.0), (-4.0, 0.0))
+    assert GRID.cells(points).tolist() == [0, 4 * 8 + 4, 7 * 8 + 3]
+    assert GRID.inside(points).sum() == 4
+    wide = BEVGrid((-4.0, 4.0), (0.0, 3.0), 1.0)
+    assert wide.shape == (8, 3)
+    assert wide.cells(cloud((-3.5, 2.5), (3.5, 0.5))).tolist() == [2, 21]
+
+
+def test_every_point_of_the_published_grid_has_a_cell():
+    """The largest float32 below 50 m falls in the last cell and not beyond."""
+    edge = torch.nextafter(torch.tensor(50.0), torch.tensor(0.0)).item()
+    cells = BEVGrid().cells(cloud((edge, edge), (-edge, -edge)))
+    assert cells.tolist() == [0, 2000 * 2000 - 1]
+
+
+def test_histogram_counts_clouds():
+    counts = GRID.histogram([cloud((0.1, 0.1), (0.2, 0.2)), cloud((0.5, 0.5), (-1.5, 0.5))])
+    assert counts[4, 4] == 2
+    assert counts[2, 4] == 1
+    assert counts.sum() == 3
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (torch.zeros(0, 3), "cloud 1 has no point"),
+        (torch.zeros(4, 2), r"cloud 1: expected points \(P, 3 or more\), got \(4, 2\)"),
+        (torch.tensor([[0.0, 0, 0], [0, torch.nan, 0]]), "cloud 1: 1 of 2 points .* is point 1"),
+        (torch.full((3, 3), 9.0), "cloud 1: none of 3 points has x in"),
+    ],
+)
+def test_clouds_that_cannot_be_judged(points, message):
+    with pytest.raises(ValueError, match=message):
+        GRID.histogram([cloud((0, 0)), points])
+
+
+def test_histogram_distances_by_hand():
+    """Shares (1, 0) and (1/2, 1/2): m = (3/4, 1/4), (ln 4/3 + ln 2/3 / 2 + ln 2 / 2) / 2."""
+    result = histogram_distance(torch.tensor([2, 0, 0]), torch.tensor([3, 3, 0]))
+    expected = (math.log(4 / 3) + math.log(2 / 3) / 2 + math.log(2) / 2) / 2
+    assert result.jsd_divergence == pytest.approx(expected, rel=1e-14)
+    assert result.jsd_distance == pytest.approx(math.sqrt(expected), rel=1e-14)
+    assert (result.l1, result.total_variation) == (1, 0.5)
+    apart = histogram_distance(torch.tensor([1, 0]), torch.tensor([0, 5]))
+    assert apart.jsd_distance == pytest.approx(math.sqrt(math.log(2)))
+    assert (apart.l1, apart.total_variation) == (2, 1)
+    same = histogram_distance(torch.tensor([1, 2]), torch.tensor([2, 4]))
+    assert set(vars(same).values()) == {0}
+
+
+@pytest.mark.parametrize(
+    ("counts", "message"),
+    [
+        (torch.zeros(2), "second histogram is empty"),
+        (torch.ones(3), r"shapes \(2,\) and \(3,\)"),
+        (torch.tensor([2.0, -1.0]), "second histogram holds counts below 0"),
+    ],
+)
+def test_histograms_that_cannot_be_compared(counts, message):
+    with pytest.raises(ValueError, match=message):
+        histogram_distance(torch.ones(2), counts)
+
+
+def test_chamfer_by_hand():
+    """(0 + 4) / 2 one way, 0 the other: half of 2; a fourth column does not count."""
+    a = torch.tensor([[0.0, 0, 0, 7], [0, 0, 2, 9]])
+    assert chamfer_squared(a, torch.zeros(1, 3)) == 1
+    assert chamfer_squared(torch.zeros(1, 3), a) == 1
+    with pytest.raises(ValueError, match="points_b has no point"):
+        chamfer_squared(a, torch.zeros(0, 3))
+
+
+def test_matching_by_hand():
+    """On 8 x 8 cells: 3 and 4 cells apart are 25 / 64; the nearer sample is 1 / 64 away."""
+    reference = GRID.cells(cloud((0.5, 0.5)))
+    far, near = GRID.cells(cloud((3.5, -3.5))), GRID.cells(cloud((0.5, 1.5)))
+    assert chamfer_cells(reference, far, GRID) == 25 / 64
+    result = minimum_matching([reference], [far, near], GRID)
+    assert result.squared_normalised.tolist() == [1 / 64]
+    assert result.nearest.tolist() == [1]
+    assert result.num_compared == 1  # the first direction of the far one rules it out
+
+
+def random_cells(grid, num_clouds, seed):
+    generator = torch.Generator().manual_seed(seed)
+    width = grid.x_m[1] - grid.x_m[0]
+    for _ in range(num_clouds):
+        centre = torch.rand(1, 3, generator=generator) - 0.5
+        points = centre + 0.2 * torch.randn(150, 3, generator=generator)
+        yield grid.cells((width * points)[points.abs().amax(dim=1) < 0.5])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_matching_equals_all_against_all(threads):
+    grid = BEVGrid((-50.0, 50.0), (-50.0, 50.0), 1.0)
+    references, samples = list(random_cells(grid, 12, 0)), list(random_cells(grid, 15, 1))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        result = minimum_matching(references, samples, grid)
+    finally:
+        torch.set_num_threads(before)
+    pairs = torch.tensor([[chamfer_cells(x, y, grid) for y in samples] for x in references])
+    best = pairs.double().min(dim=1)
+    torch.testing.assert_close(result.squared_normalised, best.values, rtol=1e-6, atol=0)
+    assert torch.equal(result.nearest, best.indices)
+    assert result.num_compared < len(references) * len(samples)
+    assert result.mmd_squared_normalised == pytest.approx(best.values.mean().item(), rel=1e-6)
+
+
+def test_matching_refuses():
+    cells = GRID.cells(cloud((0, 0)))
+    with pytest.raises(ValueError, match="samples: no cloud, or one without"):
+        minimum_matching([cells], [], GRID)
+    with pytest.raises(ValueError, match=r"square grid .* got 8 x 3"):
+        minimum_matching([cells], [cells], BEVGrid((-4.0, 4.0), (0.0, 3.0), 1.0))
+
+
+def test_timing_compares_both_ways():
+    grid = BEVGrid((-50.0, 50.0), (-50.0, 50.0), 1.0)
+    clouds = list(random_cells(grid, 4, 0))
+    timing = timing_against_brute_force(clouds[:2], clouds[2:], grid)
+    assert timing.largest_difference < 1e-12
+    ours, brute_force = timing.extrapolate(10, 20)
+    assert ours == pytest.approx(30 * timing.table_s + 400 * timing.lookup_s)
+    assert brute_force == pytest.approx(200 * timing.brute_force_s)
+
+
+# How sure a number is
+
+
+def test_interval_of_a_mean():
+    """The mean of 400 numbers of deviation s is known to 1.96 s / 20."""
+    x = draw(400) + 3
+    interval = bootstrap_interval(
+        lambda i: x[i].mean(), [400], torch.Generator().manual_seed(0), num_resamples=2000
+    )
+    half = 1.96 * x.std().item() / 20
+    assert interval.value == pytest.approx(x.mean().item())
+    assert interval.high - interval.value == pytest.approx(half, rel=0.1)
+    assert interval.value - interval.low == pytest.approx(half, rel=0.1)
+    again = bootstrap_interval(
+        lambda i: x[i].mean(), [400], torch.Generator().manual_seed(0), num_resamples=2000
+    )
+    assert again == interval
+
+
+def test_paired_sets_are_resampled_alike():
+    x = draw(50)
+
+    def difference(i, j):
+        return (x[i] - (x[j] - 0.5)).mean()
+
+    generator = torch.Generator().manual_seed(0)
+    paired = bootstrap_interval(difference, [50, 50], generator, paired=True)
+    assert paired.low == pytest.approx(0.5)
+    assert paired.high == pytest.approx(0.5)
+    alone = bootstrap_interval(difference, [50, 50], generator)
+    assert alone.high - alone.low > 0.2
+
+
+@pytest.mark.parametrize(
+    ("sizes", "options", "message"),
+    [
+        ([1], {}, r"\[1\] samples; resampling"),
+        ([3, 4], {"paired": True}, "paired sets of"),
+        ([3], {"num_resamples": 10}, "10 resamples cannot tell"),
+    ],
+)
+def test_interval_refuses(sizes, options, message):
+    with pytest.raises(ValueError, match=message):
+        bootstrap_interval(lambda *i: 0.0, sizes, torch.Generator(), **options)
+
+
+def test_floor_compares_halves_without_a_common_scan():
+    seen = []
+
+    def statistic(a, b):
+        seen.append((a, b))
+        return len(a) + len(b)
+
+    floor = real_vs_real_floor(statistic, 9, torch.Generator().manual_seed(0), num_splits=3)
+    assert (floor.mean, floor.low, floor.high, floor.num_samples) == (8, 8, 8, 4)
+    assert all(not set(a.tolist()) & set(b.tolist()) for a, b in seen)
+    assert len({tuple(a.tolist()) for a, _ in seen}) == 3
+    with pytest.raises(ValueError, match="3 real scans"):
+        real_vs_real_floor(statistic, 3, torch.Generator())
