@@ -17,6 +17,8 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
+import math
+import mmap
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _LARGEST_CODE = 127
+_TORCH = {"<f2": torch.float16, "<f4": torch.float32, "|i1": torch.int8}
 
 
 class FeatureGridWriter:
@@ -184,7 +187,7 @@ class FeatureGrids:
         missing = wanted - {name for name, _ in self._places}
         if missing:
             raise _missing([scan for scan in scans if scan.name in missing], self._folder)
-        self._maps: dict[int, np.ndarray] = {}
+        self._maps: dict[int, mmap.mmap] = {}
 
     def read(self, scan: Scan, num_bytes: int) -> Tensor:
         """Grid ``(N, D)`` float32 of one scan, cells row by row; empty cells are zero.
@@ -201,15 +204,31 @@ class FeatureGrids:
         if place is None:
             raise self._replaced_or_missing(scan, num_bytes)
         shard, position = place
-        if shard not in self._maps:
-            # A writer may be in the middle of a row at the end of the file.
-            path = _rows_path(self._folder, shard)
-            length = path.stat().st_size // self._row.itemsize
-            self._maps[shard] = np.memmap(path, self._row, "r", shape=(length,)).view(np.ndarray)
-        row = self._maps[shard][position]
+        start = position * self._row.itemsize
+        mapping = self._mapped(shard)
+        # Asked for as a whole: page by page, as they are touched, a disk is slower than one read.
+        page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
+        mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + self._row.itemsize)
+
+        def field(name: str) -> Tensor:
+            assert self._row.fields is not None
+            dtype, offset = self._row.fields[name][:2]
+            kind, shape = dtype.subdtype or (dtype, ())
+            values = torch.frombuffer(
+                mapping, dtype=_TORCH[kind.str], count=math.prod(shape), offset=start + offset
+            )
+            return values.reshape(shape).float()
+
         if "values" in (self._row.names or ()):
-            return torch.from_numpy(row["values"].astype(np.float32))
-        return torch.from_numpy(row["codes"] * row["scale"][:, None])
+            return field("values")
+        return field("codes").mul_(field("scale")[:, None])
+
+    def _mapped(self, shard: int) -> mmap.mmap:
+        if shard not in self._maps:
+            with _rows_path(self._folder, shard).open("rb") as file:
+                # A private copy that nobody writes: torch takes no memory that is read-only.
+                self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        return self._maps[shard]
 
     def __getstate__(self) -> dict[str, Any]:
         """State without the open files: each process maps them itself."""
