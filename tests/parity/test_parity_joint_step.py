@@ -21,6 +21,8 @@ from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator
 class RecordedData(LidarDataModule):
     """The recorded images and features in place of scans."""
 
+    feature_source = "recorded"
+
     def __init__(self, case, num_steps):
         L.LightningDataModule.__init__(self)
         image = case["in/step0/image"]

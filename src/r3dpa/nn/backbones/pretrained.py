@@ -99,7 +99,6 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     about = {"width": network.width, "depth": network.depth, "grid": asdict(grid)}
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         save_file(state, temporary, metadata={_ABOUT: json.dumps(about)})
 

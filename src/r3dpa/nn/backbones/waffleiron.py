@@ -148,8 +148,9 @@ class Embedding(nn.Module):
         with torch.autocast(features.device.type, enabled=False):
             features = self.norm(features)
         if self.training:  # the batch norms need all neighbours at once
-            offsets = features[neighbors] - features[:, None]
-            around = self._around(offsets.flatten(0, 1)).unflatten(0, neighbors.shape).amax(dim=1)
+            others = features.index_select(0, neighbors.flatten())
+            offsets = others - features.repeat_interleave(neighbors.shape[1], dim=0)
+            around = self._around(offsets).unflatten(0, neighbors.shape).amax(dim=1)
         else:  # one after the other: a K-th of the memory
             each = (self._around(features[index] - features) for index in neighbors.unbind(dim=1))
             around = reduce(torch.maximum, each)
@@ -190,7 +191,8 @@ class SpatialMixing(nn.Module):
         # Channels stay last in memory, so that neither permutation copies the image.
         image = means.unflatten(0, plane.size).permute(0, 3, 1, 2)
         mixed = self.convs(image).permute(0, 2, 3, 1).flatten(0, 2)
-        return torch.addcmul(tokens, self.scale, mixed[plane.cells])
+        # Not mixed[plane.cells], whose gradient is summed in another order on every run.
+        return torch.addcmul(tokens, self.scale, mixed.index_select(0, plane.cells))
 
 
 class ChannelMixing(nn.Module):
