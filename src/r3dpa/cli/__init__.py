@@ -169,8 +169,7 @@ def probe(
     from r3dpa.cli.probe import probe as compare
 
     _check_file(out)
-    names = [name.strip() for name in sources.split(",")]
-    _print(compare(data, names, ckpt, train_scans, val_scans, device, out))
+    _print(compare(data, _words(sources), ckpt, train_scans, val_scans, device, out))
 
 
 def sample(
@@ -214,6 +213,85 @@ def sample(
     generate(
         ckpt, out, num, seed, sampler, batch_size, precision, device, weights, pictures, overwrite
     )
+
+
+def reference(
+    data: Path,
+    out: Path,
+    spaces: str = "fwid,fgeo",
+    ckpt: dict[str, Path] | None = None,
+    split: Literal["train", "val", "all"] = "all",
+    limit: int | None = None,
+    protocol: Literal["default", "published"] = "default",
+    device: str = "auto",
+) -> None:
+    """Write the statistics of real scans that r3dpa evaluate compares samples with.
+
+    The same command completes what was interrupted.
+
+    Args:
+        data: Folder of scans, in the KITTI-360 layout or any other, or a data YAML.
+        out: File to write, ``.safetensors``.
+        spaces: Feature spaces, separated by commas: ``fwid`` and ``fgeo`` need no file; ``frid``,
+            ``fld``, ``fsvd`` and ``fpvd`` the weights of the official networks.
+        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
+        split: Which scans of the data.
+        limit: Use this many scans at most, spread evenly.
+        protocol: ``published`` prepares scans as the published numbers do: points on the corners
+            of pixels, and pictures of LIP-Loc that wrap around.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+    """
+    from r3dpa.cli.evaluate import reference as write
+
+    _check_file(out)
+    try:
+        line = write(data, out, _words(spaces), ckpt, split, limit, protocol, device)
+    except KeyboardInterrupt:
+        sys.stderr.write(f"r3dpa reference: stopped; the same command goes on with {out}\n")
+        sys.exit(130)  # as a shell reports an interrupt
+    _print(line)
+
+
+def evaluate(
+    samples: Path,
+    reference: Path,
+    spaces: str | None = None,
+    ckpt: dict[str, Path] | None = None,
+    protocol: Literal["default", "published"] | None = None,
+    skip_bad: bool = False,
+    allow_few: bool = False,
+    allow_oracle: bool = False,
+    label: str | None = None,
+    device: str = "auto",
+    out: Path | None = None,
+) -> None:
+    """Tell how near the samples of any generator are to real scans.
+
+    Prints every metric with its confidence interval and its floor, the distance of real scans from
+    real scans, and a table beside the published numbers.
+
+    Args:
+        samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
+            or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
+        reference: File of ``r3dpa reference``.
+        spaces: Feature spaces, separated by commas; where not given, those of the reference that
+            need no file or have one in ``ckpt``.
+        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
+        protocol: Refuse a reference of another protocol than this.
+        skip_bad: Leave out samples that cannot be used, and say which.
+        allow_few: Accept fewer samples than features: only to try it.
+        allow_oracle: Evaluate also what was made with features that read the labels.
+        label: Name of the generator in tables; that of ``samples`` where not given.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
+    """
+    from r3dpa.cli.evaluate import evaluate as compare
+
+    if out is not None:
+        _check_folder(out)
+    names = None if spaces is None else _words(spaces)
+    options = (skip_bad, allow_few, allow_oracle, label, device, out)
+    _print(compare(samples, reference, names, ckpt, protocol, *options))
 
 
 def convert(
@@ -319,8 +397,16 @@ _BENCHES: dict[str, Callable[..., None]] = {
 }
 _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__: command
-    for command in (simulate, check, view, realism, probe, sample, convert, report)
+    for command in (
+        *(simulate, check, view, realism, probe),
+        *(sample, reference, evaluate, convert, report),
+    )
 }
+
+
+def _words(text: str) -> list[str]:
+    """Words separated by commas."""
+    return [word.strip() for word in text.split(",")]
 
 
 def _print(text: Any) -> None:

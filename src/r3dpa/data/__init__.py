@@ -24,6 +24,7 @@ from r3dpa.data.feature_store import (
 )
 from r3dpa.data.grid_settings import FeatureGridError, GridSettings
 from r3dpa.data.points import PointDataset, PointSample, list_collate
+from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     CheckReport,
@@ -63,6 +64,9 @@ __all__ = [
     "PointDataModule",
     "PointDataset",
     "PointSample",
+    "Sample",
+    "SampleError",
+    "Samples",
     "Scan",
     "ScanError",
     "SimulatedDataModule",
@@ -77,6 +81,7 @@ __all__ = [
     "read_beside",
     "read_npz",
     "read_ply",
+    "read_samples",
     "read_scan",
     "stored_feature_dim",
     "stored_source",

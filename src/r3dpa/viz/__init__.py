@@ -7,6 +7,7 @@ pictures of different scenes can be compared. Dark means that there is no return
 """
 
 from r3dpa.viz.curves import Series, loss_curves, read_metrics
+from r3dpa.viz.evaluation import MatchedPair, bev_histograms, matches_figure, range_histogram
 from r3dpa.viz.features import (
     FeatureColours,
     feature_figure,
@@ -24,8 +25,10 @@ from r3dpa.viz.sheets import birds_eye_sheet, range_strips
 __all__ = [
     "Category",
     "FeatureColours",
+    "MatchedPair",
     "PageScan",
     "Series",
+    "bev_histograms",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
@@ -34,7 +37,9 @@ __all__ = [
     "feature_grid_picture",
     "latents_picture",
     "loss_curves",
+    "matches_figure",
     "pca_colours",
+    "range_histogram",
     "range_image_picture",
     "range_strips",
     "read_metrics",

@@ -1,0 +1,189 @@
+"""How near generated scenes are to real ones: all metrics with intervals and floors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from typing import Any, NamedTuple
+
+from r3dpa.metrics.distances import Resampling, histogram_rows, matching_rows
+from r3dpa.metrics.feature_distances import FeatureSample, feature_rows
+from r3dpa.metrics.functional_bev import Matching
+from r3dpa.metrics.protocol import Protocol
+from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
+from r3dpa.metrics.results import About, Evaluation, MetricResult
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import SceneFeatures
+from r3dpa.metrics.scene_set import SceneSet, add_scenes
+
+_GROUPS = 16  # of the bootstrap of histograms
+_BATCH = 8
+_RESAMPLING = Resampling()
+# What the maker of the scenes may tell; the rest of what it tells goes to ``extra``.
+_MADE_WITH = ("solver", "steps", "seed", "precision", "feature_source")
+
+
+class Comparison(NamedTuple):
+    """An evaluation, and what its figures are drawn from.
+
+    Attributes:
+        evaluation: All numbers.
+        samples: Generated scenes.
+        references: Real scans.
+        matching: Of the real scans whose images are kept to the generated scenes.
+    """
+
+    evaluation: Evaluation
+    samples: SceneSet
+    references: SceneSet
+    matching: Matching
+
+
+def evaluate(
+    scenes: Iterable[EvaluationScene],
+    reference: ReferenceStatistics,
+    spaces: Sequence[SceneFeatures],
+    *,
+    label: str,
+    source: str = "",
+    made_with: Mapping[str, Any] | None = None,
+    commit: str | None = None,
+    allow_few: bool = False,
+    batch_size: int = _BATCH,
+    resampling: Resampling = _RESAMPLING,
+) -> Comparison:
+    """Compare generated scenes with real ones under the protocol of the reference.
+
+    Real and generated scenes take one way, :func:`r3dpa.metrics.scene.through_sensor`. The same
+    scenes in the same order give the same numbers.
+
+    The floor of a distance is that between the halves of the reference: other drives where there
+    are several. For feature spaces it is taken at as many scenes as are evaluated, or at as many as
+    are kept; MMD's halves are smaller, which raises its floor. Precision and its relatives are no
+    distances: what the halves reach is in their notes.
+
+    Args:
+        scenes: Read once; the first ``num_samples`` of the protocol count.
+        reference: Complete statistics of the real scans.
+        spaces: Feature spaces, each one of the reference.
+        label: Of the generator or run.
+        source: Where the scenes come from.
+        made_with: What is known of their making: ``solver``, ``steps``, ``seed``, ``precision``,
+            ``feature_source``; anything else JSON can hold is kept, too.
+        commit: Version of the code.
+        allow_few: Accept fewer scenes than features.
+        batch_size: Scenes per pass of a network.
+        resampling: Seed, and cost of the intervals.
+
+    Raises:
+        ValueError: If the reference is not complete or lacks a space, there are fewer than two
+            scenes or, without ``allow_few``, not more scenes than features; if a scene is empty,
+            holds NaN or has another size, it is named.
+    """
+    if not reference.complete:
+        raise ValueError(
+            f"the reference holds {reference.num_done} of {len(reference.names)} scans; repeat its "
+            "command to complete it"
+        )
+    check_spaces(reference.spaces, spaces)
+    protocol = reference.protocol
+    samples, more = gather(scenes, spaces, protocol, batch_size)
+    references = reference.whole
+    _check_counts(samples.count, references.count, spaces, allow_few)
+
+    rows = histogram_rows(references, samples, resampling)
+    matched, matching = matching_rows(references, samples, resampling)
+    rows += matched
+    for space in spaces:
+        real, generated = (FeatureSample.of(part, space.name) for part in (references, samples))
+        rows += feature_rows(space.label, real, generated, resampling)
+    floors = _floors(reference, spaces, samples.count, resampling)
+    told = dict(made_with or {})
+    about: About = {
+        "backbones": {space.label: dict(space.card) for space in spaces},
+        "protocol": protocol.to_dict(),
+        "reference": reference.describe(),
+        **{key: told.pop(key, None) for key in _MADE_WITH},  # type: ignore[typeddict-item]
+        "commit": commit,
+        "published": False,
+        "source": source,
+        "extra": told | _counted(samples.count, more, protocol) | {"bootstrap": vars(resampling)},
+    }
+    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
+    return Comparison(evaluation, samples, references, matching)
+
+
+def gather(
+    scenes: Iterable[EvaluationScene],
+    spaces: Sequence[SceneFeatures],
+    protocol: Protocol,
+    batch_size: int = _BATCH,
+) -> tuple[SceneSet, bool]:
+    """Statistics of generated scenes, and whether there were more than the protocol counts."""
+    widths = {space.name: space.dim for space in spaces}
+    samples = SceneSet(protocol, widths, protocol.num_samples, protocol.num_mmd_samples, _GROUPS)
+    stream = iter(scenes)
+    counted = islice(stream, protocol.num_samples)
+    for batch, features in add_scenes(counted, spaces, protocol, batch_size):
+        samples.add(batch, features)
+    return samples, next(stream, None) is not None
+
+
+def _check_counts(
+    num_samples: int, num_references: int, spaces: Sequence[SceneFeatures], allow_few: bool
+) -> None:
+    if num_samples < 2:
+        raise ValueError(f"{num_samples} generated scenes; a comparison needs at least 2")
+    counts = {"generated scenes": num_samples, "real scans": num_references}
+    few = [
+        f"{count} {what} for the {space.dim} features of {space.label}"
+        for space in spaces
+        for what, count in counts.items()
+        if count <= space.dim
+    ]
+    if few and not allow_few:
+        raise ValueError(
+            f"{'; '.join(few)}: the covariance would be singular, and the distance tell mostly how "
+            "few there are. Give more, choose a smaller space, or allow it with --allow_few"
+        )
+
+
+def _floors(
+    reference: ReferenceStatistics,
+    spaces: Sequence[SceneFeatures],
+    num_samples: int,
+    resampling: Resampling,
+) -> dict[str, MetricResult]:
+    """Rows of the first half of the reference as if it were generated, against the second."""
+    first, second = reference.halves
+    if min(first.count, second.count) < 2:
+        return {}
+    without = replace(resampling, num_resamples=0)
+    rows = histogram_rows(second, first, without) + matching_rows(second, first, without)[0]
+    for space in spaces:
+        real, held_out = (FeatureSample.of(part, space.name) for part in (second, first))
+        same_size = held_out.subset(num_samples, resampling.generator())
+        rows += feature_rows(space.label, real, same_size, without)
+    return {row.name: row for row in rows}
+
+
+def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> MetricResult:
+    floor = floors.get(row.name)
+    if floor is None or floor.value is None or row.value is None:
+        return row
+    counts = f"{floor.num_samples} and {floor.num_references} scans"
+    if row.direction == "higher":
+        text = f"real scans reach {floor.value:.3g} ({counts})"
+        return replace(row, note="; ".join(filter(None, [row.note, text])))
+    note = "; ".join(filter(None, [row.note, f"floor of {counts}"]))
+    return replace(row, floor=max(floor.value, 0.0), note=note)
+
+
+def _counted(count: int, more: bool, protocol: Protocol) -> dict[str, Any]:
+    """What differs from the number of scenes that the protocol asks for."""
+    if more:
+        return {"scenes": f"only the first {count} were used, as many as the protocol counts"}
+    if count < protocol.num_samples:
+        return {"scenes": f"{count}, where the protocol asks for {protocol.num_samples}"}
+    return {}

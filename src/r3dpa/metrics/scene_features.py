@@ -1,0 +1,223 @@
+"""Feature spaces in which sets of scenes are compared, one vector per scene.
+
+========  ==============================================  ========  ==========================
+name      features                                        width     weights
+========  ==============================================  ========  ==========================
+``frid``  decoder of RangeViT, means of bands of rows     1024      official file
+``fld``   mean patch token of LIP-Loc's range encoder     384       official file
+``fsvd``  MinkowskiNet before its head, means of rings    768       official file
+``fpvd``  SPVCNN before its head, means of rings          768       official file
+``fwid``  tokens of ``waffleiron-s``, mean over points    128       in the package
+``fgeo``  ``geometric``, mean over points                 64        needs none
+========  ==============================================  ========  ==========================
+
+Distances in the last two have no published numbers; they need no download.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r3dpa.metrics.protocol import DEFAULT, Protocol
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
+from r3dpa.nn.backbones.geometric import CENTRES
+from r3dpa.nn.backbones.liploc import GREY_LEVELS_PER_M, LIPLoc
+from r3dpa.nn.backbones.minkowski import MinkowskiNet
+from r3dpa.nn.backbones.rangevit import RangeViT
+from r3dpa.nn.backbones.sparse_features import NUM_BINS, pool_voxels, voxelize
+from r3dpa.nn.backbones.spvcnn import SPVCNN
+from r3dpa.nn.backbones.tokens import sha256
+
+#: Names that :func:`scene_features` knows.
+SPACES = ("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo")
+#: Of these, the ones that need no file.
+FREE_SPACES = ("fwid", "fgeo")
+# Generated scenes have no intensity: all points get the mean of real scans.
+_INTENSITY = CENTRES[-1]
+
+
+@dataclass(frozen=True)
+class SceneFeatures:
+    """A frozen network as a map from scenes to vectors.
+
+    Args:
+        name: One of :data:`SPACES`.
+        label: Head of the column in tables.
+        dim: Width F of the features.
+        card: What they are made with: ``backbone``, ``layer``, ``weights`` (SHA-256, or None
+            without weights) and ``preprocessing``.
+        extract: Features ``(B, F)`` of scenes that :func:`through_sensor` made.
+    """
+
+    name: str
+    label: str
+    dim: int
+    card: dict[str, Any]
+    extract: Callable[[Sequence[EvaluationScene]], Tensor]
+
+    @torch.inference_mode()
+    def __call__(self, scenes: Sequence[EvaluationScene]) -> Tensor:
+        """Features ``(B, F)`` float32 on the CPU.
+
+        Args:
+            scenes: As :func:`through_sensor` makes them, at least one.
+
+        Raises:
+            ValueError: If a feature is NaN or infinite; the message names the scene.
+        """
+        features = self.extract(scenes).float().cpu()
+        broken = (~features.isfinite().all(dim=1)).nonzero().flatten().tolist()
+        if broken:
+            raise ValueError(
+                f"{scenes[broken[0]].name}: its features of {self.label} hold NaN or infinite "
+                "values; check the scene, and the weights"
+            )
+        return features
+
+
+def scene_features(
+    name: str,
+    ckpt: str | Path | None = None,
+    protocol: Protocol = DEFAULT,
+    device: str = "cpu",
+) -> SceneFeatures:
+    """Feature space by its name.
+
+    Args:
+        name: One of :data:`SPACES`.
+        ckpt: Official ``model.ckpt`` of the first four; of ``fwid`` other weights than those of
+            the package.
+        protocol: Sensor, cast of LIP-Loc's pictures, and size of voxels.
+        device: Where the network computes.
+
+    Raises:
+        ValueError: If the name is unknown, a file is missing, given where there are no weights, or
+            holds something else; the message names it.
+    """
+    if name not in SPACES:
+        raise ValueError(f"there is no feature space {name!r}; there are {', '.join(SPACES)}")
+    if name == "fgeo" and ckpt is not None:
+        raise ValueError(f"fgeo has no weights: leave {ckpt} out")
+    if name not in FREE_SPACES and ckpt is None:
+        raise ValueError(
+            f"{name} needs its official weights: give --ckpt.{name} FILE, the model.ckpt of the "
+            f"release; without a file there are {' and '.join(FREE_SPACES)}"
+        )
+    if name in ("fwid", "fgeo"):
+        return _of_points(name, None if ckpt is None else Path(ckpt), device)
+    assert ckpt is not None
+    if name == "frid":
+        return range_vit_space(RangeViT.from_checkpoint(ckpt, protocol.sensor).to(device))
+    if name == "fld":
+        return lip_loc_space(LIPLoc.from_checkpoint(ckpt).to(device), protocol)
+    network = (SPVCNN if name == "fpvd" else MinkowskiNet).from_checkpoint(ckpt)
+    return voxel_space(network.to(device), protocol)
+
+
+def range_vit_space(network: RangeViT) -> SceneFeatures:
+    """FRID's features; a network of 5 input channels needs scenes with intensity."""
+    needs_intensity = network.in_channels == 5
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        intensity = None
+        if needs_intensity:
+            for scene in scenes:
+                if scene.intensity is None:
+                    raise ValueError(
+                        f"{scene.name}: has no intensity, which these weights of RangeViT read; "
+                        "give those of rangevit_wo_i"
+                    )
+            intensity = _stack(scenes, "intensity", network.image_mean.device)
+        return network(_stack(scenes, "range_m", network.image_mean.device), intensity)
+
+    card = _card(network, "decoder, means of bands of rows", "pixel corners, -1 where empty")
+    card["in_channels"] = network.in_channels
+    return SceneFeatures("frid", "FRID", network.dim, card, extract)
+
+
+def lip_loc_space(network: LIPLoc, protocol: Protocol) -> SceneFeatures:
+    """FLD's features, with the cast of the protocol."""
+    farthest_m = 255 / GREY_LEVELS_PER_M
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        range_m = _stack(scenes, "range_m", network.embedding.weight.device)
+        if protocol.liploc_cast == "clip":
+            range_m = range_m.clamp(0, farthest_m)
+        return network(range_m)
+
+    preprocessing = f"{GREY_LEVELS_PER_M} grey levels a metre, {protocol.liploc_cast} to 8 bits"
+    card = _card(network, "mean patch token, normalised", preprocessing)
+    return SceneFeatures("fld", "FLD", network.dim, card, extract)
+
+
+def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
+    """Features of FPVD for an SPVCNN, of FSVD for a plain MinkowskiNet."""
+    name = "fpvd" if isinstance(network, SPVCNN) else "fsvd"
+    if isinstance(network, SPVCNN):
+        network.voxel_m = protocol.voxel_m
+    network.requires_grad_(False).eval()
+    sensor, voxel_m = protocol.sensor, protocol.voxel_m
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        device = network.head.weight.device
+        clouds = []
+        for index, scene in enumerate(scenes):
+            assert scene.points is not None
+            limits = {"range_min_m": sensor.range_min_m, "range_max_m": sensor.range_max_m}
+            voxels, inputs = voxelize(scene.points, voxel_m, **limits)
+            clouds.append((F.pad(voxels, (0, 1), value=index), inputs))
+        coordinates, inputs = (torch.cat(parts).to(device) for parts in zip(*clouds, strict=True))
+        features = network(coordinates, inputs)
+        return pool_voxels(features, coordinates, len(scenes), "rings", voxel_m)
+
+    preprocessing = f"voxels of {voxel_m:g} m, first point, no intensity"
+    card = _card(network, f"before the head, means of {NUM_BINS} rings", preprocessing)
+    return SceneFeatures(name, name.upper(), NUM_BINS * network.widths[-1], card, extract)
+
+
+def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
+    """Means of the features of a point extractor, without their lift to a higher dimension."""
+    extractor: WaffleIronS | GeometricFeatures
+    if name == "fwid":
+        extractor = WaffleIronS(ckpt).to(device)
+        dim, layer = extractor.network.width, "normalised tokens, mean over points"
+    else:
+        extractor = GeometricFeatures().to(device)
+        dim, layer = extractor.basis.shape[1], "kernel features, mean over points"
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        prepared: list[Any] = []
+        for scene in scenes:
+            assert scene.points is not None
+            prepared.append(extractor.prepare(F.pad(scene.points, (0, 1), value=_INTENSITY)))
+        return torch.stack([values.mean(dim=0) for values in extractor.point_features(prepared)])
+
+    card = {
+        "backbone": extractor.name,
+        "layer": layer,
+        "weights": extractor.settings.get("weights"),
+        "preprocessing": f"intensity {_INTENSITY:g} for all points",
+        "version": extractor.settings["version"],
+    }
+    return SceneFeatures(name, name.upper(), dim, card, extract)
+
+
+def _card(network: nn.Module, layer: str, preprocessing: str) -> dict[str, Any]:
+    return {
+        "backbone": type(network).__name__,
+        "layer": layer,
+        "weights": sha256(network),
+        "preprocessing": preprocessing,
+    }
+
+
+def _stack(scenes: Sequence[EvaluationScene], field: str, device: torch.device) -> Tensor:
+    return torch.stack([getattr(scene, field) for scene in scenes]).to(device)

@@ -1,0 +1,257 @@
+"""Figures of an evaluation: where samples and real scans differ, and what matches what.
+
+Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, SymLogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part
+from r3dpa.viz.scans import RANGE_MAP, range_image_picture, range_scale
+from r3dpa.viz.sheets import range_ticks
+
+SAMPLES, REFERENCES = "tab:orange", "tab:blue"
+MAX_CELLS = 250  # drawn along a side; finer histograms are summed over squares of cells
+SHARE_MAP = bright_part("viridis", 0.1)
+DECADES = 4  # of the logarithmic scales
+
+
+class MatchedPair(NamedTuple):
+    """A generated scene and the real one that is nearest to it.
+
+    Args:
+        title: Such as the name of the sample and the distance.
+        sample_m: ``(H, W)`` range in metres, not above 0 where there is no return.
+        reference_m: The same of the real scan.
+    """
+
+    title: str
+    sample_m: Array
+    reference_m: Array
+
+
+def bev_histograms(
+    samples: Array,
+    references: Array,
+    x_m: tuple[float, float] = (-50.0, 50.0),
+    y_m: tuple[float, float] = (-50.0, 50.0),
+) -> Figure:
+    """Where the points of samples and of real scans lie seen from above, and the difference.
+
+    Forward is up and left is left. Counts are shown as shares of all counts of their histogram,
+    both on one logarithmic scale of four decades; shares below it have the lowest colour, empty
+    cells the dark background. The third panel shows samples - references, linear near 0.
+
+    Args:
+        samples: ``(X, Y)`` counts; index 0 is at the lower limit of x and of y.
+        references: The same of real scans.
+        x_m: Limits of x (forward) in metres.
+        y_m: Limits of y (left) in metres.
+
+    Returns:
+        Figure of three panels, 16 x 5.4 inches.
+
+    Raises:
+        ValueError: If the shapes differ, or a histogram is empty or has a negative count.
+    """
+    drawn = _shares(samples, "samples", ("X", "Y"))
+    real = _shares(references, "references", ("X", "Y"))
+    if drawn.shape != real.shape:
+        raise ValueError(
+            f"samples are {drawn.shape} but references {real.shape}; give histograms of one grid"
+        )
+    steps = [-(-size // MAX_CELLS) for size in drawn.shape]
+    height_m, width_m = (
+        step * (high - low) / size
+        for step, size, (low, high) in zip(steps, drawn.shape, (x_m, y_m), strict=True)
+    )
+    drawn, real = (_summed(shares, *steps) for shares in (drawn, real))
+    rows, columns = drawn.shape
+    # The last cells may reach beyond the limits, where the axes end.
+    drawn_to = (y_m[0] + columns * width_m, y_m[0], x_m[0], x_m[0] + rows * height_m)
+    difference = drawn - real
+    top = max(drawn.max(), real.max())
+    share_scale = LogNorm(top / 10**DECADES, top, clip=True)
+    largest = max(float(np.abs(difference).max()), top / 10**DECADES)
+    linear_up_to = 10.0 ** np.ceil(np.log10(largest / 100))
+    difference_scale = SymLogNorm(linear_up_to, vmin=-largest, vmax=largest)
+
+    figure = Figure(figsize=(16.0, 5.4), layout="constrained")
+    panels = figure.subplots(1, 3)
+    background = tuple(channel / 255 for channel in BACKGROUND)
+    for axes, values, colours, scale, title in (
+        (panels[0], drawn, SHARE_MAP, share_scale, "samples"),
+        (panels[1], real, SHARE_MAP, share_scale, "references"),
+        (panels[2], difference, "RdBu_r", difference_scale, "samples - references"),
+    ):
+        empty = (drawn == 0) & (real == 0) if values is difference else values == 0
+        axes.set_facecolor(background)
+        axes.imshow(
+            np.ma.array(values, mask=empty)[:, ::-1],
+            cmap=colours,
+            norm=scale,
+            extent=drawn_to,  # +y is to the left
+            origin="lower",
+            interpolation="nearest",
+        )
+        axes.set(xlim=y_m[::-1], ylim=x_m)
+        axes.set_title(title, fontsize=11)
+        axes.set_xlabel("y, left (m)")
+    panels[0].set_ylabel("x, forward (m)")
+    label = f"share of all counts in a cell of {height_m:.3g} x {width_m:.3g} m"
+    figure.colorbar(ScalarMappable(share_scale, SHARE_MAP), ax=panels[:2], label=label, shrink=0.8)
+    figure.colorbar(
+        ScalarMappable(difference_scale, "RdBu_r"),
+        ax=panels[2],
+        label="difference of the shares",
+        shrink=0.8,
+    )
+    return figure
+
+
+def range_histogram(
+    edges_m: Array, samples: Array, references: Array, halves: Array | None = None
+) -> Figure:
+    """How many returns come from which range, and how far samples differ from real scans.
+
+    The band is the floor: between the smallest and the largest of parts of the real scans. Samples
+    inside the band differ no more than real scans do among themselves. A bin without any return of
+    the real scans has no ratio.
+
+    Args:
+        edges_m: ``(K + 1,)`` ascending borders of the bins in metres.
+        samples: ``(K,)`` counts.
+        references: ``(K,)`` counts of real scans.
+        halves: ``(S, K)`` counts of parts of the real scans, such as the two halves; none for a
+            figure without the band.
+
+    Returns:
+        Figure of two panels: densities, and their ratio to the density of the real scans.
+
+    Raises:
+        ValueError: If the numbers of bins differ, borders do not ascend, or a histogram is empty
+            or has a negative count.
+    """
+    edges = as_numpy(edges_m, ("K + 1",))
+    if len(edges) < 2 or not (np.diff(edges) > 0).all():
+        raise ValueError("edges_m does not ascend; give the borders of the bins from near to far")
+    parts = [] if halves is None else list(as_numpy(halves, ("S", "K")))
+    named = {"samples": samples, "references": references}
+    named |= {f"halves[{number}]": part for number, part in enumerate(parts)}
+    densities = {}
+    for name, counts in named.items():
+        shares = _shares(counts, name, ("K",))
+        if len(shares) != len(edges) - 1:
+            raise ValueError(f"{name} has {len(shares)} bins but edges_m {len(edges) - 1}")
+        densities[name] = shares / np.diff(edges)
+    drawn, real, *floor = densities.values()
+
+    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for axes, base in ((upper, np.ones_like(real)), (lower, real)):
+        with np.errstate(divide="ignore", invalid="ignore"):  # bins without any real return
+            lines = [np.where(base > 0, values / base, np.nan) for values in (real, drawn)]
+            ends = [np.where(base > 0, values / base, np.nan) for values in floor]
+        if ends:
+            limits = [limit(ends, axis=0) for limit in (np.min, np.max)]
+            axes.fill_between(
+                edges,
+                *(np.append(values, values[-1]) for values in limits),  # the last step has an end
+                step="post",
+                color=REFERENCES,
+                alpha=0.3,
+                linewidth=0,
+                label="floor: parts of the references",
+            )
+        for values, colour, label in zip(
+            lines, (REFERENCES, SAMPLES), ("references", "samples"), strict=True
+        ):
+            axes.stairs(values, edges, color=colour, linewidth=1.3, label=label, baseline=None)
+        axes.set_yscale("log")
+        axes.grid(alpha=0.3)
+    upper.set_ylabel("share of the returns per metre")
+    upper.legend(frameon=False)
+    lower.set_ylabel("ratio to the references")
+    lower.set_xlabel("range (m)")
+    top = 10.0 ** np.clip(np.ceil(np.log10(_largest_factor(drawn, real))), 0.5, 2)
+    lower.set_ylim(1 / top, top)
+    lower.set_xlim(edges[0], edges[-1])
+    return figure
+
+
+def matches_figure(
+    best: Sequence[MatchedPair], worst: Sequence[MatchedPair], sensor: LidarSensor
+) -> Figure:
+    """The best and the worst matches: each sample above the real scan that is nearest to it.
+
+    Args:
+        best: Pairs of small distance, the best first.
+        worst: Pairs of large distance, the worst first.
+        sensor: Gives the limits of the colour scale.
+
+    Returns:
+        Figure, 13 inches wide and about 1.9 inches high for each pair.
+
+    Raises:
+        ValueError: If there is no pair, or the images of a pair have other than one shape
+            ``(H, W)``.
+    """
+    pairs = [("best", pair) for pair in best] + [("worst", pair) for pair in worst]
+    if not pairs:
+        raise ValueError("got no pair to draw; give at least one of the best or the worst")
+    figure = Figure(figsize=(13.0, 1.9 * len(pairs) + 0.3), dpi=110, layout="constrained")
+    blocks = figure.subfigures(len(pairs), 1, squeeze=False).ravel()
+    rows = []
+    for block, (kind, pair) in zip(blocks, pairs, strict=True):
+        images = [as_numpy(image, ("H", "W")) for image in (pair.sample_m, pair.reference_m)]
+        if images[0].shape != images[1].shape:
+            raise ValueError(
+                f"{pair.title}: sample_m is {images[0].shape} but reference_m {images[1].shape}; "
+                "give two range images of the same sensor"
+            )
+        cells = block.subplots(2, 1)
+        rows.extend(cells)
+        cells[0].set_title(f"{kind}: {pair.title}", loc="left", fontsize=10, parse_math=False)
+        for axes, image, name in zip(cells, images, ("sample", "nearest"), strict=True):
+            axes.imshow(range_image_picture(image, sensor), aspect="auto", interpolation="nearest")
+            axes.set(xticks=[], yticks=[])
+            axes.set_ylabel(name, fontsize=9)
+        block.colorbar(
+            ScalarMappable(range_scale(sensor), RANGE_MAP),
+            ax=list(cells),
+            label="range (m)",
+            ticks=range_ticks(sensor),
+            format="%g",
+            pad=0.01,
+            aspect=12,
+        )
+    return figure
+
+
+def _shares(counts: Array, name: str, axes: tuple[str, ...]) -> NDArray[np.float64]:
+    """Counts divided by their sum."""
+    values = as_numpy(counts, axes)
+    if not np.isfinite(values).all() or (values < 0).any() or values.sum() == 0:
+        raise ValueError(f"{name} holds no counts; give numbers of at least 0 that are not all 0")
+    return values / values.sum()
+
+
+def _summed(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
+    """Sums over blocks of rows x columns; the last blocks may be cut off by the border."""
+    by_row = np.add.reduceat(values, range(0, values.shape[0], rows), axis=0)
+    return np.add.reduceat(by_row, range(0, values.shape[1], columns), axis=1)
+
+
+def _largest_factor(drawn: NDArray[np.float64], real: NDArray[np.float64]) -> float:
+    """How far apart two densities are in the bins where both are."""
+    both = (drawn > 0) & (real > 0)
+    return float(np.exp(np.abs(np.log(drawn[both] / real[both])).max(initial=0.0)))

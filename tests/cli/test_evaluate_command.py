@@ -1,0 +1,257 @@
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+import r3dpa.cli.evaluate as command
+from r3dpa.cli import main
+from r3dpa.cli.evaluate import evaluate_scenes
+from r3dpa.data.scans import write_bin, write_npz
+from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+from r3dpa.metrics.distances import Resampling
+from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
+from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
+
+SENSOR = LidarSensor(beams=16, columns=64)
+PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
+FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
+
+
+@pytest.fixture(autouse=True)
+def coarse_protocols(monkeypatch):
+    """Cells of half a metre: a hundredth of the work."""
+    coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
+    monkeypatch.setattr(command, "PROTOCOLS", coarse)
+
+
+def range_images(seed, count):
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(count):
+        wall = 4 + 20 * torch.rand(1, 64, generator=generator)
+        yield wall.expand(16, 64) + torch.rand(16, 64, generator=generator)
+
+
+def clouds(seed, count):
+    return [points_of(image, SphericalProjection(SENSOR)) for image in range_images(seed, count)]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Data YAML of 12 scans of two drives, for a sensor of 16 x 64."""
+    folder = tmp_path_factory.mktemp("real")
+    for index, points in enumerate(clouds(0, 12)):
+        write_bin(folder / "scans" / "ab"[index % 2] / f"{index:03d}.bin", points)
+    sensor = {"class_path": "r3dpa.geometry.LidarSensor", "init_args": {"beams": 16, "columns": 64}}
+    settings = {"scans": str(folder / "scans"), "sensor": sensor, "val_drives": ["b"]}
+    path = folder / "data.yaml"
+    content = {"data": {"class_path": "r3dpa.data.LidarDataModule", "init_args": settings}}
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.fixture
+def reference_file(data, tmp_path):
+    out = tmp_path / "reference.safetensors"
+    command.reference(data, out, ["fgeo"])
+    return out
+
+
+@pytest.fixture
+def samples(tmp_path):
+    folder = tmp_path / "samples"
+    for index, points in enumerate(clouds(1, 10)):
+        write_bin(folder / f"{index:03d}.bin", points)
+    return folder
+
+
+def evaluate(*words):
+    main(["evaluate", *map(str, words), "--device", "cpu"])
+
+
+def test_samples_are_compared_with_a_reference(data, samples, tmp_path, capsys):
+    reference, out = tmp_path / "ref.safetensors", tmp_path / "results"
+    main(["reference", "--data", str(data), "--out", str(reference), "--device", "cpu"])
+    assert re.search(
+        r"12 scans, names [0-9a-f]{12}; fwid, fgeo; protocol default", capsys_line(capsys)
+    )
+    evaluate("--samples", samples, "--reference", reference, "--allow_few", "--out", out)
+    printed = capsys.readouterr().out
+    for metric in ("JSD", "TV", "W1 range", "MMD", "CD 3D", "FWID", "FGEO", "FGEO recall"):
+        assert re.search(rf"^{re.escape(metric)}[ x]", printed, re.MULTILINE), metric
+    assert "R3DPA (published)" in printed
+    assert re.search(r"^samples +[-\d]", printed, re.MULTILINE)
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES
+    stored = Evaluation.load(out / "evaluation.json")
+    assert stored.label == "samples"
+    assert stored.row("JSD").num_references == 12
+    assert stored.row("JSD").floor > 0
+    assert stored.about["source"] == str(samples)
+    assert "R3DPA (published)" in (out / "table.md").read_text()
+    assert (out / "metrics.csv").read_text().count("\nsamples,False,") == len(stored.rows)
+
+
+def capsys_line(capsys):
+    return capsys.readouterr().out.strip().splitlines()[-1]
+
+
+def test_the_split_and_the_limit_choose_scans(data, tmp_path):
+    names = {}
+    for split in ("train", "val", "all"):
+        out = tmp_path / f"{split}.safetensors"
+        command.reference(data, out, ["fgeo"], split=split, limit=4)
+        names[split] = ReferenceStatistics.load(out).names
+    assert names["train"] == ("a/000", "a/002", "a/006", "a/008")
+    assert names["val"] == ("b/001", "b/003", "b/007", "b/009")
+    assert [name[0] for name in names["all"]] == ["a", "a", "b", "b"]
+
+
+def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
+    undisturbed, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    command.reference(data, undisturbed, ["fgeo"])
+    read, seen = command.read_scan, []
+
+    def dying(path, sensor):
+        if len(seen) == 10:
+            raise KeyboardInterrupt
+        seen.append(path)
+        return read(path, sensor)
+
+    monkeypatch.setattr(command, "read_scan", dying)
+    with pytest.raises(KeyboardInterrupt):
+        command.reference(data, out, ["fgeo"], every=8)
+    partial = tmp_path / "b.partial.safetensors"
+    assert partial.exists()
+    assert not out.exists()
+    seen.clear()
+    command.reference(data, out, ["fgeo"], every=8)
+    assert len(seen) == 4  # 8 of 12 were kept
+    assert out.read_bytes() == undisturbed.read_bytes()
+    assert not partial.exists()
+
+
+def test_what_made_the_samples_is_told(reference_file, samples, tmp_path):
+    metadata = {
+        "r3dpa": "1.0",
+        "feature_source": "oracle",
+        "sampler": {"solver": "heun", "steps": 7},
+        "seed": 3,
+        "weights": "ema",
+    }
+    (samples.parent / "metadata.json").write_text(json.dumps(metadata))
+    words = ["--samples", samples, "--reference", reference_file, "--allow_few"]
+    with pytest.raises(ValueError, match=r"samples: made with features of 'oracle'.*allow_oracle"):
+        evaluate(*words)
+    evaluate(*words, "--allow_oracle", "--out", tmp_path / "out", "--label", "ours")
+    stored = Evaluation.load(tmp_path / "out" / "evaluation.json")
+    about = stored.about
+    assert (stored.label, about["solver"], about["steps"], about["seed"]) == ("ours", "heun", 7, 3)
+    assert (about["feature_source"], about["extra"]["weights"]) == ("oracle", "ema")
+    (samples.parent / "metadata.json").write_text("{")
+    with pytest.raises(ValueError, match=r"metadata\.json: is damaged"):
+        evaluate(*words)
+
+
+def test_bad_samples_stop_or_are_listed(reference_file, samples, tmp_path):
+    (samples / "004.bin").write_bytes(b"no points")
+    words = ["--samples", samples, "--reference", reference_file, "--allow_few"]
+    with pytest.raises(ValueError, match=r"004\.bin: has 9 bytes"):
+        evaluate(*words)
+    with pytest.warns(UserWarning, match="1 bad samples left out"):
+        evaluate(*words, "--skip_bad", "--out", tmp_path / "out")
+    stored = Evaluation.load(tmp_path / "out" / "evaluation.json")
+    assert stored.row("JSD").num_samples == 9
+    bad = stored.about["extra"]["bad_samples"]
+    assert bad["count"] == 1
+    assert "004.bin" in bad["first"][0]
+
+
+def test_protocols_do_not_mix(data, samples, tmp_path, reference_file):
+    published = tmp_path / "published.safetensors"
+    words = ["--data", data, "--out", published, "--spaces", "fgeo", "--protocol", "published"]
+    main(["reference", *map(str, words), "--device", "cpu"])
+    options = ["--samples", samples, "--allow_few", "--reference"]
+    with pytest.raises(ValueError, match="of the protocol default, not published: compute another"):
+        evaluate(*options, reference_file, "--protocol", "published")
+    evaluate(*options, published, "--protocol", "published", "--out", tmp_path / "out")
+    stored = Evaluation.load(tmp_path / "out" / "evaluation.json")
+    assert stored.about["protocol"]["unprojection"] == "corner"
+
+
+def test_official_weights_are_given_by_space(data, samples, tmp_path):
+    torch.manual_seed(0)
+    network, weights = MinkowskiNet((2,) * 9), tmp_path / "fsvd.ckpt"
+    torch.save({official_name(k): v for k, v in network.state_dict().items()}, weights)
+    reference = tmp_path / "ref.safetensors"
+    words = ["--data", data, "--out", reference, "--spaces", "fgeo,fsvd", "--ckpt.fsvd", weights]
+    main(["reference", *map(str, words), "--device", "cpu"])
+    words = ["--samples", samples, "--reference", reference, "--allow_few"]
+    evaluate(*words, "--out", tmp_path / "free")  # without the file, without its space
+    evaluate(*words, "--ckpt.fsvd", weights, "--out", tmp_path / "both")
+    free, both = (Evaluation.load(tmp_path / name / "evaluation.json") for name in ("free", "both"))
+    assert free.row("FSVD") is None
+    assert free.row("FGEO") is not None
+    assert both.row("FSVD") is not None
+    assert both.about["backbones"]["FSVD"]["backbone"] == "MinkowskiNet"
+    torch.nn.init.ones_(network.head.bias)
+    torch.save({official_name(k): v for k, v in network.state_dict().items()}, weights)
+    with pytest.raises(ValueError, match="fsvd is not that of the reference: weights"):
+        evaluate(*words, "--ckpt.fsvd", weights)
+
+
+def test_generated_scenes_need_no_files(reference_file, tmp_path):
+    """The same numbers from images in memory and from a file of their points."""
+    made = [EvaluationScene(f"{i}", None, m) for i, m in enumerate(range_images(1, 10))]
+    statistics = ReferenceStatistics.load(reference_file)
+    options = {"allow_few": True, "device": "cpu", "resampling": Resampling(0, 40)}
+    comparison = evaluate_scenes(made, statistics, label="memory", **options)
+    rows = {row.name: row.value for row in comparison.evaluation.rows}
+    write_npz(tmp_path / "made.npz", {str(i): p for i, p in enumerate(clouds(1, 10))})
+    path = tmp_path / "made.npz"
+    evaluate("--samples", path, "--reference", reference_file, "--allow_few", "--out", tmp_path)
+    stored = Evaluation.load(tmp_path / "evaluation.json")
+    assert {row.name for row in stored.rows} == set(rows)
+    for row in stored.rows:
+        if row.value is not None and not row.name.startswith("FGEO"):
+            assert row.value == pytest.approx(rows[row.name], rel=0.01), row.name
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--spaces", "fgeo"], "10 generated scenes for the 64 features of FGEO.*allow_few"),
+        (["--spaces", "fwid"], "the reference has no features of fwid, only of fgeo"),
+        (["--spaces", "fid"], "there is no feature space 'fid'"),
+        (["--spaces", "fgeo,fgeo"], "spaces must be different names"),
+        (["--ckpt.frid", "x.ckpt"], r"--ckpt\.frid: frid is not among the spaces \(fgeo\)"),
+        (["--reference", "none.safetensors"], "none.safetensors holds no reference statistics"),
+        (["--samples", "nowhere"], "nowhere: there is no such file or folder"),
+    ],
+)
+def test_wrong_options_are_named(reference_file, samples, words, message):
+    options = ["--samples", samples, "--reference", reference_file]
+    with pytest.raises(ValueError, match=message):
+        evaluate(*options, *words)
+
+
+def test_wrong_options_of_a_reference_are_named(data, reference_file, tmp_path):
+    out = tmp_path / "new.safetensors"
+    with pytest.raises(ValueError, match=r"reference\.safetensors exists: delete it"):
+        command.reference(data, reference_file, ["fgeo"])
+    with pytest.raises(ValueError, match="is no folder of scans and no data YAML"):
+        command.reference(tmp_path / "nothing", out, ["fgeo"])
+    with pytest.raises(ValueError, match="limit must be at least 2, got 1"):
+        command.reference(data, out, ["fgeo"], limit=1)
+    with pytest.raises(ValueError, match=r"frid needs its official weights: give --ckpt\.frid"):
+        command.reference(data, out, ["frid"])
+    assert not out.exists()
+    np.full((2, 4), np.nan, "<f4").tofile(tmp_path / "0.bin")
+    np.ones((2, 4), "<f4").tofile(tmp_path / "1.bin")
+    with pytest.raises(ValueError, match=r"0\.bin: has NaN"):
+        command.reference(tmp_path, out, ["fgeo"])

@@ -1,0 +1,441 @@
+import pickle
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.data.samples import SampleError, read_samples
+from r3dpa.data.scans import ScanError, write_bin, write_npz, write_ply
+from r3dpa.geometry import LidarSensor, SphericalProjection, range_image, unproject
+
+SENSOR = LidarSensor(beams=4, columns=8)
+CLOUDS = [
+    np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.125], [-30, 1, -2, 1.0]], np.float32),
+    np.array([[5, 5, 0, 0.0], [-7, 2, -0.5, 0.75]], np.float32),
+]
+
+
+def image(seed=0, channels=5):
+    """Range, x, y, z and intensity ``(C, H, W)``; 0, 0.5 m and 60 m are no returns."""
+    generator = torch.Generator().manual_seed(seed)
+    range_m = 2 + 50 * torch.rand(4, 8, generator=generator)
+    range_m[0, 0], range_m[1, 1], range_m[2, 2] = 0.0, 0.5, 60.0
+    xyz = unproject(range_m, SphericalProjection(SENSOR)).movedim(-1, 0)
+    intensity = torch.rand(1, 4, 8, generator=generator)
+    return torch.cat([range_m[None], xyz, intensity])[:channels]
+
+
+def returns(image):
+    return (image[0] > 1) & (image[0] < 56)
+
+
+def assert_is(sample, image):
+    """The sample holds just the pixels of the image that are returns."""
+    valid = returns(image)
+    torch.testing.assert_close(sample.range_m, image[0] * valid, rtol=0, atol=0)
+    torch.testing.assert_close(sample.points[:, :3], image[1:4, valid].T, rtol=0, atol=0)
+    if len(image) == 5:
+        torch.testing.assert_close(sample.intensity, image[4] * valid, rtol=0, atol=0)
+        torch.testing.assert_close(sample.points[:, 3], image[4, valid], rtol=0, atol=0)
+    else:
+        assert sample.intensity is None
+        assert sample.points.shape == (29, 3)
+
+
+def joblib_dump(clouds, path, monkeypatch, alignment=16, protocol=4):
+    """List of arrays as joblib writes it: each pickled wrapper is followed by the array's bytes."""
+    module = types.ModuleType("joblib.numpy_pickle")
+    module.NumpyArrayWrapper = type(
+        "NumpyArrayWrapper", (), {"__module__": "joblib.numpy_pickle", "__init__": set_state}
+    )
+    monkeypatch.setitem(sys.modules, "joblib", types.ModuleType("joblib"))
+    monkeypatch.setitem(sys.modules, "joblib.numpy_pickle", module)
+
+    class Pickler(pickle._Pickler):
+        def save(self, obj):
+            if type(obj) is not np.ndarray:
+                super().save(obj)
+                return
+            order = "C" if obj.flags.c_contiguous else "F"
+            state = {"subclass": np.ndarray, "shape": obj.shape, "order": order}
+            state |= {"dtype": obj.dtype, "allow_mmap": True}
+            if alignment:
+                state["numpy_array_alignment_bytes"] = alignment
+            super().save(module.NumpyArrayWrapper(state))
+            if self.proto >= 4:
+                self.framer.commit_frame(force=True)
+            if alignment:
+                padding = alignment - (stream.tell() + 1) % alignment
+                stream.write(bytes([padding]) + b"\xff" * padding)
+            stream.write(obj.tobytes(order))
+
+    with path.open("wb") as stream:
+        Pickler(stream, protocol).dump(clouds)
+
+
+def set_state(self, state):
+    self.__dict__.update(state)
+
+
+def write_text(path, points):
+    np.savetxt(path, np.hstack([points[:, :3], np.zeros((len(points), 3))]), fmt="%.3f")
+
+
+def write_xyz(path, points):
+    path.write_bytes(points[:, :3].astype("<f4").tobytes())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "write", "columns"),
+    [("bin", write_bin, 4), ("ply", write_ply, 4), ("txt", write_text, 3)],
+)
+def test_clouds_of_a_folder_in_the_order_of_their_names(tmp_path, suffix, write, columns):
+    folder = tmp_path / "generated"
+    for name, points in zip(("0", "1"), CLOUDS, strict=True):
+        (folder / "deep").mkdir(parents=True, exist_ok=True)
+        write(folder / "deep" / f"{name}.{suffix}", points)
+    (folder / "deep" / "0.png").touch()
+    samples = read_samples(folder, SENSOR)
+    for _ in range(2):  # every iteration starts anew
+        found = list(samples)
+        assert [sample.name for sample in found] == ["deep/0", "deep/1"]
+        for sample, points in zip(found, CLOUDS, strict=True):
+            assert sample.points.dtype == torch.float32
+            assert sample.points.tolist() == points[:, :columns].tolist()
+            assert sample.range_m is None
+            assert sample.intensity is None
+        assert (samples.num_read, samples.bad) == (2, [])
+
+
+def test_rows_of_three_numbers_are_read_by_name(tmp_path):
+    write_xyz(tmp_path / "0.bin", CLOUDS[0])
+    with pytest.raises(SampleError, match=r"0.bin: has 36 bytes, not a multiple of 16"):
+        list(read_samples(tmp_path, SENSOR))
+    (sample,) = read_samples(tmp_path, SENSOR, format="bin_xyz")
+    assert sample.points.tolist() == CLOUDS[0][:, :3].tolist()
+
+
+def test_points_out_of_range_are_left_out(tmp_path):
+    points = np.array([[0.5, 0, 0, 1], [10, 0, 0, 0.5], [60, 0, 0, 1]], np.float32)
+    write_bin(tmp_path / "a.bin", points)
+    (sample,) = read_samples(tmp_path / "a.bin", SENSOR)
+    assert sample.name == "a"
+    assert sample.points.tolist() == [[10, 0, 0, 0.5]]
+
+
+def test_folder_of_r3dpa_sample_is_read_once(tmp_path):
+    for name, points in (("000000", CLOUDS[0]), ("000001", CLOUDS[1])):
+        write_bin(tmp_path / "bin" / f"{name}.bin", points[:, :3])
+        write_ply(tmp_path / "ply" / f"{name}.ply", points[:, :3])
+    write_npz(tmp_path / "scenes.npz", {"000000": CLOUDS[0][:, :3], "000001": CLOUDS[1][:, :3]})
+    with pytest.raises(SampleError, match=r"several formats \(2 bin, 1 npz, 2 ply\).*give the fo"):
+        read_samples(tmp_path, SENSOR)
+    (tmp_path / "metadata.json").touch()
+    names, points, _, _ = zip(*read_samples(tmp_path, SENSOR), strict=True)
+    assert names == ("000000", "000001")
+    assert points[1].tolist() == CLOUDS[1][:, :3].tolist()
+    names = [sample.name for sample in read_samples(tmp_path, SENSOR, format="ply")]
+    assert names == ["ply/000000", "ply/000001"]
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_cloud_in_either_memory_order(tmp_path, order):
+    np.savez(tmp_path / "a.npz", first=np.asarray(CLOUDS[0], order=order))
+    (sample,) = read_samples(tmp_path / "a.npz", SENSOR)
+    assert sample.name == "first"
+    assert sample.points.tolist() == CLOUDS[0].tolist()
+
+
+@pytest.mark.parametrize("write", [np.savez, np.savez_compressed, np.save])
+@pytest.mark.parametrize("channels", [4, 5])
+def test_stack_of_images_with_points(tmp_path, write, channels):
+    images = [image(seed, channels) for seed in range(3)]
+    file = tmp_path / ("img.npy" if write is np.save else "img.npz")
+    write(file, torch.stack(images).numpy())
+    samples = list(read_samples(file, SENSOR))
+    assert [sample.name for sample in samples] == ["000000", "000001", "000002"]
+    for sample, expected in zip(samples, images, strict=True):
+        assert_is(sample, expected)
+
+
+@pytest.mark.parametrize("unprojection", ["corner", "centre"])
+def test_stack_of_ranges_gets_its_points_from_the_rays(tmp_path, unprojection):
+    expected = image()
+    np.savez(tmp_path / "img.npz", expected[:1].numpy())  # (N, H, W), N = 1
+    (sample,) = read_samples(tmp_path / "img.npz", SENSOR, unprojection=unprojection)
+    torch.testing.assert_close(sample.range_m, expected[0] * returns(expected), rtol=0, atol=0)
+    back, _ = range_image(sample.points, SphericalProjection(SENSOR))
+    first = sample.points[0] / sample.points[0].norm()
+    azimuth = torch.atan2(first[1], first[0])  # of column 1 of 8, which starts 45 degrees from -x
+    if unprojection == "centre":
+        torch.testing.assert_close(back.clamp(min=0), sample.range_m, rtol=0, atol=1e-4)
+    assert azimuth.rad2deg().item() == pytest.approx({"corner": 135, "centre": 112.5}[unprojection])
+
+
+def test_intensity_of_images_without_points(tmp_path):
+    expected = image()
+    np.save(tmp_path / "a.npy", expected[None, [0, 4]].numpy())
+    (sample,) = read_samples(tmp_path / "a.npy", SENSOR)
+    torch.testing.assert_close(sample.points[:, 3], expected[4, returns(expected)], rtol=0, atol=0)
+
+
+def test_golden_images_and_clouds_of_the_official_code(tmp_path, request):
+    folder = request.config.rootpath / "tests" / "parity" / "data"
+    case = np.load(folder / "generate_postprocess.npz")
+    sensor = LidarSensor(*case["in/decoded"].shape[-2:])
+    for name in ("linear", "log"):
+        (tmp_path / name / "numpy").mkdir(parents=True)
+        (tmp_path / name / "pcd").mkdir()
+        images = case[f"out/{name}/dxyzi"]
+        np.savez(tmp_path / name / "numpy" / "img.npz", arr_0=images)
+        for index in range(len(images)):
+            write_text(
+                tmp_path / name / "pcd" / f"{index:06d}.txt", case[f"out/{name}/pcd_txt_{index}"]
+            )
+        samples = list(read_samples(tmp_path / name, sensor))
+        assert [sample.name for sample in samples] == ["000000", "000001"]
+        texts = list(read_samples(tmp_path / name / "pcd", sensor))
+        for index, (sample, text) in enumerate(zip(samples, texts, strict=True)):
+            range_m, intensity = case[f"out/{name}/eval_range_images"][index]
+            assert np.array_equal(sample.range_m, np.maximum(range_m, 0))
+            assert np.array_equal(sample.intensity, intensity)
+            assert np.array_equal(sample.points[:, :3], case[f"out/{name}/eval_pcd_{index}"])
+            rounded = case[f"out/{name}/pcd_txt_{index}"]
+            np.testing.assert_allclose(text.points, rounded, atol=5.1e-4)  # three decimals
+
+
+@pytest.mark.parametrize("old_file", [False, True])
+def test_tensor_files_of_r2dm(tmp_path, old_file):
+    for seed in range(2):
+        torch.save(
+            image(seed),
+            tmp_path / f"samples_{seed:010d}.pth",
+            _use_new_zipfile_serialization=not old_file,
+        )
+    samples = list(read_samples(tmp_path, SENSOR))
+    assert [sample.name for sample in samples] == ["samples_0000000000", "samples_0000000001"]
+    assert_is(samples[1], image(1))
+
+
+@pytest.mark.parametrize("channels", [4, 5])  # without a reflectance channel it is (0, H, W)
+@pytest.mark.parametrize("stacked", [False, True])
+def test_dictionaries_of_r2flow(tmp_path, channels, stacked):
+    images = torch.stack([image(seed, channels) for seed in range(2)])
+    parts = {"depth": images[:, :1], "xyz": images[:, 1:4], "reflectance": images[:, 4:]}
+    if stacked:
+        torch.save(parts, tmp_path / "all.pth")
+    else:
+        for index in range(2):
+            single = {key: part[index].clone() for key, part in parts.items()}
+            torch.save(single, tmp_path / f"sample_{index}.pth")
+    samples = list(read_samples(tmp_path, SENSOR))
+    assert [sample.name for sample in samples] == (
+        ["all/000000", "all/000001"] if stacked else ["sample_0", "sample_1"]
+    )
+    for sample, expected in zip(samples, images, strict=True):
+        assert_is(sample, expected)
+
+
+def test_half_precision_images_are_read(tmp_path):
+    torch.save(image().bfloat16(), tmp_path / "a.pth")
+    (sample,) = read_samples(tmp_path / "a.pth", SENSOR)
+    assert_is(sample, image().bfloat16().float())
+
+
+@pytest.mark.parametrize(("alignment", "protocol"), [(16, 4), (16, 5), (None, 4), (None, 3)])
+def test_joblib_list_of_clouds(tmp_path, monkeypatch, alignment, protocol):
+    clouds = [CLOUDS[0], np.asfortranarray(CLOUDS[1]), CLOUDS[1][:, :3].astype(np.float64)]
+    joblib_dump(clouds, tmp_path / "samples.pcd", monkeypatch, alignment, protocol)
+    samples = list(read_samples(tmp_path / "samples.pcd", SENSOR))
+    assert [sample.name for sample in samples] == ["000000", "000001", "000002"]
+    for sample, points in zip(samples, clouds, strict=True):
+        assert sample.points.tolist() == points.tolist()
+
+
+class Payload:
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+@pytest.mark.parametrize("suffix", ["pcd", "pth", "npy", "npz"])
+def test_no_file_runs_code(tmp_path, capsys, suffix):
+    file = tmp_path / f"evil.{suffix}"
+    objects = np.array([Payload()], dtype=object)
+    if suffix == "pcd":
+        file.write_bytes(pickle.dumps([Payload()]))
+    elif suffix == "pth":
+        torch.save([Payload()], file)
+    else:
+        {"npy": np.save, "npz": np.savez}[suffix](file, objects)
+    reason = {"pcd": "print is no array", "pth": "cannot be read as tensors alone"}
+    with pytest.raises(SampleError, match=f"evil.{suffix}.*{reason.get(suffix, 'not unpickled')}"):
+        list(read_samples(file, SENSOR))
+    assert capsys.readouterr().out == ""
+
+
+def images_file(change):
+    def write(path):
+        stack = torch.stack([image(0), image(1)])
+        np.savez(path / "img.npz", change(stack).numpy())
+
+    return write
+
+
+def setting(value, *index):
+    def change(stack):
+        stack[index] = value
+        return stack
+
+    return images_file(change)
+
+
+def tensor_file(content):
+    return lambda path: torch.save(content, path / "a.pth")
+
+
+def array_file(array):
+    return lambda path: np.save(path / "a.npy", array)
+
+
+def bytes_file(name, content):
+    return lambda path: (path / name).write_bytes(content)
+
+
+def cut(path):
+    write_npz(path / "a.npz", {"x": CLOUDS[0]})
+    (path / "a.npz").write_bytes((path / "a.npz").read_bytes()[:-30])
+
+
+def flipped(path):
+    np.savez_compressed(path / "a.npz", np.random.default_rng(0).random((9, 4)))
+    data = bytearray((path / "a.npz").read_bytes())
+    data[120] ^= 255
+    (path / "a.npz").write_bytes(data)
+
+
+BAD = {
+    "empty file": (bytes_file("a.txt", b""), r"a\.txt: is empty"),
+    "empty bin": (bytes_file("a.bin", b""), r"a\.bin: is empty"),
+    "other text": (bytes_file("a.txt", b"model: r3dpa\n"), r"a\.txt: starts with b'model: r3dpa"),
+    "ragged text": (bytes_file("a.txt", b"1 2 3\n4 5\n"), r"a\.txt: is not text rows"),
+    "narrow text": (bytes_file("a.txt", b"9 2\n4 5\n"), r"a\.txt: has rows of 2 numbers; needs 3"),
+    "real .pcd": (
+        bytes_file("a.pcd", b"# .PCD v0.7\nVERSION 0.7"),
+        r"a\.pcd: starts with b'# .PCD",
+    ),
+    "cut .pcd": (bytes_file("a.pcd", b"\x80\x04\x95"), r"a\.pcd: is not a joblib list of clouds"),
+    "no arrays": (bytes_file("a.pcd", pickle.dumps(3)), r"a\.pcd: is not a joblib list of clouds"),
+    "NaN": (bytes_file("a.txt", b"9 2 nan\n4 5 6\n"), r"a\.txt: has NaN or inf.* 1 of 2 points"),
+    "NaN in .bin": (
+        bytes_file("a.bin", np.full(4, np.nan, "<f4").tobytes()),
+        r"a\.bin: has NaN or infinite values in 1 of 1",
+    ),
+    "far": (bytes_file("a.txt", b"0 0 99\n0 0 0.5"), r"a\.txt: has no point within .* 1\.\.56 m"),
+    "no point": (array_file(np.zeros((0, 3), np.float32)), r"a\.npy: is an empty cloud"),
+    "no image": (array_file(np.zeros((0, 5, 4, 8), np.float32)), r"a\.npy: no sample .* empty"),
+    "bytes": (array_file(np.ones((2, 5, 4, 8), np.uint8)), r"a\.npy: holds uint8 numbers; metres"),
+    "vector": (array_file(np.ones(3)), r"a\.npy: has 1 axes; needs \(P, 3\)"),
+    "Fortran": (array_file(np.ones((8, 4, 5, 2)).T), r"a\.npy: is in Fortran order"),
+    "cut .npz": (cut, r"a\.npz: "),
+    "damaged .npz": (flipped, r"a\.npz: is damaged"),
+    "no member": (lambda path: np.savez(path / "a.npz"), r"a\.npz: "),
+    "no tensor": (tensor_file({"model": {}}), r"a\.pth: holds keys model; needs a float tensor"),
+    "no .pth": (bytes_file("a.pth", b"\x80\x02"), r"a\.pth: cannot be read as tensors alone"),
+    "unlike parts": (
+        tensor_file({"depth": torch.ones(1, 4, 8), "xyz": torch.ones(3, 4, 9)}),
+        r"a\.pth: holds tensors \[\(1, 4, 8\), \(3, 4, 9\)\]",
+    ),
+    "channels": (tensor_file(torch.ones(3, 4, 8)), r"a\.pth: has 3 channels; needs range"),
+    "image size": (
+        tensor_file(torch.ones(5, 8, 4)),
+        r"a\.pth: has an image of 8 x 4 pixels, but the sensor has 4 x 8; give the sensor",
+    ),
+    "encoded": (images_file(lambda s: s[:, :1] / 56 - 1), r"000000: .*values go from -1 to 0\.07"),
+    "NaN range": (setting(torch.nan, 1, 0, 3), r"img\.npz, sample 000001: has NaN .* 8 pixels"),
+    "NaN xyz": (setting(torch.nan, 1, 2, 3), r"sample 000001: channel 0 is not the length .* 8 of"),
+    "NaN intensity": (setting(torch.nan, 0, 4, 3), r"000000: has NaN or infinite intensities"),
+    "order": (images_file(lambda s: s[:, [1, 2, 3, 0, 4]].abs()), r"channel 0 is not the length"),
+    "mixed": (
+        lambda path: [write(path) for write in (cut, tensor_file(image()))],
+        r"several formats \(1 npz, 1 pth\)",
+    ),
+    "nothing": (bytes_file("a.png", b"x"), r"holds no samples; what can be read: clouds"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
+    write, message = BAD[kind]
+    write(tmp_path)
+    with pytest.raises(SampleError, match=message) as caught:
+        list(read_samples(tmp_path, SENSOR))
+    assert str(tmp_path) in str(caught.value)
+    assert isinstance(caught.value, ScanError)
+
+
+def test_missing_path_and_missing_format_are_named(tmp_path):
+    with pytest.raises(SampleError, match="there is no such file or folder"):
+        read_samples(tmp_path / "gone", SENSOR)
+    with pytest.raises(SampleError, match=r"holds no file with \.pth or \.pt"):
+        read_samples(tmp_path, SENSOR, format="pth")
+
+
+def test_bad_samples_are_counted_and_listed(tmp_path):
+    stack = torch.stack([image(seed) for seed in range(4)])
+    stack[1, 0] = torch.nan
+    stack[2, 0] = 0
+    np.savez(tmp_path / "a.npz", stack.numpy())
+    (tmp_path / "b.npz").write_bytes(b"PK no archive")
+    np.savez(tmp_path / "c.npz", image(5)[None].numpy())
+    samples = read_samples(tmp_path, SENSOR, skip_bad=True)
+    with pytest.warns(UserWarning, match=r"3 bad samples left out beside 3 good .*sample 000001"):
+        names = [sample.name for sample in samples]
+    assert names == ["a/000000", "a/000003", "c/000000"]
+    assert samples.num_read == 3
+    assert [next(s for s in ("a.npz", "b.npz") if s in bad) for bad in samples.bad] == [
+        "a.npz",
+        "a.npz",
+        "b.npz",
+    ]
+    with pytest.raises(SampleError, match=r"a\.npz.*sample 000001: has NaN"):
+        list(read_samples(tmp_path, SENSOR))
+
+
+def test_only_bad_samples_are_an_error(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"123")
+    with pytest.raises(SampleError, match=r"no sample can be used; all are bad; .*a\.bin: has 3 b"):
+        list(read_samples(tmp_path, SENSOR, skip_bad=True))
+
+
+def test_first_image_is_there_before_the_second_is_read(tmp_path):
+    file = tmp_path / "a.npy"
+    np.save(file, torch.stack([image(0), image(1)]).numpy())
+    file.write_bytes(file.read_bytes()[:-4])
+    samples = iter(read_samples(file, SENSOR))
+    assert_is(next(samples), image(0))
+    with pytest.raises(SampleError, match="sample 000001 of 2: ends after 636 of 640 bytes"):
+        next(samples)
+
+
+@pytest.mark.parametrize("kind", ["pth", "joblib"])
+def test_one_of_many_samples_is_read_at_a_time(tmp_path, monkeypatch, kind):
+    if kind == "pth":
+        torch.save(torch.stack([image(seed) for seed in range(3)]), tmp_path / "a.pth")
+    else:
+        joblib_dump(CLOUDS, tmp_path / "a.pcd", monkeypatch)
+    module, name = (torch, "cat") if kind == "pth" else (np, "frombuffer")
+    original, calls = getattr(module, name), []
+    monkeypatch.setattr(module, name, lambda *a, **k: calls.append(a) or original(*a, **k))
+    samples = iter(read_samples(tmp_path, SENSOR))
+    counts = [(next(samples), len(calls))[1] for _ in range(2)]
+    assert counts[1] == 2 * counts[0]
+
+
+def test_real_scan_is_its_own_sample(real_scans_dir):
+    file = next(iter(sorted(real_scans_dir.rglob("*.bin"))))
+    (sample,) = read_samples(file, LidarSensor())
+    rows = np.fromfile(file, "<f4").reshape(-1, 4)
+    length = np.linalg.norm(rows[:, :3].astype(float), axis=1)
+    assert len(sample.points) == np.count_nonzero((length > 1) & (length < 56))

@@ -1,0 +1,258 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.distances import Resampling
+from r3dpa.metrics.distribution import BEVHistogramDistance, MinimumMatchingDistance
+from r3dpa.metrics.evaluation import evaluate
+from r3dpa.metrics.frechet import FrechetDistance
+from r3dpa.metrics.functional import fd_infinity, precision_recall
+from r3dpa.metrics.functional_bev import chamfer_squared
+from r3dpa.metrics.protocol import DEFAULT
+from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene_features import SceneFeatures
+
+SENSOR = LidarSensor(beams=16, columns=64)
+PROTOCOL = replace(DEFAULT, sensor=SENSOR, voxel_m=1.0, num_samples=60)
+CARD = {"backbone": "toy", "layer": "all", "weights": "abc", "preprocessing": "none"}
+QUICK = Resampling(num_resamples=40)
+DISTANCES = {"JSD", "TV", "W1 range", "MMD", "CD 3D", "TOY", "TOY inf", "TOY KID"}
+SHARES = {"TOY precision", "TOY recall", "TOY density", "TOY coverage"}
+
+
+def toy(scenes):
+    """Mean, deviation and horizon of the range images."""
+    images = [scene.range_m for scene in scenes]
+    return torch.stack([torch.stack([i.mean(), i.std(), i[5].mean()]) for i in images]) / 20
+
+
+TOY = SceneFeatures("toy", "TOY", 3, CARD, toy)
+
+
+def scenes(seed=0, count=40, noise=0.0):
+    """Scans in a street of random width, of two drives; with any noise the streets are the same."""
+    generator, noise_generator = (torch.Generator().manual_seed(s) for s in (seed, 1000 + seed))
+    for i in range(count):
+        width, ground = 4 + 6 * torch.rand(2, generator=generator)
+        columns = width / (0.2 + torch.linspace(-3, 3, 64).sin().abs())
+        range_m = columns.clamp(max=50).expand(16, 64) + ground * torch.rand(
+            16, 1, generator=generator
+        )
+        range_m = range_m + noise * torch.randn(16, 64, generator=noise_generator).abs()
+        yield EvaluationScene(f"drive{i % 2}/{i:03d}", None, range_m)
+
+
+def reference_of(real, protocol=PROTOCOL, spaces=(TOY,)):
+    names = [scene.name for scene in real]
+    reference = ReferenceStatistics.prepare(spaces, protocol, names, {"split": "val"})
+    reference.update(real, spaces)
+    return reference
+
+
+def rows_of(made, reference, **options):
+    options = {"label": "made", "resampling": QUICK} | options
+    evaluation = evaluate(made, reference, [TOY], **options).evaluation
+    return {row.name: row for row in evaluation.rows}
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return reference_of(list(scenes()))
+
+
+def test_the_same_scenes_have_no_distance(reference):
+    rows = rows_of(scenes(), reference)
+    assert set(rows) == DISTANCES | SHARES
+    for name in DISTANCES - {"TOY inf", "TOY KID"}:
+        assert rows[name].value == pytest.approx(0, abs=1e-9), name
+    # Both are free of a bias that grows with few scenes, and may fall below 0.
+    assert rows["TOY inf"].value == pytest.approx(0, abs=0.005)
+    assert rows["TOY KID"].value < 0.01
+    for name in ("precision", "recall", "coverage"):
+        assert rows[f"TOY {name}"].value == 1.0
+
+
+def test_noise_makes_everything_worse(reference):
+    """Fresh streets; then the same ones with 1 m, 4 m and 12 m of noise in each pixel."""
+    clean, noisy, broken, lost = (
+        rows_of(scenes(1, noise=noise), reference) for noise in (0.0, 1.0, 4.0, 12.0)
+    )
+    for name in DISTANCES:
+        assert clean[name].value < noisy[name].value < broken[name].value, name
+    for name in SHARES:  # precision is the last to fall: balls around few scans are wide
+        assert clean[name].value > lost[name].value, name
+    for name in ("W1 range", "TOY", "CD 3D"):
+        assert clean[name].interval[1] < broken[name].interval[0], name
+
+
+def test_values_are_those_of_the_metrics_one_by_one(reference):
+    """The same numbers from the classes that see all scenes at once."""
+    rows = rows_of(scenes(1, 30, noise=1.0), reference)
+    real, made = (
+        [through_sensor(scene, PROTOCOL) for scene in part]
+        # The reference keeps the drives one after the other.
+        for part in (sorted(scenes(), key=lambda scene: scene.name), scenes(1, 30, noise=1.0))
+    )
+    clouds = [[scene.points for scene in part] for part in (real, made)]
+    bev, matching = BEVHistogramDistance(PROTOCOL.grid), MinimumMatchingDistance(PROTOCOL.grid)
+    frechet = FrechetDistance(3)
+    for metric, parts in ((bev, clouds), (matching, clouds), (frechet, [toy(real), toy(made)])):
+        metric.update(parts[0], real=True)
+        metric.update(parts[1], real=False)
+    assert rows["JSD"].value == pytest.approx(bev.compute()["jsd_distance"], rel=1e-9)
+    assert rows["TV"].value == pytest.approx(bev.compute()["total_variation"], rel=1e-9)
+    mmd = matching.compute()["mmd_squared_normalised"]
+    assert rows["MMD"].value == pytest.approx(mmd, rel=1e-9)
+    assert rows["TOY"].value == pytest.approx(frechet.compute().item(), rel=1e-6)
+    infinite = fd_infinity(toy(real), toy(made), torch.Generator().manual_seed(0))
+    assert rows["TOY inf"].value == pytest.approx(infinite.value, rel=1e-6)
+    shares = precision_recall(toy(real), toy(made))
+    assert {name: rows[f"TOY {name}"].value for name in vars(shares)} == vars(shares)
+    assert (rows["JSD"].num_samples, rows["JSD"].num_references) == (30, 40)
+
+
+def test_ranges_move_by_what_they_moved():
+    """All returns 2 m farther away: W1 is 2 m, and so is the mean; no matter how many returns."""
+    near = [
+        EvaluationScene(f"{d}/{i}", None, torch.full((16, 64), 10.05))
+        for d in "ab"
+        for i in range(3)
+    ]
+    far = [EvaluationScene(str(i), None, torch.full((16, 64), 12.05)) for i in range(4)]
+    rows = rows_of(far, reference_of(near), allow_few=True)
+    assert rows["W1 range"].value == pytest.approx(2.0)
+    assert rows["W1 range"].interval == pytest.approx((2.0, 2.0))
+    assert (rows["W1 range"].floor, rows["W1 range"].unit) == (0.0, "m")
+    # Mean and horizon both move by 2 m / 20; nothing varies.
+    assert rows["TOY"].value == pytest.approx(2 * 0.1**2, rel=1e-5)
+    clouds = [through_sensor(scene, PROTOCOL).points for scene in (near[0], far[0])]
+    assert rows["CD 3D"].value == pytest.approx(chamfer_squared(*clouds))
+
+
+def test_floors_are_between_the_drives(reference):
+    rows = rows_of(scenes(1), reference)
+    drives = [
+        [through_sensor(scene, PROTOCOL) for scene in scenes() if scene.name.startswith(drive)]
+        for drive in ("drive0", "drive1")
+    ]
+    bev, frechet = BEVHistogramDistance(PROTOCOL.grid), FrechetDistance(3)
+    for real, drive in zip((False, True), drives, strict=True):
+        bev.update([scene.points for scene in drive], real=real)
+        frechet.update(toy(drive), real=real)
+    assert rows["JSD"].floor == pytest.approx(bev.compute()["jsd_distance"], rel=1e-9)
+    assert rows["TOY"].floor == pytest.approx(frechet.compute().item(), rel=1e-6)
+    assert "floor of 20 and 20 scans" in rows["TOY"].note
+    assert rows["TOY precision"].floor is None  # no distance, so nothing ties with it
+    assert "real scans reach" in rows["TOY precision"].note
+    few = rows_of(scenes(1, 8), reference)
+    assert "floor of 8 and 20 scans" in few["TOY"].note  # compared at equal numbers
+
+
+def test_intervals_are_as_wide_as_fresh_sets_differ(reference):
+    """Half a 95 % interval is two standard deviations; both are estimates from few."""
+    sets = [rows_of(scenes(seed, noise=1.0), reference) for seed in range(2, 14)]
+    for name in ("W1 range", "TOY", "JSD"):
+        spread = torch.tensor([rows[name].value for rows in sets]).std().item()
+        ratio = sets[0][name].half_width / (2 * spread)
+        assert 0.4 < ratio < 2.5, (name, ratio)
+
+
+def test_results_repeat_and_go_through_json(reference, tmp_path):
+    told = {"solver": "heun", "steps": 5, "seed": 3, "weights": "ema"}
+    runs = [
+        evaluate(
+            scenes(1),
+            reference,
+            [TOY],
+            label="made",
+            source="files",
+            made_with=told,
+            commit="c0ffee",
+            resampling=QUICK,
+        ).evaluation
+        for _ in range(2)
+    ]
+    assert runs[0] == runs[1]
+    about = runs[0].about
+    assert (about["solver"], about["steps"], about["seed"], about["commit"]) == (
+        *("heun", 5, 3),
+        "c0ffee",
+    )
+    assert about["extra"]["weights"] == "ema"
+    assert about["extra"]["scenes"] == "40, where the protocol asks for 60"
+    assert about["backbones"]["TOY"] == CARD
+    assert about["protocol"]["unprojection"] == "centre"
+    assert about["reference"].startswith("val, 40 scans")
+    runs[0].save(tmp_path / "a.json")
+    assert Evaluation.load(tmp_path / "a.json") == runs[0]
+
+
+def test_only_as_many_scenes_as_the_protocol_counts():
+    reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
+    comparison = evaluate(scenes(1, 30), reference, [TOY], label="x", resampling=QUICK)
+    assert comparison.samples.count == 20
+    assert comparison.evaluation.about["extra"]["scenes"].startswith("only the first 20 were used")
+
+
+def test_corners_and_centres_differ_by_half_a_pixel():
+    """The protocol changes points, so cells and 3D distances change; ranges do not."""
+    real = list(scenes())
+    kinds = {}
+    for kind in ("centre", "corner"):
+        protocol = replace(PROTOCOL, unprojection=kind, voxel_m=0.25)
+        kinds[kind] = evaluate(
+            scenes(1, noise=1.0), reference_of(real, protocol), [TOY], label=kind, resampling=QUICK
+        )
+    rows = {k: {r.name: r.value for r in c.evaluation.rows} for k, c in kinds.items()}
+    for name in ("JSD", "TV", "MMD"):
+        assert rows["centre"][name] != rows["corner"][name], name
+        assert rows["centre"][name] == pytest.approx(rows["corner"][name], rel=0.3), name
+    assert rows["centre"]["W1 range"] == rows["corner"]["W1 range"]
+    assert rows["centre"]["TOY"] == rows["corner"]["TOY"]
+
+
+def test_few_scenes_are_refused_or_marked(reference):
+    with pytest.raises(
+        ValueError, match=r"3 generated scenes for the 3 features of TOY.*allow_few"
+    ):
+        rows_of(scenes(1, 3), reference)
+    rows = rows_of(scenes(1, 3), reference, allow_few=True)
+    assert rows["TOY"].note.startswith("3 scenes for 3 features")
+    assert (rows["TOY inf"].value, rows["TOY inf"].note) == (None, "needs 16 scenes of both kinds")
+    assert rows["TOY KID"].value is None
+    assert rows["TOY recall"].note == "needs 6 scenes of both kinds"
+    with pytest.raises(ValueError, match="1 generated scenes; a comparison needs at least 2"):
+        rows_of(scenes(1, 1), reference, allow_few=True)
+    small = reference_of(list(scenes(count=2)))
+    with pytest.raises(ValueError, match="2 real scans for the 3 features of TOY"):
+        rows_of(scenes(1), small)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (EvaluationScene("bad/1", torch.zeros(0, 3)), "bad/1: none of 0 points"),
+        (EvaluationScene("bad/1", torch.full((1, 3), math.nan)), "bad/1: cloud holds 3 NaN"),
+        (EvaluationScene("bad/1", None, torch.ones(8, 8)), r"bad/1: range image of shape \(8, 8\)"),
+        (EvaluationScene("bad/1", torch.tensor([[0.0, 52.0, 0.0]])), "bad/1: none of 1 points has"),
+    ],
+)
+def test_bad_scenes_are_named(reference, bad, message):
+    with pytest.raises(ValueError, match=message):
+        rows_of([*scenes(1, 5), bad], reference)
+
+
+def test_an_unfinished_reference_is_refused():
+    names = [scene.name for scene in scenes()]
+    reference = ReferenceStatistics.prepare([TOY], PROTOCOL, names, {})
+    with pytest.raises(ValueError, match="0 of 40 scans; repeat its command"):
+        rows_of(scenes(1), reference)
+    with pytest.raises(ValueError, match="no features of other, only of toy"):
+        evaluate(
+            scenes(), reference_of(list(scenes())), [replace(TOY, name="other")], label="other"
+        )

@@ -1,0 +1,179 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.protocol import DEFAULT
+from r3dpa.metrics.reference import (
+    ReferenceStatistics,
+    check_spaces,
+    resume_or_start,
+    split_halves,
+)
+from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene_features import SceneFeatures
+from r3dpa.metrics.scene_set import Chosen
+
+SENSOR = LidarSensor(beams=16, columns=64)
+PROTOCOL = replace(
+    DEFAULT, sensor=SENSOR, voxel_m=1.0, num_samples=8, num_mmd_samples=6, num_mmd_references=4
+)
+CARD = {"backbone": "toy", "layer": "all", "weights": "abc", "preprocessing": "none"}
+
+
+def toy(scenes):
+    return torch.stack([torch.stack([s.range_m.mean(), s.range_m.std()]) for s in scenes])
+
+
+TOY = SceneFeatures("toy", "TOY", 2, CARD, toy)
+
+
+def scenes(count=11):
+    """Scans of three drives with 1 / 3 of the scans each."""
+    generator = torch.Generator().manual_seed(0)
+    for i in range(count):
+        range_m = 5 + i + 9 * torch.rand(16, 64, generator=generator)
+        yield EvaluationScene(f"drive{i % 3}/{i:03d}", None, range_m)
+
+
+def empty(count=11, spaces=(TOY,), **changes):
+    about = {"data": "somewhere", "split": "val", "commit": "c0ffee"}
+    names = [scene.name for scene in scenes(count)]
+    return ReferenceStatistics.prepare(spaces, replace(PROTOCOL, **changes), names, about)
+
+
+def filled():
+    reference = empty()
+    reference.update(scenes(), [TOY], batch_size=2)
+    return reference
+
+
+def test_moments_and_histograms_are_those_of_all_scans():
+    reference = filled()
+    whole = reference.whole
+    features = toy([*scenes()]).double().numpy()
+    moments = whole.moments["toy"]
+    assert moments.mean.numpy() == pytest.approx(features.mean(axis=0), rel=1e-9)
+    assert moments.covariance().numpy() == pytest.approx(np.cov(features.T), rel=1e-9)
+    assert whole.count == moments.count == 11
+    ranges = torch.cat([scene.range_m.flatten() for scene in scenes()])
+    counts, _ = np.histogram(ranges.numpy(), bins=560, range=(0, 56))
+    assert whole.ranges.sum() == len(ranges)
+    # Float32 may put a range beside the border of its bin; the CDF then differs by that return.
+    assert np.abs(np.cumsum(counts) - np.cumsum(whole.ranges[0].numpy())).max() <= 5
+    clouds = [through_sensor(scene, PROTOCOL).points for scene in scenes()]
+    expected = PROTOCOL.grid.histogram(clouds)
+    assert torch.equal(whole.cells.view(100, 100).long(), expected)
+
+
+def test_kept_scans_are_few_and_the_halves_have_different_drives():
+    reference = filled()
+    drives = []
+    for half in reference.halves:
+        assert (len(half.rows), len(half.images)) == (4, 2)
+        drives.append({name.split("/")[0] for name, *_ in half.rows.items()})
+    assert drives[0].isdisjoint(drives[1])
+    assert [half.count for half in reference.halves] == [7, 4]
+    images = {scene.name: scene.range_m for scene in scenes()}
+    for name, _, image in reference.whole.images.items():
+        assert torch.equal(image, images[name])
+    assert reference.whole.features("toy").shape == (8, 2)
+
+
+def test_halves_are_whole_drives_or_ends_of_one():
+    names = ["a/0", "a/1", "a/2", "b/0", "c/0", "c/1", "d/0"]
+    halves = split_halves(names)  # a, then c and b into the smaller half, then d
+    assert [halves[name] for name in names] == [0, 0, 0, 1, 1, 1, 0]
+    assert split_halves(["a/0", "a/3", "a/1"]) == {"a/0": 0, "a/1": 0, "a/3": 1}
+
+
+def test_the_choice_does_not_depend_on_the_order():
+    names = [f"scan {i}" for i in range(50)]
+    choices = []
+    for order in (names, names[::-1]):
+        chosen = Chosen(7)
+        for place, name in enumerate(order):
+            chosen.offer(name, place, None)
+        choices.append({name for name, *_ in chosen.items()})
+    assert choices[0] == choices[1]
+    assert len(choices[0]) == 7
+    assert choices[0] != set(names[:7])
+
+
+def test_a_reference_comes_back_from_its_file(tmp_path):
+    reference = filled()
+    reference.save(tmp_path / "a.safetensors")
+    again = ReferenceStatistics.load(tmp_path / "a.safetensors")
+    again.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    assert again.complete
+    assert again.protocol == reference.protocol
+    assert again.describe() == reference.describe()
+    assert again.describe().startswith("somewhere, val, 11 scans, names ")
+
+
+def test_resumed_is_the_same_as_undisturbed(tmp_path):
+    undisturbed, partial = tmp_path / "a.safetensors", tmp_path / "partial.safetensors"
+    filled().save(undisturbed)
+
+    def killed():
+        for index, scene in enumerate(scenes()):
+            if index == 9:
+                raise KeyboardInterrupt
+            yield scene
+
+    with pytest.raises(KeyboardInterrupt):
+        empty().update(killed(), [TOY], partial, every=3, batch_size=2)  # every 4, whole batches
+    resumed = resume_or_start(empty(), partial)
+    assert resumed.num_done == 8
+    resumed.update(list(scenes())[8:], [TOY], partial, every=3, batch_size=2)
+    resumed.save(partial)
+    assert partial.read_bytes() == undisturbed.read_bytes()
+
+
+def test_what_another_job_has_left_is_refused(tmp_path):
+    partial = tmp_path / "partial.safetensors"
+    empty().save(partial)
+    assert resume_or_start(empty(), tmp_path / "none").num_done == 0
+    for other, key in (
+        (empty(12), "names"),
+        (empty(unprojection="corner"), "protocol"),
+        (empty(spaces=(replace(TOY, card={**CARD, "weights": "x"}),)), "spaces"),
+    ):
+        with pytest.raises(ValueError, match=f"of another job: its {key} differ.*delete the file"):
+            resume_or_start(other, partial)
+
+
+def test_scans_must_come_as_announced():
+    with pytest.raises(ValueError, match=r"number 0 on are .*drive1/001.* were announced"):
+        empty().update(list(scenes())[1:], [TOY])
+    with pytest.raises(ValueError, match="got 5 of 11 scans"):
+        empty().update(list(scenes(5)), [TOY], batch_size=1)
+    with pytest.raises(ValueError, match="given twice: a/0"):
+        ReferenceStatistics(PROTOCOL, {}, ["a/0", "a/0", "a/1"], {})
+    with pytest.raises(ValueError, match="at least 2 scans"):
+        ReferenceStatistics(PROTOCOL, {}, ["a/0"], {})
+
+
+def test_other_features_are_refused():
+    stored = empty().spaces
+    check_spaces(stored, [TOY])
+    with pytest.raises(ValueError, match="no features of fgeo, only of toy"):
+        check_spaces(stored, [replace(TOY, name="fgeo")])
+    with pytest.raises(ValueError, match="toy is not that of the reference: weights x not abc"):
+        check_spaces(stored, [replace(TOY, card={**CARD, "weights": "x"})])
+
+
+def test_files_of_something_else_are_named(tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
+        ReferenceStatistics.load(path)
+    path.write_bytes(b"no tensors at all")
+    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
+        ReferenceStatistics.load(path)
+    filled().save(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
+        ReferenceStatistics.load(path)
