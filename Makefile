@@ -19,7 +19,7 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation bench-features clean
+.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation bench-features bench-metrics clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
@@ -64,8 +64,10 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 		--num 16 --steps 64 --batch_size 16 --overwrite true
 	$(BIN)/r3dpa report $(OUT)/vae_alignment
 	$(BIN)/r3dpa report $(OUT)/joint
+	$(BIN)/r3dpa test --config $(OUT)/joint/config.yaml \
+		--ckpt_path $(OUT)/joint/checkpoints/last.ckpt
 
-bench: bench-training bench-simulation bench-features ## all of the following
+bench: bench-training bench-simulation bench-features bench-metrics ## all of the following
 
 bench-training: $(READY) ## one full-size training step of each stage: time and peak memory
 	$(BIN)/r3dpa bench training
@@ -75,6 +77,9 @@ bench-simulation: $(READY) ## what a simulated scan costs on one core, by part a
 
 bench-features: $(READY) ## what feature grids cost: building, reading, one pass of a network
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench features
+
+bench-metrics: $(READY) ## what metrics cost: networks, histograms, matching, sparse convolution
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench metrics
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

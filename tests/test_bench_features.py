@@ -70,7 +70,7 @@ class TestCompare:
         found = compare({"only": lambda: next(alternating)}, rounds=3)
         assert not found.sound
         assert found.repeat.value == 2
-        assert "claim nothing" in bench._comparison_table("table", found)
+        assert "claim nothing" in bench.comparison_table("table", found)
 
     def test_seconds_takes_the_time_of_the_function(self):
         import time
@@ -113,7 +113,7 @@ class TestNetwork:
         from r3dpa.bench import point_network
 
         times = iter([(0.0, 0.0), (1.0, 2.0), (3.0, 2.5), (7.0, 4.5)])
-        monkeypatch.setattr(point_network, "_now", lambda: next(times))
+        monkeypatch.setattr(point_network, "now", lambda: next(times))
         clock = _PartClock()
         clock.mark("a")
         clock.mark("b")

@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.utilities import rank_zero_info
 from matplotlib.figure import Figure
+from safetensors.torch import load_file, save_file
 from torch import Tensor
+from tqdm import tqdm
 
 from r3dpa import viz
-from r3dpa.data import write_bin
+from r3dpa.atomic import atomic_path
+from r3dpa.checkpoints import source_commit
+from r3dpa.data import Scan, write_bin
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import points_of
+from r3dpa.metrics.evaluation import check_counts
+from r3dpa.metrics.evaluation import evaluate as compare
+from r3dpa.metrics.protocol import PROTOCOLS
+from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
+from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
+from r3dpa.scoring import cached_reference, feature_spaces, report, save_reports
 
-__all__ = ["PictureLogger", "ReconstructionWriter", "RunCheckpoint"]
+__all__ = ["PictureLogger", "ReconstructionWriter", "RunCheckpoint", "SceneScorer"]
+
+_SAMPLER = SamplerConfig()
 
 
 class RunCheckpoint(ModelCheckpoint):
@@ -119,14 +137,219 @@ class PictureLogger(L.Callback):
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
 
     def _samples(self, module: GenerativeModule, average: EMA) -> Figure:
-        geometry = module.scan_geometry
-        generator = SceneGenerator(
-            module.vae,
-            average.sit,
-            average.latent_norm,
-            geometry,
-            self.sampler,
-            module.interpolant.path,
-        )
+        generator = _generator(module, average, self.sampler)
         scenes = generator.generate(range(self.num_scenes), self.seed)
-        return viz.scenes_sheet(list(scenes.range_m.cpu()), geometry.projection)
+        return viz.scenes_sheet(list(scenes.range_m.cpu()), generator.geometry.projection)
+
+
+class SceneScorer(L.Callback):
+    """Samples scenes after a test run and tells how near they are to real scans.
+
+    The processes share the sampling; the first one compares. Scenes are sampled in the same
+    batches whatever the number of processes, so that the numbers do not depend on it. It prints
+    the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and writes them with
+    tables and figures to ``<run_dir>/evaluation``, which all processes must see.
+
+    A stage that trains no velocity has nothing to sample, and says so.
+
+    Args:
+        num_scenes: Scenes to sample, more than there are features; 0 samples none.
+        batch_size: Scenes sampled together.
+        sampler: Solver and steps.
+        precision: Of the networks that sample.
+        seed: Of the scenes, see :class:`SceneGenerator`.
+        reference: File of ``r3dpa reference``. Without it, all scans of the data module are the
+            reference, training and held-out; their statistics are computed once and kept in
+            ``<run_dir>/evaluation/reference.safetensors``.
+        spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
+        ckpt: Official weights by space.
+        protocol: ``default`` or ``published``, which that of a reference file must be.
+        allow_few: Accept fewer scenes than features: only to try it.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        num_scenes: int = 256,
+        batch_size: int = 8,
+        sampler: SamplerConfig = _SAMPLER,
+        precision: Literal["fp32", "bf16"] = "fp32",
+        seed: int = 0,
+        reference: str | None = None,
+        spaces: list[str] | None = None,
+        ckpt: dict[str, str] | None = None,
+        protocol: Literal["default", "published"] = "default",
+        allow_few: bool = False,
+    ) -> None:
+        for name, value, least in (
+            ("num_scenes", num_scenes, 0),
+            ("batch_size", batch_size, 1),
+            ("seed", seed, 0),
+        ):
+            if value < least:
+                raise ValueError(f"scorer.{name} must be at least {least}, got {value}")
+        self.num_scenes = num_scenes
+        self.batch_size = batch_size
+        self.sampler = sampler
+        self.precision = precision
+        self.seed = seed
+        self.reference = reference
+        self.spaces = spaces
+        self.ckpt = ckpt or {}
+        self.protocol = protocol
+        self.allow_few = allow_few
+        self._job: tuple[ReferenceStatistics, list[SceneFeatures], list[Scan]] | None = None
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Checks all that can be checked before scenes are sampled."""
+        self._job = None
+        if not isinstance(pl_module, GenerativeModule) or not self.num_scenes:
+            return
+        if pl_module.ema is None:
+            rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
+            return
+        datamodule = getattr(trainer, "datamodule", None)
+        if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
+            raise TypeError(f"SceneScorer needs a LidarDataModule, got {type(datamodule).__name__}")
+        device = str(pl_module.device)
+        if self.reference is not None:
+            statistics, scans = ReferenceStatistics.load(self.reference), []
+            setting, names = statistics.protocol, tuple(statistics.spaces)
+            if setting.name != self.protocol:
+                raise ValueError(
+                    f"scorer.reference: {self.reference} is of the protocol {setting.name}, not "
+                    f"{self.protocol}; set scorer.protocol, or compute another one"
+                )
+            free = [name for name in names if name in (*FREE_SPACES, *self.ckpt)]
+            spaces = feature_spaces(self.spaces or free, self.ckpt, setting, device)
+            check_spaces(statistics.spaces, spaces)
+        else:
+            scans = datamodule.all_set.scans
+            setting = PROTOCOLS[self.protocol].with_sensor(datamodule.sensor)
+            names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
+            spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)
+            about = {
+                "data": str(datamodule.scans),
+                "split": "all",
+                "bytes": sum(scan.path.stat().st_size for scan in scans),  # names may stay
+                "commit": source_commit(),
+            }
+            scan_names = [scan.name for scan in scans]
+            statistics = ReferenceStatistics.prepare(spaces, setting, scan_names, about)
+        counts = {"generated scenes": self.num_scenes, "real scans": len(statistics.names)}
+        check_counts(counts, spaces, self.allow_few)
+        self._job = (statistics, spaces, scans)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Samples and compares."""
+        if self._job is None or not isinstance(pl_module, GenerativeModule):
+            return
+        statistics, spaces, scans = self._job
+        self._job = None
+        folder = Path(trainer.default_root_dir) / "evaluation"
+        made_with = self._sample(trainer, pl_module, folder)
+        trainer.strategy.barrier("SceneScorer")
+        if not trainer.is_global_zero:
+            return
+        if self.reference is None:
+            path = folder / "reference.safetensors"
+            statistics = cached_reference(statistics, scans, spaces, path)
+        comparison = compare(
+            self._sampled(pl_module, folder, statistics),
+            statistics,
+            spaces,
+            label=folder.absolute().parent.name,
+            source=str(trainer.ckpt_path),
+            made_with=made_with,
+            commit=source_commit(),
+            allow_few=self.allow_few,
+        )
+        shutil.rmtree(_parts(folder))
+        save_reports(comparison, statistics, folder)
+        trainer.print(report(comparison.evaluation, statistics))
+        _log(trainer, comparison.evaluation, trainer.global_step or pl_module.loaded_step)
+
+    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> dict[str, Any]:
+        """Writes the batches of this process; returns what made them."""
+        assert module.ema is not None
+        generator = _generator(module, module.ema, self.sampler, self.precision)
+        starts, nfe = range(0, self.num_scenes, self.batch_size), None
+        quiet = None if trainer.is_global_zero else True
+        for first in tqdm(
+            starts[trainer.global_rank :: trainer.world_size],
+            "sampling",
+            unit="batch",
+            disable=quiet,
+        ):
+            indices = range(first, min(first + self.batch_size, self.num_scenes))
+            scenes = generator.generate(indices, self.seed)
+            nfe = scenes.nfe
+            with atomic_path(_part(folder, first)) as temporary:
+                save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
+        return {
+            "solver": self.sampler.solver,
+            "steps": self.sampler.steps,
+            "seed": self.seed,
+            "precision": self.precision,
+            "feature_source": module.feature_source,
+            "checkpoint": str(trainer.ckpt_path),
+            "stage": module.stage,
+            "step": trainer.global_step or module.loaded_step,
+            "weights": "ema",
+            "nfe": nfe,
+            "sampler": asdict(self.sampler),
+        }
+
+    def _sampled(
+        self, module: GenerativeModule, folder: Path, statistics: ReferenceStatistics
+    ) -> Iterator[EvaluationScene]:
+        """Scenes of all processes, in order; as points where the reference has other pixels."""
+        projection = module.scan_geometry.projection
+        for first in range(0, self.num_scenes, self.batch_size):
+            images = load_file(_part(folder, first))["range_m"]
+            for index, range_m in enumerate(images, first):
+                name = f"{index:06d}"
+                if projection == statistics.protocol.projection:
+                    yield EvaluationScene(name, None, range_m)
+                else:
+                    yield EvaluationScene(name, points_of(range_m, projection))
+
+
+def _generator(
+    module: GenerativeModule,
+    average: EMA,
+    sampler: SamplerConfig,
+    precision: Literal["fp32", "bf16"] = "fp32",
+) -> SceneGenerator:
+    """Samples from the averaged weights of a module."""
+    return SceneGenerator(
+        module.vae,
+        average.sit,
+        average.latent_norm,
+        module.scan_geometry,
+        sampler,
+        module.interpolant.path,
+        precision,
+    )
+
+
+def _parts(folder: Path) -> Path:
+    return folder / "sampled"
+
+
+def _part(folder: Path, first: int) -> Path:
+    """File of the batch that starts with this scene."""
+    return _parts(folder) / f"{first:06d}.safetensors"
+
+
+def _log(trainer: L.Trainer, evaluation: Evaluation, step: int) -> None:
+    values = {
+        f"test/{row.name.replace(' ', '_')}": row.value
+        for row in evaluation.rows
+        if row.value is not None
+    }
+    for logger in trainer.loggers:
+        logger.log_metrics(values, step)
+        logger.save()

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 COMMANDS = {
     *("fit", "validate", "test", "predict", "features"),
     *("simulate", "check", "view", "realism", "sample", "convert", "report", "bench", "probe"),
-    *("reference", "evaluate"),
+    *("reference", "evaluate", "selfcheck"),
 }
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml

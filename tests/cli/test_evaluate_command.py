@@ -8,6 +8,7 @@ import torch
 import yaml
 
 import r3dpa.cli.evaluate as command
+from r3dpa import scoring
 from r3dpa.cli import main
 from r3dpa.cli.evaluate import evaluate_scenes
 from r3dpa.data.scans import write_bin, write_npz
@@ -115,7 +116,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
 def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
     undisturbed, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     command.reference(data, undisturbed, ["fgeo"])
-    read, seen = command.read_scan, []
+    read, seen = scoring.read_scan, []
 
     def dying(path, sensor):
         if len(seen) == 10:
@@ -123,7 +124,7 @@ def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
         seen.append(path)
         return read(path, sensor)
 
-    monkeypatch.setattr(command, "read_scan", dying)
+    monkeypatch.setattr(scoring, "read_scan", dying)
     with pytest.raises(KeyboardInterrupt):
         command.reference(data, out, ["fgeo"], every=8)
     partial = tmp_path / "b.partial.safetensors"

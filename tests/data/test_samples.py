@@ -8,7 +8,13 @@ import torch
 
 from r3dpa.data.samples import SampleError, read_samples
 from r3dpa.data.scans import ScanError, write_bin, write_npz, write_ply
-from r3dpa.geometry import LidarSensor, SphericalProjection, range_image, unproject
+from r3dpa.geometry import (
+    EMPTY_RANGE_M,
+    LidarSensor,
+    SphericalProjection,
+    range_image,
+    unproject,
+)
 
 SENSOR = LidarSensor(beams=4, columns=8)
 CLOUDS = [
@@ -34,7 +40,8 @@ def returns(image):
 def assert_is(sample, image):
     """The sample holds just the pixels of the image that are returns."""
     valid = returns(image)
-    torch.testing.assert_close(sample.range_m, image[0] * valid, rtol=0, atol=0)
+    expected = torch.where(valid, image[0], EMPTY_RANGE_M)
+    torch.testing.assert_close(sample.range_m, expected, rtol=0, atol=0)
     torch.testing.assert_close(sample.points[:, :3], image[1:4, valid].T, rtol=0, atol=0)
     if len(image) == 5:
         torch.testing.assert_close(sample.intensity, image[4] * valid, rtol=0, atol=0)
@@ -165,12 +172,13 @@ def test_stack_of_ranges_gets_its_points_from_the_rays(tmp_path, unprojection):
     expected = image()
     np.savez(tmp_path / "img.npz", expected[:1].numpy())  # (N, H, W), N = 1
     (sample,) = read_samples(tmp_path / "img.npz", SENSOR, unprojection=unprojection)
-    torch.testing.assert_close(sample.range_m, expected[0] * returns(expected), rtol=0, atol=0)
+    in_metres = torch.where(returns(expected), expected[0], EMPTY_RANGE_M)
+    torch.testing.assert_close(sample.range_m, in_metres, rtol=0, atol=0)
     back, _ = range_image(sample.points, SphericalProjection(SENSOR))
     first = sample.points[0] / sample.points[0].norm()
     azimuth = torch.atan2(first[1], first[0])  # of column 1 of 8, which starts 45 degrees from -x
     if unprojection == "centre":
-        torch.testing.assert_close(back.clamp(min=0), sample.range_m, rtol=0, atol=1e-4)
+        torch.testing.assert_close(back, sample.range_m, rtol=0, atol=1e-4)
     assert azimuth.rad2deg().item() == pytest.approx({"corner": 135, "centre": 112.5}[unprojection])
 
 
@@ -199,7 +207,7 @@ def test_golden_images_and_clouds_of_the_official_code(tmp_path, request):
         texts = list(read_samples(tmp_path / name / "pcd", sensor))
         for index, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             range_m, intensity = case[f"out/{name}/eval_range_images"][index]
-            assert np.array_equal(sample.range_m, np.maximum(range_m, 0))
+            assert np.array_equal(sample.range_m, range_m)
             assert np.array_equal(sample.intensity, intensity)
             assert np.array_equal(sample.points[:, :3], case[f"out/{name}/eval_pcd_{index}"])
             rounded = case[f"out/{name}/pcd_txt_{index}"]

@@ -56,15 +56,15 @@ def expected(name):
         return {"kid_mean": mean, "kid_std": std}
     if name == "prdc":
         return vars(precision_recall(real, generated, 3))
+    outside = {
+        f"{which}_outside_share": len(part) / sum(map(len, part))
+        for which, part in (("real", real), ("generated", generated))
+    }
     if name == "bev":
-        outside = {
-            f"{which}_outside_share": len(part) / sum(map(len, part))
-            for which, part in (("real", real), ("generated", generated))
-        }
         return vars(histogram_distance(GRID.histogram(real), GRID.histogram(generated))) | outside
     cells = [[GRID.cells(cloud) for cloud in part] for part in (real, generated)]
     value = minimum_matching(*cells, GRID).mmd_squared_normalised
-    return {"mmd_squared_normalised": value, "mmd_m2": value * 16**2}
+    return {"mmd_squared_normalised": value, "mmd_m2": value * 16**2} | outside
 
 
 @pytest.mark.parametrize("name", ["kid", "prdc", "bev", "mmd"])

@@ -256,3 +256,14 @@ def test_an_unfinished_reference_is_refused():
         evaluate(
             scenes(), reference_of(list(scenes())), [replace(TOY, name="other")], label="other"
         )
+
+
+def test_points_beyond_the_grid_are_told(reference):
+    """Straight ahead, 2 of 64 columns, 55 m are beyond the grid of 50 m."""
+    inside = list(scenes(1))
+    assert not rows_of(inside, reference)["MMD"].note.startswith(tuple("0123456789"))
+    far = [scene._replace(range_m=scene.range_m.clone()) for scene in inside]
+    for scene in far:
+        scene.range_m[:, 31:33] = 55.0
+    note = rows_of(far, reference)["MMD"].note
+    assert note.startswith("3.12% of the points, 0.00% of the real ones, lie beyond the grid")

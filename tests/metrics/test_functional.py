@@ -423,6 +423,12 @@ def test_interval_of_a_mean():
     assert again == interval
 
 
+def test_what_resampling_adds_is_taken_off():
+    """Of 100 indices a resample holds 63.4 on average, 1 - 1/e of them: ends around 136.6."""
+    found = bootstrap_interval(lambda i: len(i.unique()), [100], torch.Generator().manual_seed(0))
+    assert found.value == 100 < found.low < 136.6 < found.high < 150
+
+
 def test_paired_sets_are_resampled_alike():
     x = draw(50)
 

@@ -104,6 +104,8 @@ def test_protocols_come_back_from_plain_values():
         replace(DEFAULT, unprojection="middle")
     with pytest.raises(ValueError, match="num_samples must be above 0"):
         replace(DEFAULT, num_samples=0)
+    with pytest.raises(ValueError, match=r"2500 cells along a side.*2048; give at least 0\.0488"):
+        replace(DEFAULT, voxel_m=0.04)
 
 
 # --- spaces ---
@@ -149,6 +151,20 @@ def test_the_cast_of_lip_loc_is_that_of_the_protocol():
     assert torch.equal(features(CORNER, near), network(near[None]))
     assert not torch.allclose(features(CORNER, near), features(CENTRE, near))
     assert not torch.allclose(features(CORNER, far), features(CENTRE, far))
+
+
+def test_gpus_do_not_round_the_factors_of_convolutions():
+    """Features are those of a CPU: TF32 is off inside, and as it was behind."""
+    inside = []
+
+    def extract(scenes):
+        inside.append((torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled))
+        return torch.zeros(len(scenes), 2)
+
+    before = torch.backends.cudnn.allow_tf32
+    SceneFeatures("toy", "TOY", 2, {}, extract)(seen(1))
+    assert inside == [(False, True)]
+    assert torch.backends.cudnn.allow_tf32 == before
 
 
 @pytest.mark.parametrize("network_class", [MinkowskiNet, SPVCNN])

@@ -402,9 +402,14 @@ def test_files_are_named_in_errors(tmp_path):
     for _, path, load in released(tmp_path, keep_nothing):
         with pytest.raises(ValueError, match=rf"{path.name}: holds no"):
             load()
-        torch.save({"model": {}}, path)
+        torch.save({"model": {}}, path, _use_new_zipfile_serialization=False)
         with pytest.raises(ValueError, match=rf"{path.name}: holds no entry state_dict"):
             load()
+        whole = path.read_bytes()
+        for length in (1, 2, len(whole) // 2):  # each stops the reader in another way
+            path.write_bytes(whole[:length])
+            with pytest.raises(ValueError, match=rf"{path.name}: is damaged"):
+                load()
         path.write_bytes(pickle.dumps(print, protocol=2))  # would be imported by a plain torch.load
         with pytest.raises(ValueError, match=rf"{path.name}: is damaged, or holds more"):
             load()

@@ -228,5 +228,7 @@ def test_pooling_by_hand():
     assert pool_voxels(features, coordinates, 3, "all").tolist() == [[2, 20], [0, 0], [7, 60]]
     beyond = torch.tensor([[1200, 0, 0, 0], [-1200, 0, 0, 0]])  # 60 m
     assert not pool_voxels(features[:2], beyond, 1).any()
+    above = torch.tensor([[120, 0, 160, 0], [-120, 0, -160, 0]])  # 6 m aside, 10 m in space
+    assert pool_voxels(features[:2], above, 1).view(16, 2)[1].tolist() == [2, 20]
     with pytest.raises(ValueError, match="rings, sectors or all, got 'depth'"):
         pool_voxels(features, coordinates, 3, "depth")

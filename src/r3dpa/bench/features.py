@@ -77,7 +77,7 @@ def features(
         ScanError: If the scan cannot be used.
     """
     sizes = _QUICK if quick else _Sizes()
-    points = _simulated() if scan is None else torch.from_numpy(read_scan(scan, LidarSensor()))
+    points = simulated_scan() if scan is None else torch.from_numpy(read_scan(scan, LidarSensor()))
     threads_given, cores = torch.get_num_threads(), os.cpu_count() or 1
     building = {}
     # A few threads on a busy machine wait for each other, for seconds: not when only trying.
@@ -119,7 +119,7 @@ def features(
     lines: list[str] = []
     for threads, comparison in building.items():
         title = f"grid of {len(points)} points x {sizes.dim}, {threads} thread(s)"
-        lines += [_comparison_table(title, comparison), ""]
+        lines += [comparison_table(title, comparison), ""]
     for name, comparison in reading.items():
         lines += [_reading_table(name, comparison, sizes.reads, sizes_on_disk), ""]
     lines += [f"opening a store of {sizes.open_rows} grids: {opening:.3g} s", ""]
@@ -165,7 +165,7 @@ def _loop_over_cells(xyz: Tensor, values: Tensor) -> Tensor:
     return grid
 
 
-def _simulated() -> Tensor:
+def simulated_scan() -> Tensor:
     """A scan of a dry street."""
     scene = Street(0, 0, Weather()).scene(0)
     return torch.from_numpy(simulate_scan(scene, hdl64e(), (0, "effects", 0, 0)).points)
@@ -310,7 +310,7 @@ def _verdict(comparison: Comparison) -> str:
     return f"first case over itself: {found}{end}"
 
 
-def _comparison_table(title: str, comparison: Comparison) -> str:
+def comparison_table(title: str, comparison: Comparison) -> str:
     """Times and ratios of the cases."""
     rows = []
     for name, ms in comparison.ms.items():

@@ -98,11 +98,11 @@ class _PartClock:
 
     def __init__(self) -> None:
         self.seconds: dict[str, tuple[float, float]] = {}
-        self._last = _now()
+        self._last = now()
 
     def mark(self, part: str) -> None:
         """The time since the last mark belongs to ``part``."""
-        wall, core = _now()
+        wall, core = now()
         before, (last_wall, last_core) = self.seconds.get(part, (0.0, 0.0)), self._last
         self.seconds[part] = before[0] + wall - last_wall, before[1] + core - last_core
         self._last = wall, core
@@ -132,14 +132,14 @@ def _measure(name: str, values: Any, threads: int) -> NetworkCost:
     points = torch.from_numpy(values)
     extractor: Any = NETWORKS[name]()
     network = next(part for part in extractor.modules() if isinstance(part, WaffleIron))
-    start, core_start = _now()
+    start, core_start = now()
     clock = _PartClock()
     clock.watch(extractor)
     prepared = extractor.prepare(points)
     clock.mark("preparation")
     (features,) = extractor.point_features([prepared])
     clock.mark("upsampling")
-    end, core_end = _now()
+    end, core_end = now()
     peak = _peak_host_bytes()
 
     num_points, num_neighbors = prepared.neighbors.shape
@@ -156,8 +156,8 @@ def _measure(name: str, values: Any, threads: int) -> NetworkCost:
     return NetworkCost(seen, *spent, peak, flop_s / 1e9, bytes_s / 1e9, parts)
 
 
-def _now() -> tuple[float, float]:
-    """Wall and core seconds."""
+def now() -> tuple[float, float]:
+    """Wall seconds, and seconds of all cores together."""
     return time.perf_counter(), time.process_time()
 
 

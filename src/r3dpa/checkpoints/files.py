@@ -8,7 +8,6 @@ import hashlib
 import json
 import pickle
 import re
-import struct
 import subprocess
 import zipfile
 from collections.abc import Mapping
@@ -25,6 +24,7 @@ from r3dpa import __version__
 from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
 from r3dpa.checkpoints.official import from_official, is_official
+from r3dpa.unpickling import UNPICKLING_ERRORS
 
 __all__ = [
     "official_neighbour",
@@ -56,21 +56,6 @@ _LIGHTNING = {
     "ema": ("ema.sit.", "sit"),
     "ema_latent_norm": ("ema.latent_norm.", "latent_norm"),
 }
-# What unpickling a damaged file raises, depending on where the damage is.
-_DAMAGE = (
-    OSError,
-    RuntimeError,
-    EOFError,
-    ValueError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    TypeError,
-    OverflowError,
-    AssertionError,
-    struct.error,
-    zipfile.BadZipFile,
-)
 
 
 @functools.cache
@@ -232,7 +217,7 @@ def _load_pickle(path: Path) -> Any:
             f"the file would run {forbidden[1]} when loaded; only tensors, plain values and "
             "argparse.Namespace are read"
         ) from error
-    except _DAMAGE as error:
+    except (*UNPICKLING_ERRORS, OSError, zipfile.BadZipFile) as error:
         raise ValueError(f"the file is damaged or incomplete ({_first_line(error)})") from error
 
 

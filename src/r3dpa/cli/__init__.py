@@ -264,6 +264,7 @@ def evaluate(
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
+    split: Literal["val", "all"] | None = None,
 ) -> None:
     """Tell how near the samples of any generator are to real scans.
 
@@ -273,7 +274,7 @@ def evaluate(
     Args:
         samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
             or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
-        reference: File of ``r3dpa reference``.
+        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``.
         spaces: Feature spaces, separated by commas; where not given, those of the reference that
             need no file or have one in ``ckpt``.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
@@ -284,14 +285,46 @@ def evaluate(
         label: Name of the generator in tables; that of ``samples`` where not given.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
+        split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
     """
     from r3dpa.cli.evaluate import evaluate as compare
 
     if out is not None:
         _check_folder(out)
     names = None if spaces is None else _words(spaces)
-    options = (skip_bad, allow_few, allow_oracle, label, device, out)
+    options = (skip_bad, allow_few, allow_oracle, label, device, out, split)
     _print(compare(samples, reference, names, ckpt, protocol, *options))
+
+
+def selfcheck(
+    data: Path,
+    against: Path | None = None,
+    spaces: str = "fwid,fgeo",
+    ckpt: dict[str, Path] | None = None,
+    protocol: Literal["default", "published"] = "default",
+    limit: int | None = None,
+    device: str = "auto",
+    out: Path | None = None,
+) -> None:
+    """Tell whether every metric worsens when real scans are made worse step by step.
+
+    One half of the scans is compared with the other half: as it is, with noise on its ranges, with
+    points dropped, and turned; of other drives where there are several.
+
+    Args:
+        data: Folder of real scans, in the KITTI-360 layout or any other.
+        against: Folder of simulated scans, to be compared with the same half.
+        spaces: Feature spaces, separated by commas, as for ``r3dpa reference``.
+        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
+        protocol: ``default`` or ``published``, as for ``r3dpa reference``.
+        limit: Use this many real scans at most, spread evenly.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        out: JSON file for all numbers.
+    """
+    from r3dpa.cli.selfcheck import selfcheck as check_metrics
+
+    _check_file(out)
+    _print(check_metrics(data, against, _words(spaces), ckpt, protocol, limit, device, out))
 
 
 def convert(
@@ -390,16 +423,33 @@ def bench_features(
     _print(features(scan, out, quick, wi48))
 
 
+def bench_metrics(scan: Path | None = None, out: Path | None = None, quick: bool = False) -> None:
+    """Time the networks of the metrics, JSD, MMD and sparse convolution; print the cost.
+
+    JSD, MMD and the convolution run beside a plain way to the same result, which must agree.
+
+    Args:
+        scan: KITTI ``.bin`` file; a simulated scan where not given.
+        out: JSON file for the same figures.
+        quick: Small sizes, only to try it.
+    """
+    from r3dpa.bench.metrics import metrics
+
+    _check_file(out)
+    _print(metrics(scan, out, quick))
+
+
 _BENCHES: dict[str, Callable[..., None]] = {
     "training": bench_training,
     "simulation": bench_simulation,
     "features": bench_features,
+    "metrics": bench_metrics,
 }
 _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__: command
     for command in (
         *(simulate, check, view, realism, probe),
-        *(sample, reference, evaluate, convert, report),
+        *(sample, reference, evaluate, selfcheck, convert, report),
     )
 }
 

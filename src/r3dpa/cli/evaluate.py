@@ -3,34 +3,45 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 from tqdm import tqdm
 
 from r3dpa.checkpoints import refuse_leak, source_commit
-from r3dpa.cli.evaluation_report import report, save_reports
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
 from r3dpa.data.samples import read_samples
-from r3dpa.data.scans import Scan, evenly, read_scan
+from r3dpa.data.scans import Scan, evenly
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.distances import Resampling
 from r3dpa.metrics.evaluation import Comparison
 from r3dpa.metrics.evaluation import evaluate as compare
+from r3dpa.metrics.official_statistics import (
+    OfficialSplit,
+    OfficialStatistics,
+    evaluate_official,
+    is_official,
+)
 from r3dpa.metrics.protocol import PROTOCOLS
-from r3dpa.metrics.reference import ReferenceStatistics, resume_or_start
+from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures, scene_features
+from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
+from r3dpa.scoring import (
+    AnyReference,
+    complete_reference,
+    feature_spaces,
+    report,
+    save_reports,
+    save_tables,
+)
 
 __all__ = ["evaluate", "evaluate_scenes", "reference"]
 
 SplitName = Literal["train", "val", "all"]
-_EVERY = 2000  # scans between two savings of an unfinished reference
 _SHOWN_BAD = 20  # messages of unusable samples that are kept
 
 
@@ -43,7 +54,7 @@ def reference(
     limit: int | None = None,
     protocol: str = "default",
     device: str = "auto",
-    every: int = _EVERY,
+    every: int = 2000,
 ) -> str:
     """Statistics of real scans for ``r3dpa evaluate``; see ``r3dpa reference --help``.
 
@@ -70,22 +81,11 @@ def reference(
         raise ValueError(f"{out} exists: delete it, or give another --out")
     scans, sensor = _scans(data, split, limit)
     setting = PROTOCOLS[protocol].with_sensor(sensor)
-    found = _spaces(spaces, ckpt, setting, device)
+    found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
     names = [scan.name for scan in scans]
-    partial = out.with_name(f"{out.stem}.partial{out.suffix}")
-    statistics = resume_or_start(ReferenceStatistics.prepare(found, setting, names, about), partial)
-
-    def scenes() -> Iterator[EvaluationScene]:
-        start = statistics.num_done
-        for scan in tqdm(
-            scans[start:], "reference", len(scans), initial=start, unit="scan", disable=None
-        ):
-            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
-
-    statistics.update(scenes(), found, partial, every)
-    statistics.save(partial)
-    partial.replace(out)
+    job = ReferenceStatistics.prepare(found, setting, names, about)
+    statistics = complete_reference(job, scans, found, out, every)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
@@ -101,12 +101,13 @@ def evaluate(
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
+    split: OfficialSplit | None = None,
 ) -> str:
     """Compares samples in files with real scans; see ``r3dpa evaluate --help``.
 
     Args:
         samples: File or folder, see :func:`r3dpa.data.samples.read_samples`.
-        reference: File of ``r3dpa reference``.
+        reference: File of ``r3dpa reference``, or the official statistics file.
         spaces: Feature spaces; where None, those of the reference that need no file or that
             ``ckpt`` has one for.
         ckpt: Their weights by name.
@@ -116,7 +117,8 @@ def evaluate(
         allow_oracle: Accept samples of a model that learned from labels.
         label: Of the generator; the name of ``samples`` where None.
         device: Where the networks compute.
-        out: Folder for tables and figures.
+        out: Folder for tables and figures; without figures for the official file.
+        split: Part of the official file, see :meth:`OfficialStatistics.load`.
 
     Returns:
         The numbers, and a table with the published ones.
@@ -126,32 +128,49 @@ def evaluate(
     """
     made_with = _made_with(samples)
     refuse_leak(made_with.get("feature_source"), str(samples), allow=allow_oracle)
-    statistics = ReferenceStatistics.load(reference)
+    statistics = _load(reference, split)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
     )
     progress = tqdm((EvaluationScene(*scene) for scene in files), "samples", disable=None)
-    comparison = evaluate_scenes(
-        progress,
-        statistics,
-        label=label or samples.stem,
-        source=str(samples),
-        spaces=spaces,
-        ckpt=ckpt,
-        protocol=protocol,
-        made_with=made_with,
-        allow_few=allow_few,
-        device=device,
-    )
+    found = _chosen_spaces(statistics, spaces, ckpt, protocol, device)
+    options: dict[str, Any] = {
+        "label": label or samples.stem,
+        "source": str(samples),
+        "made_with": made_with,
+        "commit": source_commit(),
+        "allow_few": allow_few,
+    }
+    comparison = None
+    if isinstance(statistics, OfficialStatistics):
+        evaluation = evaluate_official(progress, statistics, found, **options)
+    else:
+        comparison = compare(progress, statistics, found, **options)
+        evaluation = comparison.evaluation
     if files.bad:
-        about = comparison.evaluation.about
         bad = {"count": len(files.bad), "first": files.bad[:_SHOWN_BAD]}
-        about = {**about, "extra": {**about["extra"], "bad_samples": bad}}
-        comparison = comparison._replace(evaluation=replace(comparison.evaluation, about=about))
+        extra = {**evaluation.about["extra"], "bad_samples": bad}
+        evaluation = replace(evaluation, about={**evaluation.about, "extra": extra})
     if out is not None:
-        save_reports(comparison, statistics, out)
-    return report(comparison.evaluation, statistics)
+        if comparison is None:
+            save_tables(evaluation, statistics, out)
+        else:
+            assert isinstance(statistics, ReferenceStatistics)
+            save_reports(comparison._replace(evaluation=evaluation), statistics, out)
+    return report(evaluation, statistics)
+
+
+def _load(path: Path, split: OfficialSplit | None) -> AnyReference:
+    """Reference of either kind."""
+    if is_official(path):
+        return OfficialStatistics.load(path, split)
+    if split is not None:
+        raise ValueError(
+            f"{path}: is no official statistics file, so --split {split} does not apply to it; "
+            "leave it out"
+        )
+    return ReferenceStatistics.load(path)
 
 
 def evaluate_scenes(
@@ -187,15 +206,7 @@ def evaluate_scenes(
         ValueError: If the reference is of another protocol or lacks a space, or as
             :func:`r3dpa.metrics.evaluation.evaluate`.
     """
-    setting = statistics.protocol
-    if protocol is not None and protocol != setting.name:
-        raise ValueError(
-            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
-            f"with `r3dpa reference --protocol {protocol}`"
-        )
-    if spaces is None:
-        spaces = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
-    found = _spaces(spaces, ckpt, setting, device)
+    found = _chosen_spaces(statistics, spaces, ckpt, protocol, device)
     return compare(
         scenes,
         statistics,
@@ -209,20 +220,23 @@ def evaluate_scenes(
     )
 
 
-def _spaces(
-    names: Sequence[str], ckpt: Mapping[str, Path] | None, protocol: Any, device: str
+def _chosen_spaces(
+    statistics: AnyReference,
+    spaces: Sequence[str] | None,
+    ckpt: Mapping[str, Path] | None,
+    protocol: str | None,
+    device: str,
 ) -> list[SceneFeatures]:
-    """Feature spaces by name; every weight file must belong to one of them."""
-    if len(set(names)) < len(names):
-        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
-    unused = [name for name in ckpt or {} if name not in names]
-    if unused:
+    """Feature spaces of a comparison; the arguments are those of :func:`evaluate`."""
+    setting = statistics.protocol
+    if protocol is not None and protocol != setting.name:
         raise ValueError(
-            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)})"
+            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
+            f"with `r3dpa reference --protocol {protocol}`"
         )
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
+    if spaces is None:
+        spaces = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
+    return feature_spaces(spaces, ckpt, setting, device)
 
 
 def _scans(data: Path, split: SplitName, limit: int | None) -> tuple[list[Scan], LidarSensor]:

@@ -10,7 +10,7 @@ from typing import Any, cast
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
-from r3dpa.callbacks import RunCheckpoint
+from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint, refuse_leak
 from r3dpa.modules import GenerativeModule
 
@@ -53,11 +53,12 @@ class StageCLI(LightningCLI):
     """
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Adds ``run_dir`` and the checkpoint callback that follows it."""
+        """Adds ``run_dir``, the checkpoint callback that follows it, and the one that scores."""
         parser.add_argument(
             "--run_dir", type=str, default="runs/default", help="folder that the run writes to"
         )
         parser.add_lightning_class_args(RunCheckpoint, "checkpoint")
+        parser.add_lightning_class_args(SceneScorer, "scorer")
         parser.set_defaults({"checkpoint.save_last": True, "checkpoint.filename": "{step:07d}"})
         parser.link_arguments("run_dir", "trainer.default_root_dir")
         parser.link_arguments(

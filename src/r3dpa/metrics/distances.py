@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from r3dpa.metrics.bootstrap import bootstrap_interval
 from r3dpa.metrics.functional_bev import (
+    BEVGrid,
     Matching,
     chamfer_squared,
     histogram_distance,
@@ -19,7 +20,9 @@ from r3dpa.metrics.measures import wasserstein_1
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene_set import RANGE_BIN_M, SceneSet
 
-Interval = tuple[float, float]
+Ends = tuple[float, float]
+#: Generated scenes and real scans; None where their number is not known.
+Counts = tuple[int, int | None]
 
 #: Powers of ten that the published table prints its columns in.
 _SCALES = {"FLD": -1, "JSD": -2, "MMD": -5}
@@ -42,7 +45,7 @@ class Resampling:
         """Fresh source of randomness."""
         return torch.Generator().manual_seed(self.seed)
 
-    def interval(self, statistic: Callable[[Tensor], float], size: int) -> Interval | None:
+    def interval(self, statistic: Callable[[Tensor], float], size: int) -> Ends | None:
         """Bootstrap interval over one set of samples; None where it has fewer than two."""
         if size < 2 or not self.num_resamples:
             return None
@@ -60,11 +63,30 @@ def histogram_rows(
     The bootstrap resamples the groups that the histograms of the generated scenes are counted in.
     """
     counts = (generated.count, real.count)
-    groups = min(generated.count, len(generated.cells))
-    real_cells = real.cells.sum(dim=0)
+    real_ranges, ranges = real.ranges.sum(dim=0).double(), generated.ranges.double()
+
+    def range_distance(counted: Tensor) -> float:
+        return wasserstein_1(real_ranges.numpy(), counted.numpy(), RANGE_BIN_M)
+
+    return [
+        *cell_rows(real.cells.sum(dim=0), generated, counts, resampling),
+        _histogram_row("W1 range", range_distance, ranges, counts, resampling, "m"),
+    ]
+
+
+def cell_rows(
+    real_cells: Tensor, generated: SceneSet, counts: Counts, resampling: Resampling
+) -> list[MetricResult]:
+    """JSD and TV of occupied cells alone, as :func:`histogram_rows` has them.
+
+    Args:
+        real_cells: ``(cells,)``, real scans that occupy each cell.
+        generated: Generated scenes.
+        counts: Generated scenes and, where it is known, real scans.
+        resampling: Of the intervals.
+    """
     occupied = (real_cells > 0) | (generated.cells > 0).any(dim=0)
     real_cells, cells = real_cells[occupied].double(), generated.cells[:, occupied].float()
-    real_ranges, ranges = real.ranges.sum(dim=0).double(), generated.ranges.double()
 
     def jsd(counted: Tensor) -> float:
         return histogram_distance(real_cells, counted).jsd_distance
@@ -72,29 +94,31 @@ def histogram_rows(
     def total_variation(counted: Tensor) -> float:
         return histogram_distance(real_cells, counted).total_variation
 
-    def range_distance(counted: Tensor) -> float:
-        return wasserstein_1(real_ranges.numpy(), counted.numpy(), RANGE_BIN_M)
-
-    def row(
-        name: str,
-        distance: Callable[[Tensor], float],
-        table: Tensor,
-        unit: str = "",
-        note: str = "",
-    ) -> MetricResult:
-        def resampled(drawn: Tensor) -> float:
-            weights = torch.bincount(drawn, minlength=len(table)).to(table)
-            return distance(weights @ table)
-
-        ends = resampling.interval(resampled, groups)
-        value = distance(table.sum(dim=0))
-        return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
-
+    half = "half of what the official code calls TV"
     return [
-        row("JSD", jsd, cells),
-        row("TV", total_variation, cells, note="half of what the official code calls TV"),
-        row("W1 range", range_distance, ranges, "m"),
+        _histogram_row("JSD", jsd, cells, counts, resampling),
+        _histogram_row("TV", total_variation, cells, counts, resampling, note=half),
     ]
+
+
+def _histogram_row(
+    name: str,
+    distance: Callable[[Tensor], float],
+    table: Tensor,
+    counts: Counts,
+    resampling: Resampling,
+    unit: str = "",
+    note: str = "",
+) -> MetricResult:
+    """Distance of the sum of the groups ``(G, bins)`` of generated scenes."""
+
+    def resampled(drawn: Tensor) -> float:
+        weights = torch.bincount(drawn, minlength=len(table)).to(table)
+        return distance(weights @ table)
+
+    ends = resampling.interval(resampled, min(counts[0], len(table)))
+    value = distance(table.sum(dim=0))
+    return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
 
 
 def matching_rows(
@@ -103,33 +127,46 @@ def matching_rows(
     """MMD of occupied cells, and the 3D Chamfer distance of the scenes it matches.
 
     The 3D distance is the mean over up to 200 real scans, each with the generated scene that is
-    nearest to it by its cells. Intervals are over the real scans.
+    nearest to it by its cells. Intervals are over the real scans. Points beyond the grid do not
+    count in MMD, by its definition; its note tells their share.
     """
     grid = real.protocol.grid
-    references, samples = (
-        [grid.cells(cloud) for cloud in scenes.clouds(range(len(scenes.images)))]
-        for scenes in (real, generated)
+    (references, real_beyond), (samples, beyond) = (
+        _cells_and_share_beyond(scenes, grid) for scenes in (real, generated)
     )
+    note = f"{beyond:.2%} of the points, {real_beyond:.2%} of the real ones, lie beyond the grid"
     matching = minimum_matching(references, samples, grid)
     nearest = matching.nearest[:_CHAMFER_PAIRS].tolist()
     pairs = zip(real.clouds(range(len(nearest))), generated.clouds(nearest), strict=True)
     chamfer = torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)
 
-    def row(name: str, values: Tensor, unit: str = "") -> MetricResult:
+    def row(name: str, values: Tensor, unit: str = "", note: str = "") -> MetricResult:
         ends = resampling.interval(lambda drawn: values[drawn].mean().item(), len(values))
         counts = (len(samples), len(values))
-        return distance_row(name, name, values.mean().item(), counts, interval=ends, unit=unit)
+        value = values.mean().item()
+        return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
 
-    return [row("MMD", matching.squared_normalised), row("CD 3D", chamfer, "m2")], matching
+    mmd = row("MMD", matching.squared_normalised, note=note if beyond or real_beyond else "")
+    return [mmd, row("CD 3D", chamfer, "m2")], matching
+
+
+def _cells_and_share_beyond(scenes: SceneSet, grid: BEVGrid) -> tuple[list[Tensor], float]:
+    """Occupied cells of the kept scenes, and the share of their points that are not on the grid."""
+    cells, points, beyond = [], 0, 0
+    for cloud in scenes.clouds(range(len(scenes.images))):
+        cells.append(grid.cells(cloud))
+        points += len(cloud)
+        beyond += int((~grid.inside(cloud)).sum())
+    return cells, beyond / max(points, 1)
 
 
 def distance_row(
     name: str,
     scaled_as: str,
     value: float | None,
-    counts: Sequence[int],
+    counts: Counts,
     *,
-    interval: Interval | None = None,
+    interval: Ends | None = None,
     unit: str = "",
     note: str = "",
 ) -> MetricResult:

@@ -83,69 +83,83 @@ class PrecisionRecall(_FeatureSets):
         return dict(vars(precision_recall(*self._features(), self.num_neighbors)))
 
 
-class BEVHistogramDistance(Metric):
+class _CloudSets(Metric):
+    """Cells that clouds occupy, and how many of their points are outside the grid."""
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+
+    def __init__(self, grid: BEVGrid | None = None) -> None:
+        super().__init__()
+        self.grid = BEVGrid() if grid is None else grid
+        for name in ("real", "generated"):
+            points = torch.zeros(2, dtype=torch.int64)  # all, outside
+            self.add_state(f"{name}_points", default=points, dist_reduce_fx="sum")
+
+    def _cells(self, clouds: Sequence[Tensor], name: str) -> list[Tensor]:
+        """Cells of each cloud; all are checked before the points of the first one count."""
+        cells = [self.grid.cells(cloud, f"{name} cloud {i}") for i, cloud in enumerate(clouds)]
+        points = getattr(self, f"{name}_points")
+        for cloud in clouds:
+            outside = len(cloud) - int(self.grid.inside(cloud).sum())
+            points += points.new_tensor([len(cloud), outside])
+        return cells
+
+    def _outside_shares(self) -> dict[str, float]:
+        shares = {}
+        for name in ("real", "generated"):
+            total, outside = getattr(self, f"{name}_points").tolist()
+            shares[f"{name}_outside_share"] = outside / total
+        return shares
+
+
+class BEVHistogramDistance(_CloudSets):
     """JSD and its relatives of how many clouds occupy each cell seen from above.
 
     Points outside the grid do not count, by the definition of the published number;
-    ``outside_share`` tells how many these were.
+    ``*_outside_share`` tells how many these were.
 
     Args:
         grid: Cells; the default is that of the published numbers.
     """
 
-    is_differentiable = False
-    higher_is_better = False
-    full_state_update = False
-
     real_counts: Tensor
     generated_counts: Tensor
 
     def __init__(self, grid: BEVGrid | None = None) -> None:
-        super().__init__()
-        self.grid = BEVGrid() if grid is None else grid
+        super().__init__(grid)
         rows, columns = self.grid.shape
         for name in ("real", "generated"):
             counts = torch.zeros(rows * columns, dtype=torch.int32)
             self.add_state(f"{name}_counts", default=counts, dist_reduce_fx="sum")
-            points = torch.zeros(2, dtype=torch.int64)  # all, outside
-            self.add_state(f"{name}_points", default=points, dist_reduce_fx="sum")
 
     def update(self, clouds: Sequence[Tensor], real: bool) -> None:
         """Add clouds ``(P, 3 or more)``; NaN, or no point on the grid, is a ``ValueError``."""
         name = "real" if real else "generated"
-        # All clouds are checked before the first one counts.
-        cells = [self.grid.cells(cloud, f"{name} cloud {i}") for i, cloud in enumerate(clouds)]
-        counts, points = getattr(self, f"{name}_counts"), getattr(self, f"{name}_points")
-        for cloud, occupied in zip(clouds, cells, strict=True):
+        counts = getattr(self, f"{name}_counts")
+        for occupied in self._cells(clouds, name):
             counts[occupied.to(counts.device)] += 1
-            outside = len(cloud) - int(self.grid.inside(cloud).sum())
-            points += points.new_tensor([len(cloud), outside])
 
     def compute(self) -> dict[str, float]:
         """Fields of :class:`HistogramDistance` and the ``*_outside_share`` of the points."""
         if not (self.real_counts.any() and self.generated_counts.any()):
             raise ValueError("the histogram needs at least one real and one generated cloud")
-        result = dict(vars(histogram_distance(self.real_counts, self.generated_counts)))
-        for name in ("real", "generated"):
-            total, outside = getattr(self, f"{name}_points").tolist()
-            result[f"{name}_outside_share"] = outside / total
-        return result
+        distances = histogram_distance(self.real_counts, self.generated_counts)
+        return vars(distances) | self._outside_shares()
 
 
-class MinimumMatchingDistance(Metric):
+class MinimumMatchingDistance(_CloudSets):
     """Published "MMD" of clouds: squared, without unit, on occupied cells seen from above.
+
+    Points outside the grid do not count, as for :class:`BEVHistogramDistance`.
 
     Args:
         grid: Square grid of cells; the default is that of the published number.
     """
 
-    is_differentiable = False
-    higher_is_better = False
-    full_state_update = False
-
     def __init__(self, grid: BEVGrid | None = None) -> None:
-        super().__init__()
-        self.grid = BEVGrid() if grid is None else grid
+        super().__init__(grid)
         for name in ("real", "generated"):
             self.add_state(f"{name}_cells", default=[], dist_reduce_fx="cat")
             self.add_state(f"{name}_sizes", default=[], dist_reduce_fx="cat")
@@ -153,7 +167,7 @@ class MinimumMatchingDistance(Metric):
     def update(self, clouds: Sequence[Tensor], real: bool) -> None:
         """Add clouds ``(P, 3 or more)``; NaN, or no point on the grid, is a ``ValueError``."""
         name = "real" if real else "generated"
-        cells = [self.grid.cells(cloud, f"{name} cloud {i}") for i, cloud in enumerate(clouds)]
+        cells = self._cells(clouds, name)
         if not cells:
             return
         getattr(self, f"{name}_cells").append(torch.cat(cells).int())
@@ -161,7 +175,7 @@ class MinimumMatchingDistance(Metric):
         getattr(self, f"{name}_sizes").append(sizes)
 
     def compute(self) -> dict[str, float]:
-        """The published number, and the same in square metres (times the width of the grid)."""
+        """The published number, in square metres too, and the ``*_outside_share`` of points."""
         real, generated = (
             _joined(getattr(self, f"{name}_cells"), f"{name} clouds")
             .long()
@@ -170,4 +184,5 @@ class MinimumMatchingDistance(Metric):
         )
         value = minimum_matching(real, generated, self.grid).mmd_squared_normalised
         width_m = self.grid.shape[0] * self.grid.cell_m
-        return {"mmd_squared_normalised": value, "mmd_m2": value * width_m**2}
+        published = {"mmd_squared_normalised": value, "mmd_m2": value * width_m**2}
+        return published | self._outside_shares()

@@ -60,8 +60,9 @@ def evaluate(
 
     The floor of a distance is that between the halves of the reference: other drives where there
     are several. For feature spaces it is taken at as many scenes as are evaluated, or at as many as
-    are kept; MMD's halves are smaller, which raises its floor. Precision and its relatives are no
-    distances: what the halves reach is in their notes.
+    are kept. JSD, TV and W1 are taken over all scans of both halves, which lowers their floor where
+    these are more than are evaluated; MMD's halves are smaller, which raises its floor.
+    Precision and its relatives are no distances: what the halves reach is in their notes.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
@@ -90,7 +91,8 @@ def evaluate(
     protocol = reference.protocol
     samples, more = gather(scenes, spaces, protocol, batch_size)
     references = reference.whole
-    _check_counts(samples.count, references.count, spaces, allow_few)
+    counts = {"generated scenes": samples.count, "real scans": references.count}
+    check_counts(counts, spaces, allow_few)
 
     rows = histogram_rows(references, samples, resampling)
     matched, matching = matching_rows(references, samples, resampling)
@@ -99,8 +101,34 @@ def evaluate(
         real, generated = (FeatureSample.of(part, space.name) for part in (references, samples))
         rows += feature_rows(space.label, real, generated, resampling)
     floors = _floors(reference, spaces, samples.count, resampling)
-    told = dict(made_with or {})
-    about: About = {
+    about = about_generated(samples.count, more, spaces, reference, made_with, commit, source)
+    about["extra"]["bootstrap"] = vars(resampling)
+    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
+    return Comparison(evaluation, samples, references, matching)
+
+
+def about_generated(
+    count: int,
+    more: bool,
+    spaces: Sequence[SceneFeatures],
+    reference: Any,
+    made_with: Mapping[str, Any] | None,
+    commit: str | None,
+    source: str,
+) -> About:
+    """Where the numbers come from.
+
+    Args:
+        count: Scenes compared.
+        more: Whether there were more of them than the protocol counts.
+        spaces: Feature spaces.
+        reference: What has their ``protocol`` and can ``describe`` itself.
+        made_with: As for :func:`evaluate`.
+        commit: As for :func:`evaluate`.
+        source: As for :func:`evaluate`.
+    """
+    told, protocol = dict(made_with or {}), reference.protocol
+    return {
         "backbones": {space.label: dict(space.card) for space in spaces},
         "protocol": protocol.to_dict(),
         "reference": reference.describe(),
@@ -108,10 +136,8 @@ def evaluate(
         "commit": commit,
         "published": False,
         "source": source,
-        "extra": told | _counted(samples.count, more, protocol) | {"bootstrap": vars(resampling)},
+        "extra": told | _counted(count, more, protocol),
     }
-    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    return Comparison(evaluation, samples, references, matching)
 
 
 def gather(
@@ -130,12 +156,22 @@ def gather(
     return samples, next(stream, None) is not None
 
 
-def _check_counts(
-    num_samples: int, num_references: int, spaces: Sequence[SceneFeatures], allow_few: bool
+def check_counts(
+    counts: Mapping[str, int], spaces: Sequence[SceneFeatures], allow_few: bool
 ) -> None:
+    """Refuses fewer than two scenes and, unless allowed, fewer than features.
+
+    Args:
+        counts: How many there are of each kind; ``generated scenes`` among them.
+        spaces: Feature spaces.
+        allow_few: Accept fewer scenes than features.
+
+    Raises:
+        ValueError: Naming the kinds and the spaces.
+    """
+    num_samples = counts["generated scenes"]
     if num_samples < 2:
         raise ValueError(f"{num_samples} generated scenes; a comparison needs at least 2")
-    counts = {"generated scenes": num_samples, "real scans": num_references}
     few = [
         f"{count} {what} for the {space.dim} features of {space.label}"
         for space in spaces

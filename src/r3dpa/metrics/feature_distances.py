@@ -7,19 +7,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.metrics.distances import Interval, Resampling, distance_row
+from r3dpa.metrics.distances import Counts, Ends, Resampling, distance_row
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
     frechet_distance,
     polynomial_mmd,
-    precision_recall,
+    shared_balls,
 )
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene_set import SceneSet
 
 _NUM_NEIGHBORS = 5
-_DENSITY_GROUPS = 10
 _KID_SUBSETS, _KID_SUBSET_SIZE = 100, 1000
 _NORMAL_95 = 1.96  # deviations of a normal distribution that hold 95 % of it, to each side
 
@@ -53,7 +52,8 @@ def feature_rows(
 
     The intervals are over the generated scenes: bootstrap for the Fréchet distance, the error of
     the line for FD-infinity, the spread of subsets for the polynomial MMD (wider than needed), and
-    of the shares the bootstrap of the scenes that count (real ones for recall and coverage).
+    of the shares the bootstrap of the scenes that they are means over (real ones for recall and
+    coverage), with the balls left as they are.
 
     Args:
         label: Of the space.
@@ -63,28 +63,39 @@ def feature_rows(
     """
     counts = (int(generated.moments.count), int(real.moments.count))
     kept = (len(generated.rows), len(real.rows))
+    mean, covariance = real.moments.mean, real.moments.covariance()
     return [
-        _frechet(label, real, generated, resampling, counts),
+        frechet_row(label, mean, covariance, generated, resampling, counts),
         _infinity(label, real.rows, generated.rows, resampling, kept),
         _polynomial(label, real.rows, generated.rows, resampling, kept),
         *_shares(label, real.rows, generated.rows, resampling, kept),
     ]
 
 
-def _frechet(
+def frechet_row(
     label: str,
-    real: FeatureSample,
+    mean: Tensor,
+    covariance: Tensor,
     generated: FeatureSample,
     resampling: Resampling,
-    counts: tuple[int, int],
+    counts: Counts,
 ) -> MetricResult:
-    mean, covariance = real.moments.mean, real.moments.covariance()
+    """Fréchet distance to real scans of which only moments are known.
+
+    Args:
+        label: Of the space.
+        mean: ``(F,)`` of the real scans.
+        covariance: ``(F, F)`` of the real scans.
+        generated: At least two scenes.
+        resampling: Of the interval.
+        counts: Generated scenes and, where it is known, real scans.
+    """
 
     def distance(moments: Moments) -> float:
         return frechet_distance(mean, covariance, moments.mean, moments.covariance()).item()
 
-    width = len(mean)
-    few = f"{min(counts)} scenes for {width} features: tells mostly how few they are"
+    width, fewest = len(mean), min(count for count in counts if count is not None)
+    few = f"{fewest} scenes for {width} features: tells mostly how few they are"
     ends = resampling.interval(
         lambda drawn: distance(Moments.of(generated.rows[drawn])), len(generated.rows)
     )
@@ -94,7 +105,7 @@ def _frechet(
         distance(generated.moments),
         counts,
         interval=ends,
-        note=few if min(counts) <= width else "",
+        note=few if fewest <= width else "",
     )
 
 
@@ -128,7 +139,7 @@ def _polynomial(
 def _shares(
     label: str, real: Tensor, generated: Tensor, resampling: Resampling, counts: tuple[int, int]
 ) -> list[MetricResult]:
-    def row(name: str, value: float | None, ends: Interval | None, note: str = "") -> MetricResult:
+    def row(name: str, value: float | None, ends: Ends | None, note: str = "") -> MetricResult:
         return MetricResult(
             f"{label} {name}",
             value,
@@ -144,29 +155,15 @@ def _shares(
         names = ("precision", "recall", "density", "coverage")
         return [row(name, None, None, note) for name in names]
 
-    def of_flags(share: float, size: int) -> Interval | None:
-        flags = torch.arange(size) < round(share * size)
-        return resampling.interval(lambda drawn: flags[drawn].double().mean().item(), size)
+    def mean(name: str, by_scene: Tensor) -> MetricResult:
+        values = by_scene.double()
+        ends = resampling.interval(lambda drawn: values[drawn].mean().item(), len(values))
+        return row(name, values.mean().item(), ends)
 
-    found = precision_recall(real, generated, _NUM_NEIGHBORS)
+    balls = shared_balls(real, generated, _NUM_NEIGHBORS)
     return [
-        row("precision", found.precision, of_flags(found.precision, len(generated))),
-        row("recall", found.recall, of_flags(found.recall, len(real))),
-        row("density", found.density, _density_interval(real, generated, resampling)),
-        row("coverage", found.coverage, of_flags(found.coverage, len(real))),
+        mean("precision", balls.precise),
+        mean("recall", balls.recalled),
+        mean("density", balls.density),
+        mean("coverage", balls.covered),
     ]
-
-
-def _density_interval(real: Tensor, generated: Tensor, resampling: Resampling) -> Interval | None:
-    """The density is a mean over generated scenes, so groups of them can be resampled."""
-    groups = min(_DENSITY_GROUPS, len(generated) // (_NUM_NEIGHBORS + 1))
-    if groups < 2 or not resampling.num_resamples:
-        return None
-    parts = [generated[first::groups] for first in range(groups)]
-    sizes = torch.tensor([len(part) for part in parts]).double()
-    density = torch.tensor(
-        [precision_recall(real, part, _NUM_NEIGHBORS).density for part in parts]
-    ).double()
-    return resampling.interval(
-        lambda drawn: ((density * sizes)[drawn].sum() / sizes[drawn].sum()).item(), groups
-    )

@@ -47,6 +47,22 @@ def checked_features(features: Tensor, name: str = "features", at_least: int = 1
     return features.double()
 
 
+def checked_pair(real: Tensor, generated: Tensor, at_least: int = 1) -> tuple[Tensor, Tensor]:
+    """Both sets of features as float64, after a check that they can be compared.
+
+    Raises:
+        ValueError: As :func:`checked_features`, or if their widths differ.
+    """
+    real = checked_features(real, "real features", at_least)
+    generated = checked_features(generated, "generated features", at_least)
+    if real.shape[1] != generated.shape[1]:
+        raise ValueError(
+            f"real features are {real.shape[1]} wide but generated ones {generated.shape[1]}; "
+            "extract both with one network"
+        )
+    return real, generated
+
+
 @dataclass(frozen=True)
 class Moments:
     """Count, mean and scatter of feature vectors; two of them merge without loss of digits.
@@ -80,6 +96,10 @@ class Moments:
 
     def merge(self, other: Self) -> Self:
         """Moments of both sets together; either may hold no sample."""
+        if self.mean.shape != other.mean.shape:
+            raise ValueError(
+                f"moments of {len(self.mean)} and of {len(other.mean)} features do not merge"
+            )
         count = self.count + other.count
         share = other.count / count.clamp(min=1)
         step = other.mean - self.mean
@@ -201,9 +221,8 @@ def fd_infinity(
     Raises:
         ValueError: If a quarter of the smaller set is less than F + 1 samples.
     """
-    width = real.shape[-1]
-    real = checked_features(real, "real features")
-    generated = checked_features(generated, "generated features")
+    real, generated = checked_pair(real, generated)
+    width = real.shape[1]
     largest = min(len(real), len(generated))
     smallest = largest // _SMALLEST_SHARE
     if smallest <= width or num_sizes < 3:
@@ -245,8 +264,7 @@ def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
     Returns:
         ``()`` float64.
     """
-    x = checked_features(real, "real features", at_least=2)
-    y = checked_features(generated, "generated features", at_least=2)
+    x, y = checked_pair(real, generated, at_least=2)
 
     def kernel(a: Tensor, b: Tensor) -> Tensor:
         return (a @ b.T / a.shape[1] + 1) ** degree
@@ -287,8 +305,7 @@ def polynomial_mmd(
             f"polynomial_mmd: {num_subsets} subsets of {subset_size} out of {len(real)} real and "
             f"{len(generated)} generated samples; give 2 subsets or more of 2 to {smaller} samples"
         )
-    real = checked_features(real, "real features")
-    generated = checked_features(generated, "generated features")
+    real, generated = checked_pair(real, generated)
 
     def subset(features: Tensor) -> Tensor:
         return features[torch.randperm(len(features), generator=generator)[:subset_size]]
@@ -315,12 +332,35 @@ class PRDC:
     coverage: float
 
 
+@dataclass(frozen=True)
+class SharedBalls:
+    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC.
+
+    Args:
+        in_real: ``(M,)`` int64, real balls that a generated sample is in.
+        recalled: ``(N,)`` bool, whether a real sample is in the ball of a generated one.
+        covered: ``(N,)`` bool, whether the ball of a real sample holds a generated one.
+        num_neighbors: k of the balls.
+    """
+
+    in_real: Tensor
+    recalled: Tensor
+    covered: Tensor
+    num_neighbors: int
+
+    @property
+    def precise(self) -> Tensor:
+        """``(M,)`` bool, whether a generated sample is in a real ball."""
+        return self.in_real > 0
+
+    @property
+    def density(self) -> Tensor:
+        """``(M,)`` float64, real balls that a generated sample is in, divided by k."""
+        return self.in_real.double() / self.num_neighbors
+
+
 def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> PRDC:
-    """Precision, recall, density and coverage by balls up to the k-th neighbour in the own set.
-
-    A sample on the edge of a ball is outside. Distances are held 1024 rows at a time.
-
-    Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
+    """Precision, recall, density and coverage: the means of :func:`shared_balls`.
 
     Args:
         real: ``(N, F)``.
@@ -328,10 +368,26 @@ def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) ->
         num_neighbors: k, below N and M.
 
     Raises:
-        ValueError: If a set has k samples or fewer, or holds NaN.
+        ValueError: If a set has k samples or fewer or holds NaN, or if widths differ.
     """
-    real = checked_features(real, "real features", num_neighbors + 1)
-    generated = checked_features(generated, "generated features", num_neighbors + 1)
+    balls = shared_balls(real, generated, num_neighbors)
+    return PRDC(
+        precision=balls.precise.double().mean().item(),
+        recall=balls.recalled.double().mean().item(),
+        density=balls.density.mean().item(),
+        coverage=balls.covered.double().mean().item(),
+    )
+
+
+def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> SharedBalls:
+    """Which samples lie in the balls of the other set, each up to the k-th neighbour in its own.
+
+    A sample on the edge of a ball is outside. Distances are held 1024 rows at a time.
+
+    Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
+    Arguments and errors are those of :func:`precision_recall`.
+    """
+    real, generated = checked_pair(real, generated, num_neighbors + 1)
     centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances
     real, generated = real - centre, generated - centre
     norms = torch.cat([real, generated]).square().sum(dim=1)
@@ -339,21 +395,15 @@ def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) ->
     real_radius = _kth_neighbor(real, num_neighbors) - edge
     generated_radius = _kth_neighbor(generated, num_neighbors) - edge
 
-    precise, dense = [], []
+    inside = []
     recalled = torch.zeros(len(real), dtype=torch.bool, device=real.device)
     covered = torch.zeros_like(recalled)
     for rows, squared in _squared_distances(generated, real):
         in_real = squared < real_radius
-        precise.append(in_real.any(dim=1))
-        dense.append(in_real.sum(dim=1))
+        inside.append(in_real.sum(dim=1))
         covered |= in_real.any(dim=0)
         recalled |= (squared < generated_radius[rows, None]).any(dim=0)
-    return PRDC(
-        precision=torch.cat(precise).double().mean().item(),
-        recall=recalled.double().mean().item(),
-        density=torch.cat(dense).double().mean().item() / num_neighbors,
-        coverage=covered.double().mean().item(),
-    )
+    return SharedBalls(torch.cat(inside), recalled, covered, num_neighbors)
 
 
 def _squared_distances(x: Tensor, y: Tensor) -> Iterator[tuple[slice, Tensor]]:

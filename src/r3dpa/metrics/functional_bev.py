@@ -26,6 +26,9 @@ from r3dpa.metrics.measures import jensen_shannon
 Cells = NDArray[np.int64]
 Result = TypeVar("Result")
 
+#: Cells along a side of a grid that clouds can be matched on.
+MAX_SIDE = 2048
+
 
 @dataclass(frozen=True)
 class BEVGrid:
@@ -268,10 +271,10 @@ def chamfer_cells(cells_a: Tensor, cells_b: Tensor, grid: BEVGrid) -> float:
 
 def _side(grid: BEVGrid) -> int:
     rows, columns = grid.shape
-    if rows != columns or rows > 2048:
+    if rows != columns or rows > MAX_SIDE:
         raise ValueError(
-            f"matching needs a square grid of at most 2048 x 2048 cells, got {rows} x {columns}; "
-            "change x_m, y_m or cell_m"
+            f"matching needs a square grid of at most {MAX_SIDE} x {MAX_SIDE} cells, got {rows} x "
+            f"{columns}; change x_m, y_m or cell_m"
         )
     return rows
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, Self, get_args
 
 from r3dpa.geometry import LidarSensor, SphericalProjection
-from r3dpa.metrics.functional_bev import BEVGrid
+from r3dpa.metrics.functional_bev import MAX_SIDE, BEVGrid
 
 Unprojection = Literal["corner", "centre"]
 LIPLocCast = Literal["wrap", "clip"]
@@ -51,6 +51,12 @@ class Protocol:
         for key in ("voxel_m", "num_samples", "num_mmd_samples", "num_mmd_references"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be above 0, got {getattr(self, key)}")
+        side, (low, high) = max(self.grid.shape), self.grid.x_m
+        if side > MAX_SIDE:  # here, and not by MMD at the end of an evaluation
+            raise ValueError(
+                f"voxel_m = {self.voxel_m} makes a grid of {side} cells along a side, but MMD can "
+                f"match {MAX_SIDE}; give at least {(high - low) / MAX_SIDE:.4f}"
+            )
 
     @property
     def corner(self) -> bool:

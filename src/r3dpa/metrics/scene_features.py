@@ -73,7 +73,9 @@ class SceneFeatures:
         Raises:
             ValueError: If a feature is NaN or infinite; the message names the scene.
         """
-        features = self.extract(scenes).float().cpu()
+        # GPUs round the factors of a convolution to 10 bits (TF32) unless told not to.
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            features = self.extract(scenes).float().cpu()
         broken = (~features.isfinite().all(dim=1)).nonzero().flatten().tolist()
         if broken:
             raise ValueError(

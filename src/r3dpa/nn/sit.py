@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from r3dpa.nn.attention import SelfAttention
 from r3dpa.nn.layers import at_least_float32
 
 __all__ = ["SiT", "SiTOutput", "sincos_position_embedding", "time_frequencies"]
@@ -185,11 +186,11 @@ class SiT(nn.Module):
             _Block(hidden_size, num_heads, mlp_ratio, qk_norm) for _ in range(depth)
         )
         self.projector = nn.Sequential(
-            _xavier(nn.Linear(hidden_size, projector_dim)),
+            _xavier_linear(hidden_size, projector_dim),
             nn.SiLU(),
-            _xavier(nn.Linear(projector_dim, projector_dim)),
+            _xavier_linear(projector_dim, projector_dim),
             nn.SiLU(),
-            _xavier(nn.Linear(projector_dim, feature_dim)),
+            _xavier_linear(projector_dim, feature_dim),
         )
         self.final_layer = _FinalLayer(hidden_size, patch_size**2 * in_channels)
 
@@ -291,7 +292,8 @@ class SiT(nn.Module):
             )
 
 
-def _xavier(layer: nn.Linear) -> nn.Linear:
+def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
+    layer = nn.Linear(in_features, out_features)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
@@ -349,31 +351,11 @@ class _ClassEmbedding(nn.Module):
         return self.embedding_table(labels)
 
 
-class _Attention(nn.Module):
-    def __init__(self, hidden_size: int, num_heads: int, qk_norm: bool) -> None:
-        super().__init__()
-        self.num_heads = num_heads
-        self.qkv = _xavier(nn.Linear(hidden_size, 3 * hidden_size))
-        head_width = hidden_size // num_heads
-        self.q_norm = nn.LayerNorm(head_width) if qk_norm else nn.Identity()
-        self.k_norm = nn.LayerNorm(head_width) if qk_norm else nn.Identity()
-        self.proj = _xavier(nn.Linear(hidden_size, hidden_size))
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        query, key, value = rearrange(
-            self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads
-        )
-        # Layer norm answers in float32 under autocast; attention wants one dtype.
-        query, key = self.q_norm(query).to(value.dtype), self.k_norm(key).to(value.dtype)
-        mixed = F.scaled_dot_product_attention(query, key, value)
-        return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
-
-
 class _Mlp(nn.Module):
     def __init__(self, hidden_size: int, mlp_size: int) -> None:
         super().__init__()
-        self.fc1 = _xavier(nn.Linear(hidden_size, mlp_size))
-        self.fc2 = _xavier(nn.Linear(mlp_size, hidden_size))
+        self.fc1 = _xavier_linear(hidden_size, mlp_size)
+        self.fc2 = _xavier_linear(mlp_size, hidden_size)
 
     def forward(self, tokens: Tensor) -> Tensor:
         return self.fc2(F.gelu(self.fc1(tokens), approximate="tanh"))
@@ -391,7 +373,7 @@ def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
 class _Block(nn.Module):
     def __init__(self, hidden_size: int, num_heads: int, mlp_ratio: float, qk_norm: bool) -> None:
         super().__init__()
-        self.attn = _Attention(hidden_size, num_heads, qk_norm)
+        self.attn = SelfAttention(hidden_size, num_heads, qk_norm, _xavier_linear)
         self.mlp = _Mlp(hidden_size, int(hidden_size * mlp_ratio))
         self.adaLN_modulation = _modulation(hidden_size, 6)
 

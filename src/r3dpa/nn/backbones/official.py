@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from r3dpa.unpickling import UNPICKLING_ERRORS
 
 _MODEL = "the model.ckpt of the released weights"
 
@@ -31,7 +32,7 @@ def read_released(path: Path, released: str = _MODEL) -> Any:
         return torch.load(
             path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
         )
-    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError) as error:
+    except (*UNPICKLING_ERRORS, OSError) as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(
             f"is damaged, or holds more than tensors and plain values ({reason}); give {released}, "

@@ -229,7 +229,7 @@ class SparseConv(nn.Module):
         super().__init__()
         size = (in_channels, out_channels)
         shape = size if kernel_size == 1 else (kernel_size**3, *size)
-        # Unit variance of the result where all offsets are occupied, as for dense layers.
+        # Bound of PyTorch's dense layers, as if all offsets were occupied.
         bound = (in_channels * kernel_size**3) ** -0.5
         self.kernel = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None

@@ -99,29 +99,32 @@ def pool_voxels(
     Raises:
         ValueError: If ``pooling`` is not known.
     """
-    cloud, xyz = coordinates[:, 3].long(), coordinates[:, :3].float()
+    features = at_least_float32(features)
+    # In float64 the mean of whole numbers is exact: it does not depend on the order of the voxels.
+    cloud, xyz = coordinates[:, 3].long(), coordinates[:, :3].double()
     centred = xyz - _means(xyz, cloud, num_clouds)[cloud]
     if pooling == "rings":
-        edges = torch.linspace(_RINGS_FROM_M, _RINGS_TO_M, NUM_BINS + 1, device=xyz.device)
+        edges = torch.linspace(_RINGS_FROM_M, _RINGS_TO_M, NUM_BINS + 1).to(xyz)
         edges[0] = 0
         values = centred.norm(dim=1) * voxel_m
     elif pooling == "sectors":
         end = math.pi + _SECTOR_MARGIN_RAD
-        edges = torch.linspace(-end, end, NUM_BINS + 1, device=xyz.device)
+        edges = torch.linspace(-end, end, NUM_BINS + 1).to(xyz)
         values = torch.atan2(centred[:, 1], centred[:, 0])
     elif pooling == "all":
-        return _means(features, cloud, num_clouds)
+        return _means(features, cloud, num_clouds).to(features)
     else:
         raise ValueError(f"pooling must be rings, sectors or all, got {pooling!r}.")
     bins = torch.bucketize(values, edges, right=True) - 1
     inside = bins < NUM_BINS
     place = cloud[inside] * NUM_BINS + bins[inside]
-    return _means(features[inside], place, num_clouds * NUM_BINS).reshape(num_clouds, -1)
+    means = _means(features[inside], place, num_clouds * NUM_BINS).to(features)
+    return means.reshape(num_clouds, -1)
 
 
 def _means(values: Tensor, place: Tensor, num_places: int) -> Tensor:
-    """Mean ``(num_places, F)`` of the rows at each place, zeros where there is none."""
-    values = at_least_float32(values)
+    """Mean ``(num_places, F)`` float64 of the rows at each place, zeros where there is none."""
+    values = values.double()  # float32 sums of 10^5 rows would depend on their order
     sums = values.new_zeros(num_places, values.shape[1]).index_add_(0, place, values)
     counts = torch.bincount(place, minlength=num_places)
     return sums / counts.clamp(min=1)[:, None]

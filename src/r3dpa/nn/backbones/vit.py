@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from r3dpa.nn.attention import SelfAttention
+
 _HEAD_WIDTH = 64  # of every released ViT
 _MLP_RATIO = 4
 _TABLE_STD = 0.02
@@ -96,28 +98,13 @@ class _Block(nn.Module):
     def __init__(self, width: int, num_heads: int, norm_eps: float) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, norm_eps)
-        self.attn = _Attention(width, num_heads)
+        self.attn = SelfAttention(width, num_heads)
         self.norm2 = nn.LayerNorm(width, norm_eps)
         self.mlp = _Mlp(width)
 
     def forward(self, tokens: Tensor) -> Tensor:
         tokens = tokens + self.attn(self.norm1(tokens))
         return tokens + self.mlp(self.norm2(tokens))
-
-
-class _Attention(nn.Module):
-    def __init__(self, width: int, num_heads: int) -> None:
-        super().__init__()
-        self.num_heads = num_heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        query, key, value = rearrange(
-            self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads
-        )
-        mixed = F.scaled_dot_product_attention(query, key, value)
-        return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
 
 
 class _Mlp(nn.Module):

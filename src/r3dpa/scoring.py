@@ -1,0 +1,204 @@
+"""Generated scenes beside real scans: the reference of a set of scans, and what is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tqdm import tqdm
+
+from r3dpa import viz
+from r3dpa.data.scans import Scan, read_scan
+from r3dpa.metrics.evaluation import Comparison
+from r3dpa.metrics.official_statistics import OfficialStatistics
+from r3dpa.metrics.protocol import Protocol
+from r3dpa.metrics.reference import ReferenceStatistics, resume_or_start
+from r3dpa.metrics.result_table import EvaluationTable
+from r3dpa.metrics.results import Evaluation, published_evaluations
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import SPACES, SceneFeatures, scene_features
+from r3dpa.metrics.scene_set import RANGE_BIN_M
+from r3dpa.viz import evaluation as figures
+
+__all__ = [
+    "cached_reference",
+    "complete_reference",
+    "feature_spaces",
+    "report",
+    "save_reports",
+    "save_tables",
+]
+
+AnyReference = ReferenceStatistics | OfficialStatistics
+
+_EVERY = 2000  # scans between two savings of an unfinished reference
+_SHOWN_MATCHES = 3
+
+
+def feature_spaces(
+    names: Sequence[str],
+    ckpt: Mapping[str, str | Path] | None,
+    protocol: Protocol,
+    device: str,
+) -> list[SceneFeatures]:
+    """Feature spaces by name.
+
+    Args:
+        names: Of :data:`r3dpa.metrics.scene_features.SPACES`.
+        ckpt: Weight files by name.
+        protocol: How scenes are prepared.
+        device: Where the networks compute; ``auto`` is the GPU where there is one.
+
+    Raises:
+        ValueError: If a name occurs twice, a file belongs to none of them, or as
+            :func:`scene_features`.
+    """
+    if len(set(names)) < len(names):
+        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
+    unused = [name for name in ckpt or {} if name not in names]
+    if unused:
+        raise ValueError(
+            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)})"
+        )
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
+
+
+def complete_reference(
+    job: ReferenceStatistics,
+    scans: Sequence[Scan],
+    spaces: Sequence[SceneFeatures],
+    out: Path,
+    every: int = _EVERY,
+) -> ReferenceStatistics:
+    """Statistics of scans as a file; goes on where an interrupted call has stopped.
+
+    Args:
+        job: Empty statistics that were prepared for these scans and spaces.
+        scans: All of them, in the order of their names in ``job``.
+        spaces: Those of ``job``.
+        out: File to write; beside it lies ``<name>.partial.safetensors`` until it is complete.
+        every: Scans after which the unfinished file is saved.
+
+    Raises:
+        ValueError: If the unfinished file is of another job, or a scan cannot be used.
+    """
+    partial = _partial(out)
+    statistics = resume_or_start(job, partial)
+    start, sensor = statistics.num_done, statistics.protocol.sensor
+
+    def scenes() -> Iterator[EvaluationScene]:
+        for scan in tqdm(
+            scans[start:], "reference", len(scans), initial=start, unit="scan", disable=None
+        ):
+            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
+
+    statistics.update(scenes(), spaces, partial, every)
+    statistics.save(partial)
+    partial.replace(out)
+    return statistics
+
+
+def cached_reference(
+    job: ReferenceStatistics, scans: Sequence[Scan], spaces: Sequence[SceneFeatures], out: Path
+) -> ReferenceStatistics:
+    """The same, but read from ``out`` where that file is of the same job; replaced where not."""
+    for path in (out, _partial(out)):
+        try:
+            found = resume_or_start(job, path)
+        except ValueError:  # of other scans, spaces or settings, or damaged
+            path.unlink()
+        else:
+            if found.complete:
+                return found
+    return complete_reference(job, scans, spaces, out)
+
+
+def _partial(out: Path) -> Path:
+    return out.with_name(f"{out.stem}.partial{out.suffix}")
+
+
+def report(evaluation: Evaluation, statistics: AnyReference) -> str:
+    """All numbers of an evaluation, and below those that the paper has, beside the published."""
+    text, table = str(evaluation), _beside_published(evaluation, statistics)
+    return text if table is None else f"{text}\n\n{table}"
+
+
+def save_reports(comparison: Comparison, statistics: ReferenceStatistics, out: Path) -> None:
+    """Writes numbers, tables and figures of a comparison to a folder.
+
+    Beside what :func:`save_tables` writes, ``birds_eye.png``, ``ranges.png`` and ``matches.png``
+    are drawn from the sets themselves.
+
+    Args:
+        comparison: Result of :func:`r3dpa.metrics.evaluation.evaluate`.
+        statistics: Its reference.
+        out: Folder; files of these names are replaced.
+    """
+    save_tables(comparison.evaluation, statistics, out)
+    _draw(comparison, statistics, out)
+
+
+def save_tables(evaluation: Evaluation, statistics: AnyReference, out: Path) -> None:
+    """Writes the numbers of an evaluation to a folder.
+
+    ``evaluation.json`` and ``metrics.csv`` hold all rows; ``table.md`` and ``table.tex`` the
+    distances beside the published ones.
+
+    Args:
+        evaluation: All numbers.
+        statistics: Its reference.
+        out: Folder; files of these names are replaced.
+    """
+    evaluation.save(out / "evaluation.json")
+    EvaluationTable((evaluation,)).save(out / "metrics.csv")
+    table = _beside_published(evaluation, statistics) or EvaluationTable((evaluation,))
+    table.save(out / "table.md")
+    table.save(out / "table.tex")
+
+
+def _beside_published(evaluation: Evaluation, statistics: AnyReference) -> EvaluationTable | None:
+    """Distances without relatives of theirs, below the published rows that have some of them."""
+    split: Literal["val-only", "train-val"] = (
+        "val-only" if statistics.about.get("split") == "val" else "train-val"
+    )
+    heads = {space.upper() for space in SPACES} | {"JSD", "MMD"}
+    own = replace(evaluation, rows=tuple(r for r in evaluation.rows if r.name in heads))
+    names = {row.name for row in own.rows}
+    others = [
+        replace(other, rows=tuple(row for row in other.rows if row.name in names))
+        for other in published_evaluations(split)
+    ]
+    others = [other for other in others if other.rows]
+    return EvaluationTable((*others, own)) if others else None
+
+
+def _draw(comparison: Comparison, statistics: ReferenceStatistics, out: Path) -> None:
+    samples, references, matching = comparison[1:]
+    setting = statistics.protocol
+    grid, sensor = setting.grid, setting.sensor
+    both = (samples, references)
+    made, real = (part.cells.sum(dim=0).view(grid.shape).numpy() for part in both)
+    viz.save(figures.bev_histograms(made, real, grid.x_m, grid.y_m), out / "birds_eye.png")
+    edges_m = torch.arange(references.ranges.shape[1] + 1).double() * RANGE_BIN_M
+    halves = [part.ranges[0] for part in statistics.halves if part.count]
+    made, real = (part.ranges.sum(dim=0).numpy() for part in both)
+    ranges = figures.range_histogram(edges_m.numpy(), made, real, torch.stack(halves).numpy())
+    viz.save(ranges, out / "ranges.png")
+
+    shown, scans = samples.images.items(), references.images.items()
+    order = matching.squared_normalised.argsort().tolist()
+
+    def pair(index: int) -> figures.MatchedPair:
+        name, _, sample_m = shown[int(matching.nearest[index])]
+        scan, _, reference_m = scans[index]
+        title = f"{name} and {scan}: {matching.squared_normalised[index]:.3g}"
+        return figures.MatchedPair(title, sample_m.numpy(), reference_m.numpy())
+
+    best = [pair(index) for index in order[:_SHOWN_MATCHES]]
+    worst = [pair(index) for index in order[::-1][:_SHOWN_MATCHES]]
+    viz.save(figures.matches_figure(best, worst, sensor), out / "matches.png")

@@ -1,0 +1,190 @@
+"""``r3dpa test`` at smoke size: samples a checkpoint and compares the scenes with the scans."""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from r3dpa import callbacks
+from r3dpa.callbacks import SceneScorer
+from r3dpa.cli import main
+from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
+from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.results import Evaluation
+
+pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
+
+FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
+PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
+QUIET = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
+GEOMETRIC = ["--scorer.spaces=[fgeo]"]
+WEIGHTS = ("vae_alignment", "sit_alignment")
+NO_FEATURES = [f"--model.init_args.weights.{name}=0" for name in WEIGHTS]
+NO_FEATURES += ["--data.init_args.extractor=null"]
+
+
+@pytest.fixture(autouse=True)
+def coarse_protocols(monkeypatch):
+    """Cells of half a metre: a hundredth of the work."""
+    coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
+    monkeypatch.setattr(callbacks, "PROTOCOLS", coarse)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(smoke_args, vae_checkpoint, tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("joint")
+    start = ["--model.init_args.init_from", str(vae_checkpoint)]
+    main(smoke_args("joint", run_dir, *start, *QUIET))
+    return run_dir / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture
+def words(smoke_args, checkpoint):
+    """``words(run_dir, *more)``: arguments of ``r3dpa``."""
+
+    def arguments(run_dir, *more):
+        fixed = smoke_args("joint", run_dir, "--ckpt_path", str(checkpoint))
+        return ["test", *fixed[1:], *more]
+
+    return arguments
+
+
+@pytest.fixture
+def scored(words, tmp_path):
+    """Run folder of a test that used the geometric features alone."""
+    main(words(tmp_path / "run", *QUIET, *GEOMETRIC))
+    return tmp_path / "run"
+
+
+def values(run_dir):
+    rows = Evaluation.load(run_dir / "evaluation" / "evaluation.json").rows
+    return {row.name: (row.value, row.interval, row.floor) for row in rows}
+
+
+def test_the_table_is_printed_written_and_logged(words, tmp_path, capsys):
+    logger = {"class_path": "CSVLogger", "init_args": {"save_dir": "x", "name": ""}}
+    main(words(tmp_path / "run", f"--trainer.logger={logger}"))
+    printed = capsys.readouterr().out
+    for metric in ("JSD", "TV", "W1 range", "MMD", "CD 3D", "FWID", "FGEO", "FGEO recall"):
+        assert re.search(rf"^{re.escape(metric)}[ x]", printed, re.MULTILINE), metric
+    assert "R3DPA (published)" in printed
+    assert "test/range_error_m" in printed
+    out = tmp_path / "run" / "evaluation"
+    assert {path.name for path in out.iterdir()} == {*FILES, *PICTURES, "reference.safetensors"}
+    stored = Evaluation.load(out / "evaluation.json")
+    about = stored.about
+    assert stored.label == "run"
+    assert (stored.row("JSD").num_samples, stored.row("JSD").num_references) == (4, 12)
+    assert (about["solver"], about["steps"], about["seed"]) == ("euler", 2, 0)
+    assert about["feature_source"] == "geometric"
+    assert (about["extra"]["stage"], about["extra"]["step"], about["extra"]["nfe"]) == (
+        *("joint", 3),
+        2,
+    )
+    lines = (tmp_path / "run" / "version_0" / "metrics.csv").open(newline="")
+    logged = {key: value for row in csv.DictReader(lines) for key, value in row.items() if value}
+    assert int(logged["step"]) == 3
+    for metric in ("JSD", "W1 range", "FWID"):
+        key = f"test/{metric.replace(' ', '_')}"
+        assert float(logged[key]) == pytest.approx(stored.row(metric).value)
+
+
+def test_scenes_are_those_of_sample_and_evaluate(scored, checkpoint, tmp_path):
+    reference = scored / "evaluation" / "reference.safetensors"
+    out = ["--out", str(tmp_path / "scenes"), "--device", "cpu"]
+    how = ["--num", "4", "--solver", "euler", "--steps", "2", "--pictures", "0"]
+    main(["sample", "--ckpt", str(checkpoint), *out, *how])
+    options = ["--reference", str(reference), "--allow_few", "--device", "cpu"]
+    options += ["--out", str(tmp_path / "evaluation")]
+    main(["evaluate", "--samples", str(tmp_path / "scenes" / "bin"), *options])
+    mine, theirs = values(scored), values(tmp_path)
+    assert set(mine) == set(theirs)
+    for name in ("JSD", "TV", "W1 range", "MMD", "FGEO"):
+        assert theirs[name][0] == pytest.approx(mine[name][0], rel=0.02), name
+
+
+def test_the_reference_is_kept_while_it_fits(words, smoke_root, tmp_path, monkeypatch):
+    """And computed again under another protocol, or where a scan has changed."""
+    done = []
+    compute = ReferenceStatistics.update
+    monkeypatch.setattr(
+        ReferenceStatistics, "update", lambda *args: (done.append(1), compute(*args))
+    )
+    data, run_dir = tmp_path / "data", tmp_path / "run"
+    shutil.copytree(smoke_root, data)
+    fixed = [*QUIET, *GEOMETRIC, *NO_FEATURES, "--data.init_args.root", str(data)]
+    main(words(run_dir, *fixed))
+    first = values(run_dir)
+    main(words(run_dir, *fixed))
+    assert len(done) == 1
+    assert values(run_dir) == first
+    main(words(run_dir, *fixed, "--scorer.protocol=published"))
+    assert len(done) == 2
+    assert values(run_dir) != first
+    scan = next(data.rglob("velodyne_points/data/*.bin"))
+    scan.write_bytes(scan.read_bytes()[:-160])
+    main(words(run_dir, *fixed, "--scorer.protocol=published"))
+    assert len(done) == 3
+
+
+def test_what_does_not_fit_is_said_before_scenes_are_sampled(scored, words, tmp_path, monkeypatch):
+    monkeypatch.setattr(SceneScorer, "_sample", lambda *_: pytest.fail("has sampled"))
+    reference = scored / "evaluation" / "reference.safetensors"
+    given = [*QUIET, f"--scorer.reference={reference}"]
+    with pytest.raises(ValueError, match="4 generated scenes for the 64 features of FGEO; 12"):
+        main(words(tmp_path, *QUIET, *GEOMETRIC, "--scorer.allow_few=false"))
+    with pytest.raises(ValueError, match=r"scorer\.reference: .* is of the protocol default, not"):
+        main(words(tmp_path, *given, "--scorer.protocol=published"))
+    with pytest.raises(ValueError, match="the reference has no features of fwid"):
+        main(words(tmp_path, *given, "--scorer.spaces=[fwid]"))
+    with pytest.raises(ValueError, match=r"nothing\.safetensors holds no reference statistics"):
+        main(words(tmp_path, *QUIET, "--scorer.reference=nothing.safetensors"))
+    with pytest.raises(ValueError, match=r"scorer\.batch_size must be at least 1, got 0"):
+        SceneScorer(batch_size=0)
+
+
+def test_without_scenes_the_losses_alone_are_reported(words, tmp_path, capsys):
+    main(words(tmp_path, *QUIET, "--scorer.num_scenes=0"))
+    assert "test/range_error_m" in capsys.readouterr().out
+    assert not (tmp_path / "evaluation").exists()
+
+
+def test_a_stage_without_velocity_says_so(smoke_args, vae_checkpoint, tmp_path, caplog):
+    fixed = smoke_args("vae_alignment", tmp_path, "--ckpt_path", str(vae_checkpoint), *QUIET)
+    with caplog.at_level("INFO"):
+        main(["test", *fixed[1:]])
+    assert "stage vae_alignment has nothing to sample" in caplog.text
+    assert not (tmp_path / "evaluation").exists()
+
+
+def flat(rows):
+    """Every number of every row by name; an interval has two."""
+    return {
+        f"{name} {place}": number
+        for name, row in rows.items()
+        for place, number in enumerate(
+            part for value in row for part in (value if isinstance(value, tuple) else [value])
+        )
+        if number is not None
+    }
+
+
+@pytest.mark.ddp
+def test_two_processes_give_the_numbers_of_one(scored, words, tmp_path):
+    """Batches are the same, whoever samples them; threads, of which two processes have fewer each,
+    may round sums otherwise."""
+    reference = scored / "evaluation" / "reference.safetensors"
+    more = [*QUIET, f"--scorer.reference={reference}", "--scorer.num_scenes=5"]
+    main(words(tmp_path / "one", *more))
+    two = ["--trainer.devices=2", "--trainer.strategy=ddp"]
+    command = [sys.executable, "-m", "r3dpa", *words(tmp_path / "two", *more, *two)]
+    subprocess.run(command, check=True, timeout=300, capture_output=True)
+    two, one = (flat(values(tmp_path / name)) for name in ("two", "one"))
+    assert two == pytest.approx(one, rel=1e-5, abs=1e-6, nan_ok=True)
+    assert not (tmp_path / "two" / "evaluation" / "sampled").exists()

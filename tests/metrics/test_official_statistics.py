@@ -1,0 +1,267 @@
+import io
+import os
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.cli import main
+from r3dpa.data.scans import write_bin
+from r3dpa.metrics.distances import Resampling
+from r3dpa.metrics.distribution import BEVHistogramDistance, MinimumMatchingDistance
+from r3dpa.metrics.frechet import FrechetDistance
+from r3dpa.metrics.official_statistics import (
+    OfficialStatistics,
+    evaluate_official,
+    is_official,
+)
+from r3dpa.metrics.protocol import PUBLISHED
+from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene_features import SceneFeatures
+from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
+
+WITHOUT = Resampling(num_resamples=0)
+
+
+def features(scenes):
+    """Mean, deviation and horizon of the range images."""
+    images = [scene.range_m for scene in scenes]
+    return torch.stack([torch.stack([i.mean(), i.std(), i[20].mean()]) for i in images]) / 20
+
+
+FRID = SceneFeatures("frid", "FRID", 3, {"in_channels": 4}, features)
+
+
+def scenes(seed, count):
+    """Walls and ground, 64 x 1024 pixels; two drives."""
+    generator = torch.Generator().manual_seed(seed)
+    for index in range(count):
+        wall = 5 + 30 * torch.rand(1, 64, generator=generator).repeat_interleave(16, dim=1)
+        ground = 3 + 10 * torch.rand(64, 1, generator=generator)
+        yield EvaluationScene(f"{'ab'[index % 2]}/{index:03d}", None, torch.minimum(wall, ground))
+
+
+REAL = list(scenes(0, 6))
+
+
+def content(seen=None):
+    """The layout of the official file, from scenes as the sensor sees them."""
+    seen = seen or [through_sensor(scene, PUBLISHED) for scene in REAL]
+    rows = features(seen).double().numpy()
+    grid, counts, points = PUBLISHED.grid, np.zeros((2000, 2000), np.float32), []
+    for scene in seen:
+        x, y = np.divmod(grid.cells(scene.points).numpy(), 2000)
+        counts[x, y] += 1
+        points.append((np.stack([x, y], axis=1) / 2000).astype(np.float32))
+    moments = {"mu": rows.mean(axis=0), "sigma": np.cov(rows, rowvar=False)}
+    split = {"rangevit_wo_i": moments, "dataset_bev_hist": counts}
+    paths = [["2013_05_28", f"{index}.bin"] for index in range(len(points))]
+    clouds = {"points": points, "file_paths": paths}
+    return {"all": dict(split), "val": {**split, "valset_voxelized_bev": clouds}}
+
+
+CONTENT = content()
+
+
+def write(path, value=CONTENT):
+    np.save(path, np.array(value, dtype=object), allow_pickle=True)
+    return path
+
+
+def changed(key, value, split="val"):
+    """The content with one field replaced, or left out where the value is None."""
+    part = {name: entry for name, entry in CONTENT[split].items() if name != key}
+    return {split: part if value is None else {**part, key: value}}
+
+
+@pytest.fixture
+def file(tmp_path):
+    return write(tmp_path / "data_statistics.npy")
+
+
+class TestEvaluateOfficial:
+    def test_rows_are_those_against_the_scans_themselves(self, file):
+        """From the file alone, the numbers that the metrics give from all scans."""
+        bev, matching = BEVHistogramDistance(), MinimumMatchingDistance()
+        frechet = FrechetDistance(3)
+        for real, part in ((True, REAL), (False, scenes(1, 5))):
+            seen = [through_sensor(scene, PUBLISHED) for scene in part]
+            bev.update([scene.points for scene in seen], real=real)
+            matching.update([scene.points for scene in seen], real=real)
+            frechet.update(features(seen), real=real)
+        distances = bev.compute()
+        expected = {
+            "JSD": distances["jsd_distance"],
+            "TV": distances["total_variation"],
+            "MMD": matching.compute()["mmd_squared_normalised"],
+            "FRID": frechet.compute().item(),
+        }
+        found = evaluate_official(
+            scenes(1, 5), OfficialStatistics.load(file), [FRID], label="made", resampling=WITHOUT
+        )
+        assert [row.name for row in found.rows] == ["JSD", "TV", "MMD", "FRID"]
+        for row in found.rows:
+            assert row.value == pytest.approx(expected[row.name], rel=1e-6), row.name
+            assert row.num_samples == 5
+            assert row.num_references == (6 if row.name == "MMD" else None)
+            assert row.floor is None
+        assert found.about["protocol"]["name"] == "published"
+        assert found.about["reference"].startswith("official statistics data_statistics.npy, ")
+        assert "precision" in found.about["extra"]["left_out"]
+
+    def test_what_the_file_lacks_is_left_out_and_said(self, tmp_path):
+        part = {"all": {"rangevit_wo_i": CONTENT["all"]["rangevit_wo_i"]}}
+        statistics = OfficialStatistics.load(write(tmp_path / "s.npy", part))
+        found = evaluate_official(
+            scenes(1, 6), statistics, [FRID], label="made", resampling=Resampling(num_resamples=40)
+        )
+        assert [row.name for row in found.rows] == ["FRID"]
+        assert found.rows[0].interval[0] < found.rows[0].interval[1]
+        for name in ("JSD", "TV", "MMD"):
+            assert name in found.about["extra"]["left_out"]
+        found.save(tmp_path / "found.json")
+        assert Evaluation.load(tmp_path / "found.json") == found
+
+    def test_few_scenes_and_other_spaces_are_refused(self, file):
+        statistics = OfficialStatistics.load(file)
+        with pytest.raises(ValueError, match="3 generated scenes for the 3 features of FRID"):
+            evaluate_official(scenes(1, 3), statistics, [FRID], label="made")
+        toy = replace(FRID, name="fgeo")
+        with pytest.raises(ValueError, match=r"no moments of fgeo .*only of rangevit_wo_i"):
+            evaluate_official(scenes(1, 3), statistics, [toy], label="made")
+        intense = replace(FRID, card={"in_channels": 5})
+        with pytest.raises(ValueError, match=r"no moments of frid \(rangevit_w_i\)"):
+            evaluate_official(scenes(1, 3), statistics, [intense], label="made")
+        with pytest.raises(ValueError, match=r"val.rangevit_wo_i.mu: has 3 numbers.*4 features"):
+            statistics.of_space(replace(FRID, dim=4))
+
+
+class TestLoad:
+    def test_fields(self, file):
+        statistics = OfficialStatistics.load(file)
+        assert (statistics.split, statistics.spaces) == ("val", ["frid"])
+        mean, covariance = statistics.of_space(FRID)
+        rows = features([through_sensor(scene, PUBLISHED) for scene in REAL]).double()
+        torch.testing.assert_close(mean, rows.mean(dim=0))
+        torch.testing.assert_close(covariance, rows.T.cov())
+        cells = [PUBLISHED.grid.cells(through_sensor(s, PUBLISHED).points) for s in REAL]
+        assert all(torch.equal(a, b) for a, b in zip(statistics.clouds, cells, strict=True))
+        assert torch.equal(statistics.cells, torch.bincount(torch.cat(cells), minlength=4000000))
+        whole = OfficialStatistics.load(file, "all")
+        assert (whole.split, whole.clouds) == ("all", [])
+
+    def test_file_of_an_older_numpy(self, tmp_path):
+        """NumPy 1 called its modules otherwise, and wrote pickles of protocol 3."""
+        stream = io.BytesIO()
+        np.lib.format.write_array_header_1_0(
+            stream, {"descr": "|O", "fortran_order": False, "shape": ()}
+        )
+        pickled = pickle.dumps(np.array(CONTENT, dtype=object), protocol=3)
+        assert b"numpy._core.multiarray\n" in pickled
+        stream.write(pickled.replace(b"numpy._core.multiarray\n", b"numpy.core.multiarray\n"))
+        path = tmp_path / "old.npy"
+        path.write_bytes(stream.getvalue())
+        assert torch.equal(
+            OfficialStatistics.load(path).cells,
+            OfficialStatistics.load(write(tmp_path / "new.npy")).cells,
+        )
+
+    def test_runs_no_code(self, tmp_path):
+        class Harm:
+            def __reduce__(self):
+                return os.mkdir, (str(tmp_path / "harm"),)
+
+        path = write(tmp_path / "bad.npy", {"val": Harm()})
+        with pytest.raises(ValueError, match=r"bad.npy: .*posix.mkdir is no array"):
+            OfficialStatistics.load(path)
+        assert not (tmp_path / "harm").exists()
+
+    @pytest.mark.parametrize(
+        ("value", "message"),
+        [
+            ({"test": {}}, "no split val or all, its fields are test"),
+            ({"val": {}}, "field val: holds no statistics, only nothing"),
+            ({"val": [1]}, "field val: is a list"),
+            (changed("rangevit_wo_i", {"mu": np.zeros(3)}), "val.rangevit_wo_i.sigma: is missing"),
+            (
+                changed("rangevit_wo_i", {"mu": np.zeros(3), "sigma": np.eye(4)}),
+                r"rangevit_wo_i.sigma: has shape \(4, 4\), but mu has 3",
+            ),
+            (
+                changed("rangevit_wo_i", {"mu": np.zeros(2), "sigma": np.triu(np.ones((2, 2)))}),
+                "rangevit_wo_i.sigma: is not symmetric",
+            ),
+            (
+                changed("rangevit_wo_i", {"mu": np.full(2, np.nan), "sigma": np.eye(2)}),
+                "rangevit_wo_i.mu: holds NaN",
+            ),
+            (changed("dataset_bev_hist", np.ones((200, 200))), r"bev_hist: has shape \(200, 200\)"),
+            (changed("dataset_bev_hist", np.zeros((2000, 2000))), "bev_hist: .*not all 0"),
+            (changed("dataset_bev_hist", "x"), "bev_hist: needs an array of numbers"),
+            (changed("valset_voxelized_bev", {"points": []}), "voxelized_bev.points: needs a list"),
+            (
+                changed("valset_voxelized_bev", {"points": [np.full((1, 2), 1.5)]}),
+                r"voxelized_bev.points\[0\]: needs occupied cells",
+            ),
+            (
+                changed("valset_voxelized_bev", {"points": [np.full((1, 2), 0.00025)]}),
+                r"voxelized_bev.points\[0\]: needs occupied cells",
+            ),
+        ],
+    )
+    def test_errors_name_file_and_field(self, tmp_path, value, message):
+        with pytest.raises(ValueError, match=message) as caught:
+            OfficialStatistics.load(write(tmp_path / "named.npy", value))
+        assert "named.npy" in str(caught.value)
+
+    def test_other_files(self, tmp_path, file):
+        np.save(tmp_path / "plain.npy", np.zeros(3))
+        for name in ("plain.npy", "missing.npy"):
+            with pytest.raises(ValueError, match=f"{name}: is no official statistics file"):
+                OfficialStatistics.load(tmp_path / name)
+        file.write_bytes(file.read_bytes()[:-1000])
+        with pytest.raises(ValueError, match="no official statistics file"):
+            OfficialStatistics.load(file)
+        assert is_official(file)
+        assert not is_official(tmp_path / "missing.npy")
+
+
+class TestCommand:
+    @pytest.fixture
+    def network(self, tmp_path):
+        torch.manual_seed(0)
+        network = MinkowskiNet((2,) * 9).eval()
+        weights = {official_name(key): value for key, value in network.state_dict().items()}
+        path = tmp_path / "model.ckpt"
+        torch.save({"state_dict": weights}, path)
+        return path
+
+    def test_prints_and_writes_the_distances(self, tmp_path, network, capsys):
+        moments = {"mu": np.zeros(32), "sigma": np.eye(32)}
+        value = {"all": {**CONTENT["all"], "minkowskinet": moments}}
+        for scene in scenes(1, 3):
+            points = through_sensor(scene, PUBLISHED).points
+            write_bin(tmp_path / "made" / f"{scene.name[2:]}.bin", points)
+        reference, out = write(tmp_path / "stats.npy", value), tmp_path / "out"
+        words = ["evaluate", "--samples", tmp_path / "made", "--reference", reference, "--out", out]
+        words += ["--spaces", "fsvd", "--ckpt.fsvd", network, "--allow_few", "--device", "cpu"]
+        main([*map(str, words), "--split", "all"])
+        printed = capsys.readouterr().out
+        rows = {row.name: row for row in Evaluation.load(out / "evaluation.json").rows}
+        assert list(rows) == ["JSD", "TV", "FSVD"]
+        # Unit covariance and mean zero: |mean|^2 + tr(1 + C - 2 sqrt C), at least the rank missing.
+        assert rows["FSVD"].value > 32 - 3
+        assert "official statistics stats.npy, split all" in printed
+        assert "left_out" in printed
+        assert (out / "table.tex").exists()
+        assert not (out / "birds_eye.png").exists()
+
+    def test_other_references_have_no_split(self, tmp_path):
+        write_bin(tmp_path / "made" / "0.bin", torch.ones(4, 4) * 5)
+        (tmp_path / "ref.safetensors").write_bytes(b"none")
+        words = ["evaluate", "--samples", tmp_path / "made", "--split", "val"]
+        with pytest.raises(ValueError, match=r"ref.safetensors: .*--split val does not apply"):
+            main([*map(str, words), "--reference", str(tmp_path / "ref.safetensors")])
