@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from r3dpa.cli import main
 
@@ -60,3 +61,12 @@ def vae_checkpoint(smoke_args, tmp_path_factory) -> Path:
     run_dir = tmp_path_factory.mktemp("vae_alignment")
     main(smoke_args("vae_alignment", run_dir, "--trainer.logger=false"))
     return run_dir / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture
+def one_thread():
+    """So that processes may be forked, and loader processes and the suite share few cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

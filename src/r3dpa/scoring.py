@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,8 @@ __all__ = [
     "save_reports",
     "save_tables",
 ]
+
+_log = logging.getLogger(__name__)
 
 AnyReference = ReferenceStatistics | OfficialStatistics
 
@@ -110,7 +113,8 @@ def cached_reference(
     for path in (out, _partial(out)):
         try:
             found = resume_or_start(job, path)
-        except ValueError:  # of other scans, spaces or settings, or damaged
+        except ValueError as error:  # of other scans, spaces or settings, or damaged
+            _log.warning("made anew: %s", error)
             path.unlink()
         else:
             if found.complete:

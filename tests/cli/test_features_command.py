@@ -25,21 +25,13 @@ from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import WaffleIron
 from r3dpa.nn.backbones.scalr import _official_name
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 CONF = Path(__file__).resolve().parents[2] / "conf"
 NUM = 30
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 GEOMETRIC = {"class_path": "r3dpa.nn.backbones.GeometricFeatures", "init_args": {"dim": 16}}
 QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
 ROW = 2 * 8 * 16 * 2  # bytes of a 2 x 8 grid, 16 float16 a cell
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """So that processes may be forked."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def make_scans(folder, count):

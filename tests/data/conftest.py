@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from torch import nn
 
 from r3dpa.geometry import LidarSensor
@@ -95,9 +94,5 @@ def files_of():
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
-    """Loader processes and the suite share few cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+def _one_thread(one_thread):
+    """For every test here."""

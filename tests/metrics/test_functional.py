@@ -11,7 +11,7 @@ import torch
 from scipy.linalg import sqrtm
 from scipy.stats import wasserstein_distance
 
-from r3dpa.metrics.bootstrap import bootstrap_interval, real_vs_real_floor
+from r3dpa.metrics.bootstrap import bootstrap_interval
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -454,18 +454,3 @@ def test_paired_sets_are_resampled_alike():
 def test_interval_refuses(sizes, options, message):
     with pytest.raises(ValueError, match=message):
         bootstrap_interval(lambda *i: 0.0, sizes, torch.Generator(), **options)
-
-
-def test_floor_compares_halves_without_a_common_scan():
-    seen = []
-
-    def statistic(a, b):
-        seen.append((a, b))
-        return len(a) + len(b)
-
-    floor = real_vs_real_floor(statistic, 9, torch.Generator().manual_seed(0), num_splits=3)
-    assert (floor.mean, floor.low, floor.high, floor.num_samples) == (8, 8, 8, 4)
-    assert all(not set(a.tolist()) & set(b.tolist()) for a, b in seen)
-    assert len({tuple(a.tolist()) for a, _ in seen}) == 3
-    with pytest.raises(ValueError, match="3 real scans"):
-        real_vs_real_floor(statistic, 3, torch.Generator())

@@ -15,21 +15,13 @@ from r3dpa.modules import FeatureExtraction, MissingScans
 from r3dpa.nn.backbones import GeometricFeatures
 
 pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
     pytest.mark.filterwarnings("ignore:predict returned None"),
     pytest.mark.filterwarnings("ignore:You have overridden `transfer_batch_to_device`"),
     pytest.mark.filterwarnings("ignore:Total length of"),
 ]
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 SIZES = [(2, 8), (4, 16)]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """So that processes may be forked."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from torch import Tensor
 
 from r3dpa.atomic import atomic_path
 from r3dpa.bench.point_network import NetworkCost, network_cost
-from r3dpa.bench.provenance import command, machine, one_line, versions
+from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare, seconds
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import FeatureGrids, FeatureGridWriter, GridSettings, read_scan
@@ -94,17 +93,10 @@ def features(
     names = ["wi3-24"] if quick else ["waffleiron-s", *(["wi48-768"] if wi48 else [])]
     networks = {name: network_cost(name, points) for name in names}
 
-    typed = command()
-    about: dict[str, str | dict[str, Any]] = {
-        # Only the name: where a scan lies is nobody's business.
-        "command": typed if scan is None else typed.replace(str(scan), scan.name),
-        "scan": {"file": "simulated" if scan is None else scan.name, "points": len(points)},
-        "machine": machine() | {"threads": threads_given},
-        "versions": versions(torch, np),
-    }
+    facts = provenance(scan, len(points), np)
     if out is not None:
         content = {
-            **about,
+            **facts,
             "grid_building": {f"{n} threads": asdict(case) for n, case in building.items()},
             "grid_reading": {
                 "bytes_per_scan": sizes_on_disk,
@@ -125,7 +117,7 @@ def features(
     lines += [f"opening a store of {sizes.open_rows} grids: {opening:.3g} s", ""]
     for name, cost in networks.items():
         lines += [_network_table(name, cost), ""]
-    return "\n".join([*lines, *(f"{name}: {one_line(values)}" for name, values in about.items())])
+    return "\n".join([*lines, *(f"{name}: {one_line(values)}" for name, values in facts.items())])
 
 
 def grid_building(points: Tensor, dim: int, rounds: int) -> Comparison:

@@ -25,7 +25,7 @@ from r3dpa.atomic import atomic_path
 from r3dpa.bench.features import comparison_table, simulated_scan
 from r3dpa.bench.metric_networks import NETWORKS, MetricNetworkCost, metric_network_cost
 from r3dpa.bench.point_network import now
-from r3dpa.bench.provenance import command, machine, one_line, versions
+from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import read_scan
@@ -100,13 +100,7 @@ def metrics(scan: Path | None = None, out: Path | None = None, quick: bool = Fal
     """
     sizes = _QUICK if quick else _Sizes()
     points = simulated_scan() if scan is None else torch.from_numpy(read_scan(scan, LidarSensor()))
-    about: dict[str, Any] = {
-        # Only the name: where a scan lies is nobody's business.
-        "command": command() if scan is None else command().replace(str(scan), scan.name),
-        "scan": {"file": "simulated" if scan is None else scan.name, "points": len(points)},
-        "machine": machine() | {"threads": torch.get_num_threads()},
-        "versions": versions(torch, np, scipy),
-    }
+    facts = provenance(scan, len(points), np, scipy)
     grid = BEVGrid(cell_m=sizes.cell_m)
     clouds = turned(points, max(sizes.scenes, sizes.references + sizes.samples))
     conv = convolution(points, sizes.box, sizes.channels, sizes.rounds)
@@ -121,7 +115,7 @@ def metrics(scan: Path | None = None, out: Path | None = None, quick: bool = Fal
     full = _extrapolated(jsd, mmd, timing)
     if out is not None:
         content = {
-            **about,
+            **facts,
             "networks": {name: asdict(cost) for name, cost in networks.items()},
             "jsd": asdict(jsd),
             "mmd": asdict(mmd)
@@ -147,7 +141,7 @@ def metrics(scan: Path | None = None, out: Path | None = None, quick: bool = Fal
         )
         + f"\n{one_line(compared)}"
     )
-    parts.append("\n".join(f"{name}: {one_line(values)}" for name, values in about.items()))
+    parts.append("\n".join(f"{name}: {one_line(values)}" for name, values in facts.items()))
     return "\n\n".join(parts)
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+
 from r3dpa import __version__
 from r3dpa.checkpoints import source_commit
 
@@ -39,6 +41,24 @@ def versions(*packages: ModuleType) -> dict[str, str | None]:
 def command() -> str:
     """The command line of this process, without the folder of the program."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def provenance(scan: Path | None, num_points: int, *packages: ModuleType) -> dict[str, Any]:
+    """Command, scan, machine and versions of a benchmark on one scan.
+
+    Args:
+        scan: Its file; simulated where None. Only its name is kept: where it lies is nobody's
+            business.
+        num_points: Of the scan.
+        packages: As for :func:`versions`, beside torch.
+    """
+    typed = command()
+    return {
+        "command": typed if scan is None else typed.replace(str(scan), scan.name),
+        "scan": {"file": "simulated" if scan is None else scan.name, "points": num_points},
+        "machine": machine() | {"threads": torch.get_num_threads()},
+        "versions": versions(torch, *packages),
+    }
 
 
 def one_line(values: str | dict[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+from collections.abc import Callable, Iterator, Sized
 from typing import Any, cast
 
 import numpy as np
@@ -143,6 +143,7 @@ def training_loader(
     limit_batches: float = 1.0,
     pin_memory: bool = False,
     with_epoch: bool = False,
+    collate_fn: Callable[[list[Any]], Any] | None = None,
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches.
 
@@ -158,6 +159,7 @@ def training_loader(
         pin_memory: Copy batches to page-locked memory for a GPU.
         with_epoch: Ask the data set for ``(epoch, index)``, where samples change from epoch to
             epoch.
+        collate_fn: Makes a batch of samples; that of ``DataLoader`` where None.
 
     Raises:
         ValueError: If the data set is smaller than one batch over all processes.
@@ -175,6 +177,7 @@ def training_loader(
         num_workers=num_workers,
         drop_last=True,
         pin_memory=pin_memory,
+        collate_fn=collate_fn,
         persistent_workers=num_workers > 0,
         generator=torch.Generator(),  # the default one would draw from the global random state
     )

@@ -104,7 +104,7 @@ class PointDataModule(LightningDataModule):
         """Shuffled, resumable loader of full batches."""
         assert self.train_set is not None
         trainer = self.trainer
-        loader = training_loader(
+        return training_loader(
             self.train_set,
             self.batch_size,
             num_workers=self.num_workers,
@@ -113,9 +113,8 @@ class PointDataModule(LightningDataModule):
             rank=0 if trainer is None else trainer.global_rank,
             limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
             with_epoch=True,
+            collate_fn=list_collate,
         )
-        loader.collate_fn = list_collate
-        return loader
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out scans in order, none twice, each drawn the same every time."""

@@ -9,7 +9,6 @@ Source: joblib's layout from its ``numpy_pickle``.
 from __future__ import annotations
 
 import math
-import pickle
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.data.scans import ScanError, read_ply, read_scan
-from r3dpa.unpickling import UNPICKLING_ERRORS
+from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly
 
 SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth", "joblib"]
 SUFFIXES: dict[SampleFormat, tuple[str, ...]] = {
@@ -218,32 +217,19 @@ class _StoredArray:
         self.file.seek(math.prod(self.shape) * self.dtype.itemsize, 1)
 
 
-class _ArraysOnly(pickle.Unpickler):
-    """Unpickler that knows no class but those of an array that joblib has written."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        super().__init__(file)
-        self._known = {
-            ("joblib.numpy_pickle", "NumpyArrayWrapper"): type(
-                "_StoredArrayHere", (_StoredArray,), {"file": file}
-            ),
-            ("numpy", "ndarray"): np.ndarray,
-            ("numpy", "dtype"): np.dtype,
-        }
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in self._known:
-            raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
-        return self._known[module, name]
-
-
 def _joblib_clouds(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Clouds of a list that joblib has written without compression."""
     advice = "save the list as .npz, or give the .txt files beside it"
     # Unbuffered, so that the unpickler never reads on into the bytes of an array.
     with file.open("rb", buffering=0) as stream:
+        stored = type("_StoredArrayHere", (_StoredArray,), {"file": stream})
+        known = {
+            ("joblib.numpy_pickle", "NumpyArrayWrapper"): stored,
+            ("numpy", "ndarray"): np.ndarray,
+            ("numpy", "dtype"): np.dtype,
+        }
         try:
-            clouds = _ArraysOnly(stream).load()
+            clouds = ArraysOnly(stream, known).load()
         except UNPICKLING_ERRORS as error:
             reason = f"is not a joblib list of clouds ({error})"
             raise SampleError(f"{file}: {reason}; {advice}") from error

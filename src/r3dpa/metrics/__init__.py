@@ -1,6 +1,6 @@
 """How realistic scans are, how near generated scenes are to real ones, what features know."""
 
-from r3dpa.metrics.bootstrap import Floor, Interval, bootstrap_interval, real_vs_real_floor
+from r3dpa.metrics.bootstrap import Interval, bootstrap_interval
 from r3dpa.metrics.distribution import (
     BEVHistogramDistance,
     MinimumMatchingDistance,
@@ -61,7 +61,6 @@ __all__ = [
     "Evaluation",
     "EvaluationScene",
     "EvaluationTable",
-    "Floor",
     "FrechetDistance",
     "Interval",
     "Measure",
@@ -97,7 +96,6 @@ __all__ = [
     "precision_recall",
     "probe_source",
     "published_evaluations",
-    "real_vs_real_floor",
     "realism_table",
     "scan_statistics",
     "scene_features",

@@ -20,8 +20,6 @@ from r3dpa.metrics.scene_set import SceneSet, add_scenes
 _GROUPS = 16  # of the bootstrap of histograms
 _BATCH = 8
 _RESAMPLING = Resampling()
-# What the maker of the scenes may tell; the rest of what it tells goes to ``extra``.
-_MADE_WITH = ("solver", "steps", "seed", "precision", "feature_source")
 
 
 class Comparison(NamedTuple):
@@ -132,7 +130,11 @@ def about_generated(
         "backbones": {space.label: dict(space.card) for space in spaces},
         "protocol": protocol.to_dict(),
         "reference": reference.describe(),
-        **{key: told.pop(key, None) for key in _MADE_WITH},  # type: ignore[typeddict-item]
+        "solver": told.pop("solver", None),
+        "steps": told.pop("steps", None),
+        "seed": told.pop("seed", None),
+        "precision": told.pop("precision", None),
+        "feature_source": told.pop("feature_source", None),
         "commit": commit,
         "published": False,
         "source": source,

@@ -10,7 +10,6 @@ Letters: F feature width, n occupied cells of one scan.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from r3dpa.metrics.protocol import PUBLISHED
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
+from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly
 
 __all__ = ["OfficialSplit", "OfficialStatistics", "evaluate_official", "is_official"]
 
@@ -38,8 +38,6 @@ _FRID = {4: "rangevit_wo_i", 5: "rangevit_w_i"}  # by input channels
 _HISTOGRAM, _CLOUDS = "dataset_bev_hist", "valset_voxelized_bev"
 _MAGIC = b"\x93NUMPY"
 _SYMMETRY = 1e-5  # of the largest entry of a covariance
-# What an unpickler raises on bytes that are no pickle, or one it does not accept.
-_NO_PICKLE = (pickle.UnpicklingError, EOFError, LookupError, OverflowError, TypeError, ValueError)
 
 
 def is_official(path: str | Path) -> bool:
@@ -224,15 +222,6 @@ _KNOWN = {
 }
 
 
-class _ArraysOnly(pickle.Unpickler):
-    """Unpickler that knows no class but those that NumPy writes arrays with."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _KNOWN:
-            raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
-        return _KNOWN[module, name]
-
-
 def _read(path: Path) -> dict[Any, Any]:
     """The dictionary of the file."""
     try:
@@ -244,11 +233,11 @@ def _read(path: Path) -> dict[Any, Any]:
             shape, _, dtype = header(stream)
             if shape != () or not dtype.hasobject:
                 raise ValueError(f"an array {shape} of {dtype} instead of one dictionary")
-            content = _ArraysOnly(stream).load()
+            content = ArraysOnly(stream, _KNOWN).load()
         content = content.item() if isinstance(content, np.ndarray) else content
         if not isinstance(content, dict):
             raise ValueError(f"holds a {type(content).__name__} instead of a dictionary")
-    except (*_NO_PICKLE, AttributeError, OSError) as error:
+    except (*UNPICKLING_ERRORS, OSError) as error:
         raise ValueError(
             f"{path}: is no official statistics file ({error}); give its data_statistics.npy"
         ) from error

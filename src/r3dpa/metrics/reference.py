@@ -184,7 +184,7 @@ class ReferenceStatistics:
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_ABOUT])
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
             if card["version"] != _VERSION:
                 raise ValueError(f"is of version {card['version']}, this is {_VERSION}")
             protocol = Protocol.from_dict(card["protocol"])

@@ -94,7 +94,7 @@ class Masking:
         Returns:
             ``(M, T)`` float32.
         """
-        local = GeometricFeatures(2).descriptors(points)[scan.kept]
+        local = GeometricFeatures.descriptors(points)[scan.kept]
         z, cells = scan.features[:, 3], scan.cells[0]
         rows, columns, _ = self.grid.cells
         shape = (1, rows, columns)
