@@ -277,3 +277,17 @@ def test_refused_checkpoints(tmp_path):
     refused(r"embed.final.weight has shape \(4, 8, 2\), but \(4, 8\) is expected")
     official_file(network, path, **{"waffleiron.spatial_mix.1.scale.weight": None})
     refused("1 missing")
+
+
+@torch.inference_mode()
+def test_no_point_learns_anything_of_a_hidden_one(network):
+    """And the hidden ones learn from the visible ones."""
+    batch = collate_scans([prepare(cloud(60))])
+    tokens = torch.randn(len(batch.features), 12)
+    visible = torch.arange(len(tokens)) % 3 > 0
+    mixed = network.mix(tokens, batch, visible)
+    changed = torch.where(visible[:, None], tokens, torch.randn_like(tokens))
+    torch.testing.assert_close(network.mix(changed, batch, visible)[visible], mixed[visible])
+    assert not torch.allclose(network.mix(changed, batch)[visible], mixed[visible], atol=1e-2)
+    others = torch.where(visible[:, None], torch.randn_like(tokens), tokens)
+    assert not torch.allclose(network.mix(others, batch, visible)[~visible], mixed[~visible])
