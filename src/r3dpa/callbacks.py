@@ -25,20 +25,29 @@ from r3dpa.data import Scan, write_bin
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import points_of
-from r3dpa.metrics.evaluation import check_counts
-from r3dpa.metrics.evaluation import evaluate as compare
+from r3dpa.metrics.evaluation import TooFewScenesError, check_counts
 from r3dpa.metrics.protocol import PROTOCOLS
-from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
+from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
-from r3dpa.scoring import cached_reference, feature_spaces, report, save_reports
+from r3dpa.scoring import (
+    AnyReference,
+    cached_reference,
+    compare,
+    feature_spaces,
+    load_reference,
+    reference_spaces,
+    report,
+    save_reports,
+)
 
 __all__ = ["PictureLogger", "ReconstructionWriter", "RunCheckpoint", "SceneScorer"]
 
 _SAMPLER = SamplerConfig()
+_OPTION = "--scorer.{} true"  # how the SceneScorer of `r3dpa test` is told to allow something
 
 
 class RunCheckpoint(ModelCheckpoint):
@@ -158,13 +167,17 @@ class SceneScorer(L.Callback):
         sampler: Solver and steps.
         precision: Of the networks that sample.
         seed: Of the scenes, see :class:`SceneGenerator`.
-        reference: File of ``r3dpa reference``. Without it, all scans of the data module are the
-            reference, training and held-out; their statistics are computed once and kept in
-            ``<run_dir>/evaluation/reference.safetensors``.
+        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``. Without it,
+            all scans of the data module are the reference, training and held-out; their statistics
+            are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
+        split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
         spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
         ckpt: Official weights by space.
-        protocol: ``default`` or ``published``, which that of a reference file must be.
+        protocol: ``default`` or ``published``; where None, that of the reference file, or
+            ``default`` without one.
         allow_few: Accept fewer scenes than features: only to try it.
+        skip_bad: Leave out scenes that cannot be used, such as those without any return; the tables
+            tell how many and the numbers' file which. Else the first one ends the test.
 
     Raises:
         ValueError: If a number is out of its range.
@@ -178,10 +191,12 @@ class SceneScorer(L.Callback):
         precision: Literal["fp32", "bf16"] = "fp32",
         seed: int = 0,
         reference: str | None = None,
+        split: Literal["val", "all"] | None = None,
         spaces: list[str] | None = None,
         ckpt: dict[str, str] | None = None,
-        protocol: Literal["default", "published"] = "default",
+        protocol: Literal["default", "published"] | None = None,
         allow_few: bool = False,
+        skip_bad: bool = True,
     ) -> None:
         for name, value, least in (
             ("num_scenes", num_scenes, 0),
@@ -196,11 +211,13 @@ class SceneScorer(L.Callback):
         self.precision = precision
         self.seed = seed
         self.reference = reference
+        self.split = split
         self.spaces = spaces
         self.ckpt = ckpt or {}
         self.protocol = protocol
         self.allow_few = allow_few
-        self._job: tuple[ReferenceStatistics, list[SceneFeatures], list[Scan]] | None = None
+        self.skip_bad = skip_bad
+        self._job: tuple[AnyReference, list[SceneFeatures], list[Scan]] | None = None
 
     def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Checks all that can be checked before scenes are sampled."""
@@ -214,20 +231,13 @@ class SceneScorer(L.Callback):
         if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
             raise TypeError(f"SceneScorer needs a LidarDataModule, got {type(datamodule).__name__}")
         device = str(pl_module.device)
-        if self.reference is not None:
-            statistics, scans = ReferenceStatistics.load(self.reference), []
-            setting, names = statistics.protocol, tuple(statistics.spaces)
-            if setting.name != self.protocol:
-                raise ValueError(
-                    f"scorer.reference: {self.reference} is of the protocol {setting.name}, not "
-                    f"{self.protocol}; set scorer.protocol, or compute another one"
-                )
-            free = [name for name in names if name in (*FREE_SPACES, *self.ckpt)]
-            spaces = feature_spaces(self.spaces or free, self.ckpt, setting, device)
-            check_spaces(statistics.spaces, spaces)
+        counts, statistics = {"generated scenes": self.num_scenes}, self._loaded()
+        scans: list[Scan] = []
+        if statistics is not None:
+            spaces = reference_spaces(statistics, self.spaces, self.ckpt, self.protocol, device)
         else:
             scans = datamodule.all_set.scans
-            setting = PROTOCOLS[self.protocol].with_sensor(datamodule.sensor)
+            setting = PROTOCOLS[self.protocol or "default"].with_sensor(datamodule.sensor)
             names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
             spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)
             about = {
@@ -238,8 +248,9 @@ class SceneScorer(L.Callback):
             }
             scan_names = [scan.name for scan in scans]
             statistics = ReferenceStatistics.prepare(spaces, setting, scan_names, about)
-        counts = {"generated scenes": self.num_scenes, "real scans": len(statistics.names)}
-        check_counts(counts, spaces, self.allow_few)
+        if isinstance(statistics, ReferenceStatistics):
+            counts["real scans"] = len(statistics.names)
+        check_counts(counts, spaces, self.allow_few, _OPTION)
         self._job = (statistics, spaces, scans)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -253,23 +264,38 @@ class SceneScorer(L.Callback):
         trainer.strategy.barrier("SceneScorer")
         if not trainer.is_global_zero:
             return
-        if self.reference is None:
+        if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
             path = folder / "reference.safetensors"
             statistics = cached_reference(statistics, scans, spaces, path)
-        comparison = compare(
-            self._sampled(pl_module, folder, statistics),
-            statistics,
-            spaces,
-            label=folder.absolute().parent.name,
-            source=str(trainer.ckpt_path),
-            made_with=made_with,
-            commit=source_commit(),
-            allow_few=self.allow_few,
-        )
+        try:
+            evaluation, comparison = compare(
+                self._sampled(pl_module, folder, statistics),
+                statistics,
+                spaces,
+                label=folder.absolute().parent.name,
+                source=str(trainer.ckpt_path),
+                made_with=made_with,
+                commit=source_commit(),
+                allow_few=True,  # checked before; what falls out later is told
+                skip_bad=self.skip_bad,
+                option=_OPTION,
+            )
+        except TooFewScenesError as error:  # the losses of the test are still to be printed
+            trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
+            return
         shutil.rmtree(_parts(folder))
-        save_reports(comparison, statistics, folder)
-        trainer.print(report(comparison.evaluation, statistics))
-        _log(trainer, comparison.evaluation, trainer.global_step or pl_module.loaded_step)
+        save_reports(evaluation, comparison, statistics, folder)
+        trainer.print(report(evaluation, statistics))
+        _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
+
+    def _loaded(self) -> AnyReference | None:
+        """The reference file, None without one."""
+        if self.reference is None:
+            return None
+        try:
+            return load_reference(Path(self.reference), self.split)
+        except ValueError as error:
+            raise ValueError(f"scorer.reference: {error}") from error
 
     def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> dict[str, Any]:
         """Writes the batches of this process; returns what made them."""
@@ -303,7 +329,7 @@ class SceneScorer(L.Callback):
         }
 
     def _sampled(
-        self, module: GenerativeModule, folder: Path, statistics: ReferenceStatistics
+        self, module: GenerativeModule, folder: Path, statistics: AnyReference
     ) -> Iterator[EvaluationScene]:
         """Scenes of all processes, in order; as points where the reference has other pixels."""
         projection = module.scan_geometry.projection

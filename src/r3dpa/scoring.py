@@ -3,34 +3,42 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
 
 from r3dpa import viz
 from r3dpa.data.scans import Scan, read_scan
-from r3dpa.metrics.evaluation import Comparison
-from r3dpa.metrics.official_statistics import OfficialStatistics
+from r3dpa.metrics.evaluation import Comparison, evaluate
+from r3dpa.metrics.official_statistics import (
+    OfficialSplit,
+    OfficialStatistics,
+    evaluate_official,
+    is_official,
+)
 from r3dpa.metrics.protocol import Protocol
-from r3dpa.metrics.reference import ReferenceStatistics, resume_or_start
+from r3dpa.metrics.reference import ReferenceStatistics, check_spaces, resume_or_start
 from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import Evaluation, published_evaluations
 from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import SPACES, SceneFeatures, scene_features
+from r3dpa.metrics.scene_features import FREE_SPACES, SPACES, SceneFeatures, scene_features
 from r3dpa.metrics.scene_set import RANGE_BIN_M
 from r3dpa.viz import evaluation as figures
 
 __all__ = [
+    "AnyReference",
     "cached_reference",
+    "compare",
     "complete_reference",
     "feature_spaces",
+    "load_reference",
+    "reference_spaces",
     "report",
     "save_reports",
-    "save_tables",
 ]
 
 _log = logging.getLogger(__name__)
@@ -64,11 +72,98 @@ def feature_spaces(
     unused = [name for name in ckpt or {} if name not in names]
     if unused:
         raise ValueError(
-            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)})"
+            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
+            f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
         )
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
+
+
+def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
+    """Reference of either kind, ready to compare with.
+
+    Args:
+        path: File of ``r3dpa reference``, or the official statistics file.
+        split: Part of the official file, see :meth:`OfficialStatistics.load`.
+
+    Raises:
+        ValueError: If the file is missing, damaged, of something else or not complete, or a split
+            is asked of a file that has none.
+    """
+    if is_official(path):
+        return OfficialStatistics.load(path, split)
+    if split is not None:
+        raise ValueError(
+            f"{path}: is no official statistics file, so the split {split} does not apply to it; "
+            "leave it out"
+        )
+    statistics = ReferenceStatistics.load(path)
+    statistics.check_complete()
+    return statistics
+
+
+def reference_spaces(
+    statistics: AnyReference,
+    names: Sequence[str] | None,
+    ckpt: Mapping[str, str | Path] | None,
+    protocol: str | None,
+    device: str,
+) -> list[SceneFeatures]:
+    """Feature spaces of a comparison with a reference.
+
+    Args:
+        statistics: The reference.
+        names: Feature spaces; where None, those of the reference that need no file or that
+            ``ckpt`` has one for.
+        ckpt: Weight files by name.
+        protocol: Must be that of the reference; not compared where None.
+        device: As for :func:`feature_spaces`.
+
+    Raises:
+        ValueError: If the reference is of another protocol or lacks a space, or as
+            :func:`feature_spaces`.
+    """
+    setting = statistics.protocol
+    if protocol is not None and protocol != setting.name:
+        raise ValueError(
+            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
+            f"with `r3dpa reference --protocol {protocol}`, or ask for no protocol"
+        )
+    if names is None:
+        names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
+    spaces = feature_spaces(names, ckpt, setting, device)
+    if isinstance(statistics, OfficialStatistics):
+        for space in spaces:
+            statistics.of_space(space)
+    else:
+        check_spaces(statistics.spaces, spaces)
+    return spaces
+
+
+def compare(
+    scenes: Iterable[EvaluationScene],
+    statistics: AnyReference,
+    spaces: Sequence[SceneFeatures],
+    **options: Any,
+) -> tuple[Evaluation, Comparison | None]:
+    """Generated scenes beside a reference of either kind.
+
+    Args:
+        scenes: Read once; a generated one is ``EvaluationScene(name, None, range_m)``.
+        statistics: Reference.
+        spaces: Of :func:`reference_spaces`.
+        options: Those that :func:`r3dpa.metrics.evaluation.evaluate` and ``evaluate_official``
+            share.
+
+    Returns:
+        All numbers, and what figures are drawn from; None for the official file, which holds no
+        scans.
+    """
+    if isinstance(statistics, OfficialStatistics):
+        return evaluate_official(scenes, statistics, spaces, **options), None
+    comparison = evaluate(scenes, statistics, spaces, **options)
+    return comparison.evaluation, comparison
 
 
 def complete_reference(
@@ -132,30 +227,19 @@ def report(evaluation: Evaluation, statistics: AnyReference) -> str:
     return text if table is None else f"{text}\n\n{table}"
 
 
-def save_reports(comparison: Comparison, statistics: ReferenceStatistics, out: Path) -> None:
-    """Writes numbers, tables and figures of a comparison to a folder.
-
-    Beside what :func:`save_tables` writes, ``birds_eye.png``, ``ranges.png`` and ``matches.png``
-    are drawn from the sets themselves.
-
-    Args:
-        comparison: Result of :func:`r3dpa.metrics.evaluation.evaluate`.
-        statistics: Its reference.
-        out: Folder; files of these names are replaced.
-    """
-    save_tables(comparison.evaluation, statistics, out)
-    _draw(comparison, statistics, out)
-
-
-def save_tables(evaluation: Evaluation, statistics: AnyReference, out: Path) -> None:
-    """Writes the numbers of an evaluation to a folder.
+def save_reports(
+    evaluation: Evaluation, comparison: Comparison | None, statistics: AnyReference, out: Path
+) -> None:
+    """Writes numbers, tables and figures to a folder.
 
     ``evaluation.json`` and ``metrics.csv`` hold all rows; ``table.md`` and ``table.tex`` the
-    distances beside the published ones.
+    distances beside the published ones; ``birds_eye.png``, ``ranges.png`` and ``matches.png`` are
+    drawn from the sets themselves, where there are any.
 
     Args:
         evaluation: All numbers.
-        statistics: Its reference.
+        comparison: Of the same scenes; see :func:`compare`.
+        statistics: The reference.
         out: Folder; files of these names are replaced.
     """
     evaluation.save(out / "evaluation.json")
@@ -163,6 +247,8 @@ def save_tables(evaluation: Evaluation, statistics: AnyReference, out: Path) -> 
     table = _beside_published(evaluation, statistics) or EvaluationTable((evaluation,))
     table.save(out / "table.md")
     table.save(out / "table.tex")
+    if comparison is not None and isinstance(statistics, ReferenceStatistics):
+        _draw(comparison, statistics, out)
 
 
 def _beside_published(evaluation: Evaluation, statistics: AnyReference) -> EvaluationTable | None:

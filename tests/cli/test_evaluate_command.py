@@ -10,7 +10,6 @@ import yaml
 import r3dpa.cli.evaluate as command
 from r3dpa import scoring
 from r3dpa.cli import main
-from r3dpa.cli.evaluate import evaluate_scenes
 from r3dpa.data.scans import write_bin, write_npz
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
 from r3dpa.metrics.distances import Resampling
@@ -159,18 +158,81 @@ def test_what_made_the_samples_is_told(reference_file, samples, tmp_path):
         evaluate(*words)
 
 
-def test_bad_samples_stop_or_are_listed(reference_file, samples, tmp_path):
+def test_bad_samples_stop_or_are_listed(reference_file, samples, tmp_path, capsys):
+    """The reader refuses the first, the scorer the second: all its points are beside the grid."""
     (samples / "004.bin").write_bytes(b"no points")
+    write_bin(samples / "007.bin", torch.tensor([[0.0, 52.0, 0.0, 0.0]]))
     words = ["--samples", samples, "--reference", reference_file, "--allow_few"]
-    with pytest.raises(ValueError, match=r"004\.bin: has 9 bytes"):
+    with pytest.raises(ValueError, match=r"004\.bin: has 9 bytes.*--skip_bad leaves such"):
         evaluate(*words)
     with pytest.warns(UserWarning, match="1 bad samples left out"):
         evaluate(*words, "--skip_bad", "--out", tmp_path / "out")
     stored = Evaluation.load(tmp_path / "out" / "evaluation.json")
-    assert stored.row("JSD").num_samples == 9
-    bad = stored.about["extra"]["bad_samples"]
-    assert bad["count"] == 1
-    assert "004.bin" in bad["first"][0]
+    assert stored.row("JSD").num_samples == 8
+    (first, second), printed = stored.bad_samples, capsys.readouterr().out
+    assert re.search(r"004\.bin: has 9 bytes", first)
+    assert second.startswith("samples/007: none of 1 points has x in")
+    assert first in printed
+    assert second in printed
+    note = "samples: samples that cannot be used and are left out: 2"
+    assert note in printed
+    assert note in (tmp_path / "out" / "table.md").read_text()
+    (samples / "004.bin").unlink()
+    with pytest.raises(ValueError, match=r"007: none of 1 points has x.*--skip_bad leaves such"):
+        evaluate(*words)
+
+
+def test_nothing_usable_is_an_error(reference_file, tmp_path):
+    for index in range(3):
+        write_bin(tmp_path / f"made/{index}.bin", torch.tensor([[0.0, 52.0, 0.0, 0.0]]))
+    words = ["--samples", tmp_path / "made", "--reference", reference_file, "--skip_bad"]
+    with pytest.raises(
+        ValueError, match=r"0 generated scenes.* 3 cannot be used, the first is made/0:"
+    ):
+        evaluate(*words)
+
+
+def images(height=16, width=64):
+    return np.full((3, 1, height, width), 10.0, np.float32)
+
+
+def one_empty():
+    values = images()
+    values[1] = -1
+    return values
+
+
+def one_nan():
+    values = images()
+    values[1, 0, 3, 5] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            one_empty(),
+            r"img\.npz, sample .*1.*: has no pixel within the sensor's range.*--skip_bad",
+        ),
+        (one_nan(), r"img\.npz, sample .*1.*: has NaN or infinite ranges in 1 pixels.*--skip_bad"),
+        (images(8, 8), r"img\.npz, .*: has an image of 8 x 8 pixels, but the sensor has 16 x 64"),
+        (images()[:1], r"1 generated scenes; a comparison needs at least 2"),
+        (images(), r"3 generated scenes for the 64 features of FGEO.*--allow_few"),
+    ],
+)
+def test_unusable_images_are_named(reference_file, tmp_path, content, message):
+    np.savez(tmp_path / "img.npz", content)
+    with pytest.raises(ValueError, match=message):
+        evaluate("--samples", tmp_path / "img.npz", "--reference", reference_file)
+
+
+def test_an_unfinished_reference_is_refused(reference_file, samples, tmp_path):
+    whole = ReferenceStatistics.load(reference_file)
+    begun = ReferenceStatistics(whole.protocol, whole.spaces, whole.names, whole.about)
+    begun.save(tmp_path / "begun.safetensors")
+    with pytest.raises(ValueError, match="the reference holds 0 of 12 scans; repeat its command"):
+        evaluate("--samples", samples, "--reference", tmp_path / "begun.safetensors")
 
 
 def test_protocols_do_not_mix(data, samples, tmp_path, reference_file):
@@ -210,9 +272,10 @@ def test_generated_scenes_need_no_files(reference_file, tmp_path):
     """The same numbers from images in memory and from a file of their points."""
     made = [EvaluationScene(f"{i}", None, m) for i, m in enumerate(range_images(1, 10))]
     statistics = ReferenceStatistics.load(reference_file)
-    options = {"allow_few": True, "device": "cpu", "resampling": Resampling(0, 40)}
-    comparison = evaluate_scenes(made, statistics, label="memory", **options)
-    rows = {row.name: row.value for row in comparison.evaluation.rows}
+    options = {"allow_few": True, "resampling": Resampling(0, 40)}
+    spaces = scoring.reference_spaces(statistics, None, None, None, "cpu")
+    found, _ = scoring.compare(made, statistics, spaces, label="memory", **options)
+    rows = {row.name: row.value for row in found.rows}
     write_npz(tmp_path / "made.npz", {str(i): p for i, p in enumerate(clouds(1, 10))})
     path = tmp_path / "made.npz"
     evaluate("--samples", path, "--reference", reference_file, "--allow_few", "--out", tmp_path)
@@ -231,6 +294,10 @@ def test_generated_scenes_need_no_files(reference_file, tmp_path):
         (["--spaces", "fid"], "there is no feature space 'fid'"),
         (["--spaces", "fgeo,fgeo"], "spaces must be different names"),
         (["--ckpt.frid", "x.ckpt"], r"--ckpt\.frid: frid is not among the spaces \(fgeo\)"),
+        (
+            ["--spaces", "frid"],
+            r"frid needs its official weights: give --ckpt\.frid FILE \(`r3dpa test`: --scorer",
+        ),
         (["--reference", "none.safetensors"], "none.safetensors holds no reference statistics"),
         (["--samples", "nowhere"], "nowhere: there is no such file or folder"),
     ],

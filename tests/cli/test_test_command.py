@@ -9,11 +9,13 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from r3dpa import callbacks
 from r3dpa.callbacks import SceneScorer
 from r3dpa.cli import main
+from r3dpa.generation import SceneGenerator
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
@@ -137,16 +139,102 @@ def test_what_does_not_fit_is_said_before_scenes_are_sampled(scored, words, tmp_
     monkeypatch.setattr(SceneScorer, "_sample", lambda *_: pytest.fail("has sampled"))
     reference = scored / "evaluation" / "reference.safetensors"
     given = [*QUIET, f"--scorer.reference={reference}"]
-    with pytest.raises(ValueError, match="4 generated scenes for the 64 features of FGEO; 12"):
+    few = "4 generated scenes for the 64 features of FGEO; 12.*with --scorer.allow_few true"
+    with pytest.raises(ValueError, match=few):
         main(words(tmp_path, *QUIET, *GEOMETRIC, "--scorer.allow_few=false"))
-    with pytest.raises(ValueError, match=r"scorer\.reference: .* is of the protocol default, not"):
+    with pytest.raises(ValueError, match="the reference is of the protocol default, not published"):
         main(words(tmp_path, *given, "--scorer.protocol=published"))
     with pytest.raises(ValueError, match="the reference has no features of fwid"):
         main(words(tmp_path, *given, "--scorer.spaces=[fwid]"))
+    with pytest.raises(ValueError, match=r"scorer\.reference: .*the split val does not apply"):
+        main(words(tmp_path, *given, "--scorer.split=val"))
+    begun, whole = tmp_path / "begun.safetensors", ReferenceStatistics.load(reference)
+    parts = (whole.protocol, whole.spaces, whole.names, whole.about)
+    ReferenceStatistics(*parts).save(begun)
+    with pytest.raises(ValueError, match="holds 0 of 12 scans; repeat its command"):
+        main(words(tmp_path, *QUIET, f"--scorer.reference={begun}"))
+    with pytest.raises(ValueError, match=r"frid needs its official weights.*--scorer\.ckpt\.frid"):
+        main(words(tmp_path, *QUIET, "--scorer.spaces=[frid]"))
     with pytest.raises(ValueError, match=r"nothing\.safetensors holds no reference statistics"):
         main(words(tmp_path, *QUIET, "--scorer.reference=nothing.safetensors"))
     with pytest.raises(ValueError, match=r"scorer\.batch_size must be at least 1, got 0"):
         SceneScorer(batch_size=0)
+
+
+@pytest.fixture
+def emptied(monkeypatch):
+    """``emptied(*indices)``: the generator makes these scenes without any return."""
+
+    def patch(*indices):
+        generate = SceneGenerator.generate
+
+        def broken(self, wanted, seed=0):
+            found = generate(self, wanted, seed)
+            for place, index in enumerate(wanted):
+                if index in indices:
+                    found.range_m[place] = -1.0
+            return found
+
+        monkeypatch.setattr(SceneGenerator, "generate", broken)
+
+    return patch
+
+
+def test_an_empty_scene_is_counted_and_listed(scored, words, tmp_path, emptied, capsys):
+    emptied(2)
+    reference = scored / "evaluation" / "reference.safetensors"
+    given = [*QUIET, f"--scorer.reference={reference}"]
+    main(words(tmp_path / "run", *given))
+    printed, out = capsys.readouterr().out, tmp_path / "run" / "evaluation"
+    stored = Evaluation.load(out / "evaluation.json")
+    assert stored.row("JSD").num_samples == 3
+    assert [reason.split(":")[0] for reason in stored.bad_samples] == ["000002"]
+    note = "run: samples that cannot be used and are left out: 1"
+    assert note in printed
+    assert stored.bad_samples[0] in printed
+    assert note in (out / "table.md").read_text()
+    stop = "000002: no pixel of the range image.*--scorer.skip_bad true leaves such scenes out"
+    with pytest.raises(ValueError, match=stop):
+        main(words(tmp_path, *given, "--scorer.skip_bad=false"))
+
+
+def test_scenes_that_fall_out_do_not_leave_too_few(scored, words, tmp_path, emptied):
+    """66 scenes are enough for 64 features; the 64 that are left are told to be few."""
+    emptied(0, 1)
+    reference = scored / "evaluation" / "reference.safetensors"
+    counts = ["--scorer.num_scenes=66", "--scorer.batch_size=33"]
+    main(words(tmp_path, *QUIET, *counts, f"--scorer.reference={reference}"))
+    row = Evaluation.load(tmp_path / "evaluation" / "evaluation.json").row("FGEO")
+    assert row.num_samples == 64
+
+
+def test_without_a_usable_scene_the_losses_are_reported(words, tmp_path, emptied, capsys):
+    emptied(0, 1, 2)
+    main(words(tmp_path, *QUIET, *GEOMETRIC))
+    printed = capsys.readouterr().out
+    assert "nothing is compared with real scans: 1 generated scenes" in printed
+    assert "3 cannot be used, the first is 000000: no pixel" in printed
+    assert "test/range_error_m" in printed
+    assert not (tmp_path / "evaluation" / "evaluation.json").exists()
+
+
+def test_the_official_file_is_a_reference(words, tmp_path, capsys):
+    """Its protocol is that of the published numbers, without being asked for."""
+    counts = np.zeros((2000, 2000), np.float32)
+    counts[900:1100, 900:1100] = 1
+    official, parts = tmp_path / "data_statistics.npy", {"val": {"dataset_bev_hist": counts}}
+    np.save(official, np.array(parts, dtype=object), allow_pickle=True)
+    main(words(tmp_path / "run", *QUIET, f"--scorer.reference={official}"))
+    assert "official statistics data_statistics.npy, split val" in capsys.readouterr().out
+    stored = Evaluation.load(tmp_path / "run" / "evaluation" / "evaluation.json")
+    assert [row.name for row in stored.rows] == ["JSD", "TV"]
+    assert stored.about["protocol"]["name"] == "published"
+    names = {path.name for path in (tmp_path / "run" / "evaluation").iterdir()}
+    assert names == FILES
+    with pytest.raises(ValueError, match="of the protocol published, not default"):
+        main(words(tmp_path, *QUIET, f"--scorer.reference={official}", "--scorer.protocol=default"))
+    with pytest.raises(ValueError, match="holds no split all"):
+        main(words(tmp_path, *QUIET, f"--scorer.reference={official}", "--scorer.split=all"))
 
 
 def test_without_scenes_the_losses_alone_are_reported(words, tmp_path, capsys):

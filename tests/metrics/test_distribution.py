@@ -13,8 +13,9 @@ from r3dpa.metrics.distribution import (
     PrecisionRecall,
 )
 from r3dpa.metrics.frechet import FrechetDistance
-from r3dpa.metrics.functional import frechet_distance_of, polynomial_mmd, precision_recall
+from r3dpa.metrics.functional import frechet_distance_of, polynomial_mmd
 from r3dpa.metrics.functional_bev import BEVGrid, histogram_distance, minimum_matching
+from r3dpa.metrics.functional_manifold import precision_recall
 
 GRID = BEVGrid((-8.0, 8.0), (-8.0, 8.0), 0.25)
 

@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -7,12 +8,14 @@ import torch
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.distances import Resampling
 from r3dpa.metrics.distribution import BEVHistogramDistance, MinimumMatchingDistance
-from r3dpa.metrics.evaluation import evaluate
+from r3dpa.metrics.evaluation import TooFewScenesError, evaluate
 from r3dpa.metrics.frechet import FrechetDistance
-from r3dpa.metrics.functional import fd_infinity, precision_recall
+from r3dpa.metrics.functional import fd_infinity
 from r3dpa.metrics.functional_bev import chamfer_squared
+from r3dpa.metrics.functional_manifold import precision_recall
 from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
@@ -233,18 +236,71 @@ def test_few_scenes_are_refused_or_marked(reference):
         rows_of(scenes(1), small)
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (EvaluationScene("bad/1", torch.zeros(0, 3)), "bad/1: none of 0 points"),
-        (EvaluationScene("bad/1", torch.full((1, 3), math.nan)), "bad/1: cloud holds 3 NaN"),
-        (EvaluationScene("bad/1", None, torch.ones(8, 8)), r"bad/1: range image of shape \(8, 8\)"),
-        (EvaluationScene("bad/1", torch.tensor([[0.0, 52.0, 0.0]])), "bad/1: none of 1 points has"),
-    ],
-)
+BAD = [
+    (EvaluationScene("bad/1", torch.zeros(0, 3)), "bad/1: none of 0 points"),
+    (EvaluationScene("bad/2", torch.full((1, 3), math.nan)), "bad/2: cloud holds 3 NaN"),
+    (EvaluationScene("bad/3", None, torch.ones(8, 8)), r"bad/3: range image of shape \(8, 8\)"),
+    (EvaluationScene("bad/4", torch.tensor([[0.0, 52.0, 0.0]])), "bad/4: none of 1 points has"),
+    (EvaluationScene("bad/5", None, torch.full((16, 64), -1.0)), "bad/5: no pixel of the range"),
+    (EvaluationScene("bad/6", None, torch.full((16, 64), math.nan)), "bad/6: range image holds"),
+    (EvaluationScene("bad/7", None), "bad/7: has neither points nor"),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD)
 def test_bad_scenes_are_named(reference, bad, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"{message}.*\. skip_bad=True leaves such scenes out"):
         rows_of([*scenes(1, 5), bad], reference)
+    with pytest.raises(ValueError, match=rf"{message}.*\. --skip leaves such scenes out"):
+        rows_of([*scenes(1, 5), bad], reference, option="--skip")
+
+
+def test_bad_scenes_are_left_out_and_listed(reference):
+    """They change no number, do not count as scenes, and everything printed tells of them."""
+    good = list(scenes(1, 10))
+    mixed = [BAD[0][0], *good[:3], *(bad for bad, _ in BAD[1:]), *good[3:]]
+    options = {"label": "made", "resampling": QUICK}
+    clean = evaluate(good, reference, [TOY], **options).evaluation
+    found = evaluate(mixed, reference, [TOY], skip_bad=True, **options).evaluation
+    assert found.rows == clean.rows
+    assert [reason.split(":")[0] for reason in found.bad_samples] == [
+        f"bad/{i}" for i in range(1, 8)
+    ]
+    for reason, (_, message) in zip(found.bad_samples, BAD, strict=True):
+        assert re.match(message, reason)
+        assert reason in str(found)
+    assert "samples that cannot be used and are left out: 7" in str(found)
+    assert (
+        "made: samples that cannot be used and are left out: 7" in EvaluationTable((found,)).notes
+    )
+    assert clean.bad_samples == []
+    assert "cannot be used" not in str(clean) + str(EvaluationTable((clean,)))
+
+
+def test_bad_scenes_do_not_use_up_what_the_protocol_counts():
+    reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
+    mixed = [*(bad for bad, _ in BAD), *scenes(1, 21)]
+    comparison = evaluate(mixed, reference, [TOY], label="x", resampling=QUICK, skip_bad=True)
+    assert comparison.samples.count == 20
+
+
+def test_bad_scenes_alone_are_an_error(reference):
+    with pytest.raises(TooFewScenesError, match=r"0 generated .* 7 cannot be used, .* bad/1: none"):
+        rows_of([bad for bad, _ in BAD], reference, skip_bad=True)
+
+
+def test_floors_are_of_as_many_scenes_as_the_values(reference):
+    """The nearest of 8 scans is no nearer than that of all 20, of which they are a part."""
+    few, many, more = (rows_of(scenes(1, count), reference) for count in (8, 20, 40))
+    for name in ("MMD", "CD 3D", "TOY"):
+        assert few[name].note.endswith("floor of 8 and 20 scans"), name
+        assert many[name].note.endswith("floor of 20 and 20 scans"), name
+        assert more[name].note.endswith(
+            "floor of 20 and 20 scans, rather high: the value is of 40 scenes"
+        ), name
+    assert few["MMD"].floor > many["MMD"].floor == more["MMD"].floor
+    assert few["JSD"].note == ("floor of 20 and 20 scans, rather low: the value is of 8 scenes")
+    assert more["TOY KID"].note.endswith("floor of 20 and 20 scans")
 
 
 def test_an_unfinished_reference_is_refused():

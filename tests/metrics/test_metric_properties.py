@@ -14,8 +14,6 @@ from r3dpa.metrics.functional import (
     fd_infinity,
     frechet_distance_of,
     polynomial_mmd,
-    precision_recall,
-    shared_balls,
     squared_mmd,
     wasserstein_1_of_values,
 )
@@ -25,10 +23,11 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
+from r3dpa.metrics.functional_manifold import precision_recall, shared_balls
 from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import scene_features
-from r3dpa.metrics.scene_set import SceneSet, add_scenes
+from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
 from r3dpa.nn.backbones.sparse_features import pool_voxels
 
 SEEDS = range(4)
@@ -197,7 +196,7 @@ def test_batches_change_nothing():
     sets = []
     for batch_size in (1, 3, 7):
         found = SceneSet(protocol, {"fgeo": space.dim}, 5, 4, num_groups=2)
-        for batch, features in add_scenes(scenes, [space], protocol, batch_size):
+        for batch, features in add_scenes(usable_scenes(scenes, protocol), [space], batch_size):
             found.add(batch, features)
         sets.append(found)
     for one, other in pairwise(sets):

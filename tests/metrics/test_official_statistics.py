@@ -263,5 +263,5 @@ class TestCommand:
         write_bin(tmp_path / "made" / "0.bin", torch.ones(4, 4) * 5)
         (tmp_path / "ref.safetensors").write_bytes(b"none")
         words = ["evaluate", "--samples", tmp_path / "made", "--split", "val"]
-        with pytest.raises(ValueError, match=r"ref.safetensors: .*--split val does not apply"):
+        with pytest.raises(ValueError, match=r"ref.safetensors: .*the split val does not apply"):
             main([*map(str, words), "--reference", str(tmp_path / "ref.safetensors")])

@@ -3,6 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.protocol import DEFAULT
@@ -87,6 +89,40 @@ def test_halves_are_whole_drives_or_ends_of_one():
     halves = split_halves(names)  # a, then c and b into the smaller half, then d
     assert [halves[name] for name in names] == [0, 0, 0, 1, 1, 1, 0]
     assert split_halves(["a/0", "a/3", "a/1"]) == {"a/0": 0, "a/1": 0, "a/3": 1}
+
+
+def test_a_drive_that_outweighs_the_others_is_divided():
+    """Drives of 50, 3 and 1: 27 and 27, of which the first are the start of the longest drive."""
+    sizes = {"long": 50, "some": 3, "one": 1}
+    names = [f"{drive}/{i:02d}" for drive, count in sizes.items() for i in range(count)]
+    halves = split_halves(names)
+    first = {name for name in names if halves[name] == 0}
+    assert first == {f"long/{i:02d}" for i in range(27)}
+    assert [*halves.values()].count(1) == 27
+    # Twice as many is still left: 4 of one drive, 2 of two others.
+    halves = split_halves(["a/0", "a/1", "a/2", "a/3", "b/0", "c/0"])
+    assert [halves[name] for name in ("a/0", "a/3", "b/0", "c/0")] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "limit", "kept"),
+    [
+        ((50, 3, 1), 20, (10, 10)),
+        ((50, 3, 1), 7, (4, 3)),
+        ((50, 3, 1), 100, (27, 27)),
+        ((4, 2), 5, (3, 2)),  # halves of 4 and 2
+        ((7, 4), 10, (6, 4)),  # the first makes up for what the second lacks
+        ((7, 4), 100, (7, 4)),
+    ],
+)
+def test_as_many_scans_are_kept_as_the_protocol_asks_for(sizes, limit, kept):
+    names = [f"{drive}/{i:02d}" for drive, count in enumerate(sizes) for i in range(count)]
+    protocol = replace(PROTOCOL, num_samples=limit, num_mmd_references=limit)
+    reference = ReferenceStatistics.prepare([TOY], protocol, names, {})
+    reference.update((EvaluationScene(n, None, torch.full((16, 64), 9.0)) for n in names), [TOY])
+    assert tuple(len(half.rows) for half in reference.halves) == kept
+    assert tuple(len(half.images) for half in reference.halves) == kept
+    assert len(reference.whole.rows) == sum(kept)
 
 
 def test_the_choice_does_not_depend_on_the_order():
@@ -176,4 +212,29 @@ def test_files_of_something_else_are_named(tmp_path):
     filled().save(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
+        ReferenceStatistics.load(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("0.moments.toy", lambda x: x[:-1], r"has shape \(6,\), expected \(7,\)"),
+        ("1.features.toy", lambda x: x[:, :1], r"has shape \(4, 1\), expected \(4, 2\)"),
+        ("0.features.toy", lambda x: x[1:], r"has shape \(3, 2\), expected \(4, 2\)"),
+        ("1.images", lambda x: x[..., :32], r"has shape \(2, 16, 32\), expected \(2, 16, 64\)"),
+        ("0.cell_counts", lambda x: x[1:], r"has shape \(\d+,\), expected \(\d+,\)"),
+        ("1.ranges", lambda x: x[:, 1:], r"has shape \(1, 559\), expected \(1, 560\)"),
+        ("1.ranges", None, r"is missing, expected \(1, 560\)"),
+    ],
+)
+def test_tensors_of_other_shapes_are_named(tmp_path, key, change, message):
+    path = tmp_path / "a.safetensors"
+    filled().save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors, card = {k: file.get_tensor(k) for k in file.keys()}, file.metadata()  # noqa: SIM118
+    changed = {k: v for k, v in tensors.items() if k != key}
+    if change is not None:
+        changed[key] = change(tensors[key]).contiguous()
+    save_file(changed, path, metadata=card)
+    with pytest.raises(ValueError, match=rf"a\.safetensors holds .*tensor {key} {message}"):
         ReferenceStatistics.load(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,35 +14,29 @@ from tqdm import tqdm
 
 from r3dpa.checkpoints import refuse_leak, source_commit
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
-from r3dpa.data.samples import read_samples
+from r3dpa.data.sample_files import SampleError
+from r3dpa.data.samples import Samples, read_samples
 from r3dpa.data.scans import Scan, evenly
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.distances import Resampling
-from r3dpa.metrics.evaluation import Comparison
-from r3dpa.metrics.evaluation import evaluate as compare
-from r3dpa.metrics.official_statistics import (
-    OfficialSplit,
-    OfficialStatistics,
-    evaluate_official,
-    is_official,
-)
+from r3dpa.metrics.official_statistics import OfficialSplit
 from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
+from r3dpa.metrics.scene_features import FREE_SPACES
 from r3dpa.scoring import (
-    AnyReference,
+    compare,
     complete_reference,
     feature_spaces,
+    load_reference,
+    reference_spaces,
     report,
     save_reports,
-    save_tables,
 )
 
-__all__ = ["evaluate", "evaluate_scenes", "reference"]
+__all__ = ["evaluate", "reference"]
 
 SplitName = Literal["train", "val", "all"]
-_SHOWN_BAD = 20  # messages of unusable samples that are kept
+_OPTION = "--{}"  # how `r3dpa evaluate` is told to allow something
 
 
 def reference(
@@ -112,7 +106,7 @@ def evaluate(
             ``ckpt`` has one for.
         ckpt: Their weights by name.
         protocol: Must be that of the reference; not compared where None.
-        skip_bad: Leave out samples that cannot be used, and say so.
+        skip_bad: Leave out samples that cannot be used, and list them.
         allow_few: Accept fewer samples than features.
         allow_oracle: Accept samples of a model that learned from labels.
         label: Of the generator; the name of ``samples`` where None.
@@ -128,115 +122,42 @@ def evaluate(
     """
     made_with = _made_with(samples)
     refuse_leak(made_with.get("feature_source"), str(samples), allow=allow_oracle)
-    statistics = _load(reference, split)
+    statistics = load_reference(reference, split)
+    found = reference_spaces(statistics, spaces, ckpt, protocol, device)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
     )
-    progress = tqdm((EvaluationScene(*scene) for scene in files), "samples", disable=None)
-    found = _chosen_spaces(statistics, spaces, ckpt, protocol, device)
-    options: dict[str, Any] = {
-        "label": label or samples.stem,
-        "source": str(samples),
-        "made_with": made_with,
-        "commit": source_commit(),
-        "allow_few": allow_few,
-    }
-    comparison = None
-    if isinstance(statistics, OfficialStatistics):
-        evaluation = evaluate_official(progress, statistics, found, **options)
-    else:
-        comparison = compare(progress, statistics, found, **options)
-        evaluation = comparison.evaluation
-    if files.bad:
-        bad = {"count": len(files.bad), "first": files.bad[:_SHOWN_BAD]}
-        extra = {**evaluation.about["extra"], "bad_samples": bad}
-        evaluation = replace(evaluation, about={**evaluation.about, "extra": extra})
-    if out is not None:
-        if comparison is None:
-            save_tables(evaluation, statistics, out)
-        else:
-            assert isinstance(statistics, ReferenceStatistics)
-            save_reports(comparison._replace(evaluation=evaluation), statistics, out)
-    return report(evaluation, statistics)
-
-
-def _load(path: Path, split: OfficialSplit | None) -> AnyReference:
-    """Reference of either kind."""
-    if is_official(path):
-        return OfficialStatistics.load(path, split)
-    if split is not None:
-        raise ValueError(
-            f"{path}: is no official statistics file, so --split {split} does not apply to it; "
-            "leave it out"
-        )
-    return ReferenceStatistics.load(path)
-
-
-def evaluate_scenes(
-    scenes: Iterable[EvaluationScene],
-    statistics: ReferenceStatistics,
-    *,
-    label: str,
-    source: str = "",
-    spaces: Sequence[str] | None = None,
-    ckpt: Mapping[str, Path] | None = None,
-    protocol: str | None = None,
-    made_with: Mapping[str, Any] | None = None,
-    allow_few: bool = False,
-    device: str = "auto",
-    resampling: Resampling | None = None,
-) -> Comparison:
-    """Compares scenes with real ones; a generated one is ``EvaluationScene(name, None, range_m)``.
-
-    Args:
-        scenes: Read once, in batches.
-        statistics: Reference to compare with.
-        label: Of the generator.
-        source: Where the scenes come from.
-        spaces: As for :func:`evaluate`.
-        ckpt: As for :func:`evaluate`.
-        protocol: As for :func:`evaluate`.
-        made_with: See :func:`r3dpa.metrics.evaluation.evaluate`.
-        allow_few: Accept fewer scenes than features.
-        device: Where the networks compute.
-        resampling: Seed, and cost of the intervals.
-
-    Raises:
-        ValueError: If the reference is of another protocol or lacks a space, or as
-            :func:`r3dpa.metrics.evaluation.evaluate`.
-    """
-    found = _chosen_spaces(statistics, spaces, ckpt, protocol, device)
-    return compare(
-        scenes,
+    evaluation, comparison = compare(
+        tqdm(_scenes(files), "samples", disable=None),
         statistics,
         found,
-        label=label,
-        source=source,
+        label=label or samples.stem,
+        source=str(samples),
         made_with=made_with,
         commit=source_commit(),
         allow_few=allow_few,
-        resampling=resampling or Resampling(),
+        skip_bad=skip_bad,
+        option=_OPTION,
     )
+    if files.bad:  # what the reader refuses never becomes a scene
+        bad = {"bad_samples": [*files.bad, *evaluation.bad_samples]}
+        about: Any = {**evaluation.about, "extra": {**evaluation.about["extra"], **bad}}
+        evaluation = replace(evaluation, about=about)
+    if out is not None:
+        save_reports(evaluation, comparison, statistics, out)
+    return report(evaluation, statistics)
 
 
-def _chosen_spaces(
-    statistics: AnyReference,
-    spaces: Sequence[str] | None,
-    ckpt: Mapping[str, Path] | None,
-    protocol: str | None,
-    device: str,
-) -> list[SceneFeatures]:
-    """Feature spaces of a comparison; the arguments are those of :func:`evaluate`."""
-    setting = statistics.protocol
-    if protocol is not None and protocol != setting.name:
-        raise ValueError(
-            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
-            f"with `r3dpa reference --protocol {protocol}`"
-        )
-    if spaces is None:
-        spaces = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
-    return feature_spaces(spaces, ckpt, setting, device)
+def _scenes(samples: Samples) -> Iterator[EvaluationScene]:
+    """Samples as scenes; the message of a bad one says how to go on without."""
+    try:
+        yield from (EvaluationScene(*sample) for sample in samples)
+    except SampleError as error:
+        if samples.skip_bad or error.__cause__ is None:  # that of one sample has a cause
+            raise
+        advice = f"{_OPTION.format('skip_bad')} leaves such samples out, and lists them"
+        raise SampleError(f"{error}. {advice}") from error
 
 
 def _scans(data: Path, split: SplitName, limit: int | None) -> tuple[list[Scan], LidarSensor]:

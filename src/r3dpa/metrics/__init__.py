@@ -16,7 +16,6 @@ from r3dpa.metrics.functional import (
     frechet_distance,
     frechet_distance_of,
     polynomial_mmd,
-    precision_recall,
     squared_mmd,
     wasserstein_1_of_values,
 )
@@ -26,6 +25,7 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
+from r3dpa.metrics.functional_manifold import precision_recall
 from r3dpa.metrics.measures import (
     MEASURES,
     Measure,

@@ -43,12 +43,12 @@ def bootstrap_interval(
     Two generators that were given the same references or seeds are compared with ``paired``: the
     statistic is their difference, and every set is resampled by the same indices.
 
-    The ends are the value minus the quantiles of (resampled - value). Distances of distributions
-    grow when samples repeat, and this takes the growth off instead of adding it; an end may lie
-    below zero for a distance near its floor.
+    The ends are the value minus the quantiles of (resampled - mean of all resampled). Distances of
+    distributions grow when samples repeat; the mean takes that growth out, so that the interval
+    surrounds the value and tells how far it scatters at this number of samples. What few samples
+    add to the value itself it does not tell. An end may lie below zero for a distance near zero.
 
-    Source: Efron and Tibshirani, "An introduction to the bootstrap", 1993; Davison and Hinkley,
-    1997, eq. 5.6.
+    Source: basic bootstrap (Davison and Hinkley 1997, eq. 5.6) about the mean of the resamples.
 
     Args:
         statistic: Of index vectors ``(n_i,)`` int64, one for each set.
@@ -83,5 +83,5 @@ def bootstrap_interval(
         dtype=torch.float64,
     )
     ends = torch.tensor([(1 + level) / 2, (1 - level) / 2], dtype=torch.float64)
-    low, high = (2 * value - resampled.quantile(ends)).tolist()
+    low, high = (value + resampled.mean() - resampled.quantile(ends)).tolist()
     return Interval(value, low, high)

@@ -9,8 +9,9 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from r3dpa.metrics.functional import checked_features, polynomial_mmd, precision_recall
+from r3dpa.metrics.functional import checked_features, polynomial_mmd
 from r3dpa.metrics.functional_bev import BEVGrid, histogram_distance, minimum_matching
+from r3dpa.metrics.functional_manifold import precision_recall
 
 
 class _FeatureSets(Metric):

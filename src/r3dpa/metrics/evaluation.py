@@ -15,11 +15,18 @@ from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
 from r3dpa.metrics.results import About, Evaluation, MetricResult
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.metrics.scene_set import SceneSet, add_scenes
+from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
 
 _GROUPS = 16  # of the bootstrap of histograms
 _BATCH = 8
+_UNBIASED = (" inf", " KID")  # distances whose mean does not depend on how many scenes there are
 _RESAMPLING = Resampling()
+#: How a caller in Python sets an option that allows something.
+PYTHON_OPTION = "{}=True"
+
+
+class TooFewScenesError(ValueError):
+    """Not two scenes are left that can be compared."""
 
 
 class Comparison(NamedTuple):
@@ -48,6 +55,8 @@ def evaluate(
     made_with: Mapping[str, Any] | None = None,
     commit: str | None = None,
     allow_few: bool = False,
+    skip_bad: bool = False,
+    option: str = PYTHON_OPTION,
     batch_size: int = _BATCH,
     resampling: Resampling = _RESAMPLING,
 ) -> Comparison:
@@ -57,9 +66,9 @@ def evaluate(
     scenes in the same order give the same numbers.
 
     The floor of a distance is that between the halves of the reference: other drives where there
-    are several. For feature spaces it is taken at as many scenes as are evaluated, or at as many as
-    are kept. JSD, TV and W1 are taken over all scans of both halves, which lowers their floor where
-    these are more than are evaluated; MMD's halves are smaller, which raises its floor.
+    are several. It is taken at as many scenes as are evaluated, or at as many as a half keeps; but
+    JSD, TV and W1, of which only sums are kept, over all scans of both halves. Fewer scenes than
+    are evaluated raise a floor and more lower it, and the note of the row then says so.
     Precision and its relatives are no distances: what the halves reach is in their notes.
 
     Args:
@@ -72,25 +81,26 @@ def evaluate(
             ``feature_source``; anything else JSON can hold is kept, too.
         commit: Version of the code.
         allow_few: Accept fewer scenes than features.
+        skip_bad: Leave out scenes that are empty, hold NaN or have another size; the result lists
+            them as ``bad_samples`` of ``extra``.
+        option: How the caller sets ``allow_few`` and ``skip_bad``, for messages.
         batch_size: Scenes per pass of a network.
         resampling: Seed, and cost of the intervals.
 
     Raises:
-        ValueError: If the reference is not complete or lacks a space, there are fewer than two
-            scenes or, without ``allow_few``, not more scenes than features; if a scene is empty,
-            holds NaN or has another size, it is named.
+        TooFewScenesError: If there are fewer than two scenes.
+        ValueError: If the reference is not complete or lacks a space, or there are, without
+            ``allow_few``, not more scenes than features; without ``skip_bad``, if a scene is empty,
+            holds NaN or has another size: it is named.
     """
-    if not reference.complete:
-        raise ValueError(
-            f"the reference holds {reference.num_done} of {len(reference.names)} scans; repeat its "
-            "command to complete it"
-        )
+    reference.check_complete()
     check_spaces(reference.spaces, spaces)
     protocol = reference.protocol
-    samples, more = gather(scenes, spaces, protocol, batch_size)
+    bad: list[str] | None = [] if skip_bad else None
+    samples, more = gather(scenes, spaces, protocol, batch_size, bad, option)
     references = reference.whole
     counts = {"generated scenes": samples.count, "real scans": references.count}
-    check_counts(counts, spaces, allow_few)
+    check_counts(counts, spaces, allow_few, option, bad or ())
 
     rows = histogram_rows(references, samples, resampling)
     matched, matching = matching_rows(references, samples, resampling)
@@ -98,9 +108,9 @@ def evaluate(
     for space in spaces:
         real, generated = (FeatureSample.of(part, space.name) for part in (references, samples))
         rows += feature_rows(space.label, real, generated, resampling)
-    floors = _floors(reference, spaces, samples.count, resampling)
+    floors = _floors(reference, spaces, samples, resampling)
     about = about_generated(samples.count, more, spaces, reference, made_with, commit, source)
-    about["extra"]["bootstrap"] = vars(resampling)
+    about["extra"] |= {"bootstrap": vars(resampling)} | ({"bad_samples": bad} if bad else {})
     evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
     return Comparison(evaluation, samples, references, matching)
 
@@ -147,19 +157,35 @@ def gather(
     spaces: Sequence[SceneFeatures],
     protocol: Protocol,
     batch_size: int = _BATCH,
+    bad: list[str] | None = None,
+    option: str = PYTHON_OPTION,
 ) -> tuple[SceneSet, bool]:
-    """Statistics of generated scenes, and whether there were more than the protocol counts."""
+    """Statistics of generated scenes, and whether there were more than the protocol counts.
+
+    Args:
+        scenes: Read once; the first usable ones count, as many as the protocol says.
+        spaces: Feature spaces.
+        protocol: How scenes are prepared.
+        batch_size: Scenes per pass of a network.
+        bad: Takes the messages of scenes that cannot be used. Where None, the first one stops.
+        option: How the caller sets ``skip_bad``, for that message.
+    """
     widths = {space.name: space.dim for space in spaces}
     samples = SceneSet(protocol, widths, protocol.num_samples, protocol.num_mmd_samples, _GROUPS)
     stream = iter(scenes)
-    counted = islice(stream, protocol.num_samples)
-    for batch, features in add_scenes(counted, spaces, protocol, batch_size):
+    advice = f". {option.format('skip_bad')} leaves such scenes out, and lists them"
+    counted = islice(usable_scenes(stream, protocol, bad, advice), protocol.num_samples)
+    for batch, features in add_scenes(counted, spaces, batch_size):
         samples.add(batch, features)
     return samples, next(stream, None) is not None
 
 
 def check_counts(
-    counts: Mapping[str, int], spaces: Sequence[SceneFeatures], allow_few: bool
+    counts: Mapping[str, int],
+    spaces: Sequence[SceneFeatures],
+    allow_few: bool,
+    option: str = PYTHON_OPTION,
+    bad: Sequence[str] = (),
 ) -> None:
     """Refuses fewer than two scenes and, unless allowed, fewer than features.
 
@@ -167,13 +193,19 @@ def check_counts(
         counts: How many there are of each kind; ``generated scenes`` among them.
         spaces: Feature spaces.
         allow_few: Accept fewer scenes than features.
+        option: How the caller sets ``allow_few``, for the message.
+        bad: Messages of generated scenes that were left out.
 
     Raises:
+        TooFewScenesError: If there are fewer than two generated scenes.
         ValueError: Naming the kinds and the spaces.
     """
     num_samples = counts["generated scenes"]
     if num_samples < 2:
-        raise ValueError(f"{num_samples} generated scenes; a comparison needs at least 2")
+        left_out = f" {len(bad)} cannot be used, the first is {bad[0]}" if bad else ""
+        raise TooFewScenesError(
+            f"{num_samples} generated scenes; a comparison needs at least 2.{left_out}"
+        )
     few = [
         f"{count} {what} for the {space.dim} features of {space.label}"
         for space in spaces
@@ -183,25 +215,31 @@ def check_counts(
     if few and not allow_few:
         raise ValueError(
             f"{'; '.join(few)}: the covariance would be singular, and the distance tell mostly how "
-            "few there are. Give more, choose a smaller space, or allow it with --allow_few"
+            "few there are. Give more, choose a smaller space, or allow it with "
+            + option.format("allow_few")
         )
 
 
 def _floors(
     reference: ReferenceStatistics,
     spaces: Sequence[SceneFeatures],
-    num_samples: int,
+    samples: SceneSet,
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
-    """Rows of the first half of the reference as if it were generated, against the second."""
+    """Rows of the first half of the reference as if it were generated, against the second.
+
+    Of it, as many scans as there are samples are used where it keeps so many.
+    """
     first, second = reference.halves
     if min(first.count, second.count) < 2:
         return {}
     without = replace(resampling, num_resamples=0)
-    rows = histogram_rows(second, first, without) + matching_rows(second, first, without)[0]
+    rows = histogram_rows(second, first, without)
+    # The nearest of more samples is nearer, so that MMD falls with their number.
+    rows += matching_rows(second, first.with_images(len(samples.images)), without)[0]
     for space in spaces:
         real, held_out = (FeatureSample.of(part, space.name) for part in (second, first))
-        same_size = held_out.subset(num_samples, resampling.generator())
+        same_size = held_out.subset(samples.count, resampling.generator())
         rows += feature_rows(space.label, real, same_size, without)
     return {row.name: row for row in rows}
 
@@ -214,7 +252,11 @@ def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> Metric
     if row.direction == "higher":
         text = f"real scans reach {floor.value:.3g} ({counts})"
         return replace(row, note="; ".join(filter(None, [row.note, text])))
-    note = "; ".join(filter(None, [row.note, f"floor of {counts}"]))
+    text = f"floor of {counts}"
+    if not row.name.endswith(_UNBIASED) and floor.num_samples != row.num_samples:
+        fewer = (floor.num_samples or 0) < (row.num_samples or 0)
+        text += f", rather {'high' if fewer else 'low'}: the value is of {row.num_samples} scenes"
+    note = "; ".join(filter(None, [row.note, text]))
     return replace(row, floor=max(floor.value, 0.0), note=note)
 
 

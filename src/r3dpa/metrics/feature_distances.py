@@ -13,8 +13,8 @@ from r3dpa.metrics.functional import (
     fd_infinity,
     frechet_distance,
     polynomial_mmd,
-    shared_balls,
 )
+from r3dpa.metrics.functional_manifold import shared_balls
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene_set import SceneSet
 

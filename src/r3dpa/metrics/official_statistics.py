@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.metrics.distances import Resampling, cell_rows, distance_row
-from r3dpa.metrics.evaluation import about_generated, check_counts, gather
+from r3dpa.metrics.evaluation import PYTHON_OPTION, about_generated, check_counts, gather
 from r3dpa.metrics.feature_distances import FeatureSample, frechet_row
 from r3dpa.metrics.functional_bev import minimum_matching
 from r3dpa.metrics.protocol import PUBLISHED
@@ -153,6 +153,8 @@ def evaluate_official(
     made_with: Mapping[str, Any] | None = None,
     commit: str | None = None,
     allow_few: bool = False,
+    skip_bad: bool = False,
+    option: str = PYTHON_OPTION,
     batch_size: int = 8,
     resampling: Resampling | None = None,
 ) -> Evaluation:
@@ -172,6 +174,8 @@ def evaluate_official(
         made_with: What is known of their making, as for ``evaluate``.
         commit: Version of the code.
         allow_few: Accept fewer scenes than features.
+        skip_bad: As for ``evaluate``.
+        option: As for ``evaluate``.
         batch_size: Scenes per pass of a network.
         resampling: Seed, and cost of the intervals.
 
@@ -181,8 +185,9 @@ def evaluate_official(
     resampling = resampling or Resampling()
     moments = [statistics.of_space(space) for space in spaces]  # before the long way
     protocol = statistics.protocol
-    samples, more = gather(scenes, spaces, protocol, batch_size)
-    check_counts({"generated scenes": samples.count}, spaces, allow_few)
+    bad: list[str] | None = [] if skip_bad else None
+    samples, more = gather(scenes, spaces, protocol, batch_size, bad, option)
+    check_counts({"generated scenes": samples.count}, spaces, allow_few, option, bad or ())
     rows: list[MetricResult] = []
     absent = ["floors", "W1 range", "CD 3D", "FD-infinity, KID, precision and its relatives"]
     if statistics.cells is None:
@@ -206,6 +211,7 @@ def evaluate_official(
     note = f"the official file does not hold what these need: {', '.join(absent)}"
     about = about_generated(samples.count, more, spaces, statistics, made_with, commit, source)
     about["extra"] |= {"left_out": note, "bootstrap": vars(resampling)}
+    about["extra"] |= {"bad_samples": bad} if bad else {}
     return Evaluation(label, tuple(rows), about)
 
 

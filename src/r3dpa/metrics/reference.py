@@ -19,10 +19,10 @@ from r3dpa.metrics.functional import Moments
 from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.metrics.scene_set import SceneSet, add_scenes
+from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
-_VERSION = 1
+_VERSION = 2
 
 
 class ReferenceStatistics:
@@ -39,7 +39,8 @@ class ReferenceStatistics:
 
     Attributes:
         halves: The two sets; features of up to ``num_samples`` scans and images of up to
-            ``num_mmd_references`` are kept, half of them in each.
+            ``num_mmd_references`` are kept, half of them in each, or more in one where the other
+            has fewer scans.
         num_done: Scans counted in so far; all of them once complete.
 
     Raises:
@@ -63,11 +64,15 @@ class ReferenceStatistics:
         self.names, self._half_of = tuple(names), split_halves(names)
         self.num_done = 0
         widths = {name: card["dim"] for name, card in spaces.items()}
-        rows, images = (
-            -(-protocol.num_samples // 2),
-            -(-protocol.num_mmd_references // 2),
+        in_first = sum(half == 0 for half in self._half_of.values())
+        sizes = (in_first, len(names) - in_first)
+        limits = [
+            _kept_of_halves(limit, sizes)
+            for limit in (protocol.num_samples, protocol.num_mmd_references)
+        ]
+        self.halves = tuple(
+            SceneSet(protocol, widths, *of_half) for of_half in zip(*limits, strict=True)
         )
-        self.halves = tuple(SceneSet(protocol, widths, rows, images) for _ in range(2))
 
     @classmethod
     def prepare(
@@ -84,6 +89,18 @@ class ReferenceStatistics:
     def complete(self) -> bool:
         """Whether every scan was counted in."""
         return self.num_done == len(self.names)
+
+    def check_complete(self) -> None:
+        """Refuses statistics that lack scans.
+
+        Raises:
+            ValueError: Telling how many are there.
+        """
+        if not self.complete:
+            raise ValueError(
+                f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
+                "command to complete it"
+            )
 
     @property
     def whole(self) -> SceneSet:
@@ -120,7 +137,8 @@ class ReferenceStatistics:
         """
         check_spaces(self.spaces, spaces)
         every = -(-every // batch_size) * batch_size
-        for batch, features in add_scenes(scenes, spaces, self.protocol, batch_size):
+        seen = usable_scenes(scenes, self.protocol)
+        for batch, features in add_scenes(seen, spaces, batch_size):
             expected = self.names[self.num_done : self.num_done + len(batch)]
             if tuple(scene.name for scene in batch) != expected:
                 raise ValueError(
@@ -202,15 +220,30 @@ class ReferenceStatistics:
 
 def _fill(part: SceneSet, tensors: dict[str, Tensor], index: int, card: dict[str, Any]) -> None:
     """Statistics of one half from a file."""
+
+    def tensor(key: str, *shape: int) -> Tensor:
+        found = tensors.get(f"{index}.{key}")
+        if found is None or found.shape != shape:
+            given = "is missing" if found is None else f"has shape {tuple(found.shape)}"
+            raise ValueError(f"tensor {index}.{key} {given}, expected {shape}")
+        return found
+
+    chosen, sensor = card["chosen"][index], part.protocol.sensor
+    rows, images = chosen["rows"], chosen["images"]
     part.count = card["counts"][index]
-    part.moments = {s: Moments.unpack(tensors[f"{index}.moments.{s}"]) for s in part.widths}
-    features = {space: tensors[f"{index}.features.{space}"] for space in part.widths}
-    for row, (name, place) in enumerate(card["chosen"][index]["rows"]):
+    part.moments = {
+        space: Moments.unpack(tensor(f"moments.{space}", 1 + width + width**2))
+        for space, width in part.widths.items()
+    }
+    features = {s: tensor(f"features.{s}", len(rows), width) for s, width in part.widths.items()}
+    for row, (name, place) in enumerate(rows):
         part.rows.offer(name, place, {space: values[row] for space, values in features.items()})
-    for row, (name, place) in enumerate(card["chosen"][index]["images"]):
-        part.images.offer(name, place, tensors[f"{index}.images"][row])
-    part.cells[0, tensors[f"{index}.cells"].long()] = tensors[f"{index}.cell_counts"]
-    part.ranges = tensors[f"{index}.ranges"]
+    stack = tensor("images", len(images), sensor.beams, sensor.columns)
+    for row, (name, place) in enumerate(images):
+        part.images.offer(name, place, stack[row])
+    occupied = len(tensors.get(f"{index}.cells", ()))
+    part.cells[0, tensor("cells", occupied).long()] = tensor("cell_counts", occupied)
+    part.ranges = tensor("ranges", *part.ranges.shape)
 
 
 def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
@@ -263,20 +296,30 @@ def check_spaces(stored: dict[str, dict[str, Any]], spaces: Sequence[SceneFeatur
 
 
 def split_halves(names: Sequence[str]) -> dict[str, int]:
-    """Half, 0 or 1, of each scan: whole drives, or the start and the end of a single one.
+    """Half, 0 or 1, of each scan: whole drives, as long as no half has over two thirds of them all.
 
     The drive of a scan is what its name has before the last ``/``. Drives go to the smaller half,
-    the largest first.
+    the largest first. A single drive, or one with over two thirds of all scans, is divided: its
+    start makes one half, and its end goes to the other, so that both have equally many.
 
     Args:
         names: ``drive/frame`` of each scan.
     """
-    drives = Counter(name.rpartition("/")[0] for name in names)
-    if len(drives) == 1:
-        ordered = sorted(names)
-        return {name: int(place >= len(names) / 2) for place, name in enumerate(ordered)}
-    sizes, half_of = [0, 0], {}
-    for drive, count in sorted(drives.items(), key=lambda item: (-item[1], item[0])):
-        half_of[drive] = sizes.index(min(sizes))
-        sizes[half_of[drive]] += count
-    return {name: half_of[name.rpartition("/")[0]] for name in names}
+    drives: dict[str, list[str]] = {}
+    for name in sorted(names):
+        drives.setdefault(name.rpartition("/")[0], []).append(name)
+    halves: tuple[list[str], list[str]] = ([], [])
+    for _, scans in sorted(drives.items(), key=lambda item: (-len(item[1]), item[0])):
+        min(halves, key=len).extend(scans)
+    larger, smaller = sorted(halves, key=len, reverse=True)
+    if len(larger) > 2 * len(smaller):  # only if it is a single drive: the others are no larger
+        cut = -(-len(names) // 2)
+        smaller.extend(larger[cut:])
+        del larger[cut:]
+    return {name: half for half, scans in enumerate(halves) for name in scans}
+
+
+def _kept_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
+    """Scans that each half of so many keeps: half the limit, and what the other half lacks."""
+    first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
+    return first, min(sizes[1], limit - first)

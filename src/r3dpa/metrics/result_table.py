@@ -237,7 +237,7 @@ class EvaluationTable:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the columns compare unlike things, and the notes of the single numbers."""
+        """Where columns compare unlike things, samples left out, and notes of single numbers."""
         own = [e for e in self.evaluations if not e.published]
         unlike = [
             f"not the same {key}: {', '.join(e.label for e in own)}"
@@ -253,6 +253,11 @@ class EvaluationTable:
                 if len(counts) > 1:
                     listed = "; ".join(f"{c:,} of {', '.join(n)}" for c, n in counts.items())
                     unlike.append(f"{metric}: not the same number of {key[4:]}: {listed}")
+        unlike += [
+            f"{_name(e)}: samples that cannot be used and are left out: {len(e.bad_samples)}"
+            for e in own
+            if e.bad_samples
+        ]
         single = [
             f"{_name(e)}, {r.name}: {r.note}" for e in self.evaluations for r in e.rows if r.note
         ]
@@ -305,7 +310,7 @@ class EvaluationTable:
         if any(mark.tied for mark in some):
             lines.append("= tie: the values differ by no more than the floor or their intervals")
         if intervals and any(result.interval for result in results):
-            lines.append("[low, high]: confidence interval")
+            lines.append("[low, high]: 95 % interval of the value at this number of scenes")
         published = {e.about["reference"]: None for e in self.evaluations if e.published}
         if published:
             ranked = "" if self.rank_published else ", not ranked"

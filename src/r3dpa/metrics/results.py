@@ -20,6 +20,8 @@ from r3dpa.atomic import atomic_path
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
 
+_SHOWN_BAD = 20  # samples that could not be used, in print
+
 
 @dataclass(frozen=True)
 class MetricResult:
@@ -28,8 +30,9 @@ class MetricResult:
     Args:
         name: Of the metric, as in the head of a column.
         value: In ``unit``; None where it cannot be told, which ``note`` then explains.
-        interval: Ends of the confidence interval. It need not hold the value: the bootstrap of a
-            distance between distributions takes off how much repeated samples add to it.
+        interval: Ends of the 95 % interval: how far the value spreads from one set of this many
+            scenes to the next. It is for the value expected of this many, which few scenes raise
+            above that of infinitely many; only an extrapolated value is for the latter.
         floor: Value that real scans reach against real scans.
         direction: Which values are better.
         unit: Of value, interval and floor; empty for a plain number.
@@ -138,7 +141,8 @@ class About(TypedDict):
     published: bool
     #: Files of the samples, or the line of the publication.
     source: str
-    #: Anything else worth keeping, such as weight averaging, guidance, files that were skipped.
+    #: Anything else worth keeping, such as weight averaging or guidance. ``bad_samples`` lists the
+    #: samples that could not be used and were left out, each with the reason.
     extra: dict[str, Any]
 
 
@@ -186,12 +190,20 @@ class Evaluation:
         """Whether the numbers come from a publication."""
         return self.about["published"]
 
+    @property
+    def bad_samples(self) -> list[str]:
+        """Name and reason of each sample that could not be used and was left out."""
+        return self.about["extra"].get("bad_samples", [])
+
     def row(self, name: str) -> MetricResult | None:
         """Result of a metric; None where this evaluation has no such row or no value."""
         return next((r for r in self.rows if r.name == name and r.value is not None), None)
 
     def __str__(self) -> str:
-        """The rows with interval, floor, counts and notes, and below what they are about."""
+        """The rows with interval, floor, counts and notes, and below what they are about.
+
+        Of many samples that were left out, the first are listed; the stored file has all.
+        """
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
         table = [heads, *map(_cells, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
@@ -202,11 +214,20 @@ class Evaluation:
             ).rstrip()
             for cells in table
         ]
+        bad = self.bad_samples
+        extra = {key: value for key, value in self.about["extra"].items() if key != "bad_samples"}
         about = [
             f"{key}: {value if isinstance(value, str) else json.dumps(value)}"
-            for key, value in self.about.items()
+            for key, value in {**self.about, "extra": extra}.items()
             if value is not None and value != {}
         ]
+        if bad:
+            about += [
+                f"samples that cannot be used and are left out: {len(bad)}",
+                *bad[:_SHOWN_BAD],
+            ]
+        if len(bad) > _SHOWN_BAD:
+            about.append(f"and {len(bad) - _SHOWN_BAD} more")
         return "\n".join([self.label, "", *lines, "", *about])
 
     def save(self, path: str | Path) -> None:

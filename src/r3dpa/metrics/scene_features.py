@@ -110,8 +110,9 @@ def scene_features(
         raise ValueError(f"fgeo has no weights: leave {ckpt} out")
     if name not in FREE_SPACES and ckpt is None:
         raise ValueError(
-            f"{name} needs its official weights: give --ckpt.{name} FILE, the model.ckpt of the "
-            f"release; without a file there are {' and '.join(FREE_SPACES)}"
+            f"{name} needs its official weights: give --ckpt.{name} FILE (`r3dpa test`: "
+            f"--scorer.ckpt.{name} FILE), the model.ckpt of the release; without a file there are "
+            f"{' and '.join(FREE_SPACES)}"
         )
     if name in ("fwid", "fgeo"):
         return _of_points(name, None if ckpt is None else Path(ckpt), device)

@@ -9,6 +9,7 @@ import hashlib
 import heapq
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from itertools import islice
 from typing import Generic, Self, TypeVar
 
@@ -137,6 +138,14 @@ class SceneSet:
         kept = self.images.items()
         return (points_of(kept[place][2], projection, corner) for place in places)
 
+    def with_images(self, limit: int) -> Self:
+        """The same with at most ``limit`` range images: those kept if the limit had been this."""
+        fewer = copy(self)
+        fewer.images = Chosen(limit)
+        for name, place, image in self.images.items():
+            fewer.images.offer(name, place, image)
+        return fewer
+
     def merge(self, other: Self) -> Self:
         """Both sets together, in one group; what is kept are the scenes kept in either."""
         rows, images = self.rows.limit + other.rows.limit, self.images.limit + other.images.limit
@@ -153,15 +162,41 @@ class SceneSet:
         return both
 
 
-def add_scenes(
+def usable_scenes(
     scenes: Iterable[EvaluationScene],
-    spaces: Sequence[SceneFeatures],
     protocol: Protocol,
-    batch_size: int,
+    bad: list[str] | None = None,
+    advice: str = "",
+) -> Iterator[EvaluationScene]:
+    """Scenes through the sensor, as long as every metric can use them.
+
+    Args:
+        scenes: As files or a generator give them.
+        protocol: How they are prepared.
+        bad: Takes the messages of the scenes that are left out. Where None, the first one stops.
+        advice: Added to the message that stops.
+
+    Raises:
+        ValueError: As :func:`through_sensor`, or if nothing lies on the grid seen from above.
+    """
+    for scene in scenes:
+        try:
+            seen = through_sensor(scene, protocol)
+            protocol.grid.kept(_points(seen), seen.name)
+        except ValueError as error:
+            if bad is None:
+                raise ValueError(f"{error}{advice}") from error
+            bad.append(str(error))
+        else:
+            yield seen
+
+
+def add_scenes(
+    scenes: Iterable[EvaluationScene], spaces: Sequence[SceneFeatures], batch_size: int
 ) -> Iterator[tuple[list[EvaluationScene], dict[str, Tensor]]]:
-    """Batches of scenes through the sensor, and their features by space: what ``add`` takes."""
+    """Batches of :func:`usable_scenes`, and their features by space: what ``add`` takes."""
     stream = iter(scenes)
-    while batch := [through_sensor(scene, protocol) for scene in islice(stream, batch_size)]:
+    while batch := list(islice(stream, batch_size)):
         yield batch, {space.name: space(batch) for space in spaces}
 
 
