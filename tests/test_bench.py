@@ -12,7 +12,8 @@ import pytest
 import torch
 import yaml
 
-from r3dpa.bench.training import STAGES, StepSettings, training
+from r3dpa.bench.data import data
+from r3dpa.bench.training import STAGES, StepSettings, _measure, training
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "xl": (1152, 28, 16)}
@@ -90,6 +91,8 @@ def small_conf(tmp_path_factory):
             arguments["discriminator"] = str(CONF / "net" / "discriminator_demo.yaml")
         config["model"]["init_args"] = arguments
         (conf / "experiment" / f"{stage}.yaml").write_text(yaml.safe_dump(config))
+        smaller = {"model": {"init_args": {"sit": {"init_args": {"hidden_size": 16}}}}}
+        (conf / "experiment" / f"{stage}_demo.yaml").write_text(yaml.safe_dump(smaller))
     return conf
 
 
@@ -141,6 +144,38 @@ def test_bench_table_says_the_same_as_the_file(figures):
     assert content["machine"]["cpu"]
 
 
+def test_speeds_follow_from_what_was_measured(figures):
+    table, content = figures
+    rows = [line.split() for line in table.splitlines()]
+    for stage in content["stages"]:
+        usual = sum(stage["step_seconds"][1:]) / 2
+        assert stage["images_per_second"] == pytest.approx(2 / usual)
+        assert stage["flop"] == sum(part["flop"] for part in stage["parts"].values()) > 0
+        assert stage["loader_images_per_second"] > 0
+        assert stage["variants"] is None
+        (row,) = (r for r in rows if r[0] == stage["stage"] and r[1] == f"{2 / usual:.3g}")
+        assert row[3] == f"{stage['flop'] / 2 / 1e9:.4g}"
+    vae, flow = (set(stage["parts"]) for stage in content["stages"])
+    parts = {"VAE encode", "VAE decode", "adversarial", "discriminator", "alignment", "optimiser"}
+    assert vae == parts
+    assert flow == {"SiT", "optimiser"}  # its latents are cached
+
+
+def test_quick_compares_settings_on_the_small_networks(small_conf, tmp_path, monkeypatch):
+    """In this process, so that two rounds do."""
+    monkeypatch.setattr("r3dpa.bench.training._QUICK_ROUNDS", 2)
+    monkeypatch.setattr("r3dpa.bench.training._in_new_process", _measure)
+    settings, out = StepSettings(batch_size=2, steps=1, device="cpu"), tmp_path / "quick.json"
+    table = training(small_conf, ("joint",), settings, out, quick=True)
+    (stage,) = json.loads(out.read_text())["stages"]
+    assert stage["num_parameters"]["sit"] < 40_000  # 72 384 at hidden size 32, here 16
+    ratios = stage["variants"]["over_first"]
+    assert len(ratios) == 4
+    assert all(0 < r["low"] <= r["value"] <= r["high"] for r in ratios.values())
+    assert "first case again" in table
+    assert "fp32, contiguous, not fused" in table
+
+
 def test_bench_names_a_missing_experiment(tmp_path):
     with pytest.raises(ValueError, match=r"experiment/joint\.yaml.*conf"):
         training(tmp_path, ("joint",))
@@ -159,3 +194,15 @@ def test_bench_says_which_stage_was_killed(small_conf, monkeypatch):
     monkeypatch.setattr("r3dpa.bench.training._measure", killed)
     with pytest.raises(RuntimeError, match=r"joint was killed.*batch_size 1"):
         training(small_conf, ("joint",))
+
+
+def test_bench_data_counts_scans(tmp_path):
+    out = tmp_path / "data.json"
+    table = data(quick=True, out=out)
+    content = json.loads(out.read_text())
+    rates, ms = content["scans_per_second"], content["steps"]["ms"]
+    assert rates["project"] == pytest.approx(8 / (ms["project"]["median"] / 1000))
+    # Reading 32 kB against projecting 114 000 points: a hundredfold, whatever the machine does.
+    assert rates["sample, cached"] > 5 * rates["sample, projected"]
+    assert {f"{kind}, {n} workers" for kind in ("projected", "cached") for n in range(3)} <= set(rates)  # fmt: skip  # noqa: E501
+    assert f"{rates['read .bin']:.4g}" in table

@@ -24,13 +24,15 @@ ALLOWED = {
     "generation": {"geometry", "nn", "flow"},
     "modules": CORE | {"data", "checkpoints", "generation"},
     "scoring": {"data", "metrics", "viz"},
+    "snapshots": {"checkpoints", "modules", "nn"},
     "callbacks": {"geometry", "data", "generation", "modules", "nn", "viz"}
     | {"checkpoints", "metrics", "scoring"},
-    "bench": {"geometry", "simulation", "nn", "data", "checkpoints", "metrics", "modules"},
+    "bench": CORE
+    | {"simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"},
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "scoring"},
+    | {"metrics", "scoring", "snapshots"},
 }
 
 

@@ -2,29 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+import copy
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from r3dpa.flow import (
-    CountingVelocity,
-    Interpolant,
-    euler,
-    euler_maruyama,
-    heun,
-    ode_times,
-    sde_times,
-)
+from r3dpa.flow.autoguidance import autoguided, renormalised
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.sde import RestartPlan, euler_maruyama, restart
+from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
+from r3dpa.flow.times import ode_times, sde_times
+from r3dpa.flow.tuned import TunedSolver
 from r3dpa.geometry import ScanGeometry
 from r3dpa.nn import VAE, LatentNorm, SiT
 
-__all__ = ["SamplerConfig", "SceneBatch", "SceneGenerator"]
+__all__ = [
+    "Autoguidance",
+    "Quality",
+    "SamplerConfig",
+    "SceneBatch",
+    "SceneGenerator",
+    "Solver",
+    "scene_random",
+]
 
-_ODE_SOLVERS = {"euler": euler, "heun": heun}
+Solver = Literal[
+    "euler",
+    "heun",
+    "midpoint",
+    "ab2",
+    "ab3",
+    "dpmpp_2m",
+    "unipc",
+    "dopri5",
+    "euler_maruyama",
+    "restart",
+]
+Quality = Literal["draft", "good", "best"]
+
+_GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 
 
 @dataclass(frozen=True)
@@ -32,24 +55,66 @@ class SamplerConfig:
     """How noise becomes latents.
 
     Args:
-        solver: ``euler`` and ``heun`` solve the ODE, ``euler_maruyama`` the SDE.
+        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``restart`` goes back
+            towards noise at times; ``dopri5`` chooses its steps itself.
         steps: Solver steps.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
+        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE.
+        eta: Strength of the noise of the SDE; 1 as published, 0 for none.
+        tuned: File of a :class:`r3dpa.flow.tuned.TunedSolver`, which replaces solver and steps.
+        restart: Where ``restart`` goes back, how often, and how it solves.
 
     Raises:
-        ValueError: If the solver is unknown.
+        ValueError: If the solver is unknown or a number out of its range.
     """
 
-    solver: Literal["euler", "heun", "euler_maruyama"] = "euler_maruyama"
+    solver: Solver = "euler_maruyama"
     steps: int = 256
     sde_last_time: float = 0.04
     sde_last: Literal["denoise", "mean"] = "denoise"
+    shift: float = 1.0
+    eta: float = 1.0
+    tuned: str | None = None
+    restart: RestartPlan = field(default_factory=RestartPlan)
 
     def __post_init__(self) -> None:
-        """Check the solver's name."""
-        if self.solver not in (*_ODE_SOLVERS, "euler_maruyama"):
-            raise ValueError(f"solver must be euler, heun or euler_maruyama, got {self.solver!r}")
+        """Check name and numbers."""
+        if self.solver not in get_args(Solver):
+            raise ValueError(
+                f"solver must be one of {', '.join(get_args(Solver))}, got {self.solver!r}"
+            )
+        if self.steps < 1 or self.shift <= 0 or self.eta < 0:
+            raise ValueError(
+                "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
+                f"{self.steps}, {self.shift} and {self.eta}"
+            )
+
+    @classmethod
+    def of_quality(cls, quality: Quality) -> Self:
+        """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
+        level = _qualities()["levels"][quality]
+        return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
+
+    @staticmethod
+    def quality_line(quality: Quality) -> str:
+        """What :meth:`of_quality` picks, in words."""
+        table = _qualities()
+        level = table["levels"][quality]
+        line = (
+            f"quality {quality}: {level['solver']}, {level['steps']} steps, "
+            f"shift {level['shift']:g}"
+        )
+        if table["measured_on"] is None:
+            return f"{line} (not measured)"
+        return (
+            f"{line}: error {level['error']:g}, {level['seconds_share']:.0%} of the time of best "
+            f"({table['measured_on']})"
+        )
+
+
+def _qualities() -> dict[str, Any]:
+    return json.loads((files("r3dpa") / "quality.json").read_text(encoding="utf-8"))
 
 
 class SceneBatch(NamedTuple):
@@ -64,11 +129,31 @@ class SceneBatch(NamedTuple):
     nfe: int
 
 
+@dataclass(frozen=True)
+class Autoguidance:
+    """Guidance away from a weaker model, see :func:`r3dpa.flow.autoguidance.autoguided`.
+
+    Args:
+        weak: Its SiT, on the device of the other networks.
+        scale: Strength, at least 1.
+        interval: First and last time that is guided.
+        latent_scale: Its latents are ``latent_scale * latents + latent_shift``.
+        latent_shift: ``(C,)``, on the same device.
+    """
+
+    weak: SiT
+    scale: float
+    interval: tuple[float, float] = (0.0, 1.0)
+    latent_scale: float = 1.0
+    latent_shift: Tensor = field(default_factory=lambda: torch.zeros(1))
+
+
 class SceneGenerator:
     """Draws scenes from a SiT and decodes them.
 
     The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU:
-    a scene is the same whatever the batch size and, up to rounding, the device.
+    a scene is the same whatever the batch size and, up to rounding, the device. The modulations
+    of a solver's times are computed once, so weights must not change after the first scene.
 
     Args:
         vae: Decoder of the latents.
@@ -77,10 +162,18 @@ class SceneGenerator:
         geometry: Projection and range encoding of the training data.
         sampler: Solver and steps.
         path: Interpolant that the SiT was trained on.
-        precision: ``bf16`` runs the networks under autocast; state and solver stay float32.
+        precision: ``bf16`` runs copies of the networks with bfloat16 weights, see
+            :meth:`SiT.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay float32.
+        autoguidance: Weak model and strength; no guidance where None.
+        batch_size: Fill up smaller batches, so that the networks meet a single shape; the scenes
+            do not depend on what fills it.
+        decode_batch_size: Scenes decoded together; all of a batch where None.
+        compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a
+            GPU batches of at most 8 scenes are replayed as CUDA graphs.
 
     Raises:
-        ValueError: If the latent statistics were never fitted.
+        ValueError: If the latent statistics were never fitted, a batch size is below 1, or
+            ``compile`` comes without ``batch_size``.
     """
 
     def __init__(
@@ -92,28 +185,64 @@ class SceneGenerator:
         sampler: SamplerConfig = SamplerConfig(),
         path: Literal["linear", "cosine"] = "linear",
         precision: Literal["fp32", "bf16"] = "fp32",
+        *,
+        autoguidance: Autoguidance | None = None,
+        batch_size: int | None = None,
+        decode_batch_size: int | None = None,
+        compile: bool = False,
     ) -> None:
         if not latent_norm.fitted:
             raise ValueError(
                 "the latent statistics were never fitted, so latents cannot be denormalised; "
                 "sample from a checkpoint of stage joint or flow_matching"
             )
+        for name, size in (("batch_size", batch_size), ("decode_batch_size", decode_batch_size)):
+            if size is not None and size < 1:
+                raise ValueError(f"{name} must be at least 1, got {size}")
+        if compile and batch_size is None:
+            raise ValueError("compiled networks have one shape: give SceneGenerator a batch_size")
         self.vae = vae.eval()
         self.sit = sit.eval()
+        weak = None if autoguidance is None else autoguidance.weak.eval()
+        if precision == "bf16":
+            self.vae = copy.deepcopy(vae).halve_decoder_()
+            self.sit = copy.deepcopy(sit).halve_()
+            weak = copy.deepcopy(weak).halve_() if weak is not None else None
+        if self.device.type == "cuda":  # where the kernels for half precision are made for it
+            self.vae = copy.deepcopy(self.vae).to(  # type: ignore[call-overload]
+                memory_format=torch.channels_last
+            )
         self.latent_norm = latent_norm.eval()
         self.geometry = geometry
         self.sampler = sampler
         self.interpolant = Interpolant(path)
         self.precision = precision
+        self.batch_size = batch_size
+        self.decode_batch_size = decode_batch_size
+        graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
+        self._strong = _ScheduledNetwork(self.sit, compile, graphs)
+        self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
+        self._autoguidance = autoguidance
+        self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
+        self._scheduled: SamplerConfig | None = None
 
     @property
     def device(self) -> torch.device:
         """Where the networks are."""
         return next(self.sit.parameters()).device
 
+    def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
+        """The same networks, compiled where these are, with another solver; both may be used."""
+        other = copy.copy(self)
+        other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
+        other.sampler, other._scheduled = sampler, None
+        return other
+
     @torch.inference_mode()
     def generate(self, indices: Sequence[int], seed: int = 0) -> SceneBatch:
         """Draws one scene per index.
+
+        Nothing waits for a GPU here: its results are ready when they are copied.
 
         Args:
             indices: Numbers of the scenes.
@@ -121,24 +250,63 @@ class SceneGenerator:
 
         Returns:
             Scenes on the networks' device.
+
+        Raises:
+            ValueError: If there are more than ``batch_size`` of them.
         """
-        generators = [_scene_random(seed, index) for index in indices]
+        size = self.batch_size or len(indices)
+        if len(indices) > size:
+            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
+        generators = [scene_random(seed, index) for index in indices]
         shape = (self.sit.in_channels, *self.sit.input_size)
 
         def draws() -> Iterator[Tensor]:
             while True:
-                noise = [torch.randn(shape, generator=generator) for generator in generators]
-                yield torch.stack(noise).to(self.device)
+                noise = torch.stack([torch.randn(shape, generator=g) for g in generators])
+                yield _filled(noise, size).to(self.device)
 
-        velocity, noise = CountingVelocity(self._velocity), draws()
-        latents = self._solve(velocity, next(noise), noise)
-        with self._autocast():
-            image = self.vae.decode(self.latent_norm.denormalise(latents))
-        range_m = self.geometry.codec.decode(image[:, 0].float(), self.geometry.projection.sensor)
-        return SceneBatch(range_m, latents, velocity.nfe)
+        self._schedule()
+        networks = [network for network in (self._strong, self._weak) if network is not None]
+        for network in networks:
+            network.calls = 0
+        noise = draws()
+        latents = self._solve(next(noise), noise)[: len(indices)]
+        range_m = self._ranges(latents)
+        return SceneBatch(range_m, latents, sum(network.calls for network in networks))
 
-    def _solve(self, velocity: CountingVelocity, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
-        sampler = self.sampler
+    def _ranges(self, latents: Tensor) -> Tensor:
+        size = self.decode_batch_size or self.batch_size or len(latents)
+        sensor = self.geometry.projection.sensor
+        parts = []
+        for part in self.latent_norm.denormalise(latents).split(size):
+            whole = part if self.batch_size is None else _filled(part, size)
+            image = self._decode(whole)[: len(part), 0]
+            parts.append(self.geometry.codec.decode(image.float(), sensor))
+        return torch.cat(parts)
+
+    def _schedule(self) -> None:
+        """Computes the modulations of all times that the solver will ask for.
+
+        One run with velocities of 0 tells which, in what order. An adaptive solver asks for others.
+        """
+        if self._scheduled == self.sampler:
+            return
+        networks = [network for network in (self._strong, self._weak) if network is not None]
+        adaptive = self.sampler.solver == "dopri5" and self.sampler.tuned is None
+        for network in networks:
+            network.times = None if adaptive else []
+            network.table = None
+        if not adaptive:
+            noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
+            self._solve(noise, iter(lambda: noise, None))
+            for network in networks:
+                network.fill_table()
+        self._scheduled = self.sampler
+
+    def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
+        sampler, velocity = self.sampler, self._velocity()
+        if sampler.tuned is not None:
+            return TunedSolver.load(sampler.tuned).solve(velocity, noise)
         if sampler.solver == "euler_maruyama":
             return euler_maruyama(
                 velocity,
@@ -147,19 +315,75 @@ class SceneGenerator:
                 draws,
                 interpolant=self.interpolant,
                 last=sampler.sde_last,
+                eta=sampler.eta,
             )
-        return _ODE_SOLVERS[sampler.solver](velocity, noise, ode_times(sampler.steps))
+        times = ode_times(sampler.steps, shift=sampler.shift)
+        if sampler.solver == "restart":
+            plan = sampler.restart
+            return restart(velocity, noise, times, draws, plan=plan, interpolant=self.interpolant)
+        if sampler.solver == "dopri5":
+            return dopri5(velocity, noise, times)
+        return ode_solver(sampler.solver, self.interpolant)(velocity, noise, times)
 
-    def _velocity(self, latents: Tensor, time: Tensor) -> Tensor:
-        with self._autocast():
-            return self.sit.velocity(latents, time).float()
-
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(
-            self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16"
+    def _velocity(self) -> Velocity:
+        guidance = self._autoguidance
+        if guidance is None or self._weak is None:
+            return self._strong
+        weak = renormalised(
+            self._weak, guidance.latent_scale, guidance.latent_shift, self.interpolant
         )
+        return autoguided(self._strong, weak, guidance.scale, guidance.interval)
 
 
-def _scene_random(seed: int, index: int) -> torch.Generator:
+class _ScheduledNetwork:
+    """A SiT as the velocity function of a solver whose times are known.
+
+    All samples of a call have the same time. It first notes the times of a trial run, then takes
+    the modulations of the k-th call from row k of a table: nothing depends on the value of a
+    time, for which a GPU would be waited for.
+
+    Attributes:
+        times: Those of the trial run, each ``(1,)``; None where they are not known beforehand.
+        table: ``(T, M)`` their modulations, after the trial run.
+        calls: Evaluations since it was set to 0.
+    """
+
+    def __init__(self, sit: SiT, compile: bool, graphs: bool) -> None:
+        self.sit = sit
+        self.times: list[Tensor] | None = None
+        self.table: Tensor | None = None
+        self.calls = 0
+        self._graphs = graphs
+        self._compiled: Callable[[Tensor, Tensor], Tensor] | None = None
+        if compile:
+            mode = "reduce-overhead" if graphs else None
+            self._compiled = torch.compile(sit.velocity_at, dynamic=False, mode=mode)
+
+    def fill_table(self) -> None:
+        """Ends the trial run."""
+        if self.times:
+            self.table = self.sit.modulations(torch.cat(self.times))
+
+    def __call__(self, latents: Tensor, time: Tensor) -> Tensor:
+        """Velocity ``(B, C, h, w)`` float32 at a time ``(B,)`` that all samples share."""
+        if self.table is None and self.times is not None:
+            self.times.append(time[:1])
+            return torch.zeros_like(latents)
+        if self.table is None:
+            row = self.sit.modulations(time[:1])
+        else:
+            row = self.table[self.calls : self.calls + 1]
+        self.calls += 1
+        velocity = (self._compiled or self.sit.velocity_at)(latents, row)
+        return velocity.clone() if self._graphs else velocity  # a replay writes to one place
+
+
+def _filled(values: Tensor, size: int) -> Tensor:
+    """``(B, C, h, w)`` with zeros up to ``size`` samples."""
+    return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
+
+
+def scene_random(seed: int, index: int) -> torch.Generator:
+    """Random numbers of a scene, on the CPU; its noise comes first."""
     key = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(key[0]) >> 1)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,9 @@ from PIL import Image
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.cli import main
 from r3dpa.data.scans import read_npz, read_ply, read_scan
-from r3dpa.geometry import LidarSensor, SphericalProjection, in_range
+from r3dpa.flow import RestartPlan
+from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
@@ -331,7 +334,7 @@ class TestSimulateAndCheck:
 
 
 def values(folder):
-    return read_npz(folder / "scenes.npz")
+    return {p.stem: read_scan(p)[:, :3] for p in sorted((folder / "bin").iterdir())}
 
 
 def assert_same_scenes(actual, expected, num=3):
@@ -343,24 +346,32 @@ def assert_same_scenes(actual, expected, num=3):
 
 
 class TestSample:
-    def test_writes_every_scene_in_every_form(self, scenes):
-        names = ["000000", "000001", "000002"]
+    def test_writes_every_scene(self, scenes):
         clouds = values(scenes)
-        assert list(clouds) == names
-        for folder, suffix in (("bin", "bin"), ("ply", "ply")):
-            assert sorted(p.name for p in (scenes / folder).iterdir()) == [
-                f"{name}.{suffix}" for name in names
-            ]
+        assert list(clouds) == ["000000", "000001", "000002"]
         projection = SphericalProjection(SENSOR)
-        for name, points in clouds.items():
+        for points, range_m in zip(clouds.values(), np.load(scenes / "range_m.npy"), strict=True):
             assert 0 < len(points) <= SENSOR.beams * SENSOR.columns
             assert in_range(torch.from_numpy(points), SENSOR).all()
             row, column = projection.pixel_of(torch.from_numpy(points))
             assert len(torch.unique(row * SENSOR.columns + column)) == len(points)
-            np.testing.assert_array_equal(read_ply(scenes / "ply" / f"{name}.ply"), points)
-            scan = read_scan(scenes / "bin" / f"{name}.bin")
-            np.testing.assert_array_equal(scan[:, :3], points)
+            np.testing.assert_array_equal(points, points_of(torch.from_numpy(range_m), projection))
         assert not np.array_equal(clouds["000000"], clouds["000001"])
+        assert {p.name for p in scenes.iterdir()} == {
+            *("bin", "range_m.npy", "range", "birds_eye", "scene_3d", "scenes.png"),
+            "metadata.json",
+        }
+
+    def test_other_forms_are_written_on_demand(self, joint_checkpoint, scenes, tmp_path):
+        words = ("--formats", "ply,npz", "--pictures", 0)
+        out = sample(joint_checkpoint, tmp_path, *words)
+        assert {p.name for p in out.iterdir()} == {
+            *("ply", "scenes.npz", "range_m.npy", "metadata.json")
+        }
+        clouds = read_npz(out / "scenes.npz")
+        for name, points in values(scenes).items():
+            np.testing.assert_array_equal(clouds[name], points)
+            np.testing.assert_array_equal(read_ply(out / "ply" / f"{name}.ply"), points)
 
     def test_draws_every_scene(self, scenes):
         pictures = [scenes / "scenes.png"]
@@ -385,6 +396,10 @@ class TestSample:
             "nfe": 3,
             "precision": "fp32",
             "batch_size": 8,
+            "compile": False,
+            "formats": ["bin"],
+            "autoguidance": None,
+            "drawn_by_last_run": 3,
             "r3dpa": "0.1.0",
             "commit": source_commit(),
             "torch": torch.__version__,
@@ -395,15 +410,89 @@ class TestSample:
             "steps": 3,
             "sde_last_time": 0.04,
             "sde_last": "denoise",
+            "shift": 1.0,
+            "eta": 1.0,
+            "tuned": None,
+            "restart": asdict(RestartPlan()),
         }
         assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
-        assert metadata["seconds_per_scene"] > 0
+        assert metadata["seconds_per_scene"] > metadata["device_seconds_per_scene"] > 0
+        assert metadata["threads"]["torch"] == torch.get_num_threads()
 
     def test_options_reach_the_sampler(self, joint_checkpoint, tmp_path):
         out = sample(joint_checkpoint, tmp_path, "--solver", "heun", "--seed", 5, "--num", 1)
         metadata = json.loads((out / "metadata.json").read_text())
         assert metadata["sampler"]["solver"] == "heun"
         assert (metadata["nfe"], metadata["seed"], metadata["num"]) == (5, 5, 1)
+
+    @pytest.mark.parametrize(
+        ("solver", "evaluations"),
+        [
+            *[("euler", 3), ("midpoint", 6), ("ab2", 3), ("ab3", 3), ("dpmpp_2m", 3)],
+            *[("unipc", 3), ("euler_maruyama", 3), ("restart", 4 + 2 * 4)],
+        ],
+    )
+    def test_every_solver_can_be_chosen(
+        self, solver, evaluations, joint_checkpoint, tmp_path, capsys
+    ):
+        words = ("--solver", solver, "--num", 1, "--pictures", 0)
+        metadata = json.loads(
+            (sample(joint_checkpoint, tmp_path, *words) / "metadata.json").read_text()
+        )
+        assert (metadata["sampler"]["solver"], metadata["nfe"]) == (solver, evaluations)
+        assert f": {evaluations} network evaluations each, " in capsys.readouterr().out
+
+    def test_a_quality_chooses_the_sampler_and_says_so(self, joint_checkpoint, tmp_path, capsys):
+        words = ["--ckpt", joint_checkpoint, "--out", tmp_path / "out", "--num", 1]
+        words += ["--quality", "draft", "--pictures", 0]
+        main(["sample", *map(str, words)])
+        metadata = json.loads((tmp_path / "out" / "metadata.json").read_text())
+        chosen = metadata["sampler"]
+        assert chosen == asdict(SamplerConfig.of_quality("draft"))
+        line = f"quality draft: {chosen['solver']}, {chosen['steps']} steps, shift"
+        assert line in capsys.readouterr().out
+        with pytest.raises(ValueError, match=r"--quality draft chooses what --steps gives"):
+            main(["sample", *map(str, words), "--steps", "4"])
+
+    def test_guidance_by_the_model_itself_changes_nothing(self, joint_checkpoint, scenes, tmp_path):
+        """v + s (v - v) = v, for twice the evaluations."""
+        words = ("--autoguidance", joint_checkpoint, "--guidance_scale", 3, "--pictures", 0)
+        out = sample(joint_checkpoint, tmp_path, *words)
+        assert_same_scenes(out, scenes)
+        metadata = json.loads((out / "metadata.json").read_text())
+        assert metadata["nfe"] == 6
+        assert metadata["autoguidance"]["scale"] == 3
+        assert metadata["autoguidance"]["interval"] == [0, 1]
+
+    def test_an_interrupted_run_goes_on(self, joint_checkpoint, scenes, tmp_path, monkeypatch):
+        def stop(*_):
+            raise KeyboardInterrupt
+
+        words = ("--batch_size", 1, "--pictures", 0)
+        with monkeypatch.context() as patch:
+            generate, calls = SceneGenerator.generate, []
+            patch.setattr(
+                SceneGenerator,
+                "generate",
+                lambda *args: stop() if len(calls) == 2 else calls.append(1) or generate(*args),
+            )
+            with pytest.raises(SystemExit) as stopped:
+                sample(joint_checkpoint, tmp_path, *words)
+        assert stopped.value.code == 130
+        assert not (tmp_path / "metadata.json").exists()
+        with pytest.raises(ValueError, match=r"unfinished run with seed 0, not 1"):
+            sample(joint_checkpoint, tmp_path, *words, "--seed", 1)
+        assert_same_scenes(sample(joint_checkpoint, tmp_path, *words), scenes)
+        metadata = json.loads((tmp_path / "metadata.json").read_text())
+        assert metadata["drawn_by_last_run"] == 1
+
+    def test_fast_path_draws_about_the_same(self, joint_checkpoint, scenes, tmp_path):
+        """bf16 moves few ranges by much more than its 0.4 % of the latents; see test_generation."""
+        words = ("--precision", "bf16", "--decode_batch_size", 2, "--pictures", 0)
+        fast = np.load(sample(joint_checkpoint, tmp_path, *words) / "range_m.npy")
+        slow = np.load(scenes / "range_m.npy")
+        assert ((fast > 0) == (slow > 0)).mean() > 0.95
+        assert np.median(np.abs(fast - slow)[(fast > 0) & (slow > 0)]) < 0.3
 
     def test_scenes_depend_on_neither_batch_size_nor_number(
         self, joint_checkpoint, scenes, tmp_path
@@ -420,13 +509,13 @@ class TestSample:
 
     def test_existing_scenes_are_kept(self, joint_checkpoint, scenes, tmp_path):
         out = sample(joint_checkpoint, tmp_path, "--num", 1)
-        before = (out / "scenes.npz").read_bytes()
+        before = (out / "range_m.npy").read_bytes()
         with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
             sample(joint_checkpoint, out, "--num", 1, "--seed", 1)
-        assert (out / "scenes.npz").read_bytes() == before
+        assert (out / "range_m.npy").read_bytes() == before
         sample(joint_checkpoint, out, "--num", 1, "--seed", 1, "--overwrite", "true")
         assert json.loads((out / "metadata.json").read_text())["seed"] == 1
-        assert (out / "scenes.npz").read_bytes() != before
+        assert (out / "range_m.npy").read_bytes() != before
 
     def test_a_checkpoint_without_velocity_is_refused(self, vae_checkpoint, tmp_path):
         with pytest.raises(

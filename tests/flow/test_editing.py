@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from r3dpa.flow.editing import pnp_flow_feature, transport_to_time
-from r3dpa.flow.solvers import CountingVelocity, ode_times
+from r3dpa.flow.solvers import CountingVelocity
+from r3dpa.flow.times import ode_times
 
 
 def latents():

@@ -5,7 +5,9 @@ import torch
 from einops import rearrange
 
 from r3dpa.flow.guidance import FeatureGuidance
-from r3dpa.flow.solvers import euler, euler_maruyama, heun, ode_times, sde_times
+from r3dpa.flow.sde import euler_maruyama
+from r3dpa.flow.solvers import euler, heun
+from r3dpa.flow.times import ode_times, sde_times
 
 
 def velocity(x, time):

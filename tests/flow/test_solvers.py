@@ -1,19 +1,32 @@
 from __future__ import annotations
 
 import math
+import sys
+from itertools import pairwise
 
 import pytest
 import torch
 
 from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.solvers import (
+    ODE_SOLVERS,
     CountingVelocity,
+    ab2,
+    ab3,
+    dopri5,
     euler,
-    euler_maruyama,
+    evaluations,
     heun,
-    ode_times,
-    sde_times,
+    ode_solver,
+    steps_for,
+    unipc,
 )
+from r3dpa.flow.times import ode_times
+
+UNEVEN = torch.tensor([1.0, 0.9, 0.75, 0.7, 0.45, 0.2, 0.1, 0.0]).double()
+INSIDE = torch.tensor([0.95, 0.9, 0.75, 0.7, 0.45, 0.2, 0.1, 0.05]).double()
+DATA_PREDICTION = ("dpmpp_2m", "unipc")
 
 
 def still(x, time):
@@ -33,43 +46,35 @@ def growth(x, time):
     return x
 
 
-def gaussian_velocity(spread):
-    """Exact velocity of Gaussian data on the linear path."""
+def wave(x, time):
+    """Velocity without any structure of a path; its solution is C exp(sin(2 t))."""
+    return 2 * torch.cos(2 * time)[:, None] * x
+
+
+def gaussian_velocity(spread, interpolant=Interpolant()):  # noqa: B008 -- frozen
+    """Exact velocity of data N(0, spread^2)."""
 
     def velocity(x, time):
-        t = time[:, None]
-        return (t - (1 - t) * spread**2) / ((1 - t).square() * spread**2 + t.square()) * x
+        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
+        slope = alpha * d_alpha * spread**2 + sigma * d_sigma
+        return slope / (alpha.square() * spread**2 + sigma.square()) * x
+
+    return velocity
+
+
+def data_velocity(data, interpolant):
+    """Velocity of a path whose expected data are ``data(log snr)``, whatever x; inside (0, 1)."""
+
+    def velocity(x, time):
+        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
+        expected = data((alpha / sigma).log())
+        return d_alpha * expected + d_sigma * (x - alpha * expected) / sigma
 
     return velocity
 
 
 def standard_noise(*shape, seed=0, dtype=torch.float64):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def test_time_grids_by_hand():
-    torch.testing.assert_close(ode_times(4), torch.tensor([1, 0.75, 0.5, 0.25, 0]).double())
-    torch.testing.assert_close(ode_times(2, 0.0, 0.6), torch.tensor([0, 0.3, 0.6]).double())
-    torch.testing.assert_close(sde_times(3, last=0.2), torch.tensor([1, 0.6, 0.2, 0]).double())
-    assert sde_times(1).tolist() == [1.0, 0.0]
-    assert sde_times(5)[-2] == 0.04
-    assert ode_times(3).dtype == sde_times(3).dtype == torch.float64
-
-
-@pytest.mark.parametrize(
-    ("grid", "message"),
-    [
-        (lambda: ode_times(0), "at least one step, got 0"),
-        (lambda: ode_times(3, start=1.2), r"1\.2 and 0\.0"),
-        (lambda: ode_times(3, start=0.0), r"0\.0 and 0\.0"),
-        (lambda: sde_times(-1), "at least one step, got -1"),
-        (lambda: sde_times(3, last=0.0), r"\(0, 1\), got 0\.0"),
-        (lambda: euler(growth, torch.ones(1, 1), torch.ones(1)), r"got shape \(1,\)"),
-    ],
-)
-def test_impossible_times_are_refused(grid, message):
-    with pytest.raises(ValueError, match=message):
-        grid()
 
 
 def test_euler_of_a_parabola_is_the_left_sum():
@@ -88,53 +93,6 @@ def test_heun_of_a_parabola_is_the_trapezoidal_sum_but_for_the_last_step():
     torch.testing.assert_close(result, torch.full((2, 1), expected).double())
 
 
-@pytest.mark.parametrize(("solver", "order"), [(euler, 1), (heun, 2)])
-@pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0)])
-def test_halving_the_step_divides_the_error_by_two_to_the_order(solver, order, ends):
-    start = torch.tensor([[2.0]]).double()
-    exact = 2 * math.exp(ends[1] - ends[0])
-    errors = [
-        (solver(growth, start, ode_times(steps, *ends)) - exact).abs().item() for steps in (40, 80)
-    ]
-    assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.15)
-
-
-@pytest.mark.parametrize(
-    ("solve", "nfe"),
-    [
-        (lambda v, x: euler(v, x, ode_times(6)), 6),
-        (lambda v, x: heun(v, x, ode_times(6)), 11),
-        (lambda v, x: heun(v, x, ode_times(1)), 1),
-        (lambda v, x: euler_maruyama(v, x, sde_times(6), torch.Generator()), 6),
-        (lambda v, x: euler_maruyama(v, x, sde_times(6), torch.Generator(), last="mean"), 6),
-        (lambda v, x: euler_maruyama(v, x, sde_times(1), []), 1),
-    ],
-)
-def test_network_evaluations_are_counted(solve, nfe):
-    counted = CountingVelocity(growth)
-    solve(counted, torch.ones(2, 3))
-    assert counted.nfe == nfe
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
-def test_state_keeps_its_dtype_and_times_are_at_least_float32(dtype):
-    seen = []
-
-    def velocity(x, time):
-        seen.append((x.dtype, time.dtype, tuple(time.shape)))
-        return x.bfloat16()
-
-    x = torch.ones(2, 3, dtype=dtype)
-    results = [solver(velocity, x, ode_times(3)) for solver in (euler, heun)]
-    results += [
-        euler_maruyama(velocity, x, sde_times(3), torch.Generator(), last=last)
-        for last in ("denoise", "mean")
-    ]
-    assert all(result.dtype == dtype for result in results)
-    wide = torch.float64 if dtype == torch.float64 else torch.float32
-    assert set(seen) == {(dtype, wide, (2,))}
-
-
 def test_solvers_keep_no_graph():
     weight = torch.ones(1, requires_grad=True)
     result = euler(lambda x, time: weight * x, torch.ones(1, 1), ode_times(2))
@@ -144,100 +102,6 @@ def test_solvers_keep_no_graph():
 def test_heun_takes_its_second_slope_from_the_corrector():
     result = heun(steady, torch.zeros(1, 1), ode_times(2), corrector_velocity=still)
     assert result.item() == -0.5 * 0.5 - 0.5
-
-
-def test_sde_without_noise_follows_its_drift():
-    times = torch.tensor([1.0, 0.6, 0.2, 0.0]).double()
-    silence = torch.zeros(2, 1, 1).double()
-    start = torch.ones(1, 1).double()
-    # On the linear path the drift of velocity 0 is x itself.
-    mean = euler_maruyama(still, start, times, silence, last="mean")
-    assert mean.item() == pytest.approx((1 - 0.4) * (1 - 0.4) * (1 - 0.2))
-    denoised = euler_maruyama(still, start, times, silence)
-    assert denoised.item() == pytest.approx((1 - 0.4) * (1 - 0.4))
-    # On the cosine path it is t x, and the expected data is cos(pi t / 2) x.
-    cosine = euler_maruyama(still, start, times, silence, interpolant=Interpolant("cosine"))
-    assert cosine.item() == pytest.approx((1 - 0.4) * (1 - 0.4 * 0.6) * math.cos(0.1 * math.pi))
-
-
-def test_sde_adds_noise_of_variance_two_t_dt():
-    def without_drift(x, time):
-        return -x / (2 - time[:, None])
-
-    times = torch.tensor([1.0, 0.6, 0.2, 0.0]).double()
-    draws = [torch.full((1, 1), 3.0).double(), torch.full((1, 1), -1.0).double()]
-    start = torch.zeros(1, 1).double()
-    result = euler_maruyama(without_drift, start, times, draws, last="mean")
-    assert result.item() == pytest.approx(3 * math.sqrt(2 * 0.4) - math.sqrt(2 * 0.6 * 0.4))
-
-
-def test_sde_drift_is_changed_in_every_step_but_the_last():
-    seen = []
-
-    def change(drift, x, time):
-        seen.append(time.item())
-        return drift + 10
-
-    times = torch.tensor([1.0, 0.5, 0.25, 0.0])
-    draws = torch.zeros(2, 1, 1)
-    result = euler_maruyama(still, torch.zeros(1, 1), times, draws, change_drift=change)
-    assert seen == [1.0, 0.5]
-    assert result.item() == pytest.approx((-5) - 0.25 * (-5 + 10))
-
-
-def test_sde_noise_is_given_or_drawn_from_a_generator():
-    x, times = standard_noise(2, 3), sde_times(4)
-    generator = torch.Generator().manual_seed(5)
-    draws = torch.randn(3, 2, 3, generator=generator, dtype=torch.float64)
-    given = euler_maruyama(growth, x, times, draws)
-    assert torch.equal(given, euler_maruyama(growth, x, times, list(draws)))
-    one, same = (
-        euler_maruyama(growth, x, times, torch.Generator().manual_seed(5)) for _ in range(2)
-    )
-    assert torch.equal(one, same)
-
-
-@pytest.mark.parametrize(
-    ("times", "draws", "options", "message"),
-    [
-        ([1.0, 0.5, 0.0], 0, {}, r"1 draws of shape \(2, 3\) are needed, got 0 draws"),
-        ([1.0, 0.5, 0.1], 1, {}, r"ends at t = 0, but the last time is 0\.1"),
-        ([0.0, 0.5, 1.0], 1, {"last": "mean"}, "must decrease"),
-        ([1.0, 1.0, 0.0], 1, {}, "must decrease"),
-        ([1.0, 0.0], 0, {"last": "full"}, "'denoise' or 'mean', got 'full'"),
-    ],
-)
-def test_sde_that_cannot_run_is_refused(times, draws, options, message):
-    times = torch.tensor(times).double()
-    with pytest.raises(ValueError, match=message):
-        euler_maruyama(growth, torch.ones(2, 3), times, torch.zeros(draws, 2, 3), **options)
-
-
-def test_sde_refuses_draws_of_another_shape():
-    with pytest.raises(ValueError, match=r"\(2, 3\) are needed, got a draw of shape \(3,\)"):
-        euler_maruyama(growth, torch.ones(2, 3), sde_times(3), torch.zeros(2, 3))
-
-
-@pytest.mark.numerics
-def test_last_step_keeps_fine_detail():
-    noise = standard_noise(20_000, 1)
-    velocity = gaussian_velocity(0.1)
-
-    def spread(times, last):
-        generator = torch.Generator().manual_seed(1)
-        return euler_maruyama(velocity, noise, times, generator, last=last).std().item()
-
-    # 20 000 samples know a standard deviation to 0.5 %.
-    assert spread(sde_times(256, last=0.005), "denoise") == pytest.approx(0.1, rel=0.02)
-    assert spread(sde_times(256), "denoise") == pytest.approx(0.093, rel=0.02)
-    assert spread(sde_times(256), "mean") == pytest.approx(0.077, rel=0.02)
-
-
-@pytest.mark.parametrize("solver", [euler, heun])
-def test_ode_recovers_the_spread_of_gaussian_data(solver):
-    noise = standard_noise(5, 7)
-    data = solver(gaussian_velocity(0.5), noise, ode_times(400))
-    torch.testing.assert_close(data, 0.5 * noise, atol=5e-3, rtol=5e-3)
 
 
 @pytest.mark.numerics
@@ -253,25 +117,314 @@ def test_float32_state_is_close_to_float64():
     assert error(torch.bfloat16) > 1e-4
 
 
-@pytest.mark.numerics
-def test_noise_per_sample_makes_a_sample_independent_of_its_batch():
-    velocity, times = gaussian_velocity(0.3), sde_times(8)
+ORDERS = {"euler": 1, "heun": 2, "midpoint": 2, "ab2": 2, "ab3": 3, "dpmpp_2m": 2, "unipc": 3}
 
-    def draws(indices):
-        generators = [torch.Generator().manual_seed(index) for index in indices]
-        while True:
-            yield torch.stack([torch.randn(4, generator=generator) for generator in generators])
 
-    def sample(indices):
-        noise = draws(indices)
-        return euler_maruyama(velocity, next(noise), times, noise)
+@pytest.mark.parametrize(("solver", "order"), ORDERS.items())
+@pytest.mark.parametrize("shift", [1.0, 2.0])
+@pytest.mark.parametrize("ends", [(0.9, 0.1), (0.1, 0.9)])
+def test_halving_the_step_divides_the_error_by_two_to_the_order(solver, order, shift, ends):
+    start = torch.tensor([[2.0]]).double()
+    exact = 2 * math.exp(math.sin(2 * ends[1]) - math.sin(2 * ends[0]))
 
-    together = sample(range(8))
-    for index in range(8):
-        assert torch.equal(sample([index])[0], together[index])
+    def error(steps):
+        return abs(ODE_SOLVERS[solver](wave, start, ode_times(steps, *ends, shift)).item() - exact)
 
-    def naive(batch):
-        generator = torch.Generator().manual_seed(0)
-        return euler_maruyama(velocity, torch.ones(batch, 4), times, generator)
+    assert math.log2(error(400) / error(800)) == pytest.approx(order, abs=0.15)
 
-    assert not torch.equal(naive(1)[0], naive(8)[0])
+
+@pytest.mark.parametrize(("solver", "order"), (ORDERS | {"unipc": 2}).items())
+@pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+def test_order_from_end_to_end(solver, order, ends, path):
+    """From noise to data and back, where the log-SNR is infinite: the slope over three doublings.
+
+    DPM-Solver++ loses a logarithm there. The midpoint rule gains an order on this ODE.
+    """
+    start, interpolant = torch.ones(1, 1).double(), Interpolant(path)
+    spread = 0.5
+    exact = spread if ends[1] == 0 else 1 / spread
+    solve = ode_solver(solver, interpolant)
+
+    def error(steps):
+        velocity = gaussian_velocity(spread, interpolant)
+        return abs(solve(velocity, start, ode_times(steps, *ends)).item() - exact)
+
+    slope = math.log2(error(80) / error(640)) / 3
+    assert slope > order - (0.4 if solver == "dpmpp_2m" else 0.25)
+    assert error(640) < (5e-3 if order == 1 else 2e-4)
+
+
+@pytest.mark.parametrize("solver", sorted(set(ODE_SOLVERS) - set(DATA_PREDICTION)))
+@pytest.mark.parametrize("times", [UNEVEN, UNEVEN.flip(0)])
+def test_constant_velocity_is_exact(solver, times):
+    start = standard_noise(3, 2)
+    result = ODE_SOLVERS[solver](steady, start, times)
+    torch.testing.assert_close(result, start + (times[-1] - times[0]))
+
+
+@pytest.mark.parametrize(("solver", "degree"), [(ab2, 1), (ab3, 2)])
+@pytest.mark.parametrize("flip", [False, True])
+def test_adams_bashforth_integrates_polynomials_on_uneven_grids(solver, degree, flip):
+    """Once its history is full; what the first steps, of lower order, add is subtracted."""
+    times = UNEVEN.flip(0) if flip else UNEVEN
+    begin = times[degree]
+
+    def power(x, time):
+        return ((time - begin) ** degree)[:, None].expand_as(x)
+
+    start = torch.zeros(1, 1).double()
+    first = solver(power, start, times[: degree + 1])
+    result = solver(power, start, times) - first
+    assert result.item() == pytest.approx(
+        ((times[-1] - begin) ** (degree + 1) / (degree + 1)).item()
+    )
+
+
+def test_adams_bashforth_on_a_uniform_grid_has_the_textbook_weights():
+    """Weights 3/2, -1/2 and 23/12, -16/12, 5/12; read from a velocity that is 1 at one time."""
+
+    def weights(solver, steps):
+        times = ode_times(steps, 0.0, 1.0)
+
+        def pulse(at):
+            return lambda x, time: (time == times[at]).double()[:, None]
+
+        start = torch.zeros(1, 1).double()
+        before = times[:-1]
+        return [
+            (steps * (solver(pulse(at), start, times) - solver(pulse(at), start, before))).item()
+            for at in range(steps)
+        ]
+
+    assert weights(ab2, 4) == pytest.approx([0, 0, -1 / 2, 3 / 2], abs=1e-12)
+    assert weights(ab3, 5) == pytest.approx([0, 0, 5 / 12, -16 / 12, 23 / 12], abs=1e-12)
+    # The second step of AB3 is one of AB2 and amends the first from Euler's to the trapezoidal.
+    assert weights(ab3, 2) == pytest.approx([-1 / 2 - 1 / 2, 3 / 2 + 1 / 2])
+
+
+@pytest.mark.parametrize("solver", DATA_PREDICTION)
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.parametrize("times", [UNEVEN, INSIDE, INSIDE.flip(0), UNEVEN[[0, -1]]])
+def test_data_prediction_is_exact_where_the_data_are_one_point(solver, path, times):
+    interpolant, point = Interpolant(path), 1.7
+    alpha, sigma, _, _ = interpolant.coefficients(times)
+    noise = standard_noise(4, 1)
+    result = ode_solver(solver, interpolant)(
+        data_velocity(lambda log_snr: point, interpolant),
+        alpha[0] * point + sigma[0] * noise,
+        times,
+    )
+    torch.testing.assert_close(result, alpha[-1] * point + sigma[-1] * noise)
+
+
+def published(velocity, x, times, interpolant, correct):
+    """DPM-Solver++(2M) and UniPC-2 (B_2) as published: h, phi and the linear system of UniC.
+
+    Independent of the code under test, for finite lambda only.
+    """
+
+    def at(time):
+        alpha, sigma, _, _ = interpolant.coefficients(time)
+        return alpha, sigma, (alpha / sigma).log()
+
+    def data_of(x, time):
+        batch = torch.full((len(x),), time.item()).double()
+        return interpolant.denoise(velocity(x, batch), x, batch)
+
+    nodes = [(at(times[0])[2], data_of(x, times[0]))]
+    for index, (now, then) in enumerate(pairwise(times)):
+        (_, sigma_s, lambda_s), (alpha_t, sigma_t, lambda_t) = at(now), at(then)
+        h = lambda_t - lambda_s
+        phi = torch.expm1(-h)
+        base = sigma_t / sigma_s * x - alpha_t * phi * nodes[-1][1]
+        differences, ratios = [], []
+        if index:
+            r = (nodes[-2][0] - lambda_s) / h
+            ratios, differences = [r], [(nodes[-2][1] - nodes[-1][1]) / r]
+        x = base - alpha_t * phi * sum(0.5 * difference for difference in differences)
+        if index == len(times) - 2:
+            return x
+        new = data_of(x, then)
+        if correct:
+            phi_2 = phi / -h - 1
+            phi_3 = phi_2 / -h - 1 / 2
+            differences.append(new - nodes[-1][1])
+            if index:
+                matrix = torch.tensor([[1, 1], [ratios[0], 1]]).double()
+                rho = torch.linalg.solve(matrix, torch.stack([phi_2, 2 * phi_3]) / phi)
+            else:
+                rho = [0.5]
+            bend = sum(
+                weight * difference for weight, difference in zip(rho, differences, strict=True)
+            )
+            x = base - alpha_t * phi * bend
+        nodes.append((lambda_t, new))
+    return x
+
+
+@pytest.mark.parametrize("solver", DATA_PREDICTION)
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.parametrize("times", [INSIDE, INSIDE.flip(0)])
+def test_data_prediction_against_the_published_formulas(solver, path, times):
+    interpolant = Interpolant(path)
+
+    def velocity(x, time):
+        return torch.sin(3 * x) + wave(x, time)
+
+    x = standard_noise(5, 3)
+    given = ode_solver(solver, interpolant)(velocity, x, times)
+    expected = published(velocity, x, times, interpolant, correct=solver == "unipc")
+    torch.testing.assert_close(given, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("solver", DATA_PREDICTION)
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+def test_infinite_log_snr_is_the_limit_of_finite_ones(solver, path):
+    """One step from almost pure noise, and the last one onto the data."""
+    interpolant = Interpolant(path)
+    solve, velocity, x = ode_solver(solver, interpolant), wave, standard_noise(2, 3)
+    times = torch.tensor([1.0, 0.6]).double()
+    near = solve(velocity, x, torch.tensor([1.0 - 1e-9, 0.6]).double())
+    torch.testing.assert_close(solve(velocity, x, times), near, rtol=1e-6, atol=1e-6)
+    state, at = near, torch.full((2,), 0.6).double()
+    expected = interpolant.denoise(velocity(state, at), state, at)
+    result = solve(velocity, near, torch.tensor([0.6, 0.0]).double())
+    torch.testing.assert_close(result, expected)
+    if path == "linear":
+        torch.testing.assert_close(solve(velocity, x, times), euler(velocity, x, times))
+
+
+def test_first_steps_of_unipc_by_hand():
+    """Linear path from pure noise: Euler, then the mean of both expected data instead of one."""
+
+    def velocity(x, time):
+        return x * time[:, None] + 1
+
+    x0 = 2.0
+    v0 = x0 + 1
+    x1 = x0 - 0.5 * v0
+    data0, data1 = x0 - v0, x1 - 0.5 * (x1 * 0.5 + 1)
+    corrected = 0.5 * (data0 + data1) / 2 + 0.5 * x0
+    # Second and last step, to 0.25: first order from the corrected state, data1 kept.
+    noise = (corrected - 0.5 * data1) / 0.5
+    times = torch.tensor([1.0, 0.5, 0.25]).double()
+    result = unipc(velocity, torch.full((1, 1), x0).double(), times)
+    assert result.item() == pytest.approx(0.75 * data1 + 0.25 * noise)
+
+
+@pytest.mark.parametrize("solver", DATA_PREDICTION)
+def test_first_two_steps_from_the_data_are_of_first_order(solver):
+    """The first is not corrected, the second has no finite step before it: Euler on this path."""
+    x, times = standard_noise(2, 3), torch.tensor([0.0, 0.25, 0.5]).double()
+    torch.testing.assert_close(ODE_SOLVERS[solver](wave, x, times), euler(wave, x, times))
+
+
+@pytest.mark.parametrize("solver", ODE_SOLVERS)
+@pytest.mark.parametrize("steps", [1, 2, 3, 6])
+def test_network_evaluations_are_known_beforehand(solver, steps):
+    counted = CountingVelocity(growth)
+    ODE_SOLVERS[solver](counted, torch.ones(2, 3), ode_times(steps))
+    assert counted.nfe == evaluations(solver, steps)
+    assert steps_for(solver, counted.nfe) == steps
+    assert steps_for(solver, counted.nfe + 2) > steps
+    assert evaluations(solver, steps_for(solver, 16)) in (15, 16)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: evaluations("rk4", 3), "euler, heun, .*, unipc, got 'rk4'"),
+        (lambda: evaluations("ab2", 0), "at least one step, got 0"),
+        (lambda: steps_for("midpoint", 1), "midpoint cannot make a step with 1 network"),
+        (lambda: steps_for("dopri5", 9), "got 'dopri5'"),
+        (lambda: ode_solver("Euler"), "got 'Euler'"),
+    ],
+)
+def test_unknown_solvers_and_counts_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("solver", [*ODE_SOLVERS.values(), dopri5])
+def test_times_that_turn_round_are_refused(solver):
+    with pytest.raises(ValueError, match="all increase or all decrease"):
+        solver(growth, torch.ones(1, 1), torch.tensor([1.0, 0.5, 0.5, 0.0]))
+
+
+@pytest.mark.parametrize("solver", ODE_SOLVERS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_state_keeps_its_dtype_and_times_are_at_least_float32(solver, dtype):
+    seen = []
+
+    def velocity(x, time):
+        seen.append((x.dtype, time.dtype, tuple(time.shape)))
+        return x.bfloat16()
+
+    result = ODE_SOLVERS[solver](velocity, torch.ones(2, 3, dtype=dtype), ode_times(4))
+    assert result.dtype == dtype
+    wide = torch.float64 if dtype == torch.float64 else torch.float32
+    assert set(seen) == {(dtype, wide, (2,))}
+
+
+@pytest.mark.parametrize("solver", ODE_SOLVERS)
+def test_samples_do_not_depend_on_their_batch(solver):
+    velocity, x = gaussian_velocity(0.3), standard_noise(5, 3)
+    together = ODE_SOLVERS[solver](velocity, x, UNEVEN)
+    for index in range(len(x)):
+        alone = ODE_SOLVERS[solver](velocity, x[index : index + 1], UNEVEN)
+        assert torch.equal(alone[0], together[index])
+
+
+@pytest.mark.parametrize("solver", ODE_SOLVERS)
+def test_ode_carries_noise_to_gaussian_data_and_back(solver):
+    mixture = GaussianMixture(torch.full((1, 7), 2.0).double(), 0.5, torch.ones(1))
+    noise, times = standard_noise(5, 7), ode_times(400, shift=1.5)
+    solve = ODE_SOLVERS[solver]
+    data = solve(mixture.velocity, noise, times)
+    torch.testing.assert_close(data, 2 + 0.5 * noise, atol=6e-3, rtol=6e-3)
+    torch.testing.assert_close(
+        solve(mixture.velocity, data, times.flip(0)), noise, atol=0.03, rtol=0
+    )
+
+
+@pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0), (0.8, 0.3)])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_dopri5_reaches_its_tolerance_within_the_interval(ends, dtype):
+    pytest.importorskip("torchdiffeq")
+    seen = []
+
+    def velocity(x, time):
+        seen.append((x.dtype, time.tolist()))
+        return wave(x, time)
+
+    x, steps = torch.tensor([[2.0], [1.0]], dtype=dtype), ode_times(3, *ends)
+    result = dopri5(velocity, x, steps, rtol=1e-6, atol=1e-6)
+    exact = x.double() * math.exp(math.sin(2 * ends[1]) - math.sin(2 * ends[0]))
+    tolerance = 0.02 if dtype == torch.bfloat16 else 1e-5
+    torch.testing.assert_close(result.double(), exact, rtol=tolerance, atol=0)
+    assert result.dtype == dtype
+    rounding = 1e-7  # of times in float32
+    assert {kind for kind, _ in seen} == {dtype}
+    assert min(min(time) for _, time in seen) >= min(ends) - rounding
+    assert max(max(time) for _, time in seen) <= max(ends) + rounding
+
+
+def test_dopri5_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchdiffeq", None)
+    with pytest.raises(ImportError, match="pip install torchdiffeq"):
+        dopri5(growth, torch.ones(1, 1), ode_times(3))
+
+
+def test_shifted_ab2_needs_an_eighth_of_eulers_evaluations():
+    """AB2 at 16 on the grid of shift 2 is at least as close as Euler at 128, on the toy mixture."""
+    velocity, noise = toy_mixture().velocity, standard_noise(64, 64, seed=1)
+    converged, halved = (heun(velocity, noise, ode_times(steps)) for steps in (1000, 500))
+
+    def error(solution):
+        return (solution - converged).square().mean().sqrt().item()
+
+    fast = error(ab2(velocity, noise, ode_times(16, shift=2.0)))
+    slow = error(euler(velocity, noise, ode_times(128)))
+    assert error(halved) < min(fast, slow) / 10
+    assert fast <= slow

@@ -155,7 +155,11 @@ def test_block_equals_the_written_out_formula():
     hidden = block.mlp.fc1(norm(expected) * (1 + scale2) + shift2)
     hidden = 0.5 * hidden * (1 + torch.tanh((2 / math.pi) ** 0.5 * (hidden + 0.044715 * hidden**3)))
     expected = expected + gate2 * block.mlp.fc2(hidden)
-    torch.testing.assert_close(block(tokens, conditioning), expected)
+    modulation = block.adaLN_modulation(conditioning)
+    torch.testing.assert_close(block(tokens, modulation), expected)
+    for index in range(2):  # of one row for all samples
+        alone = block(tokens, modulation[index : index + 1])[index]
+        torch.testing.assert_close(alone, expected[index])
 
 
 def test_position_embedding_is_a_buffer_unless_it_is_to_be_learned():
@@ -279,3 +283,57 @@ def test_token_norm_of_constant_tokens_is_finite():
     assert latents.grad.isfinite().all()
     tokens = torch.zeros(8, 16)
     assert (tokens / tokens.std(dim=1, keepdim=True)).isnan().all()  # without eps
+
+
+def test_velocity_at_known_modulations():
+    """The rows of a table are those of its times; of one row for all, float32 rounding differs."""
+    sit, (latents, time) = build(), inputs(batch=3)
+    velocity = sit.velocity(latents, time)
+    table = sit.modulations(time)
+    assert table.shape == (3, (6 * 3 + 2) * 16)
+    assert torch.equal(sit.velocity_at(latents, table), velocity)
+    for index in range(3):
+        shared = sit.velocity_at(latents, table[index : index + 1])
+        torch.testing.assert_close(shared[index], velocity[index], atol=1e-5, rtol=1e-5)
+    one_time = time[:1].expand(3)
+    torch.testing.assert_close(
+        sit.velocity_at(latents, table[:1]), sit.velocity(latents, one_time), atol=1e-5, rtol=1e-5
+    )
+
+
+def test_modulations_of_classes():
+    sit, (latents, time) = build(num_classes=2), inputs()
+    labels = torch.tensor([1, 0])
+    table = sit.modulations(time, labels)
+    expected = sit.velocity(latents, time, labels)
+    assert torch.equal(sit.velocity_at(latents, table), expected)
+    with pytest.raises(ValueError, match="2 classes needs labels"):
+        sit.modulations(time)
+
+
+@pytest.mark.parametrize(
+    ("rows", "width", "message"),
+    [(1, 319, "rows of 320 numbers"), (3, 320, "one for each of 2 samples, got 3")],
+)
+def test_modulations_of_another_shape_are_named(rows, width, message):
+    with pytest.raises(ValueError, match=message):
+        build().velocity_at(inputs()[0], torch.zeros(rows, width))
+
+
+@pytest.mark.parametrize("qk_norm", [False, True])
+def test_half_weights_leave_float32_islands(qk_norm):
+    """Closer to float32 than half of everything, which rounds the token stream in every block."""
+    sit, half, all_half = (build(qk_norm=qk_norm) for _ in range(3))
+    half.halve_()
+    narrow = {name for name, p in half.named_parameters() if p.dtype == torch.bfloat16}
+    assert {name.split(".")[2] for name in narrow} == {"attn", "mlp"}
+    latents, time = inputs(batch=16)
+    expected = sit.velocity(latents, time)
+    row = half.modulations(time)
+    assert torch.equal(row, sit.modulations(time))
+    found = half.velocity_at(latents, row)
+    assert found.dtype == torch.float32
+    error = (found - expected).square().mean().sqrt()
+    naive = all_half.bfloat16().velocity(latents.bfloat16(), time).float()
+    assert 0 < error < 0.02 * expected.std()
+    assert error < 0.7 * (naive - expected).square().mean().sqrt()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
@@ -148,3 +150,20 @@ def test_empty_scan_and_far_latents_are_finite_in_bf16(vae):
     (posterior.kl().sum() + decoded.float().square().mean()).backward()
     assert decoded.isfinite().all()
     assert all(weight.grad.isfinite().all() for weight in vae.parameters())
+
+
+def test_half_decoder_leaves_float32_ends(vae):
+    """The image is not rounded to bfloat16, in which neighbours of 0.9 are 0.004 apart."""
+    latents = torch.randn(2, vae.latent_channels, 4, 8, generator=torch.Generator().manual_seed(0))
+    half = copy.deepcopy(vae).halve_decoder_()
+    narrow = {name for name, p in half.named_parameters() if p.dtype == torch.bfloat16}
+    assert all(name.startswith("decoder.") for name in narrow)
+    assert not any("norm" in name or "conv_out" in name for name in narrow)
+    with torch.no_grad():
+        expected, found = vae.decode(latents), half.decode(latents)
+        with torch.autocast("cpu", torch.bfloat16):
+            mixed = vae.decode(latents)
+    assert found.dtype == mixed.dtype == torch.float32
+    assert not torch.equal(found, found.bfloat16().float())
+    for image in (found, mixed):
+        assert 0 < (image - expected).abs().max() < 0.05 * expected.abs().max()

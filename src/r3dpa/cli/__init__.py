@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from r3dpa.cli.files import check_file, check_folder, print_text
+
 if TYPE_CHECKING:
     from r3dpa.simulation import Weather
 
@@ -62,7 +64,7 @@ def simulate(
     except KeyboardInterrupt:
         sys.stderr.write(f"r3dpa simulate: stopped; the same command goes on in {out}\n")
         sys.exit(130)  # as a shell reports an interrupt
-    _print(report)
+    print_text(report)
 
 
 def ablate(
@@ -90,8 +92,8 @@ def ablate(
     from r3dpa.cli.ablation import ablate as run
     from r3dpa.simulation import load_sensor
 
-    _check_folder(out)
-    _print(run(out, load_sensor(sensor), scans, seed, weather, reference))
+    check_folder(out)
+    print_text(run(out, load_sensor(sensor), scans, seed, weather, reference))
 
 
 def check(path: Path) -> None:
@@ -103,7 +105,7 @@ def check(path: Path) -> None:
     from r3dpa.data.scans import check as check_scans
 
     report = check_scans(path)
-    _print(report)
+    print_text(report)
     if not report.ok:
         sys.exit(1)
 
@@ -122,8 +124,8 @@ def view(
     from r3dpa.cli.view import view as draw
 
     if out is not None:
-        _check_folder(out)
-    _print(draw(source, out, num, reference))
+        check_folder(out)
+    print_text(draw(source, out, num, reference))
 
 
 def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
@@ -136,8 +138,8 @@ def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
     """
     from r3dpa.cli.realism import realism as compare
 
-    _check_file(out)
-    _print(compare(scans, reference, out))
+    check_file(out)
+    print_text(compare(scans, reference, out))
 
 
 def probe(
@@ -168,8 +170,8 @@ def probe(
     """
     from r3dpa.cli.probe import probe as compare
 
-    _check_file(out)
-    _print(compare(data, _words(sources), ckpt, train_scans, val_scans, device, out))
+    check_file(out)
+    print_text(compare(data, _words(sources), ckpt, train_scans, val_scans, device, out))
 
 
 def sample(
@@ -177,42 +179,120 @@ def sample(
     out: Path,
     num: int = 16,
     seed: int = 0,
-    solver: Literal["euler", "heun", "euler_maruyama"] = "euler_maruyama",
-    steps: int = 256,
+    quality: Literal["draft", "good", "best"] | None = None,
+    solver: Literal[
+        "euler",
+        "heun",
+        "midpoint",
+        "ab2",
+        "ab3",
+        "dpmpp_2m",
+        "unipc",
+        "dopri5",
+        "euler_maruyama",
+        "restart",
+    ]
+    | None = None,
+    steps: int | None = None,
+    shift: float | None = None,
+    tuned: Path | None = None,
+    eta: float = 1.0,
     sde_last: Literal["denoise", "mean"] = "denoise",
     sde_last_time: float = 0.04,
+    autoguidance: Path | None = None,
+    guidance_scale: float = 2.0,
+    guidance_interval: tuple[float, float] = (0.0, 1.0),
+    allow_other_latents: bool = False,
     batch_size: int = 8,
+    decode_batch_size: int | None = None,
     precision: Literal["fp32", "bf16"] = "fp32",
+    compile: bool = False,
     device: str = "auto",
     weights: Literal["ema", "last"] = "ema",
+    formats: str = "bin",
     pictures: int = 64,
     overwrite: bool = False,
 ) -> None:
     """Generate scenes from a checkpoint.
+
+    The same command completes what was interrupted.
 
     Args:
         ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
         out: Folder for scenes, pictures and metadata; must not hold other scenes.
         num: Number of scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
-        solver: ODE (euler, heun) or SDE (euler_maruyama) solver.
-        steps: Solver steps.
+        quality: Choose solver, steps and shift from what was measured: ``draft``, ``good`` or
+            ``best``.
+        solver: ODE solver; or ``euler_maruyama`` for the SDE, where none is given.
+        steps: Solver steps; 256 where not given.
+        shift: Finer steps near noise (above 1) or data (below 1) of the ODE; 1 where not given.
+        tuned: File of a tuned solver, which replaces solver, steps and shift.
+        eta: Strength of the noise of the SDE; 1 as published.
         sde_last: Last SDE step: ``denoise``, or ``mean`` as in the official sampler.
         sde_last_time: Time from which the last SDE step starts.
+        autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
+        guidance_scale: Strength of autoguidance, 1 for none.
+        guidance_interval: Guided times, such as '[0.2, 0.8]'; 0 is data, 1 noise.
+        allow_other_latents: Accept a snapshot whose latents are only about the same.
         batch_size: Scenes sampled together.
-        precision: Precision of the networks.
+        decode_batch_size: Scenes decoded together; ``batch_size`` where not given.
+        precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
+        compile: Compile the networks: a minute or more at first, then faster.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         weights: Averaged (``ema``) or last weights of the SiT.
-        pictures: Draw this many scenes; all are written as ``.bin``, ``.ply`` and ``.npz``.
-        overwrite: Write into a folder that holds scenes already.
+        formats: Files of points, separated by commas: ``bin``, ``ply``, ``npz``; the range images
+            are in ``range_m.npy``.
+        pictures: Draw this many scenes.
+        overwrite: Write into a folder that holds scenes already, and start anew.
     """
+    from r3dpa.cli.scenes import WeakGuide
     from r3dpa.cli.scenes import sample as generate
     from r3dpa.generation import SamplerConfig
 
-    sampler = SamplerConfig(solver, steps, sde_last_time, sde_last)
-    generate(
-        ckpt, out, num, seed, sampler, batch_size, precision, device, weights, pictures, overwrite
-    )
+    chosen = {"solver": solver, "steps": steps, "shift": shift, "tuned": tuned}
+    given: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+    if quality is not None and given:
+        raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
+    if tuned is not None and len(given) > 1:
+        raise ValueError(f"--tuned replaces --{next(iter(given))}; drop one")
+    if quality is not None:
+        sampler = SamplerConfig.of_quality(quality)
+        print_text(SamplerConfig.quality_line(quality))
+    else:
+        given = {name: str(v) if name == "tuned" else v for name, v in given.items()}
+        sampler = SamplerConfig(**given, eta=eta, sde_last=sde_last, sde_last_time=sde_last_time)
+    guide = None
+    if autoguidance is not None:
+        guide = WeakGuide(autoguidance, guidance_scale, guidance_interval, allow_other_latents)
+    try:
+        metadata = generate(
+            ckpt,
+            out,
+            num,
+            seed,
+            sampler,
+            batch_size=batch_size,
+            decode_batch_size=decode_batch_size,
+            compile=compile,
+            precision=precision,
+            device=device,
+            weights=weights,
+            guide=guide,
+            formats=_words(formats),
+            pictures=pictures,
+            overwrite=overwrite,
+        )
+    except KeyboardInterrupt:
+        sys.stderr.write(f"r3dpa sample: stopped; the same command goes on in {out}\n")
+        sys.exit(130)  # as a shell reports an interrupt
+    if metadata["drawn_by_last_run"]:
+        print_text(
+            f"{num} scenes in {out}: {metadata['nfe']} network evaluations each, "
+            f"{metadata['device_seconds_per_scene']:.3g} s a scene on the device, "
+            f"{metadata['seconds_per_scene']:.3g} s end to end; "
+            f"{metadata['threads']['torch']} CPU threads"
+        )
 
 
 def reference(
@@ -243,13 +323,13 @@ def reference(
     """
     from r3dpa.cli.evaluate import reference as write
 
-    _check_file(out)
+    check_file(out)
     try:
         line = write(data, out, _words(spaces), ckpt, split, limit, protocol, device)
     except KeyboardInterrupt:
         sys.stderr.write(f"r3dpa reference: stopped; the same command goes on with {out}\n")
         sys.exit(130)  # as a shell reports an interrupt
-    _print(line)
+    print_text(line)
 
 
 def evaluate(
@@ -290,10 +370,10 @@ def evaluate(
     from r3dpa.cli.evaluate import evaluate as compare
 
     if out is not None:
-        _check_folder(out)
+        check_folder(out)
     names = None if spaces is None else _words(spaces)
     options = (skip_bad, allow_few, allow_oracle, label, device, out, split)
-    _print(compare(samples, reference, names, ckpt, protocol, *options))
+    print_text(compare(samples, reference, names, ckpt, protocol, *options))
 
 
 def selfcheck(
@@ -323,8 +403,8 @@ def selfcheck(
     """
     from r3dpa.cli.selfcheck import selfcheck as check_metrics
 
-    _check_file(out)
-    _print(check_metrics(data, against, _words(spaces), ckpt, protocol, limit, device, out))
+    check_file(out)
+    print_text(check_metrics(data, against, _words(spaces), ckpt, protocol, limit, device, out))
 
 
 def convert(
@@ -351,7 +431,7 @@ def convert(
     result = convert_checkpoint(
         source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding
     )
-    _print(result.table())
+    print_text(result.table())
 
 
 def report(run: Path) -> None:
@@ -362,94 +442,67 @@ def report(run: Path) -> None:
     """
     from r3dpa.cli.scenes import report as draw
 
-    _print(draw(run))
+    print_text(draw(run))
 
 
-def bench_training(
-    conf: Path = Path("conf"),
-    stages: tuple[str, ...] = ("vae_alignment", "joint", "flow_matching"),
-    batch_size: int = 1,
-    steps: int = 2,
-    precision: Literal["32-true", "bf16-mixed"] = "32-true",
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-    out: Path | None = None,
+def tune_solver(
+    ckpt: Path,
+    out: Path,
+    steps: int = 10,
+    num: int = 64,
+    val: int = 64,
+    reference_steps: int = 200,
+    iterations: int = 200,
+    velocities: int = 2,
+    batch_size: int = 16,
+    seed: int = 0,
+    weights: Literal["ema", "last"] = "ema",
+    device: str = "auto",
 ) -> None:
-    """Train each stage for a few steps at its real size; print time, memory and parameters.
+    """Fit a solver of few steps to a checkpoint: times and weights of past velocities.
+
+    Prints it beside Euler, AB2 and learned times; ``r3dpa sample --tuned FILE`` uses it.
 
     Args:
-        conf: Folder of the configurations.
-        stages: Experiments below ``<conf>/experiment``, such as ``[joint]``; one process each.
-        batch_size: Scans per step.
-        steps: Optimiser steps; two are needed for the peak memory of a long run.
-        precision: Precision as the Trainer names it.
-        device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
-        out: JSON file for the same figures.
+        ckpt: Checkpoint of stage joint or flow_matching.
+        out: JSON file of the solver.
+        steps: Steps, which are its network evaluations.
+        num: Noises to fit it to.
+        val: Noises to choose by, and as many again that only test it.
+        reference_steps: Heun steps of the converged solutions.
+        iterations: Of the search.
+        velocities: Past velocities that a step combines.
+        batch_size: Noises solved together.
+        seed: Of the noises.
+        weights: Averaged (``ema``) or last weights of the SiT.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
-    from r3dpa.bench.training import StepSettings, training
+    from r3dpa.cli.tune import tune
 
-    _check_file(out)
-    _print(training(conf, stages, StepSettings(batch_size, steps, precision, device), out))
-
-
-def bench_simulation(quick: bool = False, out: Path | None = None) -> None:
-    """Simulate scans of plain streets and of bad weather; print the time of each part and effect.
-
-    The budget is that of one core: set ``OMP_NUM_THREADS=1``, as ``make bench-simulation`` does.
-
-    Args:
-        quick: Two scans of each case instead of 9 or 36.
-        out: JSON file for the same figures.
-    """
-    from r3dpa.bench.simulation import simulation
-
-    _check_file(out)
-    _print(simulation(quick, out))
-
-
-def bench_features(
-    scan: Path | None = None, out: Path | None = None, quick: bool = False, wi48: bool = False
-) -> None:
-    """Build feature grids, read them back and pass one scan through networks; print the cost.
-
-    Args:
-        scan: KITTI ``.bin`` file; a simulated scan where not given.
-        out: JSON file for the same figures.
-        quick: Small sizes, only to try it.
-        wi48: Measure one pass of WI-48-768, too: minutes on a CPU.
-    """
-    from r3dpa.bench.features import features
-
-    _check_file(out)
-    _print(features(scan, out, quick, wi48))
+    check_file(out)
+    print_text(
+        tune(
+            ckpt,
+            out,
+            steps,
+            num,
+            val,
+            reference_steps,
+            iterations,
+            velocities,
+            batch_size,
+            seed,
+            weights,
+            device,
+        )
+    )
 
 
-def bench_metrics(scan: Path | None = None, out: Path | None = None, quick: bool = False) -> None:
-    """Time the networks of the metrics, JSD, MMD and sparse convolution; print the cost.
-
-    JSD, MMD and the convolution run beside a plain way to the same result, which must agree.
-
-    Args:
-        scan: KITTI ``.bin`` file; a simulated scan where not given.
-        out: JSON file for the same figures.
-        quick: Small sizes, only to try it.
-    """
-    from r3dpa.bench.metrics import metrics
-
-    _check_file(out)
-    _print(metrics(scan, out, quick))
-
-
-_BENCHES: dict[str, Callable[..., None]] = {
-    "training": bench_training,
-    "simulation": bench_simulation,
-    "features": bench_features,
-    "metrics": bench_metrics,
-}
 _COMMANDS: dict[str, Callable[..., None]] = {
-    command.__name__: command
+    command.__name__.replace("_", "-"): command
     for command in (
         *(simulate, check, view, realism, probe),
-        *(sample, reference, evaluate, selfcheck, convert, report),
+        *(sample, tune_solver, reference, evaluate, selfcheck, convert, report),
     )
 }
 
@@ -459,31 +512,12 @@ def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",")]
 
 
-def _print(text: Any) -> None:
-    sys.stdout.write(f"{text}\n")
-
-
-def _check_folder(out: Path) -> None:
-    """Refuse what could not be a folder, before minutes of work are lost with it."""
-    for folder in (out, *out.parents):
-        if folder.exists() and not folder.is_dir():
-            raise ValueError(f"{folder} is a file; give another --out")
-
-
-def _check_file(out: Path | None) -> None:
-    """The same for a file that is written at the end, if any."""
-    if out is not None:
-        if out.is_dir():
-            raise ValueError(f"{out} is a folder; give --out the name of a file")
-        _check_folder(out.parent)
-
-
 def _help() -> str:
     summaries = _STAGE_COMMANDS | {
         name: (command.__doc__ or "").splitlines()[0] for name, command in _COMMANDS.items()
     }
     summaries["features"] = "write the feature grids of a data set, on any number of devices"
-    summaries["bench"] = "measure what training steps, simulated scans or feature grids cost"
+    summaries["bench"] = "measure what a part costs: r3dpa bench --help lists them"
     lines = [f"  {name:<10} {summary}" for name, summary in summaries.items()]
     head = ["usage: r3dpa COMMAND [options]", "", "Generate LiDAR scenes (R3DPA).", ""]
     return "\n".join([*head, *lines, "", "r3dpa COMMAND --help lists the options of a command."])
@@ -512,11 +546,11 @@ def _run_function(
 
 def _run(args: list[str]) -> None:
     if not args or args[0] in ("-h", "--help"):
-        _print(_help())
+        print_text(_help())
     elif args[0] == "--version":
         from r3dpa import __version__
 
-        _print(__version__)
+        print_text(__version__)
     elif args[0] in _STAGE_COMMANDS:
         from r3dpa.cli.stages import run
 
@@ -529,12 +563,14 @@ def _run(args: list[str]) -> None:
         words = [word for word in args[1:] if word != "--ablate"]
         _run_function(ablate, words, "r3dpa simulate --ablate")
     elif args[0] == "bench":
-        _run_function(_BENCHES, args[1:], "r3dpa bench")
+        from r3dpa.cli.benches import BENCHES
+
+        _run_function(BENCHES, args[1:], "r3dpa bench")
     elif args[0] in _COMMANDS:
         positional = args[0] in ("check", "view", "convert", "report")
         _run_function(_COMMANDS[args[0]], args[1:], f"r3dpa {args[0]}", positional)
     else:
-        _print(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
+        print_text(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
         sys.exit(2)
 
 

@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import time
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 import r3dpa
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
-from r3dpa.checkpoints import Checkpoint, read_checkpoint, source_commit
-from r3dpa.data.scans import write_bin, write_npz, write_ply
-from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.checkpoints import Checkpoint, leaks_labels, read_checkpoint, source_commit
+from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.nn import VAE, LatentNorm, SiT
 
-__all__ = ["generator_from", "report", "sample"]
+if TYPE_CHECKING:
+    from r3dpa.bench.problems import Setting
+
+__all__ = ["WeakGuide", "generator_from", "generators_of", "report", "sample"]
 
 _ON_SHEET = 16
-_KINDS = ("bin", "ply", "range", "birds_eye", "scene_3d")
+_PICTURES = ("range", "birds_eye", "scene_3d")
+
+
+@dataclass(frozen=True)
+class WeakGuide:
+    """A weak model that guides: file, strength, guided times, and whether other latents may."""
+
+    path: Path
+    scale: float
+    interval: tuple[float, float]
+    allow: bool
 
 
 def generator_from(
@@ -35,8 +50,19 @@ def generator_from(
     weights: Literal["ema", "last"] = "ema",
     precision: Literal["fp32", "bf16"] = "fp32",
     device: str = "cpu",
+    autoguidance: Autoguidance | None = None,
+    **fast_path: Any,
 ) -> SceneGenerator:
     """Rebuilds the networks of a checkpoint for sampling, on the path they were trained on.
+
+    Args:
+        checkpoint: Of stage joint or flow_matching.
+        sampler: Solver and steps.
+        weights: Averaged or last weights of the SiT.
+        precision: Of the networks.
+        device: Where they compute.
+        autoguidance: Weak model, on the same device.
+        **fast_path: ``batch_size``, ``decode_batch_size`` and ``compile`` of the generator.
 
     Raises:
         ValueError: If a network, the latent statistics or the scan geometry is missing.
@@ -56,7 +82,66 @@ def generator_from(
     if not (isinstance(vae, VAE) and isinstance(sit, SiT) and isinstance(norm, LatentNorm)):
         raise ValueError(f"{checkpoint.path} holds other classes than VAE, SiT and LatentNorm")
     geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
-    return SceneGenerator(vae, sit, norm, geometry, sampler, checkpoint.interpolant, precision)
+    return SceneGenerator(
+        vae,
+        sit,
+        norm,
+        geometry,
+        sampler,
+        checkpoint.interpolant,
+        precision,
+        autoguidance=autoguidance,
+        **fast_path,
+    )
+
+
+def _autoguidance(
+    checkpoint: Checkpoint, guide: WeakGuide, weights: Literal["ema", "last"], device: str
+) -> tuple[Autoguidance, dict[str, Any]]:
+    """The weak model, and what the metadata tell of it."""
+    from r3dpa.snapshots import read_snapshot  # brings lightning, which takes seconds
+
+    weak = read_snapshot(guide.path, checkpoint, weights, guide.allow)
+    about = {
+        "checkpoint": str(guide.path),
+        "checkpoint_written": _written(guide.path),
+        "step": weak.step,
+        "feature_source": weak.feature_source,
+        "scale": guide.scale,
+        "interval": list(guide.interval),
+    }
+    sit, shift = weak.sit.to(device), weak.shift.to(device)
+    return Autoguidance(sit, guide.scale, guide.interval, weak.scale, shift), about
+
+
+def generators_of(
+    ckpt: Path, guide: WeakGuide | None, device: str
+) -> tuple[Callable[[Setting], SceneGenerator], dict[str, Any]]:
+    """Generators of a checkpoint as ``r3dpa bench sampling`` wants them, and what it is.
+
+    All share the networks that are read here.
+    """
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    checkpoint = read_checkpoint(ckpt)
+    plain = generator_from(checkpoint, SamplerConfig(), device=device)
+    guidance = None if guide is None else _autoguidance(checkpoint, guide, "ema", device)[0]
+
+    def make(setting: Setting) -> SceneGenerator:
+        return SceneGenerator(
+            plain.vae,
+            plain.sit,
+            plain.latent_norm,
+            plain.geometry,
+            setting.sampler,
+            checkpoint.interpolant,
+            setting.precision,
+            autoguidance=guidance if setting.autoguided else None,
+            batch_size=setting.batch if setting.compiled else None,
+            compile=setting.compiled,
+        )
+
+    return make, {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
 
 
 def sample(
@@ -65,12 +150,17 @@ def sample(
     num: int,
     seed: int,
     sampler: SamplerConfig,
-    batch_size: int,
-    precision: Literal["fp32", "bf16"],
-    device: str,
-    weights: Literal["ema", "last"],
-    pictures: int,
-    overwrite: bool,
+    *,
+    batch_size: int = 8,
+    decode_batch_size: int | None = None,
+    compile: bool = False,
+    precision: Literal["fp32", "bf16"] = "fp32",
+    device: str = "auto",
+    weights: Literal["ema", "last"] = "ema",
+    guide: WeakGuide | None = None,
+    formats: Sequence[str] = ("bin",),
+    pictures: int = 64,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Writes scenes, pictures and metadata below ``out``; see ``r3dpa sample --help``.
 
@@ -78,68 +168,143 @@ def sample(
         The metadata.
 
     Raises:
-        ValueError: If ``out`` holds scenes already, or the checkpoint cannot be sampled from.
+        ValueError: If ``out`` holds scenes already, or unfinished ones of another request, or the
+            checkpoint cannot be sampled from.
+        OSError: If a file cannot be written.
     """
-    if (out / "metadata.json").exists() and not overwrite:
-        raise ValueError(f"{out} holds scenes already; give another --out or --overwrite true")
     if num < 1 or batch_size < 1:
         raise ValueError(f"num and batch_size must be at least 1, got {num} and {batch_size}")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     checkpoint = read_checkpoint(ckpt)
-    generator = generator_from(checkpoint, sampler, weights, precision, device)
-    for kind in _KINDS:
-        shutil.rmtree(out / kind, ignore_errors=True)  # of an earlier run with more scenes
-    drawn, points, seconds, nfe = [], {}, 0.0, 0
-    with tqdm(total=num, unit="scene", desc="sampling") as progress:
-        for first in range(0, num, batch_size):
-            indices = range(first, min(first + batch_size, num))
-            start = time.perf_counter()
-            batch = generator.generate(indices, seed)
-            range_m, nfe = batch.range_m.cpu(), batch.nfe  # the copy waits for the GPU
-            seconds += time.perf_counter() - start
-            for index, scene_m in zip(indices, range_m, strict=True):
-                name = f"{index:06d}"
-                points[name] = points_of(scene_m, generator.geometry.projection)
-                write_bin(out / "bin" / f"{name}.bin", points[name])
-                write_ply(out / "ply" / f"{name}.ply", points[name])
-                if index < pictures:
-                    _draw_scene(out, name, scene_m, points[name], generator.geometry)
-                    drawn.append(scene_m)
-            progress.update(len(indices))
-    write_npz(out / "scenes.npz", points)
-    if drawn:
-        sheet = viz.scenes_sheet(drawn[:_ON_SHEET], generator.geometry.projection)
-        viz.save(sheet, out / "scenes.png")
-    metadata = {
+    guidance, about_guide, feature_source = None, None, checkpoint.feature_source
+    if guide is not None:
+        guidance, about_guide = _autoguidance(checkpoint, guide, weights, device)
+        if leaks_labels(about_guide["feature_source"]):
+            feature_source = about_guide["feature_source"]  # a leak is one of the scenes, too
+    generator = generator_from(
+        checkpoint,
+        sampler,
+        weights,
+        precision,
+        device,
+        guidance,
+        batch_size=batch_size if compile else None,
+        decode_batch_size=decode_batch_size,
+        compile=compile,
+    )
+    request = {
         "checkpoint": str(ckpt),
+        "checkpoint_written": _written(ckpt),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
-        "feature_source": checkpoint.feature_source,
+        "feature_source": feature_source,
         "weights": weights,
         "num": num,
         "seed": seed,
         "sampler": asdict(sampler),
+        "tuned_written": None if sampler.tuned is None else _written(Path(sampler.tuned)),
+        "autoguidance": about_guide,
         "interpolant": checkpoint.interpolant,
-        "nfe": nfe,
         "precision": precision,
         "device": device,
+        "compile": compile,
         "batch_size": batch_size,
-        "seconds_per_scene": seconds / num,
+        "decode_batch_size": decode_batch_size,
+        "formats": list(formats),
         "geometry": generator.geometry.to_dict(),
         "r3dpa": r3dpa.__version__,
         "commit": source_commit(),
         "torch": torch.__version__,
     }
-    with atomic_path(out / "metadata.json") as temporary:
-        temporary.write_text(json.dumps(metadata, indent=2) + "\n")
+    projection = generator.geometry.projection
+    with SceneWriter(out, num, projection, formats, request, overwrite) as writer:
+        for kind in _PICTURES:
+            shutil.rmtree(out / kind, ignore_errors=True)  # of an earlier run with more scenes
+        measured = _draw_scenes(generator, writer, batch_size, seed)
+        seconds = -time.perf_counter()
+        ranges = np.load(writer.range_path, mmap_mode="r")
+        drawn = [torch.from_numpy(np.array(range_m)) for range_m in ranges[:pictures]]
+        for index, range_m in enumerate(drawn):
+            _draw_scene(out, f"{index:06d}", range_m, generator.geometry)
+        if drawn:
+            sheet = viz.scenes_sheet(drawn[:_ON_SHEET], projection)
+            viz.save(sheet, out / "scenes.png")
+        metadata = request | measured | {"picture_seconds": seconds + time.perf_counter()}
+        writer.finish(metadata)
     return metadata
 
 
-def _draw_scene(
-    out: Path, name: str, range_m: Tensor, points: Tensor, geometry: ScanGeometry
-) -> None:
-    sensor = geometry.projection.sensor
+def _draw_scenes(
+    generator: SceneGenerator, writer: SceneWriter, batch_size: int, seed: int
+) -> dict[str, Any]:
+    """Draws and writes the scenes that are missing; returns what it took.
+
+    Device seconds are those of the networks; on a GPU by its own clock, which nothing waits for.
+    """
+    first_index, nfe, clock = writer.num_done, None, _DeviceClock(generator.device)
+    start = time.perf_counter()
+    with tqdm(
+        total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
+    ) as progress:
+        for first in range(first_index, writer.num, batch_size):
+            indices = range(first, min(first + batch_size, writer.num))
+            clock.start()
+            batch = generator.generate(indices, seed)
+            clock.stop()
+            writer.put(batch.range_m)
+            nfe = batch.nfe
+            progress.update(len(indices))
+    writer.close()
+    elapsed = time.perf_counter() - start
+    device_seconds = clock.seconds()
+    drawn = writer.num - first_index
+    return {
+        "nfe": nfe,
+        "drawn_by_last_run": drawn,
+        "device_seconds_per_scene": sum(device_seconds) / drawn if drawn else None,
+        "seconds_per_scene": elapsed / drawn if drawn else None,
+        "first_batch_device_seconds": device_seconds[0] if drawn else None,
+        "threads": {
+            "torch": torch.get_num_threads(),
+            "between_operations": torch.get_num_interop_threads(),
+            "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"),
+        },
+    }
+
+
+class _DeviceClock:
+    """Seconds between each start and stop, in the time of the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._on_gpu = device.type == "cuda"
+        self._marks: list[Any] = []
+
+    def start(self) -> None:
+        if not self._on_gpu:
+            self._marks.append(time.perf_counter())
+            return
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self._marks.append(event)
+
+    stop = start
+
+    def seconds(self) -> list[float]:
+        pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
+        if not self._on_gpu:
+            return [stop - start for start, stop in pairs]
+        torch.cuda.synchronize()
+        return [start.elapsed_time(stop) / 1000 for start, stop in pairs]
+
+
+def _written(path: Path) -> str:
+    """When a file was written last: the same name may hold other weights by now."""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
+
+
+def _draw_scene(out: Path, name: str, range_m: Tensor, geometry: ScanGeometry) -> None:
+    sensor, points = geometry.projection.sensor, points_of(range_m, geometry.projection)
     picture = viz.range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
     viz.save(picture, out / "range" / f"{name}.png")
     viz.save(viz.birds_eye_view(points), out / "birds_eye" / f"{name}.png")

@@ -7,7 +7,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from r3dpa.data.augmentation import Augmentation, View
-from r3dpa.data.datasets import LidarBatch, LidarDataset, LidarSample
+from r3dpa.data.datasets import (
+    LatentBatch,
+    LatentDataset,
+    LatentSample,
+    LidarBatch,
+    LidarDataset,
+    LidarSample,
+)
 from r3dpa.data.feature_grids import (
     Extractor,
     GridPlan,
@@ -25,6 +32,13 @@ from r3dpa.data.feature_store import (
 from r3dpa.data.grid_settings import FeatureGridError, GridSettings
 from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
+from r3dpa.data.scan_cache import (
+    CachedTensors,
+    ScanCache,
+    ScanCacheError,
+    range_image_cache,
+    write_range_images,
+)
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     CheckReport,
@@ -49,6 +63,7 @@ if TYPE_CHECKING:
 __all__ = [
     "KITTI360_DRIVES",
     "Augmentation",
+    "CachedTensors",
     "CheckReport",
     "Extractor",
     "FeatureGridError",
@@ -57,6 +72,9 @@ __all__ = [
     "GridPlan",
     "GridSettings",
     "KITTI360DataModule",
+    "LatentBatch",
+    "LatentDataset",
+    "LatentSample",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",
@@ -68,6 +86,8 @@ __all__ = [
     "SampleError",
     "Samples",
     "Scan",
+    "ScanCache",
+    "ScanCacheError",
     "ScanError",
     "SimulatedDataModule",
     "View",
@@ -78,6 +98,7 @@ __all__ = [
     "kitti360_scans",
     "list_collate",
     "pooled_grids",
+    "range_image_cache",
     "read_beside",
     "read_npz",
     "read_ply",
@@ -89,6 +110,7 @@ __all__ = [
     "write_feature_grids",
     "write_npz",
     "write_ply",
+    "write_range_images",
 ]
 
 

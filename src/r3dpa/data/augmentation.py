@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r3dpa.data.datasets import LidarDataset, LidarSample
+from r3dpa.data.datasets import LatentDataset, LatentSample, LidarDataset, LidarSample
 
 _STREAM = 1  # separates these draws from those of the order, which have the same seed
 
@@ -69,14 +69,19 @@ class View:
         """
         return self._reordered(grid.unflatten(0, (-1, self.grid_columns)), 1, 1).flatten(0, 1)
 
-    def sample(self, sample: LidarSample) -> LidarSample:
-        """Training sample seen this way; index and name stay."""
-        seen = sample.copy()
-        seen["range_image"] = self.image(sample["range_image"])
-        seen["valid_mask"] = self.image(sample["valid_mask"])
-        if "feature_grid" in sample:
-            seen["feature_grid"] = self.grid(sample["feature_grid"])
-        return seen
+    def sample(self, sample: LidarSample | LatentSample) -> LidarSample | LatentSample:
+        """Training sample seen this way; index and name stay.
+
+        Posteriors are images, too: the encoder commutes with rotation by its column stride. With
+        mirroring it does not, see :meth:`Augmentation.check_latents`.
+        """
+        seen: dict[str, Any] = dict(sample)
+        for name in ("range_image", "valid_mask", "posterior_moments"):
+            if name in seen:
+                seen[name] = self.image(seen[name])
+        if "feature_grid" in seen:
+            seen["feature_grid"] = self.grid(seen["feature_grid"])
+        return cast(LidarSample, seen)
 
     def _reordered(self, values: Tensor, axis: int, cell_columns: int) -> Tensor:
         if self.mirrored:
@@ -150,8 +155,32 @@ class Augmentation:
                 "true to train on the approximation."
             )
 
+    def check_latents(self, latent_columns: int, grid_columns: int) -> None:
+        """Refuse cached posteriors that are not those of the scan seen otherwise.
 
-class AugmentedDataset(Dataset[LidarSample]):
+        Args:
+            latent_columns: Columns w of the latents.
+            grid_columns: Columns of the feature grid, by which scans are rotated.
+
+        Raises:
+            ValueError: If scans are mirrored, or rotated by parts of a latent column.
+        """
+        if self.flip:
+            reason = "flip: the encoder of the VAE does not commute with mirroring"
+        elif self.rotate and latent_columns % grid_columns:
+            reason = (
+                f"rotate: {grid_columns} grid columns do not divide the {latent_columns} columns "
+                "of the latents"
+            )
+        else:
+            return
+        raise ValueError(
+            f"augmentation.{reason}, so that cached latents would not be those of the augmented "
+            "scan. Switch it off, or encode in each step: model.init_args.cache_latents: false"
+        )
+
+
+class AugmentedDataset(Dataset[LidarSample | LatentSample]):
     """Training samples seen otherwise in each epoch.
 
     Args:
@@ -162,7 +191,11 @@ class AugmentedDataset(Dataset[LidarSample]):
     """
 
     def __init__(
-        self, dataset: LidarDataset, augmentation: Augmentation, seed: int, grid_columns: int
+        self,
+        dataset: LidarDataset | LatentDataset,
+        augmentation: Augmentation,
+        seed: int,
+        grid_columns: int,
     ) -> None:
         self.dataset, self.augmentation = dataset, augmentation
         self.seed, self.grid_columns = seed, grid_columns
@@ -171,7 +204,7 @@ class AugmentedDataset(Dataset[LidarSample]):
         """Number of scans."""
         return len(self.dataset)
 
-    def __getitem__(self, key: tuple[int, int]) -> LidarSample:
+    def __getitem__(self, key: tuple[int, int]) -> LidarSample | LatentSample:
         """Sample of ``(epoch, index)``.
 
         Loader processes live longer than an epoch, so that each sample asked for names its own.

@@ -1,31 +1,17 @@
-"""Feature grids on disk: fixed-size rows that are memory-mapped, and a journal of what they are.
+"""Feature grids on disk: a row store and the settings of how its grids were made.
 
-``features_dir`` belongs to one extractor. Each grid size has a store in ``features_dir/<h>x<w>``::
-
-    settings.json        how the grids were made, see :class:`GridSettings`
-    shard_00000.rows     one row of fixed size a grid, see :attr:`GridSettings.row`
-    shard_00000.jsonl    journal: one line a row, {"scan": name, "bytes": of its file, "row": i}
-
-A line is written when its row is on disk, so that a process killed at any moment leaves no wrong
-grid: rows that the journal does not name and a torn last line do not count. Every writing process
-has a shard of its own. The key of a grid is the name of the scan and the size of its file.
+``features_dir`` belongs to one extractor. Each grid size has a store in ``features_dir/<h>x<w>``:
+that of :mod:`r3dpa.data.row_store`, and beside it ``settings.json``, see :class:`GridSettings`.
 Letters: B batch, N = h * w cells, D feature width.
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
-import logging
 import math
-import mmap
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from io import FileIO
-from itertools import count
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -43,15 +29,16 @@ from r3dpa.data.grid_settings import (
     wanted_settings,
     write_settings,
 )
+from r3dpa.data.row_store import RowReader, Rows, RowWriter
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
 
 if TYPE_CHECKING:
     from r3dpa.data.feature_grids import Extractor
 
-_log = logging.getLogger(__name__)
 _LARGEST_CODE = 127
 _TORCH = {"<f2": torch.float16, "<f4": torch.float32, "|i1": torch.int8}
+_GRIDS = Rows("feature grids", "features_dir", f"grids again with {REMEDY}", FeatureGridError)
 
 
 class FeatureGridWriter:
@@ -75,23 +62,12 @@ class FeatureGridWriter:
 
     def __init__(self, features_dir: str | Path, settings: GridSettings, shard: int = 0) -> None:
         self._shape, self._row = settings.shape, settings.row
-        self._folder = store_folder(features_dir, settings.grid_size)
-        with _writing(self._folder):
-            with folder_lock(self._folder):
-                check_settings(features_dir, settings)
-                write_settings(features_dir, settings)
-            self.shard, self._rows, self._journal = _take_shard(self._folder, shard)
-        try:
-            path = _journal_path(self._folder, self.shard)
-            keys, length = _read_journal(path, self._row.itemsize)
-            self._num_rows = len(keys)
-            with _writing(self._folder):
-                self._rows.truncate(self._num_rows * self._row.itemsize)
-                self._journal.truncate(length)
-            self._known = set(_read_places(self._folder, self._row.itemsize))
-        except BaseException:
-            self.close()
-            raise
+        folder = store_folder(features_dir, settings.grid_size)
+        with _GRIDS.writing(folder), _GRIDS.lock(folder):
+            check_settings(features_dir, settings)
+            write_settings(features_dir, settings)
+        self._writer = RowWriter(folder, self._row.itemsize, _GRIDS, shard)
+        self.shard = self._writer.shard
 
     def add(self, samples: Sequence[tuple[Scan, int]], grids: Tensor) -> None:
         """Append grids; those that the store had when it was opened, or has since, are left out.
@@ -111,32 +87,14 @@ class FeatureGridWriter:
                 f"grids must be {(len(samples), *self._shape)}, got {tuple(grids.shape)}."
             )
         keys = [(scan.name, num_bytes) for scan, num_bytes in samples]
-        new = {key: place for place, key in enumerate(keys) if key not in self._known}
-        if not new:
-            return
-        rows = _packed(grids[list(new.values())].float().cpu().numpy(), self._row)
-        lines = [
-            json.dumps({"scan": name, "bytes": num_bytes, "row": row}) + "\n"
-            for row, (name, num_bytes) in enumerate(new, start=self._num_rows)
-        ]
-        try:
-            # Not through a memory map: a full disk is an error here and a killed process there.
-            with _writing(self._folder):
-                _append(self._rows, rows.tobytes())
-                os.fdatasync(self._rows)
-                _append(self._journal, "".join(lines).encode())
-        except BaseException:
-            self.close()  # whoever opens the shard next cuts off what is unfinished
-            raise
-        self._num_rows += len(new)
-        self._known |= new.keys()
+        new = self._writer.new(keys)
+        if new:
+            rows = _packed(grids[new].float().cpu().numpy(), self._row)
+            self._writer.add([keys[place] for place in new], rows.tobytes())
 
     def close(self) -> None:
         """Give the shard free; a second call does nothing."""
-        if not self._rows.closed:
-            fcntl.flock(self._rows, fcntl.LOCK_UN)  # loader processes still hold copies of it
-            self._rows.close()
-            self._journal.close()
+        self._writer.close()
 
     def __enter__(self) -> Self:
         """The writer itself."""
@@ -182,12 +140,11 @@ class FeatureGrids:
         self._folder, settings = store_folder(features_dir, size), stored[size]
         compare_settings(wanted_settings(projection, extractor), settings, self._folder)
         self.dim, self._row = settings.dim, settings.row
-        places, wanted = _read_places(self._folder, self._row.itemsize), {s.name for s in scans}
-        self._places = {key: place for key, place in places.items() if key[0] in wanted}
-        missing = wanted - {name for name, _ in self._places}
+        wanted = {scan.name for scan in scans}
+        self._reader = RowReader(self._folder, self._row.itemsize, _GRIDS, wanted)
+        missing = wanted - {name for name, _ in self._reader.places}
         if missing:
             raise _missing([scan for scan in scans if scan.name in missing], self._folder)
-        self._maps: dict[int, mmap.mmap] = {}
 
     def read(self, scan: Scan, num_bytes: int) -> Tensor:
         """Grid ``(N, D)`` float32 of one scan, cells row by row; empty cells are zero.
@@ -200,15 +157,10 @@ class FeatureGrids:
             FeatureGridError: If the scan was not given to the constructor, or the grid was made
                 from a file of another size.
         """
-        place = self._places.get((scan.name, num_bytes))
-        if place is None:
+        found = self._reader.find((scan.name, num_bytes))
+        if found is None:
             raise self._replaced_or_missing(scan, num_bytes)
-        shard, position = place
-        start = position * self._row.itemsize
-        mapping = self._mapped(shard)
-        # Asked for as a whole: page by page, as they are touched, a disk is slower than one read.
-        page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
-        mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + self._row.itemsize)
+        mapping, start = found
 
         def field(name: str) -> Tensor:
             assert self._row.fields is not None
@@ -223,19 +175,8 @@ class FeatureGrids:
             return field("values")
         return field("codes").mul_(field("scale")[:, None])
 
-    def _mapped(self, shard: int) -> mmap.mmap:
-        if shard not in self._maps:
-            with _rows_path(self._folder, shard).open("rb") as file:
-                # A private copy that nobody writes: torch takes no memory that is read-only.
-                self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-        return self._maps[shard]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """State without the open files: each process maps them itself."""
-        return self.__dict__ | {"_maps": {}}
-
     def _replaced_or_missing(self, scan: Scan, num_bytes: int) -> FeatureGridError:
-        others = [str(other) for name, other in self._places if name == scan.name]
+        others = [str(other) for name, other in self._reader.places if name == scan.name]
         if not others:
             return _missing([scan], self._folder)
         return FeatureGridError(
@@ -258,7 +199,7 @@ def known_grids(features_dir: str | Path, settings: GridSettings) -> set[tuple[s
         return set()
     reading = ("projection", "extractor", "dim")
     compare_settings({key: getattr(settings, key) for key in reading}, stored, folder)
-    return set(_read_places(folder, stored.row.itemsize))
+    return set(_GRIDS.places(folder, stored.row.itemsize))
 
 
 def stored_feature_dim(features_dir: str | Path) -> int:
@@ -279,8 +220,7 @@ def stored_source(features_dir: str | Path) -> str:
     return str(_any_settings(features_dir).extractor["name"])
 
 
-@contextmanager
-def folder_lock(folder: Path, waiting: str | None = None) -> Iterator[None]:
+def folder_lock(folder: Path, waiting: str | None = None) -> AbstractContextManager[None]:
     """Holds ``folder/.lock``, which the system releases when the process dies.
 
     Args:
@@ -290,19 +230,7 @@ def folder_lock(folder: Path, waiting: str | None = None) -> Iterator[None]:
     Raises:
         FeatureGridError: If the folder cannot be written.
     """
-    with _writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / ".lock").open("w")
-    with file:
-        with _writing(folder):
-            if not _try_lock(file):
-                if waiting is not None:
-                    _log.warning(waiting)
-                fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.flock(file, fcntl.LOCK_UN)  # loader processes still hold copies of the file
+    return _GRIDS.lock(folder, waiting)
 
 
 def _any_settings(features_dir: str | Path) -> GridSettings:
@@ -312,48 +240,6 @@ def _any_settings(features_dir: str | Path) -> GridSettings:
             f"No feature grids in {features_dir}: make them with {REMEDY}, or give an extractor."
         )
     return next(iter(stored.values()))
-
-
-def _take_shard(folder: Path, first: int) -> tuple[int, FileIO, FileIO]:
-    """Number, locked rows and journal of the first shard from ``first`` that nobody writes."""
-    for shard in count(first):
-        # Without a buffer, which would be written when the file is closed after an error.
-        rows = _rows_path(folder, shard).open("ab", buffering=0)
-        if _try_lock(rows):
-            return shard, rows, _journal_path(folder, shard).open("ab", buffering=0)
-        rows.close()
-    raise AssertionError("numbers do not end")
-
-
-def _read_places(folder: Path, row_bytes: int) -> dict[tuple[str, int], tuple[int, int]]:
-    """Shard and row of each grid, by the name and the bytes of its scan, from all journals."""
-    places: dict[tuple[str, int], tuple[int, int]] = {}
-    for path in sorted(folder.glob("shard_*.jsonl")):
-        shard = int(path.stem.removeprefix("shard_"))
-        keys, _ = _read_journal(path, row_bytes)
-        places.update((key, (shard, row)) for row, key in enumerate(keys))
-    return places
-
-
-def _read_journal(path: Path, row_bytes: int) -> tuple[list[tuple[str, int]], int]:
-    """Name and bytes of the scan of each row, and the length in bytes of all whole lines."""
-    data = path.read_bytes()
-    end, rows = data.rfind(b"\n") + 1, path.with_suffix(".rows")
-    keys: list[tuple[str, int]] = []
-    try:
-        # As one list: twice as fast as line by line, which matters for 80 000 lines.
-        for entry in json.loads(b"[" + b",".join(data[:end].splitlines()) + b"]"):
-            if entry["row"] != len(keys):
-                raise ValueError(f"line {len(keys) + 1} is of row {entry['row']}")
-            keys.append((entry["scan"], entry["bytes"]))
-        if keys and rows.stat().st_size < len(keys) * row_bytes:
-            raise ValueError(f"{rows.name} has fewer than its {len(keys)} rows")
-    except (KeyError, TypeError, ValueError, FileNotFoundError) as error:
-        raise FeatureGridError(
-            f"{path} is damaged ({error!r}): delete it and {rows.name} beside it, and make their "
-            f"grids again with {REMEDY}."
-        ) from error
-    return keys, end
 
 
 def _packed(grids: np.ndarray, row: np.dtype[Any]) -> np.ndarray:
@@ -377,37 +263,3 @@ def _missing(scans: Sequence[Scan], folder: Path) -> FeatureGridError:
         f"No feature {what} in {folder}: make what is missing with {REMEDY}, or give the data "
         "module an extractor, which does."
     )
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    """Turns errors of the system into one that names the folder and the remedy."""
-    try:
-        yield
-    except OSError as error:
-        raise FeatureGridError(
-            f"Feature grids cannot be written to {folder} ({error.strerror}): give a features_dir "
-            "on a disk that can be written and has space."
-        ) from error
-
-
-def _try_lock(file: IO[Any]) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _append(file: FileIO, data: bytes) -> None:
-    left = memoryview(data)
-    while left:  # the system may write a part
-        left = left[file.write(left) :]
-
-
-def _rows_path(folder: Path, shard: int) -> Path:
-    return folder / f"shard_{shard:05d}.rows"
-
-
-def _journal_path(folder: Path, shard: int) -> Path:
-    return folder / f"shard_{shard:05d}.jsonl"

@@ -143,7 +143,7 @@ def read_samples(
     but arrays allowed in them.
 
     The folders that ``r3dpa sample`` and the official R3DPA write hold each scene several times;
-    of these ``scenes.npz`` and ``numpy/img.npz`` are read.
+    of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
 
     Args:
         path: File or folder. Files of a folder are read in the order of their names.
@@ -185,6 +185,8 @@ def _find(
             return [("", folder / "numpy" / "img.npz")], "npz"
         if (folder / "scenes.npz").is_file() and (folder / "metadata.json").is_file():
             return [("", folder / "scenes.npz")], "npz"
+        if (folder / "bin").is_dir() and (folder / "metadata.json").is_file():
+            return _find(folder / "bin", "bin")
         if (folder / "data_3d_raw").is_dir():
             counts = Counter({"bin": counts["bin"]})  # beside them KITTI-360 has time stamps
         if len(counts) > 1:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
@@ -255,19 +256,29 @@ def read_ply(path: str | Path) -> np.ndarray:
     return np.stack([table[name].astype(np.float32) for name in wanted], axis=1)
 
 
-def write_npz(path: str | Path, scans: Mapping[str, np.ndarray | torch.Tensor]) -> None:
-    """Write many scans to one compressed ``.npz`` file, atomically.
+def write_npz(
+    path: str | Path,
+    scans: Mapping[str, np.ndarray | torch.Tensor]
+    | Iterable[tuple[str, np.ndarray | torch.Tensor]],
+) -> None:
+    """Write many scans to one compressed ``.npz`` file, atomically and one after the other.
 
     Args:
         path: File to write.
-        scans: Points by name, each ``(P, 3)`` or ``(P, 4)``, metres.
+        scans: Points by name, or pairs of name and points, which need not be in memory together;
+            each ``(P, 3)`` or ``(P, 4)``, metres.
 
     Raises:
         ValueError: If a shape is another or a value is not finite.
     """
-    arrays = {name: _rows(points) for name, points in scans.items()}
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    pairs = scans.items() if isinstance(scans, Mapping) else scans
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        for name, points in pairs:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, _rows(points))
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import Velocity, euler, ode_times
+from r3dpa.flow.solvers import Velocity, euler
+from r3dpa.flow.times import ode_times
 
 __all__ = ["pnp_flow_feature", "transport_to_time"]
 
@@ -67,7 +68,7 @@ def pnp_flow_feature(
         latents: ``(B, C, h, w)`` normalised latents of the scene to edit.
         edit_mask: ``(B, 1, h, w)`` bool, True where latents are generated anew.
         times: ``(T,)`` decreasing times that include both ends, see
-            :func:`r3dpa.flow.solvers.ode_times`.
+            :func:`r3dpa.flow.times.ode_times`.
         noise: T Gaussian draws ``(B, C, h, w)``, one per time.
         exponent: Step sizes are ``t^exponent``.
 

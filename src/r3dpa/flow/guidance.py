@@ -10,7 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.flow.solvers import DriftChange, Velocity
+from r3dpa.flow.sde import DriftChange
+from r3dpa.flow.solvers import Velocity
 
 __all__ = ["FeatureGuidance", "GuidanceRecord"]
 

@@ -1,36 +1,52 @@
-"""ODE and SDE solvers over a velocity function, between t = 1 (noise) and t = 0 (data).
+"""ODE solvers over a velocity function, between t = 1 (noise) and t = 0 (data).
 
 A solver knows neither network nor guidance: what changes the velocity wraps the velocity function.
 Letters: B batch, ``...`` any further axes. The state keeps the dtype of the given ``x``; the
 velocity function receives it together with ``(B,)`` times in at least float32, and may answer in
-any dtype.
+any dtype. Every solver is called ``(velocity, x, times) -> x`` with
+
+* ``velocity``: ``(x (B, ...), time (B,)) -> (B, ...)``;
+* ``x``: ``(B, ...)`` state at the first time;
+* ``times``: ``(T,)`` times that all increase or all decrease, see
+  :func:`r3dpa.flow.times.ode_times`;
+
+returns the ``(B, ...)`` state at the last time, and raises a ``ValueError`` for other times. The
+orders hold on grids whose steps shrink alike.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from itertools import pairwise
-from typing import Literal
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.times import batch_time, step_pairs
 
 __all__ = [
+    "ODE_SOLVERS",
     "CountingVelocity",
-    "DriftChange",
+    "OdeSolver",
     "Velocity",
+    "ab2",
+    "ab3",
+    "dopri5",
+    "dpm_solver_pp_2m",
     "euler",
-    "euler_maruyama",
+    "evaluations",
     "heun",
-    "ode_times",
-    "sde_times",
+    "midpoint",
+    "ode_solver",
+    "steps_for",
+    "unipc",
 ]
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
-DriftChange = Callable[[Tensor, Tensor, Tensor], Tensor]
+OdeSolver = Callable[[Velocity, Tensor, Tensor], Tensor]
 
 _LINEAR = Interpolant("linear")
 
@@ -46,7 +62,7 @@ class CountingVelocity:
 
     Example:
         >>> counted = CountingVelocity(lambda x, time: -x)
-        >>> _ = heun(counted, torch.ones(2, 3), ode_times(4))
+        >>> _ = heun(counted, torch.ones(2, 3), torch.linspace(1, 0, 5))
         >>> counted.nfe
         7
     """
@@ -61,63 +77,11 @@ class CountingVelocity:
         return self._velocity(x, time)
 
 
-def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0) -> Tensor:
-    """Equidistant times of an ODE solver.
-
-    Args:
-        num_steps: Number of steps, at least 1.
-        start: First time.
-        stop: Last time; above ``start`` to go from data towards noise.
-
-    Returns:
-        ``(num_steps + 1,)`` float64.
-
-    Raises:
-        ValueError: If there is no step or the times are not two different ones in [0, 1].
-    """
-    _check_num_steps(num_steps)
-    if not (0 <= start <= 1 and 0 <= stop <= 1) or start == stop:
-        raise ValueError(f"start and stop must be two times in [0, 1], got {start} and {stop}")
-    return torch.linspace(start, stop, num_steps + 1, dtype=torch.float64)
-
-
-def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
-    """Times of the SDE solver: equidistant from 1 to ``last``, then one step to 0.
-
-    Args:
-        num_steps: Number of network evaluations, at least 1.
-        last: Time from which the last, noise-free step starts. Detail finer than about ``last``
-            standard deviations is lost with few steps near the data; 0.005 keeps it.
-
-    Returns:
-        ``(num_steps + 1,)`` float64.
-
-    Raises:
-        ValueError: If there is no step or ``last`` is not in (0, 1).
-    """
-    _check_num_steps(num_steps)
-    if not 0 < last < 1:
-        raise ValueError(f"the last time before 0 must lie in (0, 1), got {last}")
-    return torch.cat([torch.linspace(1.0, last, num_steps, dtype=torch.float64), torch.zeros(1)])
-
-
 @torch.no_grad()
 def euler(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by Euler steps; order 1, one evaluation per step.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        x: ``(B, ...)`` state at the first time.
-        times: ``(T,)`` increasing or decreasing times, see :func:`ode_times`.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
-    Raises:
-        ValueError: If ``times`` holds no step.
-    """
-    for now, then in _steps(times):
-        x = x + (then - now) * velocity(x, _batch_time(now, x)).to(x.dtype)
+    """Solve ``dx/dt = v(x, t)`` by Euler steps; order 1, one evaluation per step."""
+    for now, then in step_pairs(times):
+        x = x + (then - now) * _slope(velocity, x, now)
     return x
 
 
@@ -131,112 +95,334 @@ def heun(
     error of order 2 leaves the order as it is.
 
     Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        x: ``(B, ...)`` state at the first time.
-        times: ``(T,)`` increasing or decreasing times, see :func:`ode_times`.
+        velocity: See the module.
+        x: See the module.
+        times: See the module.
         corrector_velocity: Velocity of the second slope, if it is another one.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
 
     Raises:
-        ValueError: If ``times`` holds no step.
+        ValueError: If ``times`` are not those of a solver.
     """
     corrector_velocity = corrector_velocity or velocity
-    *steps, (now, then) = _steps(times)
+    *steps, (now, then) = step_pairs(times)
     for step_now, step_then in steps:
         step = step_then - step_now
-        slope = velocity(x, _batch_time(step_now, x)).to(x.dtype)
-        predicted = x + step * slope
-        second = corrector_velocity(predicted, _batch_time(step_then, x)).to(x.dtype)
+        slope = _slope(velocity, x, step_now)
+        second = _slope(corrector_velocity, x + step * slope, step_then)
         x = x + step * 0.5 * (slope + second)
-    return x + (then - now) * velocity(x, _batch_time(now, x)).to(x.dtype)
+    return x + (then - now) * _slope(velocity, x, now)
 
 
 @torch.no_grad()
-def euler_maruyama(
-    velocity: Velocity,
-    x: Tensor,
-    times: Tensor,
-    noise: torch.Generator | Iterable[Tensor],
-    *,
-    interpolant: Interpolant = _LINEAR,
-    last: Literal["denoise", "mean"] = "denoise",
-    change_drift: DriftChange | None = None,
+def midpoint(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+    """Solve ``dx/dt = v(x, t)`` by the explicit midpoint rule; order 2, two evaluations per step.
+
+    The velocity is never asked at the last time.
+    """
+    for now, then in step_pairs(times):
+        middle = (now + then) / 2
+        halfway = x + (middle - now) * _slope(velocity, x, now)
+        x = x + (then - now) * _slope(velocity, halfway, middle)
+    return x
+
+
+def ab2(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+    """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 2, one evaluation per step.
+
+    With step ``h`` and the step before ``h0``, after one Euler step::
+
+        x <- x + h ((1 + h / 2 h0) v_n - (h / 2 h0) v_{n-1})
+    """
+    return _adams_bashforth(velocity, x, times, order=2)
+
+
+def ab3(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+    """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 3, one evaluation per step.
+
+    The parabola through the last three velocities is integrated. The first step is an Euler step,
+    the second an AB2 step. The error of the Euler step alone would leave order 2; the second
+    evaluation amends it to the trapezoidal rule, ``x <- x + h0 / 2 (v_1 - v_0)``.
+    """
+    return _adams_bashforth(velocity, x, times, order=3)
+
+
+def dpm_solver_pp_2m(
+    velocity: Velocity, x: Tensor, times: Tensor, *, interpolant: Interpolant = _LINEAR
 ) -> Tensor:
-    """Solve the reverse SDE with diffusion ``2 t`` by Euler-Maruyama steps.
+    """Solve ``dx/dt = v(x, t)`` by DPM-Solver++(2M); order 2, one evaluation per step.
 
-    One evaluation per step; every step but the last adds ``sqrt(2 t |dt|)`` times a Gaussian draw.
+    With the expected data ``D(x, t)`` and ``lambda = log(alpha / sigma)`` the ODE is
+    ``d(x / sigma) = D d(alpha / sigma)``: where D is constant a step of any length is exact, and
+    where D leaves a line in lambda the step knows its slope from the step before. From s to t::
 
-    Source: SiT (Ma et al. 2024), eq. 6; ``last="mean"`` is the published sampler of R3DPA.
+        x_t = alpha_t D_s + sigma_t N_s + g (h / 2 h0) (D_s - D_{s-1})
+        g = alpha_t - alpha_s sigma_t / sigma_s          h, h0: this and the last step in lambda
+
+    with the noise ``N = (x - alpha D) / sigma``, taken from x and v without that division. On the
+    linear path ``D = x - t v``, ``N = x + (1 - t) v``, and the first two terms are an Euler step.
+
+    Ends: the step that starts from pure noise has ``h = inf``, and so has ``h0`` of the next one,
+    where ``h / h0 -> 0``: both are of first order (on the linear path Euler) without further
+    care. For the step that reaches the data ``h / h0 -> inf``: it is of first order by choice, as
+    published for few steps (``lower_order_final``), and returns ``D_s``. The same holds from data
+    to noise. Steps in lambda do not shrink at the ends however many there are, which costs the
+    order 2 a logarithm: measured 1.6 to 1.8 over all of [0, 1].
+
+    Source: DPM-Solver++ (Lu et al. 2022), alg. 2.
 
     Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        x: ``(B, ...)`` Gaussian noise, the state at t = 1.
-        times: ``(T,)`` decreasing times, see :func:`sde_times`.
-        noise: The T - 2 Gaussian draws ``(B, ...)`` in order, or where to draw them from. Draws
-            that are given per sample make a sample independent of its batch.
+        velocity: See the module.
+        x: See the module.
+        times: See the module.
         interpolant: Path of the velocity.
-        last: Noise-free last step. ``denoise`` goes to the expected data; ``mean`` takes a full
-            step of drift, which removes the noise twice and shrinks detail (data of standard
-            deviation 0.1 comes out at 0.077 from t = 0.04).
-        change_drift: ``(drift, x, time) -> drift`` applied in every step but the last.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
 
     Raises:
-        ValueError: If ``times`` do not decrease, the ``denoise`` step does not end at 0, ``last``
-            is unknown, or the draws do not suffice or have another shape.
+        ValueError: If ``times`` are not those of a solver.
     """
-    if last not in ("denoise", "mean"):
-        raise ValueError(f"last must be 'denoise' or 'mean', got {last!r}")
-    *steps, (now, then) = _steps(times)
-    if then >= now or any(step_then >= step_now for step_now, step_then in steps):
-        raise ValueError("the SDE runs from noise to data: its times must decrease")
-    if last == "denoise" and then != 0:
-        raise ValueError(f"last='denoise' ends at t = 0, but the last time is {then}")
-    draws = _draws(noise, x)
-    for index, (step_now, step_then) in enumerate(steps):
-        time = _batch_time(step_now, x)
-        drift = interpolant.sde_drift(velocity(x, time), x, time)
-        if change_drift is not None:
-            drift = change_drift(drift, x, time)
-        draw = next(draws, None)
-        if draw is None or draw.shape != x.shape:
-            given = f"{index} draws" if draw is None else f"a draw of shape {tuple(draw.shape)}"
-            raise ValueError(
-                f"{len(steps)} draws of shape {tuple(x.shape)} are needed, got {given}"
-            )
-        step = step_then - step_now
-        spread = math.sqrt(2 * step_now * -step)
-        x = x + step * drift.to(x.dtype) + spread * draw.to(x.device, x.dtype)
-    time = _batch_time(now, x)
-    final_velocity = velocity(x, time)
-    if last == "denoise":
-        return interpolant.denoise(final_velocity, x, time).to(x.dtype)
-    return x + (then - now) * interpolant.sde_drift(final_velocity, x, time).to(x.dtype)
+    return _data_prediction(velocity, x, times, interpolant, correct=False)
 
 
-def _steps(times: Tensor) -> list[tuple[float, float]]:
-    if times.dim() != 1 or len(times) < 2:
-        raise ValueError(f"a solver needs two or more times, got shape {tuple(times.shape)}")
-    return list(pairwise(times.tolist()))
+def unipc(
+    velocity: Velocity, x: Tensor, times: Tensor, *, interpolant: Interpolant = _LINEAR
+) -> Tensor:
+    """Solve ``dx/dt = v(x, t)`` by UniPC-2 with ``B_2(h)``; one evaluation per step.
+
+    Its predictor is :func:`dpm_solver_pp_2m`. The evaluation at the predicted point serves twice:
+    as the start of the next step, and before that to correct the last one by the parabola through
+    ``D_{s-1}, D_s, D_t`` in lambda, integrated exactly; in the first step by the mean of ``D_s``
+    and ``D_t``. As nothing is evaluated at the last time, the last step is not corrected. Order 3
+    where lambda stays finite; with the first-order steps at both ends of [0, 1] order 2.
+
+    Source: UniPC (Zhao et al. 2023), alg. 5 to 8, multistep with data prediction.
+
+    Args:
+        velocity: See the module.
+        x: See the module.
+        times: See the module.
+        interpolant: Path of the velocity.
+
+    Returns:
+        ``(B, ...)`` state at the last time, dtype of ``x``.
+
+    Raises:
+        ValueError: If ``times`` are not those of a solver.
+    """
+    return _data_prediction(velocity, x, times, interpolant, correct=True)
 
 
-def _batch_time(time: float, x: Tensor) -> Tensor:
-    dtype = torch.promote_types(x.dtype, torch.float32)
-    return torch.full((len(x),), time, dtype=dtype, device=x.device)
+@torch.no_grad()
+def dopri5(
+    velocity: Velocity, x: Tensor, times: Tensor, *, rtol: float = 1e-5, atol: float = 1e-5
+) -> Tensor:
+    """Solve ``dx/dt = v(x, t)`` by adaptive Dormand-Prince steps of ``torchdiffeq``; order 5.
+
+    Only the first and the last time count. The solver chooses its steps, the same for the whole
+    batch: a sample depends within the tolerance on the batch it is in, and the number of
+    evaluations is known afterwards (:class:`CountingVelocity`). A state below float32 is carried
+    in float32.
+
+    Args:
+        velocity: See the module.
+        x: See the module.
+        times: See the module.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step.
+
+    Returns:
+        ``(B, ...)`` state at the last time, dtype of ``x``.
+
+    Raises:
+        ValueError: If ``times`` are not those of a solver.
+        ImportError: If ``torchdiffeq`` is not installed.
+    """
+    try:
+        from torchdiffeq import odeint
+    except ImportError as error:
+        raise ImportError(
+            "the solver dopri5 needs the package torchdiffeq: pip install torchdiffeq"
+        ) from error
+    steps = step_pairs(times)
+    start, stop = steps[0][0], steps[-1][1]
+    state = x.to(torch.promote_types(x.dtype, torch.float32))
+
+    def slope(progress: Tensor, now: Tensor) -> Tensor:
+        time = start + (stop - start) * float(progress)
+        return (stop - start) * _slope(velocity, now.to(x.dtype), time).to(now.dtype)
+
+    progress = torch.tensor([0.0, 1.0], dtype=torch.float64, device=x.device)
+    # Step on the end: torchdiffeq would otherwise step past it, where no velocity is defined.
+    options = {"step_t": progress[1:], "dtype": torch.float64}
+    solution = odeint(
+        slope, state, progress, rtol=rtol, atol=atol, method="dopri5", options=options
+    )
+    return solution[-1].to(x.dtype)
 
 
-def _draws(noise: torch.Generator | Iterable[Tensor], x: Tensor) -> Iterator[Tensor]:
-    if not isinstance(noise, torch.Generator):
-        yield from noise
-        return
-    while True:
-        yield torch.randn(x.shape, generator=noise, device=noise.device, dtype=x.dtype)
+ODE_SOLVERS: dict[str, OdeSolver] = {
+    "euler": euler,
+    "heun": heun,
+    "midpoint": midpoint,
+    "ab2": ab2,
+    "ab3": ab3,
+    "dpmpp_2m": dpm_solver_pp_2m,
+    "unipc": unipc,
+}
 
 
-def _check_num_steps(num_steps: int) -> None:
-    if num_steps < 1:
-        raise ValueError(f"a solver needs at least one step, got {num_steps}")
+def ode_solver(name: str, interpolant: Interpolant = _LINEAR) -> OdeSolver:
+    """The solver of that name, for velocities of that path.
+
+    Args:
+        name: A key of :data:`ODE_SOLVERS`.
+        interpolant: Path of the velocity, which only ``dpmpp_2m`` and ``unipc`` use.
+
+    Returns:
+        ``(velocity, x, times) -> x``.
+
+    Raises:
+        ValueError: If there is no solver of that name.
+    """
+    _check_name(name)
+    if name == "dpmpp_2m":
+        return partial(dpm_solver_pp_2m, interpolant=interpolant)
+    if name == "unipc":
+        return partial(unipc, interpolant=interpolant)
+    return ODE_SOLVERS[name]
+
+
+def evaluations(solver: str, steps: int) -> int:
+    """Network evaluations per sample of a solver, known before it runs.
+
+    Args:
+        solver: A key of :data:`ODE_SOLVERS`.
+        steps: Number of steps, at least 1.
+
+    Returns:
+        The NFE.
+
+    Raises:
+        ValueError: If there is no solver of that name or no step.
+    """
+    _check_name(solver)
+    if steps < 1:
+        raise ValueError(f"a solver needs at least one step, got {steps}")
+    return {"heun": 2 * steps - 1, "midpoint": 2 * steps}.get(solver, steps)
+
+
+def steps_for(solver: str, nfe: int) -> int:
+    """Largest number of steps of a solver within a number of network evaluations.
+
+    Args:
+        solver: A key of :data:`ODE_SOLVERS`.
+        nfe: Evaluations per sample that are allowed.
+
+    Returns:
+        The number of steps, at least 1.
+
+    Raises:
+        ValueError: If there is no solver of that name or one step takes more evaluations.
+    """
+    _check_name(solver)
+    steps = {"heun": (nfe + 1) // 2, "midpoint": nfe // 2}.get(solver, nfe)
+    if steps < 1:
+        raise ValueError(f"{solver} cannot make a step with {nfe} network evaluations")
+    return steps
+
+
+@torch.no_grad()
+def _adams_bashforth(velocity: Velocity, x: Tensor, times: Tensor, *, order: int) -> Tensor:
+    nodes: deque[float] = deque(maxlen=order)
+    slopes: deque[Tensor] = deque(maxlen=order)
+    for now, then in step_pairs(times):
+        nodes.appendleft(now)
+        slopes.appendleft(_slope(velocity, x, now))
+        if order == 3 and len(slopes) == 2:
+            x = x + (nodes[0] - nodes[1]) / 2 * (slopes[0] - slopes[1])
+        weights = _adams_bashforth_weights(list(nodes), then)
+        x = x + sum(weight * slope for weight, slope in zip(weights, slopes, strict=True))
+    return x
+
+
+def _adams_bashforth_weights(nodes: list[float], then: float) -> list[float]:
+    """Weights of the slopes at ``nodes``, newest first, in a step from ``nodes[0]`` to ``then``.
+
+    They integrate every polynomial of degree below ``len(nodes)`` exactly. In units of the step,
+    from its start, the moments are ``1, 1/2, 1/3, ...``.
+    """
+    step = then - nodes[0]
+    powers = torch.arange(len(nodes), dtype=torch.float64)
+    places = (torch.tensor(nodes, dtype=torch.float64) - nodes[0]) / step
+    weights = torch.linalg.solve(places ** powers[:, None], 1 / (powers + 1))
+    return (step * weights).tolist()
+
+
+@torch.no_grad()
+def _data_prediction(
+    velocity: Velocity, x: Tensor, times: Tensor, interpolant: Interpolant, *, correct: bool
+) -> Tensor:
+    """Multistep method in the expected data, see :func:`dpm_solver_pp_2m` and :func:`unipc`.
+
+    Every step takes the mean of D over the step as ``D_s`` plus a bend: from the step before when
+    it predicts, from the next evaluation too when it corrects.
+    """
+    steps = step_pairs(times)
+    time = times.double().cpu()
+    path = interpolant.coefficients(time)
+    alpha, sigma, d_alpha, d_sigma = (values.tolist() for values in path)
+    log_snr = (path.alpha / path.sigma).log()
+    log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
+    widths = log_snr.diff().tolist()
+    ratio = bend_factor = 0.0
+    data = change = bend = torch.zeros_like(x)
+    for index, (now, _) in enumerate(steps):
+        slope = _slope(velocity, x, now)
+        # x = alpha D + sigma N and v = alpha' D + sigma' N, solved for D and N.
+        determinant = alpha[index] * d_sigma[index] - d_alpha[index] * sigma[index]
+        noise = (alpha[index] * slope - d_alpha[index] * x) / determinant
+        before, past_change = data, change
+        data = (d_sigma[index] * x - sigma[index] * slope) / determinant
+        change = data - before
+        if correct and index > 0:
+            corrected = _corrected_bend(widths[index - 1], ratio, past_change, change)
+            noise = noise + bend_factor / sigma[index] * (corrected - bend)
+        neighbours = widths[max(index - 1, 0) : index + 1]
+        known = index > 0 and all(map(math.isfinite, neighbours))
+        ratio = neighbours[1] / neighbours[0] if known else 0.0
+        bend = ratio / 2 * change
+        # From the data itself (sigma = 0) the step is of first order, there is nothing to bend.
+        bend_factor = (
+            alpha[index + 1] - alpha[index] * sigma[index + 1] / sigma[index] if now else 0.0
+        )
+        x = alpha[index + 1] * data + sigma[index + 1] * noise + bend_factor * bend
+    return x
+
+
+def _corrected_bend(width: float, ratio: float, past_change: Tensor, change: Tensor) -> Tensor:
+    """Mean of D over a finished step minus its start, by the parabola in lambda through three D.
+
+    The mean is weighted by ``exp(lambda)``. ``width`` and ``ratio`` are ``h`` and ``h / h0`` of the
+    step, 0 if the step before is not known; the changes of D are those of the step before and of
+    the step.
+    """
+    if ratio == 0:
+        return change / 2
+    weight_of_end = -1 / math.expm1(-width)
+    mean = weight_of_end - 1 / width  # of r in [0, 1] under a density like exp(h r)
+    square = weight_of_end - 2 * mean / width  # and of r^2
+    past = ratio**2 * (mean - square) * past_change
+    return (past + (mean + ratio * square) * change) / (1 + ratio)
+
+
+def _slope(velocity: Velocity, x: Tensor, time: float) -> Tensor:
+    return velocity(x, batch_time(time, x)).to(x.dtype)
+
+
+def _check_name(solver: str) -> None:
+    if solver not in ODE_SOLVERS:
+        raise ValueError(f"the ODE solvers are {', '.join(ODE_SOLVERS)}, got {solver!r}")

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import lightning as L
 import numpy as np
@@ -60,6 +60,15 @@ def frozen(*networks: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
+def _nothing_of(network: nn.Module) -> Tensor:
+    """A loss of exactly 0 that gives each trained parameter a gradient of 0.
+
+    Nothing is computed for it: it is the sum of no element of each parameter.
+    """
+    empty = [p.flatten()[:0].sum() for p in network.parameters() if p.requires_grad]
+    return torch.stack(empty).sum()
+
+
 class GenerativeModule(L.LightningModule):
     """Base of the training modules.
 
@@ -89,6 +98,10 @@ class GenerativeModule(L.LightningModule):
         keep_projector: Keep the RGB model's projection head where its shape fits.
         seed: Key of the training draws.
         max_skipped_steps: Consecutive steps with a non-finite gradient before training stops.
+        channels_last: Keep images and kernels of VAE and discriminator with their channels next to
+            each other. The same numbers to rounding; files keep the usual order.
+        compile: Compile the networks for training with ``torch.compile``: VAE, discriminator and
+            each block of the SiT. The first step takes minutes; files have the same names.
     """
 
     stage: str
@@ -114,6 +127,8 @@ class GenerativeModule(L.LightningModule):
         keep_projector: bool = False,
         seed: int = 0,
         max_skipped_steps: int = 10,
+        channels_last: bool = False,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         with warnings.catch_warnings():
@@ -137,6 +152,8 @@ class GenerativeModule(L.LightningModule):
         self.keep_projector = keep_projector
         self.seed = seed
         self.max_skipped_steps = max_skipped_steps
+        self.channels_last = channels_last
+        self.compiles = compile
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -161,6 +178,23 @@ class GenerativeModule(L.LightningModule):
 
     # Starting a stage
 
+    def configure_model(self) -> None:
+        """Arranges the memory of the networks, and compiles them for a fit."""
+        self.arrange_networks()
+        if self.compiles and self.trainer.state.fn == "fit":
+            # In place and part by part: names in checkpoints stay, and equal blocks share a graph.
+            parts = [self.vae.encoder, self.vae.decoder, self.discriminator, *self.sit.blocks]
+            for part in parts:
+                if part is not None:
+                    part.compile(dynamic=False)
+
+    def arrange_networks(self) -> None:
+        """Puts the kernels of VAE and discriminator into the memory format of ``channels_last``."""
+        format_ = torch.channels_last if self.channels_last else torch.contiguous_format
+        for network in (self.vae, self.discriminator):
+            if network is not None:
+                cast(Any, network).to(memory_format=format_)  # not in torch's own stubs
+
     def setup(self, stage: str) -> None:
         """Checks data against networks."""
         datamodule = getattr(self.trainer, "datamodule", None)
@@ -174,6 +208,29 @@ class GenerativeModule(L.LightningModule):
             self._data_source = datamodule.feature_source
         if self.needs_features() and stage != "predict":
             self._check_features(self.geometry, datamodule)
+
+    def on_train_start(self) -> None:
+        """Fits the state of a resumed optimiser to this run."""
+        optimizer = cast(torch.optim.Optimizer, self.optimizers(use_pl_optimizer=False))
+        self.arrange_optimizer(optimizer, self._fused)
+
+    @staticmethod
+    def arrange_optimizer(optimizer: torch.optim.Optimizer, fused: bool) -> None:
+        """Puts the state of an AdamW where it has to be, in the memory format of the weights.
+
+        A fused optimiser walks through the memory of weights and moments alike, unchecked.
+
+        Args:
+            optimizer: It may hold the state of a run with other settings.
+            fused: Whether one kernel moves all weights.
+        """
+        for group in optimizer.param_groups:
+            group["fused"] = fused
+        for parameter, state in optimizer.state.items():
+            state["step"] = state["step"].to(parameter.device if fused else "cpu")
+            for name in ("exp_avg", "exp_avg_sq"):
+                if state[name].stride() != parameter.stride():
+                    state[name] = torch.empty_like(parameter).copy_(state[name])
 
     def on_fit_start(self) -> None:
         """Loads the stage before, unless this run goes on from a checkpoint of its own."""
@@ -275,27 +332,23 @@ class GenerativeModule(L.LightningModule):
 
     # Losses of one step
 
-    def draw_path(self, image: Tensor, batch_number: int, stream: int = 0) -> PathDraws:
+    def draw_path(self, num_scans: int, batch_number: int, stream: int = 0) -> PathDraws:
         """Posterior noise, times and path noise for this process's part of a global batch.
 
         Args:
-            image: ``(B, 1, H, W)`` batch on this process.
+            num_scans: Scans B of the batch on this process.
             batch_number: Number of the batch since the start of training, or of the split.
             stream: Separates training (0) from evaluation draws.
         """
         world, rank = self.trainer.world_size, self.trainer.global_rank
         key = np.random.SeedSequence([self.seed, stream, batch_number]).generate_state(1)
-        generator = torch.Generator(image.device).manual_seed(int(key[0]))
-        total = image.shape[0] * world
-        shape = (
-            total,
-            self.vae.latent_channels,
-            *self.vae.latent_size((image.shape[-2], image.shape[-1])),
-        )
+        generator = torch.Generator(self.device).manual_seed(int(key[0]))
+        total = num_scans * world
+        shape = (total, self.vae.latent_channels, *self.sit.input_size)
         drawn = PathDraws(
-            torch.randn(shape, generator=generator, device=image.device),
+            torch.randn(shape, generator=generator, device=self.device),
             sample_time(total, self.time_sampling, generator=generator),
-            torch.randn(shape, generator=generator, device=image.device),
+            torch.randn(shape, generator=generator, device=self.device),
         )
         return PathDraws(*(values[rank::world] for values in drawn))
 
@@ -308,32 +361,39 @@ class GenerativeModule(L.LightningModule):
         self, image: Tensor, posterior: Posterior, reconstruction: Tensor
     ) -> dict[str, Tensor]:
         """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
-        weights = self.weights
-        parts = {
-            "reconstruction": weights.reconstruction
-            * losses.reconstruction_loss(reconstruction, image, weights.reconstruction_norm),
-            "kl": weights.kl * posterior.kl().mean(),
-        }
-        started = self.global_step >= weights.adversarial_start
-        if self.discriminator is not None and weights.adversarial != 0 and started:
+        weights, parts = self.weights, {}
+        if weights.reconstruction != 0:
+            error = losses.reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
+            parts["reconstruction"] = weights.reconstruction * error
+        if weights.kl != 0:
+            parts["kl"] = weights.kl * posterior.kl().mean()
+        if self.discriminator is not None and weights.adversarial != 0 and self._adversarial:
             with frozen(self.discriminator):
                 logits = self.discriminator(reconstruction)
             parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
+        if not parts.keys() & {"reconstruction", "adversarial"}:
+            parts["reconstruction"] = _nothing_of(self.vae)
         return parts
 
-    def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
-        """Hinge loss on scans and detached reconstructions; factor 0 before its start.
+    @property
+    def _adversarial(self) -> bool:
+        """Whether the adversarial losses count yet."""
+        return self.global_step >= self.weights.adversarial_start
 
-        It is computed before the start too: under DDP each trained network must take part in each
-        step.
+    def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
+        """Hinge loss on scans and detached reconstructions; a plain 0 before its start.
+
+        Before it, the discriminator gets gradients of 0, as if the loss were computed and had
+        factor 0: under DDP each trained network must take part in each step.
         """
         if self.discriminator is None:
             return {}
+        if self.weights.discriminator == 0 or not self._adversarial:
+            return {"discriminator": _nothing_of(self.discriminator)}
         real = self.discriminator(image)
         fake = self.discriminator(reconstruction.detach())
-        started = self.global_step >= self.weights.adversarial_start
-        factor = self.weights.discriminator * float(started)
-        return {"discriminator": factor * losses.discriminator_loss(real, fake)}
+        loss = losses.discriminator_loss(real, fake)
+        return {"discriminator": self.weights.discriminator * loss}
 
     def vae_alignment_losses(
         self, latents: Tensor, features: Tensor | None, draws: PathDraws
@@ -350,18 +410,33 @@ class GenerativeModule(L.LightningModule):
         self, latents: Tensor, features: Tensor | None, draws: PathDraws
     ) -> dict[str, Tensor]:
         """L_denoise + lambda2 L_align on detached latents; updates the latent statistics."""
+        weights = self.weights
         normalised = self.latent_norm.update(latents.detach())
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
-        target = self.interpolant.target(normalised, draws.noise, draws.time)
-        if self.weights.sit_alignment == 0:
-            velocity, projected = self.sit.velocity(noisy, draws.time), None
+        velocity, projected = self._predict(
+            self.sit, noisy, draws.time, weights.denoising != 0, weights.sit_alignment != 0
+        )
+        parts = {}
+        if velocity is None:
+            parts["denoising"] = _nothing_of(self.sit)
         else:
-            velocity, projected = self.sit(noisy, draws.time)
-        denoising = losses.flow_matching_loss(velocity, target).mean()
-        parts = {"denoising": self.weights.denoising * denoising}
+            target = self.interpolant.target(normalised, draws.noise, draws.time)
+            error = losses.flow_matching_loss(velocity, target).mean()
+            parts["denoising"] = weights.denoising * error
         if projected is not None:
-            parts["sit_alignment"] = self.weights.sit_alignment * self._aligned(projected, features)
+            parts["sit_alignment"] = weights.sit_alignment * self._aligned(projected, features)
         return parts
+
+    @staticmethod
+    def _predict(
+        sit: SiT, noisy: Tensor, time: Tensor, velocity: bool, features: bool
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Velocity and projected features, what is not asked for being None and not computed."""
+        if velocity and features:
+            return sit(noisy, time)
+        if velocity:
+            return sit.velocity(noisy, time), None
+        return None, sit.project_features(noisy, time) if features else None
 
     def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
         """Sums weighted losses; logs the sum as ``train/loss``, each loss without its weight.
@@ -391,12 +466,21 @@ class GenerativeModule(L.LightningModule):
     # Optimisation
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One AdamW with a parameter group per trained network."""
+        """One AdamW with a parameter group per trained network, fused where the device has it."""
         groups = [
             {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
             for name, network in self.trainable().items()
         ]
-        return torch.optim.AdamW(groups, **asdict(self.optimizer_config))
+        return torch.optim.AdamW(groups, **asdict(self.optimizer_config), fused=self._fused)
+
+    @property
+    def _fused(self) -> bool:
+        """Whether one kernel moves all weights.
+
+        In float16 it would also undo the scale of the gradients, after they were clipped.
+        """
+        supported = self.device.type in ("cpu", "cuda", "mps", "xpu")
+        return supported and self.trainer.precision != "16-mixed"
 
     def configure_gradient_clipping(
         self,
@@ -461,7 +545,7 @@ class GenerativeModule(L.LightningModule):
         """
         image, mask = batch["range_image"], batch["valid_mask"]
         codec = self.scan_geometry.codec
-        draws = self.draw_path(image, batch_idx, stream=1)
+        draws = self.draw_path(len(image), batch_idx, stream=1)
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
@@ -485,12 +569,14 @@ class GenerativeModule(L.LightningModule):
         networks = self if self.ema is None else self.ema
         latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
-        velocity, projected = networks.sit(noisy, draws.time)
+        velocity, projected = self._predict(
+            networks.sit, noisy, draws.time, self.trains_velocity, self.needs_features()
+        )
         values = {}
-        if self.trains_velocity:
+        if velocity is not None:
             target = self.interpolant.target(latents, draws.noise, draws.time)
             values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
-        if self.needs_features():
+        if projected is not None:
             values["alignment"] = self._aligned(projected, features)
         return values
 
@@ -511,7 +597,12 @@ class GenerativeModule(L.LightningModule):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage and scan geometry, enough to sample from, and what it was trained with."""
+        """Adds stage and scan geometry, enough to sample from, and what it was trained with.
+
+        Weights are written in the usual order in memory, whatever this run works with.
+        """
+        state = checkpoint["state_dict"]
+        checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
         checkpoint["r3dpa"] = {
             "stage": self.stage,
             "geometry": self.scan_geometry.to_dict(),

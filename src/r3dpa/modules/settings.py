@@ -12,7 +12,7 @@ __all__ = ["LossWeights", "OptimizerConfig"]
 class LossWeights:
     """Weights of the training losses.
 
-    An alignment or adversarial loss of weight 0 is not computed.
+    A loss of weight 0 is not computed, nor an adversarial one before its start.
 
     Args:
         reconstruction: Weight of the reconstruction error.

@@ -67,7 +67,7 @@ class VAEAlignment(GenerativeModule):
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on a batch of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
-        draws = self.draw_path(image, self.batch_number)
+        draws = self.draw_path(len(image), self.batch_number)
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
         reconstruction = self.vae.decode(latents)

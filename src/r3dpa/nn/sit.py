@@ -8,7 +8,8 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +17,7 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.nn.attention import SelfAttention
-from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.layers import at_least_float32, no_autocast
 
 __all__ = ["SiT", "SiTOutput", "sincos_position_embedding", "time_frequencies"]
 
@@ -168,6 +169,7 @@ class SiT(nn.Module):
             )
         self.input_size = (rows, columns)
         self.in_channels = in_channels
+        self.hidden_size = hidden_size
         self.patch_size = patch_size
         self.grid_size = (rows // patch_size, columns // patch_size)
         self.alignment_depth = alignment_depth
@@ -209,8 +211,10 @@ class SiT(nn.Module):
             ValueError: If a shape does not fit the network, or a model of several classes gets
                 no labels.
         """
-        tokens, conditioning = self._aligned_tokens(latents, time, labels)
-        return SiTOutput(self._finish(tokens, conditioning), self.projector(tokens))
+        self._check(latents, time, labels)
+        modulations = self.modulations(time, labels)
+        tokens = self._aligned_tokens(latents, modulations)
+        return SiTOutput(self._finish(tokens, modulations), self.projector(tokens))
 
     def velocity(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> Tensor:
         """Velocity alone; the projection head is not evaluated.
@@ -226,7 +230,74 @@ class SiT(nn.Module):
         Raises:
             ValueError: As :meth:`forward`.
         """
-        return self._finish(*self._aligned_tokens(latents, time, labels))
+        self._check(latents, time, labels)
+        modulations = self.modulations(time, labels)
+        return self._finish(self._aligned_tokens(latents, modulations), modulations)
+
+    def velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
+        """Velocity at times whose modulations are known: all of :meth:`velocity` but adaLN.
+
+        A schedule meets the same times for every sample, and a third of the weights do nothing
+        but turn times into modulations: the rows of a whole schedule are computed once.
+
+        Args:
+            latents: ``(B, C, h, w)`` noisy normalised latents.
+            modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
+
+        Returns:
+            ``(B, C, h, w)`` d x_t / d t; equal to :meth:`velocity` up to the rounding of another
+            batch size.
+
+        Raises:
+            ValueError: If a shape does not fit the network.
+
+        Example:
+            >>> sit = SiT(hidden_size=32, depth=2, num_heads=2, alignment_depth=1)
+            >>> table = sit.modulations(torch.linspace(1, 0, 9))
+            >>> sit.velocity_at(torch.randn(4, 8, 16, 128), table[3:4]).shape
+            torch.Size([4, 8, 16, 128])
+        """
+        self._check_latents(latents)
+        expected = (6 * len(self.blocks) + 2) * self.hidden_size
+        if modulations.dim() != 2 or modulations.shape[1] != expected:
+            raise ValueError(
+                f"modulations must be rows of {expected} numbers, got {tuple(modulations.shape)}; "
+                "take them from SiT.modulations"
+            )
+        if len(modulations) not in (1, len(latents)):
+            raise ValueError(
+                f"modulations must hold 1 row or one for each of {len(latents)} samples, "
+                f"got {len(modulations)}"
+            )
+        return self._finish(self._aligned_tokens(latents, modulations), modulations)
+
+    def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
+        """Shifts, scales and gates of all blocks and of the output layer at some times.
+
+        Args:
+            time: ``(T,)`` flow times, 0 data, 1 noise.
+            labels: ``(T,)`` int64 classes; may be left out of a one-class model.
+
+        Returns:
+            ``(T, M)``: six vectors of ``hidden_size`` for each block, then two for the output.
+
+        Raises:
+            ValueError: If ``time`` or ``labels`` is not one number per row, or a model of several
+                classes gets no labels.
+        """
+        conditioning = self._conditioning(time, labels)
+        return _rows([*self.blocks, self.final_layer], conditioning)
+
+    def halve_(self) -> Self:
+        """Casts the weights of attention and MLPs, nearly all of the work, to bfloat16 in place.
+
+        For sampling without autocast. Float32 stay the time embedding and the modulations, the
+        token stream between the blocks, the statistics of all norms, and the output layer.
+        """
+        for block in self.blocks:
+            block.attn.bfloat16()
+            block.mlp.bfloat16()
+        return self
 
     def project_features(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
@@ -244,25 +315,30 @@ class SiT(nn.Module):
         Raises:
             ValueError: As :meth:`forward`.
         """
-        return self.projector(self._aligned_tokens(latents, time, labels)[0])
-
-    def _aligned_tokens(
-        self, latents: Tensor, time: Tensor, labels: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Tokens ``(B, N, D)`` after block ``alignment_depth`` and conditioning ``(B, D)``."""
         self._check(latents, time, labels)
-        if labels is None:
-            labels = torch.zeros(len(latents), dtype=torch.long, device=latents.device)
-        tokens = self.x_embedder(latents) + self.pos_embed
-        conditioning = (self.t_embedder(time) + self.y_embedder(labels)).to(tokens.dtype)
-        for block in self.blocks[: self.alignment_depth]:
-            tokens = block(tokens, conditioning)
-        return tokens, conditioning
+        conditioning = self._conditioning(time, labels)
+        rows = _rows(self.blocks[: self.alignment_depth], conditioning)
+        return self.projector(self._aligned_tokens(latents, rows))
 
-    def _finish(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
-        for block in self.blocks[self.alignment_depth :]:
-            tokens = block(tokens, conditioning)
-        patches = self.final_layer(tokens, conditioning)
+    def _conditioning(self, time: Tensor, labels: Tensor | None) -> Tensor:
+        """Embedding ``(T, D)`` of times and classes, in the dtype of the modulation layers."""
+        _check_rows(time, labels)
+        if labels is None:
+            if self.num_classes > 1:
+                raise ValueError(f"a model of {self.num_classes} classes needs labels")
+            labels = torch.zeros(len(time), dtype=torch.long, device=time.device)
+        conditioning = self.t_embedder(time) + self.y_embedder(labels)
+        return conditioning.to(self.final_layer.linear.weight.dtype)
+
+    def _aligned_tokens(self, latents: Tensor, modulations: Tensor) -> Tensor:
+        """Tokens ``(B, N, D)`` after block ``alignment_depth``."""
+        tokens = self.x_embedder(latents) + self.pos_embed
+        return self._through(range(self.alignment_depth), tokens, modulations)
+
+    def _finish(self, tokens: Tensor, modulations: Tensor) -> Tensor:
+        later = range(self.alignment_depth, len(self.blocks))
+        tokens = self._through(later, tokens, modulations)
+        patches = self.final_layer(tokens, modulations[:, -2 * self.hidden_size :])
         return rearrange(
             patches,
             "B (row column) (p q C) -> B C (row p) (column q)",
@@ -271,25 +347,43 @@ class SiT(nn.Module):
             q=self.patch_size,
         )
 
+    def _through(self, indices: range, tokens: Tensor, modulations: Tensor) -> Tensor:
+        width = 6 * self.hidden_size
+        for index in indices:
+            block = self.blocks[index]
+            tokens = block(tokens, modulations[:, index * width : (index + 1) * width])
+        return tokens
+
     def _check(self, latents: Tensor, time: Tensor, labels: Tensor | None) -> None:
+        self._check_latents(latents)
+        if time.shape != latents.shape[:1]:
+            raise ValueError(
+                f"time must hold one value per sample, shape ({len(latents)},), "
+                f"got {tuple(time.shape)}"
+            )
+
+    def _check_latents(self, latents: Tensor) -> None:
         expected = (self.in_channels, *self.input_size)
         if latents.shape[1:] != expected:
             raise ValueError(
                 f"SiT was built for latents of shape (B, {', '.join(map(str, expected))}), "
                 f"got {tuple(latents.shape)}"
             )
-        if time.shape != latents.shape[:1]:
-            raise ValueError(
-                f"time must hold one value per sample, shape ({len(latents)},), "
-                f"got {tuple(time.shape)}"
-            )
-        if labels is None and self.num_classes > 1:
-            raise ValueError(f"a model of {self.num_classes} classes needs labels")
-        if labels is not None and labels.shape != latents.shape[:1]:
-            raise ValueError(
-                f"labels must hold one class per sample, shape ({len(latents)},), "
-                f"got {tuple(labels.shape)}"
-            )
+
+
+def _rows(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
+    """Modulations ``(T, M)`` of some layers, one after the other."""
+    rows = [layer.get_submodule("adaLN_modulation")(conditioning) for layer in layers]
+    return torch.cat(rows, dim=1)
+
+
+def _check_rows(time: Tensor, labels: Tensor | None) -> None:
+    if time.dim() != 1:
+        raise ValueError(f"times must be given as (T,), got {tuple(time.shape)}")
+    if labels is not None and labels.shape != time.shape:
+        raise ValueError(
+            f"labels must hold one class per time, shape ({len(time)},), got {tuple(labels.shape)}"
+        )
 
 
 def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
@@ -322,7 +416,7 @@ class _WideLinear(nn.Linear):
 
     def forward(self, inputs: Tensor) -> Tensor:
         weight, bias = at_least_float32(self.weight), at_least_float32(self.bias)
-        with torch.autocast(device_type=inputs.device.type, enabled=False):
+        with no_autocast(inputs.device):
             return F.linear(inputs.to(weight.dtype), weight, bias)
 
 
@@ -366,7 +460,10 @@ def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:
 
 
 def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
-    normalised = F.layer_norm(tokens, tokens.shape[-1:], eps=_TOKEN_NORM_EPS)
+    width = tokens.shape[-1:]
+    if len(shift) == 1:  # one modulation for all samples is the affine part of the norm
+        return F.layer_norm(tokens, width, 1 + scale[0], shift[0], _TOKEN_NORM_EPS)
+    normalised = F.layer_norm(tokens, width, eps=_TOKEN_NORM_EPS)
     return normalised * (1 + scale[:, None]) + shift[:, None]
 
 
@@ -377,13 +474,14 @@ class _Block(nn.Module):
         self.mlp = _Mlp(hidden_size, int(hidden_size * mlp_ratio))
         self.adaLN_modulation = _modulation(hidden_size, 6)
 
-    def forward(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
-        shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp = self.adaLN_modulation(
-            conditioning
-        ).chunk(6, dim=1)
-        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn))
+    def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
+        """Tokens ``(B, N, D)`` after the block; ``(B, 6 D)`` or, for all samples, ``(1, 6 D)``."""
+        shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp = modulation.chunk(6, 1)
+        narrow = self.mlp.fc1.weight.dtype  # bfloat16 after SiT.halve_
+        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn).to(narrow))
         tokens = tokens + gate_attn[:, None] * attended
-        return tokens + gate_mlp[:, None] * self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp))
+        hidden = self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp).to(narrow))
+        return tokens + gate_mlp[:, None] * hidden
 
 
 class _FinalLayer(nn.Module):
@@ -392,6 +490,6 @@ class _FinalLayer(nn.Module):
         self.linear = _zero(nn.Linear(hidden_size, patch_values))
         self.adaLN_modulation = _modulation(hidden_size, 2)
 
-    def forward(self, tokens: Tensor, conditioning: Tensor) -> Tensor:
-        shift, scale = self.adaLN_modulation(conditioning).chunk(2, dim=1)
+    def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
+        shift, scale = modulation.chunk(2, dim=1)
         return self.linear(_modulated_norm(tokens, shift, scale))

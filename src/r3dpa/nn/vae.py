@@ -6,6 +6,7 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 from __future__ import annotations
 
 import math
+from typing import Self
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -17,6 +18,7 @@ from r3dpa.nn.layers import (
     GroupNorm,
     ResBlock,
     Upsample,
+    WideCircularConv2d,
 )
 from r3dpa.nn.posterior import Posterior
 
@@ -146,6 +148,17 @@ class VAE(nn.Module):
         """
         return self.decoder(self.post_quant_conv(latents))
 
+    def halve_decoder_(self) -> Self:
+        """Casts the convolutions of the decoder to bfloat16 in place, for sampling.
+
+        Float32 stay the statistics of the norms and the first and the last layer: the result of
+        :meth:`decode` is float32.
+        """
+        for layer in self.decoder.modules():
+            if isinstance(layer, nn.Conv2d) and layer is not self.decoder.conv_out:
+                layer.bfloat16()
+        return self
+
 
 class _Encoder(nn.Module):
     def __init__(
@@ -195,10 +208,10 @@ class _Decoder(nn.Module):
             for level in zip(before, widths, attention, [None, *strides], strict=True)
         )
         self.norm_out = GroupNorm(widths[0])
-        self.conv_out = CircularConv2d(widths[0], out_channels, (1, 4))
+        self.conv_out = WideCircularConv2d(widths[0], out_channels, (1, 4))
 
     def forward(self, latents: Tensor) -> Tensor:
-        hidden = self.mid(self.conv_in(latents))
+        hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))
         for level in reversed(self.up):
             hidden = level(hidden)
         return self.conv_out(F.silu(self.norm_out(hidden)))

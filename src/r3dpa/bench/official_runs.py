@@ -1,0 +1,420 @@
+"""The official sampler script and training script, run as they are on the CPU with given weights.
+
+Both scripts expect CUDA, several processes and files of data. What they would ask of those is
+answered here by overlays of the modules they import; their own lines run unchanged.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import time
+import warnings
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from r3dpa.bench.official_imports import OfficialCode, OneProcess, Overlay
+from r3dpa.checkpoints import Checkpoint, to_official
+
+__all__ = [
+    "PATCHES",
+    "Trained",
+    "official_sit",
+    "official_vae",
+    "replaced",
+    "save_for_official",
+    "train_official",
+    "write_official_scenes",
+]
+
+PATCHES = (
+    "generate.py: CUDA answers for the CPU, one process instead of torch.distributed, weights read "
+    "with weights_only; progress bars off",
+    "train_repae.py: scans, loss weights and networks come from memory; the preview at step 1, "
+    "which is not timed, decodes a narrow strip",
+)
+_MODEL, _VAE = "r3dpa/2", "h2p4d8"
+_STRIDE = (4, 8)
+_STEP = 1
+
+
+class _Cpu:
+    """In place of a number of GPUs: ``rank % count`` is then the CPU."""
+
+    def __rmod__(self, rank: int) -> torch.device:
+        return torch.device("cpu")
+
+
+def official_sit(code: OfficialCode, checkpoint: Checkpoint, **given: Any) -> nn.Module:
+    """The official SiT with the sizes of ``sit`` in a checkpoint; fresh weights.
+
+    Args:
+        code: Imported checkout.
+        checkpoint: Whose arguments are taken.
+        **given: Arguments that an official script gives.
+    """
+    sizes = checkpoint.network("sit").arguments
+    arguments = {
+        "input_size": sizes["input_size"],
+        "in_channels": sizes["in_channels"],
+        "encoder_depth": sizes["alignment_depth"],
+        "num_classes": sizes["num_classes"],
+        "class_dropout_prob": 0.0,
+        "bn_momentum": 0.1,
+        "fused_attn": True,
+        "qk_norm": sizes["qk_norm"],
+    } | given
+    return code["models.sit"].SiT(
+        patch_size=sizes["patch_size"],
+        hidden_size=sizes["hidden_size"],
+        decoder_hidden_size=sizes["hidden_size"],
+        depth=sizes["depth"],
+        num_heads=sizes["num_heads"],
+        mlp_ratio=sizes["mlp_ratio"],
+        projector_dim=sizes["projector_dim"],
+        **arguments | {"z_dims": [sizes["feature_dim"]]},
+    )
+
+
+def official_vae(code: OfficialCode, checkpoint: Checkpoint) -> nn.Module:
+    """The official range-image VAE with the sizes of ``vae`` in a checkpoint; fresh weights."""
+    sizes = checkpoint.network("vae").arguments
+    width = {"ch": sizes["channels"], "num_res_blocks": sizes["num_res_blocks"]}
+    autoencoder, lidm = code["models.autoencoder"], code["models.model_lidm"]
+    overlay = Overlay(
+        lidm, Encoder=partial(lidm.Encoder, **width), Decoder=partial(lidm.Decoder, **width)
+    )
+    with replaced(autoencoder, model_lidm=overlay):
+        return autoencoder.AutoencoderKL(
+            embed_dim=sizes["latent_channels"],
+            ch_mult=list(sizes["channel_multipliers"]),
+            strides=[list(stride) for stride in sizes["strides"]],
+            attn_levels=list(sizes["attention_levels"]),
+            in_channels=1,
+            out_ch=1,
+            lib_name="lidm",
+        )
+
+
+def save_for_official(code: OfficialCode, checkpoint: Checkpoint, folder: Path) -> None:
+    """Writes the experiment folder that ``generate.py`` reads: ``args.json`` and one checkpoint.
+
+    Raises:
+        ValueError: If the latents are not those of ``h2p4d8``, the layout the script knows.
+    """
+    sizes = checkpoint.network("sit").arguments
+    strides = checkpoint.network("vae").arguments["strides"]
+    if tuple(np.prod(strides, axis=0)) != _STRIDE or sizes["in_channels"] != 8:
+        raise ValueError(
+            f"the official scripts are run with the layout {_VAE} (stride 4 x 8, 8 channels), but "
+            f"{checkpoint.path} has strides {strides} and {sizes['in_channels']} channels"
+        )
+    options = {
+        "dataset_config": str(code.repo / "configs" / "kitti.yaml"),
+        "vae": _VAE,
+        "resolution": [size * by for size, by in zip(sizes["input_size"], _STRIDE, strict=True)],
+        "model": _MODEL,
+        "num_classes": sizes["num_classes"],
+        "cfg_prob": 0.0,
+        "encoder_depth": sizes["alignment_depth"],
+        "bn_momentum": 0.1,
+        "fused_attn": True,
+        "qk_norm": sizes["qk_norm"],
+    }
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "args.json").write_text(json.dumps(options))
+    content = {key: value for key, value in to_official(checkpoint).items() if key != "args"}
+    torch.save(content, folder / "checkpoints" / f"{_STEP:07d}.pt")
+
+
+def write_official_scenes(
+    code: OfficialCode,
+    checkpoint: Checkpoint,
+    experiment: Path,
+    out: Path,
+    num: int,
+    batch_size: int,
+    steps: int,
+    noise: Tensor | None = None,
+    parts: dict[str, float] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> np.ndarray:
+    """Runs ``main`` of the official ``generate.py``: Euler steps, decode, all of its files.
+
+    Args:
+        code: Imported checkout.
+        checkpoint: What :func:`save_for_official` wrote.
+        experiment: Where it wrote.
+        out: Folder for the scenes.
+        num: Scenes, a multiple of ``batch_size``.
+        batch_size: Scenes at once.
+        steps: Euler steps.
+        noise: ``(num, C, h, w)`` in place of its own draws.
+        parts: If given, seconds by part are added here; timing them costs a little.
+        clock: Seconds since some time.
+
+    Returns:
+        Ranges ``(num, H, W)`` in metres before any limit, as the script keeps them.
+    """
+    generate = code["generate"]
+    overlay: dict[str, Any] = {
+        "cuda": Overlay(
+            torch.cuda,
+            is_available=lambda: True,
+            device_count=_Cpu,
+            set_device=_nothing,
+            empty_cache=_nothing,
+        ),
+        "load": lambda path, map_location: torch.load(path, weights_only=True),
+    }
+    if noise is not None:
+        batches = iter(noise.split(batch_size))
+        overlay["randn"] = lambda *shape, device: next(batches)
+    alone = Overlay(
+        None,
+        init_process_group=_nothing,
+        get_rank=lambda: 0,
+        get_world_size=lambda: 1,
+        broadcast=_nothing,
+        barrier=_nothing,
+        destroy_process_group=_nothing,
+    )
+    timed = partial(_timed, {} if parts is None else parts, clock)
+    watched: dict[str, Any] = {}
+    if parts is not None:
+        watched = {
+            "np": Overlay(
+                np,
+                savetxt=timed("text files written", np.savetxt),
+                loadtxt=timed("text files read again", np.loadtxt),
+                concatenate=timed("array grown", np.concatenate),
+                savez=timed("npz", np.savez),
+            ),
+            "euler_sampler": timed("sampler", generate.euler_sampler),
+            "range2pcd": timed("points (range2pcd, range2xyz)", generate.range2pcd),
+            "range2xyz": timed("points (range2pcd, range2xyz)", generate.range2xyz),
+        }
+
+    def vae() -> Any:
+        network: Any = official_vae(code, checkpoint)
+        if parts is not None:
+            network.decode = timed("decode", network.decode)
+        return network
+
+    options = Namespace(
+        tf32=False,
+        global_seed=0,
+        sample_dir=str(out),
+        exp_path=str(experiment),
+        train_steps=_STEP,
+        pproc_batch_size=batch_size,
+        num_fid_samples=num,
+        mode="ode",
+        cfg_scale=1.0,
+        path_type=checkpoint.interpolant,
+        num_steps=steps,
+        heun=False,
+        guidance_low=0.0,
+        guidance_high=1.0,
+    )
+    with (
+        replaced(
+            generate,
+            torch=Overlay(torch, **overlay),
+            dist=alone,
+            tqdm=lambda steps, **_: steps,
+            SiT_models={_MODEL: partial(official_sit, code, checkpoint)},
+            UNet_models={},
+            vae_models={_VAE: vae},
+            **watched,
+        ),
+        contextlib.redirect_stdout(io.StringIO()),
+        torch.enable_grad(),  # it switches gradients off for good
+    ):
+        generate.main(options)
+    (images,) = out.glob("*/numpy/img.npz")
+    return np.load(images)["arr_0"][:, 0]
+
+
+class Trained(NamedTuple):
+    """What some training steps took and led to.
+
+    Attributes:
+        seconds: Of each step.
+        weights: Of ``vae``, ``sit`` and ``discriminator`` after them, by official name.
+    """
+
+    seconds: list[float]
+    weights: dict[str, dict[str, Tensor]]
+
+
+def train_official(
+    code: OfficialCode,
+    checkpoint: Checkpoint,
+    image: Tensor,
+    features: Tensor,
+    draws: tuple[Tensor, Tensor, Tensor],
+    steps: int,
+    folder: Path,
+    clock: Callable[[], float],
+) -> Trained:
+    """Runs ``main`` of the official ``train_repae.py`` for some steps on one batch.
+
+    Args:
+        code: Imported checkout.
+        checkpoint: Weights to start from; the latent statistics start at (0, 1) as in the script.
+        image: ``(B, 1, H, W)`` range images.
+        features: ``(B, N, F)`` feature grids.
+        draws: Posterior noise ``(B, C, h, w)``, times ``(B,)`` and noise of every step.
+        steps: Optimiser steps of each of the three optimisers.
+        folder: For what the script writes; it writes nothing.
+        clock: Seconds since some time.
+    """
+    script = code["train_repae"]
+    weights, process = to_official(checkpoint), OneProcess(clock)
+    networks: dict[str, nn.Module] = {}
+    posterior_noise, times, noise = draws
+
+    def keep(name: str, network: nn.Module, state: dict[str, Tensor]) -> nn.Module:
+        network.load_state_dict(state)
+        networks[name] = network
+        return network
+
+    def loss(config: Any) -> nn.Module:
+        function = code["loss.losses"].ReconstructionLoss_Single_Stage(config)
+        keep("discriminator", function.discriminator, weights["discriminator"])
+        return function
+
+    samples = [
+        {"image": scan, "features": grid} for scan, grid in zip(image, features, strict=True)
+    ]
+    with (
+        replaced(
+            script,
+            Accelerator=lambda **_: process,
+            SiT_models={
+                _MODEL: lambda **given: keep(
+                    "sit", official_sit(code, checkpoint, **given), weights["model"]
+                )
+            },
+            vae_models={_VAE: lambda: keep("vae", official_vae(code, checkpoint), weights["vae"])},
+            ReconstructionLoss_Single_Stage=loss,
+            KITTI360=lambda *_, **__: samples,
+            euler_sampler=lambda model, latents, *_, **__: latents[..., : _STRIDE[1]],
+            logging=logging.getLogger(__name__),
+        ),
+        replaced(
+            code["models.autoencoder"],
+            torch=Overlay(torch, randn=lambda shape, device: posterior_noise),
+        ),
+        replaced(
+            code["models.sit"],
+            torch=Overlay(
+                torch, rand=lambda shape: times.view(shape), randn_like=lambda values: noise
+            ),
+        ),
+        contextlib.redirect_stdout(io.StringIO()),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        script.main(_training_options(code, checkpoint, image, steps, folder))
+    return Trained(
+        process.seconds, {name: network.state_dict() for name, network in networks.items()}
+    )
+
+
+def _training_options(
+    code: OfficialCode, checkpoint: Checkpoint, image: Tensor, steps: int, folder: Path
+) -> Namespace:
+    """Those of the second stage as published, but without compiling and in full precision."""
+    configs, sizes = code.repo / "configs", checkpoint.network("sit").arguments
+    seldom = 10**9
+    return Namespace(
+        output_dir=str(folder),
+        exp_name="joint",
+        gradient_accumulation_steps=1,
+        mixed_precision="no",
+        allow_tf32=False,
+        compile=False,
+        seed=None,
+        # networks
+        model=_MODEL,
+        vae=_VAE,
+        resolution=list(image.shape[-2:]),
+        num_classes=sizes["num_classes"],
+        encoder_depth=sizes["alignment_depth"],
+        cfg_prob=0.0,
+        bn_momentum=0.1,
+        fused_attn=True,
+        qk_norm=sizes["qk_norm"],
+        vae_ckpt=None,
+        disc_pretrained_ckpt=None,
+        resume_step=0,
+        resume_path=None,
+        tuning=False,
+        train_vae_only=False,
+        train_diffusion_only=False,
+        # data
+        data_dir="",
+        dataset_config=str(configs / "kitti.yaml"),
+        batch_size=len(image),
+        num_workers=0,
+        # losses and optimisers
+        loss_cfg_path=str(configs / "l1_lpips_kl_gan.yaml"),
+        path_type="linear",
+        prediction="v",
+        weighting="uniform",
+        proj_coeff=0.5,
+        vae_align_proj_coeff=1.5,
+        learning_rate=1e-4,
+        vae_learning_rate=1e-4,
+        disc_learning_rate=1e-4,
+        adam_beta1=0.9,
+        adam_beta2=0.999,
+        adam_weight_decay=0.03,
+        adam_epsilon=1e-8,
+        max_grad_norm=1.0,
+        epochs=steps,
+        max_train_steps=steps,
+        sampling_steps=seldom,
+        checkpointing_steps=seldom,
+    )
+
+
+@contextmanager
+def replaced(module: Any, **names: Any) -> Iterator[None]:
+    """Other content of a module for a while."""
+    before = {name: getattr(module, name) for name in names}
+    vars(module).update(names)
+    try:
+        yield
+    finally:
+        vars(module).update(before)
+
+
+def _timed(
+    parts: dict[str, float], clock: Callable[[], float], name: str, function: Callable[..., Any]
+) -> Callable[..., Any]:
+    """The function, which adds the seconds it takes to a part."""
+
+    def run(*args: Any, **kwargs: Any) -> Any:
+        start = clock()
+        result = function(*args, **kwargs)
+        parts[name] = parts.get(name, 0.0) + clock() - start
+        return result
+
+    return run
+
+
+def _nothing(*args: Any, **kwargs: Any) -> None:
+    """In place of what has no meaning for one process on the CPU."""

@@ -1,0 +1,218 @@
+"""Generated scenes as files, written while the next ones are drawn."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r3dpa.atomic import atomic_path
+from r3dpa.data.scans import write_bin, write_npz, write_ply
+from r3dpa.geometry import points_of
+from r3dpa.geometry.projection import Projection
+
+__all__ = ["SCENE_FORMATS", "SceneFormat", "SceneWriter"]
+
+SceneFormat = Literal["bin", "ply", "npz"]
+SCENE_FORMATS: tuple[SceneFormat, ...] = ("bin", "ply", "npz")
+
+_CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
+_MOST_WAITING = 2
+
+
+class SceneWriter:
+    """Writes scenes in order, in one thread, and goes on where an interrupted run has stopped.
+
+    ===================== =====================================================================
+    ``range_m.npy``       ``(num, H, W)`` float32 metres, -1 without a return
+    ``bin/000000.bin``    points of each scene, if asked for; ``ply/000000.ply`` likewise
+    ``scenes.npz``        all of them, if asked for
+    ``metadata.json``     written last: a folder without it is unfinished
+    ===================== =====================================================================
+
+    Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json``, which
+    tells what was asked for and how many scenes are written. At most three batches are in memory.
+    An error of the thread is raised by the next calls of :meth:`put` or by :meth:`close`.
+
+    Args:
+        out: Folder.
+        num: Number of scenes.
+        projection: Of the range images.
+        formats: Of :data:`SCENE_FORMATS`.
+        request: All that decides about the scenes, as JSON knows it.
+        overwrite: Start anew in a folder that holds scenes, finished or not.
+
+    Attributes:
+        num_done: Scenes written so far, by interrupted runs of the same request too.
+
+    Raises:
+        ValueError: If a format is unknown, or ``out`` holds scenes, or unfinished ones of another
+            request.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        num: int,
+        projection: Projection,
+        formats: Sequence[str],
+        request: dict[str, Any],
+        overwrite: bool = False,
+    ) -> None:
+        unknown = [name for name in formats if name not in SCENE_FORMATS]
+        if unknown:
+            raise ValueError(
+                f"formats must be some of {', '.join(SCENE_FORMATS)}, got {unknown[0]!r}"
+            )
+        if (out / "metadata.json").exists() and not overwrite:
+            raise ValueError(f"{out} holds scenes already; give another --out or --overwrite true")
+        self.out, self.num, self.num_done = out, num, 0
+        self._projection = projection
+        self._formats = tuple(formats)
+        self._request = json.loads(json.dumps(request))  # tuples become lists, as in the file
+        self._state, self._unfinished = out / ".unfinished.json", out / ".unfinished.npy"
+        if self._state.exists() and not overwrite:
+            self.num_done = self._written_before()
+        else:
+            self._clear()
+        self._file = self._open()
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scene-writer")
+        self._waiting: deque[Future[None]] = deque()
+        self._failed = False
+
+    def __enter__(self) -> Self:
+        """Closes at the end of the block what :meth:`close` has not."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Waits for the scenes that were put; after an interrupt they need not be drawn again."""
+        self._thread.shutdown()
+        self._file.close()
+
+    @property
+    def range_path(self) -> Path:
+        """Range images of all scenes, complete after :meth:`close`."""
+        return self.out / "range_m.npy"
+
+    def put(self, range_m: Tensor) -> None:
+        """Takes the next scenes and returns at once, unless two batches wait already.
+
+        Args:
+            range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards. From a
+                GPU it is copied behind what it computes now, and nothing waits for it here.
+
+        Raises:
+            OSError: Or whatever else went wrong with scenes that were put before.
+        """
+        while len(self._waiting) >= _MOST_WAITING:
+            self._waiting.popleft().result()
+        ready = None
+        if range_m.is_cuda:
+            host = torch.empty(range_m.shape, dtype=range_m.dtype, pin_memory=True)
+            range_m = host.copy_(range_m, non_blocking=True)
+            ready = torch.cuda.Event()
+            ready.record()
+        self._waiting.append(self._thread.submit(self._write, range_m, ready))
+
+    def close(self) -> None:
+        """Waits until all scenes are written, and gives ``range_m.npy`` its name.
+
+        Raises:
+            OSError: Or whatever else went wrong with the last scenes.
+        """
+        while self._waiting:
+            self._waiting.popleft().result()
+        self._thread.shutdown()
+        self._file.close()
+        assert self.num_done == self.num, "closed before all scenes were put"
+        if "npz" in self._formats:
+            write_npz(self.out / "scenes.npz", self._clouds())
+        self._unfinished.replace(self.range_path)
+
+    def finish(self, metadata: dict[str, Any]) -> None:
+        """Writes ``metadata.json``, with which the folder is complete."""
+        with atomic_path(self.out / "metadata.json") as temporary:
+            temporary.write_text(json.dumps(metadata, indent=2) + "\n")
+        self._state.unlink()
+
+    def _written_before(self) -> int:
+        try:
+            state = json.loads(self._state.read_text(encoding="utf-8"))
+            found, num_done = state["request"], int(state["num_done"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{self._state}: is damaged ({error!r}); give --overwrite true to start anew"
+            ) from error
+        differing = [
+            key for key in {**found, **self._request} if found.get(key) != self._request.get(key)
+        ]
+        if differing:
+            key = differing[0]
+            raise ValueError(
+                f"{self.out} holds {num_done} scenes of an unfinished run with {key} "
+                f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
+                "--overwrite true starts anew"
+            )
+        if not self._unfinished.exists():  # stopped between the two last files
+            self.range_path.replace(self._unfinished)
+        return num_done
+
+    def _clear(self) -> None:
+        """Removes what earlier runs wrote, first of all what says that it is complete."""
+        for path in (self.out / "metadata.json", self._state, self._unfinished, self.range_path):
+            path.unlink(missing_ok=True)
+        (self.out / "scenes.npz").unlink(missing_ok=True)
+        for name in _CLOUD_WRITERS:
+            shutil.rmtree(self.out / name, ignore_errors=True)
+
+    def _open(self) -> IO[bytes]:
+        """File of the range images, behind those that are written."""
+        sensor = self._projection.sensor
+        shape = (self.num, sensor.beams, sensor.columns)
+        self.out.mkdir(parents=True, exist_ok=True)
+        file = self._unfinished.open("r+b" if self.num_done else "wb")
+        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.seek(4 * self.num_done * sensor.beams * sensor.columns, 1)
+        file.truncate()
+        return file
+
+    def _write(self, range_m: Tensor, ready: torch.cuda.Event | None) -> None:
+        """Writes one batch; none after one that failed, whose error the next call tells."""
+        if self._failed:
+            return
+        self._failed = True
+        if ready is not None:
+            ready.synchronize()
+        for index, scene in enumerate(range_m, self.num_done):
+            points = points_of(scene, self._projection)
+            for name in self._formats:
+                if name in _CLOUD_WRITERS:
+                    path = self.out / name / f"{index:06d}.{name}"
+                    _CLOUD_WRITERS[name](path, points)
+        self._file.write(range_m.numpy().astype("<f4", copy=False).tobytes())
+        self._file.flush()
+        num_done = self.num_done + len(range_m)
+        with atomic_path(self._state) as temporary:
+            temporary.write_text(json.dumps({"request": self._request, "num_done": num_done}))
+        self.num_done = num_done
+        self._failed = False
+
+    def _clouds(self) -> Iterator[tuple[str, Tensor]]:
+        for index, range_m in enumerate(np.load(self._unfinished, mmap_mode="r")):
+            scene = torch.from_numpy(np.array(range_m))
+            yield f"{index:06d}", points_of(scene, self._projection)

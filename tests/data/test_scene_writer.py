@@ -1,0 +1,200 @@
+"""Scenes arrive as files in order; what stops a run is told, and the next run goes on after it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import threading
+import tracemalloc
+import weakref
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.data import scene_writer
+from r3dpa.data.samples import read_samples
+from r3dpa.data.scans import read_npz, read_ply, read_scan
+from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+
+SENSOR = LidarSensor(beams=4, columns=8, range_min_m=1.0, range_max_m=50.0)
+PROJECTION = SphericalProjection(SENSOR)
+REQUEST = {"seed": 0, "interval": (0.0, 1.0)}
+
+
+def scenes(num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    range_m = 2 + 40 * torch.rand(num, 4, 8, generator=generator)
+    return torch.where(torch.rand(num, 4, 8, generator=generator) < 0.8, range_m, -1.0)
+
+
+def writer(out, num, formats=("bin",), request=REQUEST, overwrite=False):
+    return SceneWriter(out, num, PROJECTION, formats, request, overwrite)
+
+
+def write(out, range_m, batch=2, **options):
+    with writer(out, len(range_m), **options) as open_writer:
+        for first in range(open_writer.num_done, len(range_m), batch):
+            open_writer.put(range_m[first : first + batch])
+        open_writer.close()
+        open_writer.finish({"num": len(range_m)})
+
+
+def files(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def test_every_format_holds_the_points_of_the_range_images(tmp_path):
+    range_m = scenes(5)
+    write(tmp_path, range_m, formats=("bin", "ply", "npz"))
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+    clouds = read_npz(tmp_path / "scenes.npz")
+    assert list(clouds) == [f"{index:06d}" for index in range(5)]
+    for index, (name, cloud) in enumerate(clouds.items()):
+        points = points_of(range_m[index], PROJECTION).numpy()
+        assert np.array_equal(cloud, points)
+        assert np.array_equal(read_ply(tmp_path / "ply" / f"{name}.ply"), points)
+        assert np.array_equal(read_scan(tmp_path / "bin" / f"{name}.bin")[:, :3], points)
+    assert len(files(tmp_path)) == 3 + 2 * 5  # nothing hidden is left
+
+
+@pytest.mark.parametrize(("formats", "prefix"), [(("bin",), "bin/"), (("bin", "ply", "npz"), "")])
+def test_samples_are_read_from_the_folder(tmp_path, formats, prefix):
+    range_m = scenes(3)
+    write(tmp_path, range_m, formats=formats)
+    samples = list(read_samples(tmp_path, SENSOR))
+    assert [sample.name for sample in samples] == [f"{prefix}{index:06d}" for index in range(3)]
+    for sample, scene in zip(samples, range_m, strict=True):
+        assert torch.equal(sample.points[:, :3], points_of(scene, PROJECTION))
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
+    range_m = scenes(7)
+    with writer(tmp_path, 7) as first:
+        first.put(range_m[:2])
+        first.put(range_m[2:4])
+    assert files(tmp_path) == [
+        *(".unfinished.json", ".unfinished.npy"),
+        *(f"bin/{index:06d}.bin" for index in range(4)),
+    ]
+    kept = (tmp_path / "bin" / "000003.bin").stat().st_mtime_ns
+    with writer(tmp_path, 7) as second:
+        assert second.num_done == 4
+        second.put(range_m[4:])
+        second.close()
+        second.finish({})
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+    assert (tmp_path / "bin" / "000003.bin").stat().st_mtime_ns == kept
+    assert not [name for name in files(tmp_path) if name.startswith(".")]
+
+
+def test_a_run_that_stops_before_its_last_file_only_needs_that(tmp_path):
+    range_m = scenes(2)
+    with writer(tmp_path, 2) as first:
+        first.put(range_m)
+        first.close()
+    with writer(tmp_path, 2) as second:
+        assert second.num_done == 2
+        second.close()
+        second.finish({})
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+
+
+def test_half_a_batch_is_written_again(tmp_path):
+    """The images of a batch whose end was not recorded are cut off."""
+    range_m = scenes(4)
+    with writer(tmp_path, 4) as first:
+        first.put(range_m[:2])
+    with (tmp_path / ".unfinished.npy").open("ab") as file:
+        file.write(b"half of an image")
+    write(tmp_path, range_m)
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+
+
+def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
+    with writer(tmp_path, 4) as first:
+        first.put(scenes(2))
+    other = {**REQUEST, "seed": 1}
+    with pytest.raises(ValueError, match=r"2 scenes of an unfinished run with seed 0, not 1.*over"):
+        writer(tmp_path, 4, request=other)
+    write(tmp_path, scenes(1, seed=5), request=other, overwrite=True)
+    assert files(tmp_path) == ["bin/000000.bin", "metadata.json", "range_m.npy"]
+    with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
+        writer(tmp_path, 4, request=other)
+
+
+def test_a_damaged_state_is_named(tmp_path):
+    (tmp_path / ".unfinished.json").write_text("{")
+    with pytest.raises(ValueError, match=r"unfinished.json: is damaged.*--overwrite true"):
+        writer(tmp_path, 1)
+
+
+def test_unknown_formats_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"some of bin, ply, npz, got 'txt'"):
+        writer(tmp_path, 1, formats=("bin", "txt"))
+
+
+@pytest.mark.parametrize("where", ["put", "close"])
+def test_an_error_while_writing_stops_the_run_with_its_message(tmp_path, monkeypatch, where):
+    real = scene_writer.write_bin
+
+    def full_disk(path, points):
+        if path.name == "000003.bin":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        real(path, points)
+
+    monkeypatch.setitem(scene_writer._CLOUD_WRITERS, "bin", full_disk)
+    range_m = scenes(40 if where == "put" else 4)
+    with pytest.raises(OSError, match=r"No space left.*000003\.bin"):
+        write(tmp_path, range_m)
+    state = json.loads((tmp_path / ".unfinished.json").read_text())
+    assert state["num_done"] == 2  # and nothing behind the gap
+    assert not list(tmp_path.rglob(".*.partial*"))
+    monkeypatch.setitem(scene_writer._CLOUD_WRITERS, "bin", real)
+    write(tmp_path, range_m)
+    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
+
+
+def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
+    """Two batches may wait; the third `put` comes back only when one has been written."""
+    gate = threading.Event()
+    real = scene_writer.write_bin
+    monkeypatch.setitem(
+        scene_writer._CLOUD_WRITERS, "bin", lambda *args: gate.wait(10) and real(*args)
+    )
+    range_m = scenes(3)
+    with writer(tmp_path, 3) as open_writer:
+        for index in range(2):
+            open_writer.put(range_m[index : index + 1])
+        assert open_writer.num_done == 0
+        third = threading.Thread(target=open_writer.put, args=(range_m[2:],))
+        third.start()
+        third.join(0.1)
+        assert third.is_alive()
+        gate.set()
+        third.join(10)
+        open_writer.close()
+        assert open_writer.num_done == 3
+
+
+def test_1000_scenes_take_no_more_memory_than_a_few(tmp_path):
+    """At most three batches live at once, and what numpy and Python allocate stays flat."""
+    batches, most = weakref.WeakSet(), 0
+    size = 2 * 4 * 8 * 4
+    with writer(tmp_path, 1000, formats=("bin", "npz")) as open_writer:
+        for first in range(0, 1000, 2):
+            batch = scenes(2, seed=first)
+            batches.add(batch)
+            open_writer.put(batch)
+            del batch
+            most = max(most, len(batches))
+            if first == 100:
+                tracemalloc.start()
+        grown, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        open_writer.close()
+        open_writer.finish({})
+    assert most <= 4  # three and the one that is being handed over
+    assert grown < 100 * size
+    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 1000

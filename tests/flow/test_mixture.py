@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.mixture import GaussianMixture, toy_mixture
+from r3dpa.flow.solvers import heun
+from r3dpa.flow.times import ode_times
+
+
+def pair(std=0.3):
+    means = torch.tensor([[1.0, 0.0], [-1.0, 2.0]]).double()
+    return GaussianMixture(means, std, torch.tensor([1.0, 3.0]).double())
+
+
+def some_points(num=7, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(num, 2, generator=generator, dtype=torch.float64)
+
+
+def times_of(x, time):
+    return torch.full((len(x),), time, dtype=torch.float64)
+
+
+def test_velocity_at_both_ends_by_hand():
+    x = some_points()
+    torch.testing.assert_close(pair().velocity(x, times_of(x, 0.0)), -x)
+    mean = torch.tensor([-0.5, 1.5]).double()
+    torch.testing.assert_close(pair().velocity(x, times_of(x, 1.0)), x - mean)
+
+
+@pytest.mark.parametrize("time", [0.05, 0.5, 0.95])
+def test_velocity_gives_the_score_of_the_density(time):
+    """Independent: the gradient of the log density, by autograd from the definition."""
+    mixture, x = pair(), some_points()
+    leaf = x.clone().requires_grad_()
+    variance = (1 - time) ** 2 * mixture.std**2 + time**2
+    square = (leaf[:, None] - (1 - time) * mixture.means).square().sum(2)
+    log_density = torch.logsumexp(mixture.weights.log() - square / (2 * variance), dim=1)
+    (score,) = torch.autograd.grad(log_density.sum(), leaf)
+    given = Interpolant().score(mixture.velocity(x, times_of(x, time)), x, times_of(x, time))
+    torch.testing.assert_close(given, score, rtol=1e-9, atol=1e-9)
+
+
+def test_ode_carries_noise_to_the_mixture():
+    noise = some_points(4000, seed=3)
+    data = heun(pair(0.1).velocity, noise, ode_times(200))
+    first = (data - pair().means[0]).norm(dim=1) < 0.5
+    # 4000 draws know a probability of 1/4 to 0.007.
+    assert first.double().mean().item() == pytest.approx(0.25, abs=0.021)
+    within = data[first] - data[first].mean(0)
+    assert within.std().item() == pytest.approx(0.1, rel=0.05)
+
+
+def test_samples_have_the_moments_of_the_mixture():
+    data = pair().sample(20_000, torch.Generator().manual_seed(0))
+    assert data.dtype == torch.float64
+    torch.testing.assert_close(data.mean(0), torch.tensor([-0.5, 1.5]).double(), atol=0.03, rtol=0)
+    spread = torch.tensor([0.75, 0.75]).double() + 0.3**2
+    torch.testing.assert_close(data.var(0), spread, atol=0.03, rtol=0)
+
+
+@pytest.mark.numerics
+def test_velocity_stays_finite_where_densities_underflow():
+    means = torch.tensor([[100.0], [-100.0]]).double()
+    far = GaussianMixture(means, 1e-4, torch.ones(2))
+    x = torch.tensor([[99.0], [-99.0]]).double()
+    naive = torch.exp(-(x - means.T).square() / (2 * 1e-8))
+    assert (naive == 0).all()
+    velocity = far.velocity(x, times_of(x, 1e-6))
+    # Each point belongs wholly to the mean on its side.
+    for index in range(2):
+        near = GaussianMixture(means[index : index + 1], 1e-4, torch.ones(1))
+        alone = near.velocity(x[index : index + 1], times_of(x[:1], 1e-6))
+        torch.testing.assert_close(velocity[index : index + 1], alone)
+
+
+def test_velocity_keeps_dtype_and_samples_apart():
+    x = some_points().float()
+    whole = pair().velocity(x, torch.linspace(0, 1, len(x)))
+    assert whole.dtype == torch.float32
+    one = pair().velocity(x[3:4], torch.linspace(0, 1, len(x))[3:4])
+    torch.testing.assert_close(one, whole[3:4])
+
+
+def test_toy_mixture():
+    mixture = toy_mixture(1)
+    assert mixture.means.shape == (128, 64)
+    assert torch.linalg.matrix_rank(mixture.means) == 4
+    assert torch.equal(mixture.means, toy_mixture(1).means)
+    assert not torch.equal(mixture.means, toy_mixture(2).means)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: GaussianMixture(torch.zeros(2), 1.0, torch.ones(2)), r"got \(2,\) and \(2,\)"),
+        (lambda: GaussianMixture(torch.zeros(2, 3), 1.0, torch.ones(3)), r"\(2, 3\) and \(3,\)"),
+        (lambda: GaussianMixture(torch.zeros(2, 3), 0.0, torch.ones(2)), r"got std 0\.0"),
+        (lambda: GaussianMixture(torch.zeros(2, 3), 1.0, torch.eye(2)[0]), "1 weights that"),
+        (lambda: GaussianMixture(torch.zeros(2, 3), math.nan, torch.ones(2)), "std nan"),
+        (lambda: pair().velocity(torch.zeros(4, 3), torch.zeros(4)), r"\(B, 2\), got \(4, 3\)"),
+    ],
+)
+def test_impossible_mixtures_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,310 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.sde import RestartPlan, euler_maruyama, restart
+from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, euler
+from r3dpa.flow.times import ode_times, sde_times
+
+
+def still(x, time):
+    return torch.zeros_like(x)
+
+
+def growth(x, time):
+    """Linear ODE whose solution is x(1) exp(-(1 - t)) going backwards."""
+    return x
+
+
+def gaussian_velocity(spread):
+    """Exact velocity of Gaussian data on the linear path."""
+
+    def velocity(x, time):
+        t = time[:, None]
+        return (t - (1 - t) * spread**2) / ((1 - t).square() * spread**2 + t.square()) * x
+
+    return velocity
+
+
+def standard_noise(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def test_sde_without_noise_follows_its_drift():
+    times = torch.tensor([1.0, 0.6, 0.2, 0.0]).double()
+    silence = torch.zeros(2, 1, 1).double()
+    start = torch.ones(1, 1).double()
+    # On the linear path the drift of velocity 0 is x itself.
+    mean = euler_maruyama(still, start, times, silence, last="mean")
+    assert mean.item() == pytest.approx((1 - 0.4) * (1 - 0.4) * (1 - 0.2))
+    denoised = euler_maruyama(still, start, times, silence)
+    assert denoised.item() == pytest.approx((1 - 0.4) * (1 - 0.4))
+    # On the cosine path it is t x, and the expected data is cos(pi t / 2) x.
+    cosine = euler_maruyama(still, start, times, silence, interpolant=Interpolant("cosine"))
+    assert cosine.item() == pytest.approx((1 - 0.4) * (1 - 0.4 * 0.6) * math.cos(0.1 * math.pi))
+
+
+def test_sde_adds_noise_of_variance_two_t_dt():
+    def without_drift(x, time):
+        return -x / (2 - time[:, None])
+
+    times = torch.tensor([1.0, 0.6, 0.2, 0.0]).double()
+    draws = [torch.full((1, 1), 3.0).double(), torch.full((1, 1), -1.0).double()]
+    start = torch.zeros(1, 1).double()
+    result = euler_maruyama(without_drift, start, times, draws, last="mean")
+    assert result.item() == pytest.approx(3 * math.sqrt(2 * 0.4) - math.sqrt(2 * 0.6 * 0.4))
+
+
+def test_sde_drift_is_changed_in_every_step_but_the_last():
+    seen = []
+
+    def change(drift, x, time):
+        seen.append(time.item())
+        return drift + 10
+
+    times = torch.tensor([1.0, 0.5, 0.25, 0.0])
+    draws = torch.zeros(2, 1, 1)
+    result = euler_maruyama(still, torch.zeros(1, 1), times, draws, change_drift=change)
+    assert seen == [1.0, 0.5]
+    assert result.item() == pytest.approx((-5) - 0.25 * (-5 + 10))
+
+
+def test_sde_noise_is_given_or_drawn_from_a_generator():
+    x, times = standard_noise(2, 3), sde_times(4)
+    generator = torch.Generator().manual_seed(5)
+    draws = torch.randn(3, 2, 3, generator=generator, dtype=torch.float64)
+    given = euler_maruyama(growth, x, times, draws)
+    assert torch.equal(given, euler_maruyama(growth, x, times, list(draws)))
+    one, same = (
+        euler_maruyama(growth, x, times, torch.Generator().manual_seed(5)) for _ in range(2)
+    )
+    assert torch.equal(one, same)
+
+
+@pytest.mark.parametrize(
+    ("times", "draws", "options", "message"),
+    [
+        ([1.0, 0.5, 0.0], 0, {}, r"1 draws of shape \(2, 3\) are needed, got 0 draws"),
+        ([1.0, 0.5, 0.1], 1, {}, r"ends at t = 0, but the last time is 0\.1"),
+        ([0.0, 0.5, 1.0], 1, {"last": "mean"}, "must decrease"),
+        ([1.0, 1.0, 0.0], 1, {}, "all increase or all decrease"),
+        ([1.0, 0.0], 0, {"last": "full"}, "'denoise' or 'mean', got 'full'"),
+        ([1.0, 0.0], 0, {"eta": -0.5}, r"0 or above, got -0\.5"),
+    ],
+)
+def test_sde_that_cannot_run_is_refused(times, draws, options, message):
+    times = torch.tensor(times).double()
+    with pytest.raises(ValueError, match=message):
+        euler_maruyama(growth, torch.ones(2, 3), times, torch.zeros(draws, 2, 3), **options)
+
+
+def test_sde_refuses_draws_of_another_shape():
+    with pytest.raises(ValueError, match=r"\(2, 3\) are needed, got a draw of shape \(3,\)"):
+        euler_maruyama(growth, torch.ones(2, 3), sde_times(3), torch.zeros(2, 3))
+
+
+@pytest.mark.numerics
+def test_last_step_keeps_fine_detail():
+    noise = standard_noise(20_000, 1)
+    velocity = gaussian_velocity(0.1)
+
+    def spread(times, last):
+        generator = torch.Generator().manual_seed(1)
+        return euler_maruyama(velocity, noise, times, generator, last=last).std().item()
+
+    # 20 000 samples know a standard deviation to 0.5 %.
+    assert spread(sde_times(256, last=0.005), "denoise") == pytest.approx(0.1, rel=0.02)
+    assert spread(sde_times(256), "denoise") == pytest.approx(0.093, rel=0.02)
+    assert spread(sde_times(256), "mean") == pytest.approx(0.077, rel=0.02)
+
+
+@pytest.mark.numerics
+def test_noise_per_sample_makes_a_sample_independent_of_its_batch():
+    velocity, times = gaussian_velocity(0.3), sde_times(8)
+
+    def draws(indices):
+        generators = [torch.Generator().manual_seed(index) for index in indices]
+        while True:
+            yield torch.stack([torch.randn(4, generator=generator) for generator in generators])
+
+    def sample(indices):
+        noise = draws(indices)
+        return euler_maruyama(velocity, next(noise), times, noise)
+
+    together = sample(range(8))
+    for index in range(8):
+        assert torch.equal(sample([index])[0], together[index])
+
+    def naive(batch):
+        generator = torch.Generator().manual_seed(0)
+        return euler_maruyama(velocity, torch.ones(batch, 4), times, generator)
+
+    assert not torch.equal(naive(1)[0], naive(8)[0])
+
+
+@pytest.mark.parametrize("options", [{}, {"last": "mean"}, {"eta": 0.5}])
+@pytest.mark.parametrize("steps", [1, 6])
+def test_sde_evaluates_once_per_step(options, steps):
+    counted = CountingVelocity(growth)
+    euler_maruyama(counted, torch.ones(2, 3), sde_times(steps), torch.Generator(), **options)
+    assert counted.nfe == steps
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_state_keeps_its_dtype_with_noise(dtype):
+    seen = []
+
+    def velocity(x, time):
+        seen.append((x.dtype, time.dtype, tuple(time.shape)))
+        return x.bfloat16()
+
+    x, generator = torch.ones(2, 3, dtype=dtype), torch.Generator()
+    results = [
+        euler_maruyama(velocity, x, sde_times(3), generator, last=last)
+        for last in ("denoise", "mean")
+    ]
+    results.append(restart(velocity, x, ode_times(20), generator))
+    assert all(result.dtype == dtype for result in results)
+    wide = torch.float64 if dtype == torch.float64 else torch.float32
+    assert set(seen) == {(dtype, wide, (2,))}
+
+
+@pytest.mark.parametrize("last", ["denoise", "mean"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_sde_without_diffusion_is_euler_to_the_bit(last, dtype):
+    x, times = standard_noise(4, 3, dtype=dtype), sde_times(9)
+    velocity = gaussian_velocity(0.3)
+    given = euler_maruyama(velocity, x, times, torch.Generator(), eta=0.0, last=last)
+    assert torch.equal(given, euler(velocity, x, times))
+
+
+def test_sde_step_scales_with_eta():
+    # v = 0 on the linear path: score -x / t, so the drift is eta x and w = 2 eta t.
+    times = torch.tensor([1.0, 0.6, 0.0]).double()
+    draw, start = torch.full((1, 1, 1), 3.0).double(), torch.ones(1, 1).double()
+    result = euler_maruyama(still, start, times, draw, eta=0.25, last="mean")
+    after = 1 - 0.4 * 0.25 + math.sqrt(2 * 0.25 * 0.4) * 3
+    assert result.item() == pytest.approx(after * (1 - 0.6 * 0.25))
+
+
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.parametrize("eta", [0.0, 0.25, 0.5, 1.0])
+def test_every_eta_has_the_marginals_of_the_data(eta, path):
+    """Data N(2, 0.5^2): velocity of the path from its definition, mean included."""
+    interpolant = Interpolant(path)
+
+    def velocity(x, time):
+        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
+        variance = alpha**2 * 0.5**2 + sigma**2
+        slope = (alpha * d_alpha * 0.5**2 + sigma * d_sigma) / variance
+        return slope * (x - 2 * alpha) + 2 * d_alpha
+
+    generator = torch.Generator().manual_seed(4)
+    noise = standard_noise(20_000, 1)
+    times = sde_times(200, last=0.01)
+    data = euler_maruyama(velocity, noise, times, generator, eta=eta, interpolant=interpolant)
+    # 20 000 samples know the mean to 0.0035 and the deviation to 0.5 %; the steps err by 1 %.
+    assert data.mean().item() == pytest.approx(2, abs=0.015)
+    assert data.std().item() == pytest.approx(0.5, rel=0.025)
+
+
+def test_sde_converges_strongly_with_coupled_noise():
+    """The draws of a coarse grid are the normalised sums of the fine ones."""
+    noise, fine_steps = standard_noise(2000, 1), 512
+    fine = standard_noise(fine_steps, 2000, 1, seed=1)
+    velocity = gaussian_velocity(0.5)
+
+    def solve(steps):
+        merged = fine.reshape(steps, fine_steps // steps, 2000, 1).sum(1)
+        draws = merged[:-1] / math.sqrt(fine_steps // steps)
+        return euler_maruyama(velocity, noise, ode_times(steps), draws, last="mean")
+
+    exact = solve(fine_steps)
+    errors = [(solve(steps) - exact).square().mean().sqrt().item() for steps in (16, 32, 64)]
+    # Diffusion that depends on time only: strong order 1.
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.25)
+    assert errors[1] / errors[2] == pytest.approx(2, rel=0.25)
+
+
+def test_restart_jumps_by_hand():
+    # v = 0: the state only jumps. From 0.5 to 0.75 linear: a = 1/2, b^2 = 9/16 - 1/16.
+    plan = RestartPlan(lower=0.5, upper=0.75, rounds=2, round_steps=1, solver="euler")
+    draws = torch.tensor([3.0, -1.0]).double()[:, None, None]
+    start, times = torch.ones(1, 1).double(), ode_times(4)
+    result = restart(still, start, times, draws, plan=plan)
+    spread = math.sqrt(0.5)
+    assert result.item() == pytest.approx((0.5 + 3 * spread) / 2 - spread)
+    # Up to pure noise nothing of the state is kept.
+    whole = RestartPlan(lower=0.5, upper=1.0, rounds=1, round_steps=1, solver="euler")
+    assert restart(still, start, times, draws, plan=whole).item() == pytest.approx(3)
+
+
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+def test_restart_keeps_the_marginal(path):
+    interpolant = Interpolant(path)
+
+    def velocity(x, time):
+        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
+        return (alpha * d_alpha * 0.25 + sigma * d_sigma) / (alpha**2 * 0.25 + sigma**2) * x
+
+    plan = RestartPlan(lower=0.2, upper=0.8, rounds=4, round_steps=40, solver="ab3")
+    noise, generator = standard_noise(20_000, 1), torch.Generator().manual_seed(2)
+    data = restart(velocity, noise, ode_times(60), generator, plan=plan, interpolant=interpolant)
+    assert data.std().item() == pytest.approx(0.5, rel=0.015)  # three standard errors
+    assert abs((data * noise).mean().item()) < 0.1  # the noise of the start is mostly forgotten
+
+
+def test_restart_forgets_errors_made_before():
+    """A push away at t > 1/2 only is contracted by going back to noise."""
+    exact = gaussian_velocity(0.5)
+
+    def pushed(x, time):
+        return exact(x, time) - 1.0 * (time > 0.5)[:, None]
+
+    noise, times = standard_noise(4000, 1), ode_times(40)
+    plan = RestartPlan(lower=0.1, upper=0.45, rounds=6, round_steps=10)
+    without = euler(pushed, noise, times).mean().abs()
+    again = restart(pushed, noise, times, torch.Generator().manual_seed(1), plan=plan).mean().abs()
+    assert again < without / 4
+
+
+@pytest.mark.parametrize("solver", ODE_SOLVERS)
+@pytest.mark.parametrize("lower", [0.06, 0.25])
+def test_restart_evaluations_are_known_beforehand(solver, lower):
+    plan = RestartPlan(lower=lower, upper=0.5, rounds=3, round_steps=2, solver=solver)
+    counted, times = CountingVelocity(growth), ode_times(8)
+    restart(counted, torch.ones(2, 3), times, torch.Generator(), plan=plan)
+    assert counted.nfe == plan.evaluations(times)
+
+
+def test_restart_cuts_the_grid():
+    down, on = RestartPlan(lower=0.25, upper=0.5).parts(ode_times(4))
+    assert down.tolist() == [1, 0.75, 0.5, 0.25]
+    assert on.tolist() == [0.25, 0]
+    down, on = RestartPlan(lower=0.2, upper=0.5).parts(ode_times(2))
+    assert (down.tolist(), on.tolist()) == ([1, 0.5, 0.2], [0.2, 0])
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (lambda: RestartPlan(lower=0.5, upper=0.5), r"got 0\.5 and 0\.5"),
+        (lambda: RestartPlan(lower=0.0), r"got 0\.0 and"),
+        (lambda: RestartPlan(rounds=0), "one round, got 0"),
+        (lambda: RestartPlan(round_steps=0), "at least one step, got 0"),
+        (lambda: RestartPlan(solver="dopri5"), "ab3, dpmpp_2m, unipc, got 'dopri5'"),
+        (lambda: RestartPlan().parts(ode_times(2, 0.0, 1.0)), r"decrease through 0\.06"),
+        (lambda: RestartPlan().parts(ode_times(2, 1.0, 0.1)), r"decrease through 0\.06"),
+        (
+            lambda: restart(growth, torch.ones(2, 3), ode_times(4), torch.zeros(1, 2, 3)),
+            r"2 draws of shape \(2, 3\) are needed, got 1 draws",
+        ),
+    ],
+)
+def test_restart_that_cannot_run_is_refused(run, message):
+    with pytest.raises(ValueError, match=message):
+        run()

@@ -1,0 +1,248 @@
+"""What makes training faster changes no number: layouts, fused steps, caches, skipped losses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_gradients import TinyData, stage_module, train
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from r3dpa.bench.training_profile import step_parts
+from r3dpa.cli import main
+from r3dpa.modules import JointAlignment, LossWeights, flow_matching
+from r3dpa.nn import Posterior
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+]
+CHANNELS_LAST = {"memory_format": torch.channels_last}
+
+
+def load(run_dir):
+    return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+class TestCachedLatents:
+    @pytest.mark.parametrize("rotate", [False, True])
+    def test_steps_are_those_with_the_encoder(
+        self, rotate, smoke_args, vae_checkpoint, tmp_path, monkeypatch
+    ):
+        """Three steps with the same draws, without rotation to the last bit but for batching.
+
+        The convolutions of the encoder may sum in another order where scans come in other batches
+        or rotated: 1e-6 of a latent, which AdamW (eps 1e-3) keeps as small.
+        """
+        more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+        more += ["--model.init_args.init_from", str(vae_checkpoint)]
+        more += ["--model.init_args.optimizer", "{lr: 1.0e-2, eps: 1.0e-3}"]
+        more += [f"--data.init_args.augmentation.rotate={str(rotate).lower()}"]
+        read = []
+        monkeypatch.setattr(
+            flow_matching, "Posterior", lambda moments: read.append(moments) or Posterior(moments)
+        )
+        for cached in ("true", "false"):
+            words = [*more, "--model.init_args.cache_latents", cached]
+            main(smoke_args("flow_matching", tmp_path / cached, *words))
+        assert len(read) == 3  # the steps of the first run
+        assert list((tmp_path / "true" / "latents").glob("posterior_*/shard_00000.rows"))
+        assert not (tmp_path / "false" / "latents").exists()
+        cached, plain = (load(tmp_path / name)["state_dict"] for name in ("true", "false"))
+        assert cached.keys() == plain.keys()
+        moved = 0.0
+        before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
+        for key, value in plain.items():
+            torch.testing.assert_close(cached[key], value, atol=2e-5, rtol=1e-4, msg=key)
+            if key.startswith("sit.blocks"):
+                moved = max(moved, (before[key] - value).abs().max().item())
+        assert moved > 1e-3
+
+    def test_mirrored_scans_are_refused_at_once(self, smoke_args, vae_checkpoint, tmp_path):
+        more = ["--trainer.logger=false", "--model.init_args.init_from", str(vae_checkpoint)]
+        more += ["--data.init_args.augmentation.flip=true"]
+        with pytest.raises(ValueError, match=r"mirroring.*cache_latents: false"):
+            main(smoke_args("flow_matching", tmp_path, *more))
+
+
+class TestLayout:
+    def test_channels_last_trains_the_same_and_saves_the_usual_layout(self):
+        """Two steps; a convolution may sum in another order."""
+        plain = train(stage_module("joint"), TinyData([False] * 2))
+        other = train(stage_module("joint", channels_last=True), TinyData([False] * 2))
+        kernel = other.vae.encoder.down[0].block[0].conv1.weight
+        assert kernel.is_contiguous(**CHANNELS_LAST)
+        assert not kernel.is_contiguous()
+        for one, two in zip(plain.parts, other.parts, strict=True):
+            assert one.keys() == two.keys()
+            for name, value in one.items():
+                torch.testing.assert_close(two[name], value, atol=1e-5, rtol=1e-4, msg=name)
+        checkpoint = {"state_dict": other.state_dict()}
+        other.on_save_checkpoint(checkpoint)
+        saved = checkpoint["state_dict"]
+        assert list(saved) == list(plain.state_dict())
+        assert all(value.is_contiguous() for value in saved.values())
+
+    def test_a_run_goes_on_in_the_other_layout(self, smoke_args, vae_checkpoint, tmp_path):
+        """Moments that keep the old layout would be applied to other weights, without an error."""
+        more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+        more += ["--model.init_args.optimizer", "{lr: 1.0e-3, eps: 1.0e-3}"]
+        main(smoke_args("joint", tmp_path / "half", *more))
+        last = str(tmp_path / "half" / "checkpoints" / "last.ckpt")
+        whole = {}
+        for name in ("false", "true"):
+            words = ["--trainer.max_steps", "6", "--ckpt_path", last]
+            words += [f"--model.init_args.channels_last={name}"]
+            main(smoke_args("joint", tmp_path / name, *more, *words))
+            whole[name] = load(tmp_path / name)["state_dict"]
+        for key, value in whole["false"].items():
+            torch.testing.assert_close(whole["true"][key], value, atol=1e-5, rtol=1e-4, msg=key)
+
+    @pytest.mark.parametrize("fused", [False, True])
+    def test_moments_follow_their_weights(self, fused):
+        weight = torch.nn.Parameter(torch.randn(4, 3, 2, 2).to(**CHANNELS_LAST))
+        optimizer = torch.optim.AdamW([weight])
+        weight.grad = torch.randn(4, 3, 2, 2)
+        optimizer.step()
+        state = optimizer.state[weight]
+        state["exp_avg"] = state["exp_avg"].contiguous()
+        before = state["exp_avg"].clone()
+        JointAlignment.arrange_optimizer(optimizer, fused)
+        assert state["exp_avg"].stride() == weight.stride()
+        assert torch.equal(state["exp_avg"], before)
+        assert optimizer.param_groups[0]["fused"] == fused
+
+    def test_compiled_networks_keep_their_names(self, monkeypatch):
+        """Compiled but not run; the backend is torch's own business."""
+        compiled = []
+        monkeypatch.setattr(
+            torch.nn.Module, "compile", lambda self, **kwargs: compiled.append(type(self).__name__)
+        )
+        module = stage_module("joint", compile=True)
+        names = list(module.state_dict())
+        train(module)
+        assert compiled == ["_Encoder", "_Decoder", "PatchDiscriminator", "_Block", "_Block"]
+        assert list(module.state_dict()) == names
+
+    @pytest.mark.slow
+    def test_compiled_steps_are_the_same(self):
+        """Fused kernels round otherwise."""
+        plain = train(stage_module("joint"), TinyData([False] * 2))
+        other = train(stage_module("joint", compile=True), TinyData([False] * 2))
+        assert list(other.state_dict()) == list(plain.state_dict())
+        for one, two in zip(plain.parts, other.parts, strict=True):
+            for name, value in one.items():
+                torch.testing.assert_close(two[name], value, atol=1e-4, rtol=1e-3, msg=name)
+
+
+class Calls(torch.nn.Module):
+    """Counts the passes through a network."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.count = 0
+        network.register_forward_hook(self.add)
+
+    def add(self, *args):
+        self.count += 1
+
+
+class TestWorkLeftOut:
+    def test_the_discriminator_rests_before_its_start(self):
+        """And is moved as by a loss of factor 0: by the weight decay alone."""
+        weights = LossWeights(adversarial_start=1)
+        module = stage_module("joint", weights=weights)
+        calls = Calls(module.discriminator)
+        weight = module.discriminator.main[0].weight.detach().clone()
+        train(module, TinyData([False] * 2))
+        assert calls.count == 3  # of the second step: generator, real, fake
+        first, _ = module.states
+        config = module.optimizer_config
+        expected = weight * (1 - config.lr * config.weight_decay)
+        torch.testing.assert_close(first[0]["discriminator.main.0.weight"], expected)
+        grads = {n: g for n, g in module.grads[0].items() if n.startswith("discriminator")}
+        assert grads.keys() == {f"discriminator.{n}" for n, _ in module.discriminator.named_parameters()}  # fmt: skip  # noqa: E501
+        assert not any(g.count_nonzero() for g in grads.values())
+
+    @pytest.mark.parametrize(
+        ("name", "left"),
+        [
+            ("reconstruction", {"kl", "adversarial"}),
+            ("kl", {"reconstruction", "adversarial"}),
+        ],
+    )
+    def test_a_loss_of_the_vae_with_weight_0(self, name, left):
+        module = train(stage_module("joint", weights=LossWeights(**{name: 0.0})))
+        assert module.parts[0].keys() & {"reconstruction", "kl", "adversarial"} == left
+
+    def test_without_denoising_the_last_blocks_rest(self):
+        module = stage_module("joint", weights=LossWeights(denoising=0.0))
+        calls = Calls(module.sit.blocks[-1])
+        train(module)
+        assert calls.count == 0
+        assert module.parts[0]["denoising"] == 0
+        assert module.parts[0]["sit_alignment"] != 0
+        assert all(p.grad is not None or not p.requires_grad for p in module.sit.parameters())
+
+    def test_every_trained_weight_gets_a_gradient_whatever_is_left_out(self):
+        """Or plain DDP would wait for it for ever."""
+        off = {"reconstruction": 0.0, "adversarial": 0.0, "discriminator": 0.0, "denoising": 0.0}
+        module = train(stage_module("joint", weights=LossWeights(**off)))
+        trained = {n for n, p in module.named_parameters() if p.requires_grad}
+        assert module.grads[0].keys() == trained
+
+
+class Syncs(TorchDispatchMode):
+    """Counts reads of a value by the host, each of which makes it wait for a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += func is torch.ops.aten._local_scalar_dense.default
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("stage", ["vae_alignment", "joint", "flow_matching"])
+def test_a_step_waits_for_the_device_once(stage):
+    """For the check that the gradients are finite."""
+    module, syncs = stage_module(stage), Syncs()
+    counts = []
+
+    def around(step):
+        def run(*args, **kwargs):
+            syncs.count = 0
+            with syncs:
+                result = step(*args, **kwargs)
+            counts.append(syncs.count)
+            return result
+
+        return run
+
+    # From the losses to the averages: Lightning calls the first two within the third.
+    module.optimizer_step = around(module.optimizer_step)
+    train(module, TinyData([False] * 3))
+    assert counts == [1, 1, 1]
+
+
+@pytest.mark.parametrize("stage", ["vae_alignment", "joint", "flow_matching"])
+def test_parts_of_a_step_have_the_operations_of_the_step(stage):
+    module, found = stage_module(stage), {}
+
+    def on_train_batch_end(outputs, batch, batch_idx):
+        batch = {**batch, "name": ["a", "b"]}
+        with FlopCounterMode(display=False) as counter:
+            module.training_step(batch, 0).backward()
+        found["step"] = counter.get_total_flops()
+        for name, part in step_parts(module, batch).items():
+            with FlopCounterMode(display=False) as counter:
+                part()
+            found[name] = counter.get_total_flops()
+
+    module.on_train_batch_end = on_train_batch_end
+    train(module)
+    step = found.pop("step")
+    assert step > 0
+    assert sum(found.values()) == step

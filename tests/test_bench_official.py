@@ -1,0 +1,274 @@
+"""The bench against the official code: its stand-ins always, the rest with a checkout at hand."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from r3dpa.bench import official_imports
+from r3dpa.bench.official import OfficialSettings, official
+from r3dpa.bench.official_imports import Attention, Mlp, Overlay, PatchEmbed, load_official
+from r3dpa.bench.official_networks import (
+    at_times,
+    equal_error,
+    noise_of,
+    random_networks,
+    relative,
+    sits,
+    trained_networks,
+    vaes,
+)
+from r3dpa.bench.official_runs import (
+    replaced,
+    save_for_official,
+    train_official,
+    write_official_scenes,
+)
+from r3dpa.bench.official_step import train_ours
+from r3dpa.checkpoints import save_checkpoint, to_official
+from r3dpa.flow import euler, ode_times
+from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import ScanGeometry
+from r3dpa.nn import SiT
+from r3dpa.nn.attention import SelfAttention
+
+SIT = {
+    "input_size": [4, 8],
+    "hidden_size": 32,
+    "depth": 2,
+    "num_heads": 2,
+    "alignment_depth": 1,
+    "feature_dim": 12,
+    "projector_dim": 16,
+}
+VAE = {"channels": 32, "num_res_blocks": 1}
+
+
+@pytest.fixture(scope="module")
+def repo() -> Path:
+    """A checkout of valeoai/R3DPA, which is never part of this repository."""
+    given = os.environ.get("R3DPA_OFFICIAL_REPO")
+    if given is None:
+        pytest.skip("R3DPA_OFFICIAL_REPO names no checkout of valeoai/R3DPA")
+    return Path(given)
+
+
+@pytest.fixture(scope="module")
+def code(repo):
+    return load_official(repo)
+
+
+@pytest.fixture
+def networks():
+    torch.manual_seed(0)
+    return random_networks(SIT, VAE)
+
+
+# Stand-ins
+
+
+@pytest.mark.parametrize("qk_norm", [False, True])
+@pytest.mark.parametrize("fused", [False, True])
+def test_attention_is_that_of_our_transformers(qk_norm, fused):
+    theirs = Attention(24, num_heads=3, qkv_bias=True, qk_norm=qk_norm)
+    ours = SelfAttention(24, 3, qk_norm)
+    ours.load_state_dict(theirs.state_dict())
+    theirs.fused_attn = fused
+    tokens = torch.randn(2, 7, 24)
+    assert torch.allclose(theirs(tokens), ours(tokens), atol=1e-6)
+
+
+def test_patches_and_mlp_are_those_of_our_sit():
+    sit = SiT((4, 6), hidden_size=32, depth=1, num_heads=2, alignment_depth=1)
+    patches = PatchEmbed((4, 6), 2, 8, 32)
+    patches.load_state_dict(sit.x_embedder.state_dict())
+    latents = torch.randn(2, 8, 4, 6)
+    assert patches.grid_size == sit.grid_size
+    assert patches.num_patches == 6
+    assert torch.equal(patches(latents), sit.x_embedder(latents))
+    mlp = Mlp(32, 128, lambda: torch.nn.GELU(approximate="tanh"), drop=0)
+    mlp.load_state_dict(sit.blocks[0].mlp.state_dict())
+    tokens = torch.randn(2, 6, 32)
+    assert torch.allclose(mlp(tokens), sit.blocks[0].mlp(tokens), atol=1e-6)
+    with pytest.raises(ValueError, match=r"no dropout, got 0\.1"):
+        Mlp(32, 128, torch.nn.GELU, drop=0.1)
+
+
+def test_overlay_replaces_some_names_of_what_stays_as_it_is():
+    overlay = Overlay(torch, rand=lambda shape: "given")
+    assert overlay.rand(3) == "given"
+    assert overlay.zeros is torch.zeros
+    assert torch.rand(3).shape == (3,)
+
+
+def test_names_of_a_module_come_back_after_an_error():
+    module = Overlay(torch, rand=1)
+
+    def broken():
+        with replaced(module, rand=2):
+            raise KeyError(module.rand)
+
+    with pytest.raises(KeyError, match="2"):
+        broken()
+    assert module.rand == 1
+
+
+def test_configuration_reads_numbers_without_a_point(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        "losses: {kl: 1e-6, start: 0, name: lpips}\nsize: [64, 1024]\n"
+    )
+    losses = official_imports._Configuration.load(str(tmp_path / "a.yaml")).losses
+    assert losses.kl == 1e-6
+    assert losses.get("logvar", 3) == 3
+    with pytest.raises(AttributeError, match="absent"):
+        _ = losses.absent
+
+
+# Errors
+
+
+def test_missing_folder_other_folder_and_changed_file_are_named(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"nowhere is no folder.*git clone"):
+        load_official(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"no checkout of valeoai/R3DPA, it has no generate\.py"):
+        load_official(tmp_path)
+    monkeypatch.setattr(official_imports, "_DIGESTS", {"generate.py": "0" * 16})
+    (tmp_path / "generate.py").write_text("changed")
+    with pytest.raises(ValueError, match=r"generate\.py is not that of commit aa08e6d"):
+        load_official(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"parts": ("train",)}, "some of sampler"),
+        ({"parts": ()}, "some of"),
+        ({"scenes": 3}, "even"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        OfficialSettings(**wrong)
+
+
+def test_networks_of_other_range_images_are_refused(networks, tmp_path):
+    geometry = {**networks.geometry, "codec": {"encoding": "log2", "scale": None}}
+    path = tmp_path / "log.safetensors"
+    save_checkpoint(type(networks)(path, "joint", networks.networks, geometry=geometry), path)
+    with pytest.raises(ValueError, match=r"log\.safetensors was trained on .*log2"):
+        trained_networks(path)
+
+
+# Our side of the comparison
+
+
+class CurvedField:
+    """v = sin x, in place of a network: smooth, so that errors fall with the solver's order."""
+
+    in_channels, input_size = 2, (2, 2)
+
+    def velocity(self, x, time):
+        return x.sin()
+
+
+def test_equal_error_is_found_with_fewer_steps():
+    field = CurvedField()
+
+    def theirs(noise, steps):
+        return euler(field.velocity, noise, ode_times(steps))
+
+    torch.manual_seed(0)
+    sampler, remarks = equal_error(theirs, field, 30)
+    assert sampler.solver == "ab2"
+    assert 2 <= sampler.steps < 15  # order 2 against order 1
+    assert remarks[1].endswith(": certified")
+
+
+def test_noise_is_that_of_the_generator_and_of_the_seed(networks):
+    noise = noise_of(networks, 2, seed=5)
+    sit = networks.network("ema").build().eval()
+    parts = [networks.network(name).build() for name in ("vae", "ema_latent_norm")]
+    geometry = ScanGeometry.from_dict(networks.geometry)
+    generator = SceneGenerator(parts[0], sit, parts[1], geometry, SamplerConfig("euler", 3))
+    times = ode_times(3)
+    expected = euler(at_times(sit, times[:-1]), noise, times)
+    assert torch.allclose(generator.generate(range(2), 5).latents, expected, atol=1e-5)
+    assert not torch.equal(noise, noise_of(networks, 2, seed=6))
+
+
+# With a checkout
+
+
+def test_import_leaves_no_module_and_no_file_behind(repo):
+    before = {path: path.stat().st_mtime_ns for path in repo.rglob("*")}
+    path, modules = list(sys.path), set(sys.modules)
+    code = load_official(repo)
+    assert code["samplers"].__file__ == str(repo / "samplers.py")
+    assert not {name for name in set(sys.modules) - modules if "samplers" in name or "timm" in name}
+    assert sys.path == path
+    assert {path: path.stat().st_mtime_ns for path in repo.rglob("*")} == before
+
+
+def test_velocity_and_image_are_the_official_ones(code, networks):
+    latents, time_ = torch.randn(2, 8, 4, 8), torch.tensor([0.9, 0.2])
+    labels = torch.zeros(2, dtype=torch.long)
+    net = sits(code, networks)
+    with torch.no_grad():
+        assert (
+            relative(
+                net.ours.velocity(latents, time_), net.theirs.inference(latents, time_, labels)
+            )
+            < 1e-5
+        )
+        net = vaes(code, networks)
+        assert relative(net.ours.decode(latents), net.theirs.decode(latents).sample) < 1e-5
+
+
+def test_generate_script_writes_the_scenes_of_our_generator(code, networks, tmp_path):
+    save_for_official(code, networks, tmp_path / "experiment")
+    noise, parts = noise_of(networks, 4, seed=0), {}
+    range_m = write_official_scenes(
+        code, networks, tmp_path / "experiment", tmp_path / "out", 4, 2, 3, noise, parts
+    )
+    nets = [networks.network(name).build() for name in ("vae", "ema", "ema_latent_norm")]
+    geometry = ScanGeometry.from_dict(networks.geometry)
+    ours = SceneGenerator(*nets, geometry, SamplerConfig("euler", 3)).generate(range(4), 0).range_m
+    valid = ours > 0
+    assert valid.float().mean() > 0.5
+    assert torch.allclose(torch.from_numpy(range_m)[valid], ours[valid], atol=1e-3)
+    assert len(list((tmp_path / "out").glob("*/pcd/*.txt"))) == 4
+    assert {"sampler", "decode", "text files written"} <= set(parts)
+    assert torch.is_grad_enabled()
+
+
+def test_training_script_moves_the_weights_as_our_step_does(code, tmp_path):
+    torch.manual_seed(0)
+    networks = random_networks({**SIT, "learn_pos_embed": True}, VAE)
+    image = torch.rand(2, 1, 16, 64) * 2 - 1
+    features = F.normalize(torch.randn(2, 8, 12), dim=-1)
+    draws = (torch.randn(2, 8, 4, 8), torch.rand(2), torch.randn(2, 8, 4, 8))
+    clock = time.perf_counter
+    theirs = train_official(code, networks, image, features, draws, 2, tmp_path, clock)
+    ours = train_ours(networks, image, features, draws, 2, clock)
+    assert len(theirs.seconds) == len(ours.seconds) == 2
+    start = to_official(networks)
+    for name, key in {"vae": "vae", "sit": "model", "discriminator": "discriminator"}.items():
+        for weight in ("encoder.conv_in.weight", "pos_embed", "bn.running_mean", "main.0.weight"):
+            if weight in start[key]:
+                moved = theirs.weights[name][weight] - start[key][weight]
+                off = ours.weights[name][weight] - theirs.weights[name][weight]
+                assert off.norm() < 0.02 * moved.norm(), (name, weight)
+
+
+def test_other_result_is_an_error_and_no_ratio(code, repo, monkeypatch):
+    monkeypatch.setattr("r3dpa.bench.official.at_times", lambda sit, times: lambda x, time: -x)
+    monkeypatch.setattr("r3dpa.bench.official._SMALL_SIT", SIT)
+    settings = OfficialSettings(parts=("sampler",), quick=True)
+    with pytest.raises(RuntimeError, match="sampler: r3dpa differs from the official result"):
+        official(repo, sample=lambda *args: None, settings=settings)

@@ -1,0 +1,345 @@
+"""Snapshots of the average: when and what is written, and which may guide which model."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+
+from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint
+from r3dpa.cli import main
+from r3dpa.flow.autoguidance import renormalised
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.modules import FlowMatching, VAEAlignment
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
+from r3dpa.snapshots import EMASnapshots, read_snapshot
+
+GEOMETRY = ScanGeometry(
+    SphericalProjection(LidarSensor(beams=16, columns=64)), RangeCodec(), (2, 8)
+)
+SIT_ARGS = {
+    "input_size": [4, 16],
+    "in_channels": 4,
+    "hidden_size": 16,
+    "depth": 1,
+    "num_heads": 2,
+    "alignment_depth": 1,
+    "feature_dim": 4,
+    "projector_dim": 4,
+}
+VAE_ARGS = {
+    "latent_channels": 4,
+    "channels": 32,
+    "channel_multipliers": [1, 1, 1],
+    "strides": [[2, 2], [2, 2]],
+    "num_res_blocks": 1,
+}
+
+
+def module(kind=FlowMatching, **more):
+    """A module as the command line leaves it: with the configuration of its SiT."""
+    torch.manual_seed(0)
+    made = kind(VAE(**VAE_ARGS), SiT(**SIT_ARGS), **more)
+    made.hparams["sit"] = {"class_path": "r3dpa.nn.SiT", "init_args": SIT_ARGS}
+    made.geometry = GEOMETRY
+    made.latent_norm.update(2 + 3 * torch.randn(8, 4, 4, 16))
+    if made.ema is not None:
+        made.ema.reset(made.sit, made.latent_norm)
+    return made
+
+
+def trainer(folder, step=0, max_steps=64, rank=0):
+    return SimpleNamespace(
+        default_root_dir=folder, global_step=step, max_steps=max_steps, is_global_zero=rank == 0
+    )
+
+
+def run(callback, made, folder, steps, **more):
+    callback.on_fit_start(trainer(folder, **more), made)
+    for step in steps:
+        callback.on_train_batch_end(trainer(folder, step, **more), made, None, None, 0)
+    return sorted(path.name for path in folder.rglob("*.safetensors"))
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """Path of a snapshot, and the checkpoint of the same run at its end."""
+    made = module()
+    run(EMASnapshots(steps=[2]), made, tmp_path, [2])
+    path = tmp_path / "snapshots" / "step_0000002.safetensors"
+    early = read_checkpoint(path)
+    vae = NetworkState.of(made.vae, VAE_ARGS)
+    return path, replace(early, path=tmp_path / "end.ckpt", networks={**early.networks, "vae": vae})
+
+
+def with_norm(checkpoint, mean, variance):
+    """The checkpoint with other latent statistics, eps left out of the sums."""
+    state = checkpoint.network("ema_latent_norm")
+    values = {
+        **state.state_dict,
+        "running_mean": torch.as_tensor(mean).expand(4),
+        "running_var": torch.as_tensor(variance).expand(4) - state.arguments["eps"],
+    }
+    changed = {"ema_latent_norm": replace(state, state_dict=values)}
+    return replace(checkpoint, networks={**checkpoint.networks, **changed})
+
+
+def rewritten(path, checkpoint):
+    save_checkpoint(replace(checkpoint, path=path), path, overwrite=True)
+    return path
+
+
+# Writing
+
+
+def test_steps_are_fractions_of_the_training(tmp_path):
+    """Of 64 steps: 1/32, 1/16 and 1/8 are 2, 4 and 8."""
+    names = run(EMASnapshots(), module(), tmp_path, range(1, 65))
+    assert names == [f"step_{step:07d}.safetensors" for step in (2, 4, 8)]
+    assert len(list(tmp_path.rglob("*"))) == 1 + 6  # nothing temporary is left
+
+
+def test_given_steps_replace_the_fractions(tmp_path):
+    callback = EMASnapshots(steps=[3, 5], folder="weak")
+    names = run(callback, module(), tmp_path, range(1, 65), max_steps=-1)
+    assert names == ["step_0000003.safetensors", "step_0000005.safetensors"]
+    assert (tmp_path / "weak").is_dir()
+
+
+def test_a_snapshot_is_the_average_with_all_that_describes_it(tmp_path):
+    made = module()
+    with torch.no_grad():
+        made.sit.pos_embed.add_(1)  # the weights of the step are not those of the average
+    run(EMASnapshots(steps=[2]), made, tmp_path, [2])
+    found = read_checkpoint(tmp_path / "snapshots" / "step_0000002.safetensors")
+    assert (found.stage, found.step, found.interpolant) == ("flow_matching", 2, "linear")
+    assert ScanGeometry.from_dict(found.geometry) == GEOMETRY
+    assert set(found.networks) == {"ema", "ema_latent_norm"}
+    for name, average in (("ema", made.ema.sit), ("ema_latent_norm", made.ema.latent_norm)):
+        built = found.network(name).build()
+        assert type(built) is type(average)
+        for key, value in average.state_dict().items():
+            assert torch.equal(built.state_dict()[key], value)
+    with pytest.raises(ValueError, match=r"has no vae.*not kept in a snapshot"):
+        found.network("vae")
+
+
+def test_statistics_keep_their_settings(tmp_path):
+    norm = LatentNorm(4, eps=1e-2, momentum=0.3, legacy_inverse=True, replace_non_finite=True)
+    run(EMASnapshots(steps=[1]), module(latent_norm=norm), tmp_path, [1])
+    found = read_checkpoint(tmp_path / "snapshots" / "step_0000001.safetensors")
+    built = found.network("ema_latent_norm").build()
+    for name in ("eps", "momentum", "legacy_inverse", "replace_non_finite"):
+        assert getattr(built, name) == getattr(norm, name)
+
+
+def test_an_existing_snapshot_stays_as_it_is(tmp_path):
+    """As after a resume from before it, or with several batches per step."""
+    made = module()
+    run(EMASnapshots(steps=[1]), made, tmp_path, [1])
+    path = tmp_path / "snapshots" / "step_0000001.safetensors"
+    before = path.read_bytes()
+    with torch.no_grad():
+        made.ema.sit.pos_embed.add_(1)
+    run(EMASnapshots(steps=[1]), made, tmp_path, [1, 1])
+    assert path.read_bytes() == before
+
+
+def test_a_killed_writer_does_not_stop_the_next(tmp_path):
+    """The description is renamed first: alone, it is what a killed process leaves."""
+    made = module()
+    run(EMASnapshots(steps=[1]), made, tmp_path, [1])
+    path = tmp_path / "snapshots" / "step_0000001.safetensors"
+    path.unlink()
+    assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == [path.name]
+    read_checkpoint(path)
+
+
+def test_only_the_first_process_writes(tmp_path):
+    assert run(EMASnapshots(steps=[1]), module(), tmp_path, [1], rank=1) == []
+
+
+def test_a_stage_without_average_says_that_it_keeps_none(tmp_path, caplog):
+    made = module(VAEAlignment, discriminator=PatchDiscriminator(channels=4))
+    assert made.ema is None
+    with caplog.at_level("INFO"):
+        assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == []
+    assert "vae_alignment averages no SiT" in caplog.text
+
+
+def test_what_cannot_be_written_is_refused_before_training(tmp_path):
+    by_hand = module()
+    by_hand.hparams["sit"] = by_hand.sit
+    with pytest.raises(ValueError, match="built by hand"):
+        EMASnapshots().on_fit_start(trainer(tmp_path), by_hand)
+    with pytest.raises(ValueError, match="max_steps is -1"):
+        EMASnapshots().on_fit_start(trainer(tmp_path, max_steps=-1), module())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "given"), [({"fractions": [0.5, 0.0]}, "0.0"), ({"steps": [1, 0]}, "0")]
+)
+def test_numbers_out_of_range_are_refused(arguments, given):
+    with pytest.raises(ValueError, match=f"{given}]"):
+        EMASnapshots(**arguments)
+
+
+def test_a_run_of_the_command_line_keeps_and_extends_them(smoke_args, vae_checkpoint, tmp_path):
+    config = tmp_path / "snapshots.yaml"
+    callback = {"class_path": "r3dpa.snapshots.EMASnapshots", "init_args": {"steps": [1, 2, 3]}}
+    config.write_text(yaml.safe_dump({"trainer": {"callbacks": [callback], "logger": False}}))
+    words = smoke_args("flow_matching", tmp_path / "run", "--config", str(config))
+    words += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.limit_val_batches=0"]
+    main([*words, "--trainer.max_steps=2"])
+    folder = tmp_path / "run" / "snapshots"
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    first, second = sorted(folder.glob("*.safetensors"))
+    early, end = read_checkpoint(second).network("ema"), read_checkpoint(last).network("ema")
+    assert all(torch.equal(early.state_dict[key], end.state_dict[key]) for key in end.state_dict)
+    assert early.init_args == end.init_args
+    found = read_snapshot(first, read_checkpoint(last))
+    assert found.step == 1
+    assert any(
+        not torch.equal(value, end.state_dict[key]) for key, value in found.sit.state_dict().items()
+    )
+    first.unlink()  # behind the checkpoint: it does not come back
+    written = second.stat().st_mtime_ns
+    main([*words, "--trainer.max_steps=3", "--ckpt_path", str(last)])
+    assert sorted(path.name for path in folder.glob("*.safetensors")) == [
+        second.name,
+        "step_0000003.safetensors",
+    ]
+    assert second.stat().st_mtime_ns == written
+
+
+# Reading
+
+
+def test_a_snapshot_of_the_same_latents_is_used_as_it_is(pair):
+    path, strong = pair
+    weak = read_snapshot(path, strong)
+    assert (weak.path, weak.step, weak.scale) == (path, 2, 1.0)
+    assert torch.equal(weak.shift, torch.zeros(4))
+    assert not weak.sit.training
+    assert not any(parameter.requires_grad for parameter in weak.sit.parameters())
+
+
+def test_statistics_that_drifted_apart_are_converted(pair):
+    """Raw latents 2 + 3 z and 5 + 6 z' are the same where z' = z / 2 - 1 / 2."""
+    path, strong = pair
+    rewritten(path, with_norm(read_checkpoint(path), 5.0, 36.0))
+    strong = with_norm(strong, 2.0, 9.0)
+    weak = read_snapshot(path, strong)
+    assert weak.scale == pytest.approx(0.5, abs=1e-6)
+    torch.testing.assert_close(weak.shift, torch.full((4,), -0.5))
+    raw = torch.randn(2, 4, 4, 16)
+    norms = [
+        c.network("ema_latent_norm").build().normalise(raw) for c in (strong, read_checkpoint(path))
+    ]
+    shift = weak.shift[:, None, None]
+    torch.testing.assert_close(weak.scale * norms[0] + shift, norms[1], atol=1e-5, rtol=1e-5)
+    velocity = renormalised(weak.sit.velocity, weak.scale, weak.shift)
+    assert velocity(norms[0], torch.tensor([0.0, 1.0])).isfinite().all()
+
+
+def test_statistics_of_the_last_step_are_those_of_the_last_weights(pair):
+    path, strong = pair
+    networks = strong.networks
+    last = {
+        "sit": networks["ema"],
+        "latent_norm": with_norm(strong, 2.0, 9.0).network("ema_latent_norm"),
+    }
+    strong = replace(strong, networks={**networks, **last})
+    assert read_snapshot(path, strong, "last").scale != 1
+    assert read_snapshot(path, strong, "ema").scale == 1
+
+
+@pytest.mark.parametrize(("variance", "refused"), [(1.12, False), (1.18, True)])
+def test_channels_that_scale_apart_are_refused_beyond_the_tolerance(pair, variance, refused):
+    """One channel r times wider: it is r^(3/4) from the geometric mean, the others r^(-1/4).
+
+    Deviations 1.058 and 1.086 give 4.3 % and 6.4 %.
+    """
+    path, strong = pair
+    rewritten(path, with_norm(read_checkpoint(path), 0.0, 1.0))
+    strong = with_norm(strong, 0.0, torch.tensor([variance, 1.0, 1.0, 1.0]))
+    if not refused:
+        read_snapshot(path, strong)
+        return
+    with pytest.raises(ValueError, match=r"step_0000002.*differ by 6\.4% between channels"):
+        read_snapshot(path, strong)
+    with pytest.warns(UserWarning, match="an approximation"):
+        weak = read_snapshot(path, strong, allow=True)
+    assert weak.scale == pytest.approx(variance ** (1 / 8), rel=1e-5)
+
+
+def test_another_vae_is_refused_unless_allowed_and_then_nothing_is_converted(pair):
+    """As in stage joint, whose VAE trains on after the snapshot."""
+    path, strong = pair
+    vae = strong.network("vae")
+    key = "decoder.conv_out.bias"
+    moved = {**vae.state_dict, key: vae.state_dict[key] + 1e-6}
+    networks = {**strong.networks, "vae": replace(vae, state_dict=moved)}
+    strong = with_norm(replace(strong, networks=networks), 2.0, 9.0)
+    with pytest.raises(ValueError, match=r"another VAE, as within stage joint.*flow_matching"):
+        read_snapshot(path, strong)
+    with pytest.warns(UserWarning, match="another VAE"):
+        weak = read_snapshot(path, strong, allow=True)
+    assert (weak.scale, weak.shift.abs().max()) == (1.0, 0.0)
+
+
+def test_the_memory_layout_of_the_vae_does_not_matter(pair):
+    path, strong = pair
+    vae = strong.network("vae")
+    last = {
+        key: value.contiguous(memory_format=torch.channels_last) if value.dim() == 4 else value
+        for key, value in vae.state_dict.items()
+    }
+    networks = {**strong.networks, "vae": replace(vae, state_dict=last)}
+    read_snapshot(path, replace(strong, networks=networks))
+
+
+def test_a_vae_that_nobody_knows_is_another_one(pair):
+    path, strong = pair
+    rewritten(path, replace(read_checkpoint(path), left_out={}))
+    unknown = {name: state for name, state in strong.networks.items() if name != "vae"}
+    with pytest.raises(ValueError, match="another VAE"):
+        read_snapshot(path, replace(strong, networks=unknown, left_out={}))
+
+
+def test_a_whole_checkpoint_may_guide_too(pair, tmp_path):
+    _, strong = pair
+    path = rewritten(tmp_path / "whole.safetensors", strong)
+    assert read_snapshot(path, strong).scale == 1
+
+
+def test_models_that_do_not_belong_together_are_refused(pair, tmp_path):
+    path, strong = pair
+    early = read_checkpoint(path)
+    arguments = SIT_ARGS | {"input_size": [4, 8]}
+    wide = {**early.networks, "ema": NetworkState.of(SiT(**arguments), arguments)}
+    fresh = {**early.networks, "ema_latent_norm": NetworkState.of(LatentNorm(4), {"channels": 4})}
+    for other, message in (
+        (replace(early, interpolant="cosine"), "trained on the cosine path.* linear"),
+        (replace(early, networks=wide), r"latents \(4, 4, 8\).*\(4, 4, 16\)"),
+        (replace(early, networks=fresh), r"other\.safetensors: ema_latent_norm holds no fitted"),
+    ):
+        path = rewritten(tmp_path / "other.safetensors", other)
+        with pytest.raises(ValueError, match=message):
+            read_snapshot(path, strong)
+
+
+def test_files_that_are_no_snapshots_say_what_to_give(pair, vae_checkpoint, tmp_path):
+    path, strong = pair
+    with pytest.raises(ValueError, match=r"vae_alignment and holds no averaged SiT.*snapshots"):
+        read_snapshot(vae_checkpoint, strong)
+    with pytest.raises(FileNotFoundError, match="give an existing file"):
+        read_snapshot(tmp_path / "none.safetensors", strong)
+    alone = tmp_path / "alone.safetensors"
+    shutil.copy(path, alone)
+    with pytest.raises(ValueError, match=r"alone\.yaml is not beside it; copy both"):
+        read_snapshot(alone, strong)
