@@ -166,7 +166,7 @@ def test_only_the_first_process_writes(tmp_path):
 def test_a_stage_without_average_says_that_it_keeps_none(tmp_path, caplog):
     made = module(VAEAlignment, discriminator=PatchDiscriminator(channels=4))
     assert made.ema is None
-    with caplog.at_level("INFO"):
+    with caplog.at_level("INFO", "lightning.pytorch.utilities.rank_zero"):
         assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == []
     assert "vae_alignment averages no SiT" in caplog.text
 

@@ -26,7 +26,18 @@ pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
 COMMANDS = {
     *("fit", "validate", "test", "predict", "features"),
-    *("simulate", "check", "view", "realism", "sample", "convert", "report", "bench", "probe"),
+    *(
+        "simulate",
+        "check",
+        "view",
+        "realism",
+        "sample",
+        "convert",
+        "report",
+        "bench",
+        "probe",
+        "tune-solver",
+    ),
     *("reference", "evaluate", "selfcheck"),
 }
 CONF = Path(__file__).resolve().parents[2] / "conf"

@@ -518,7 +518,7 @@ def _help() -> str:
     }
     summaries["features"] = "write the feature grids of a data set, on any number of devices"
     summaries["bench"] = "measure what a part costs: r3dpa bench --help lists them"
-    lines = [f"  {name:<10} {summary}" for name, summary in summaries.items()]
+    lines = [f"  {name:<12} {summary}" for name, summary in summaries.items()]
     head = ["usage: r3dpa COMMAND [options]", "", "Generate LiDAR scenes (R3DPA).", ""]
     return "\n".join([*head, *lines, "", "r3dpa COMMAND --help lists the options of a command."])
 
