@@ -227,10 +227,7 @@ def official(
         "versions": versions(torch),
     }
     if out is not None:
-        typed = command()  # where files lie is nobody's business
-        for path in filter(None, (repo, ckpt, out)):
-            typed = typed.replace(str(path), path.name)
-        content = {"command": typed, **about, "parts": [asdict(result) for result in results]}
+        content = {"command": command(), **about, "parts": [asdict(result) for result in results]}
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
     header = ["part", "case", "median s", "min s", "official / ours (95 %)", "differs"]

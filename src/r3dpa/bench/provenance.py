@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -39,22 +40,21 @@ def versions(*packages: ModuleType) -> dict[str, str | None]:
 
 
 def command() -> str:
-    """The command line of this process, without the folder of the program."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """The command line of this process; of a path only its name."""
+    typed = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return re.sub(r"(?<![^\s='\"])[^\s='\"]*/(?=[^\s/'\"])", "", typed)
 
 
 def provenance(scan: Path | None, num_points: int, *packages: ModuleType) -> dict[str, Any]:
     """Command, scan, machine and versions of a benchmark on one scan.
 
     Args:
-        scan: Its file; simulated where None. Only its name is kept: where it lies is nobody's
-            business.
+        scan: Its file, of which only the name is kept; simulated where None.
         num_points: Of the scan.
         packages: As for :func:`versions`, beside torch.
     """
-    typed = command()
     return {
-        "command": typed if scan is None else typed.replace(str(scan), scan.name),
+        "command": command(),
         "scan": {"file": "simulated" if scan is None else scan.name, "points": num_points},
         "machine": machine() | {"threads": torch.get_num_threads()},
         "versions": versions(torch, *packages),

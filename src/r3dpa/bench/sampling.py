@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -352,10 +351,8 @@ def _front(rows: Sequence[Row], errors: Sequence[Errors], timing: Controlled) ->
 
 def _facts(about: Mapping[str, Any] | None, has_model: bool) -> dict[str, Any]:
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    # Where files lie is nobody's business: of a path only its name is told.
-    typed = re.sub(r"(?<![^\s='\"])[^\s='\"]*/(?=[^\s/'\"])", "", command())
     return {
-        "command": typed,
+        "command": command(),
         "model": dict(about or {}) if has_model else "none given: the mixture alone",
         "machine": machine() | {"threads": torch.get_num_threads(), "gpu": gpu},
         "versions": versions(torch, np),

@@ -237,12 +237,9 @@ def vae(
         for subject in tqdm(subjects.values(), "bench", unit="VAE", disable=None)
     ]
     device = settings.place
-    typed = command() if scans is None else command().replace(str(scans), scans.name)
-    for path in files.values():
-        typed = typed.replace(str(path), path.name)
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     about: dict[str, str | dict[str, Any]] = {
-        "command": typed,
+        "command": command(),
         "settings": asdict(settings)
         | {"scans": "simulated" if scans is None else scans.name, "device": device.type},
         "machine": machine()

@@ -184,6 +184,32 @@ def bench_sampling(
     )
 
 
+def bench_speed(
+    device: str = "auto",
+    rounds: int = 5,
+    batch_size: int = 64,
+    quick: bool = False,
+    out: Path | None = None,
+) -> None:
+    """Sample with full-size networks of random weights; print seconds a scene beside the limit.
+
+    Args:
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        rounds: Of the timing.
+        batch_size: Scenes of a large batch, on a GPU.
+        quick: Small networks, only to try it.
+        out: JSON file for the same figures.
+    """
+    import torch
+
+    from r3dpa.bench.speed import random_generators, speed
+
+    check_file(out)
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    print_text(speed(random_generators(device, quick), rounds, out, batch_size, quick))
+
+
 def bench_official(
     repo: Path,
     parts: tuple[Literal["sampler", "decode", "scenes", "joint"], ...] = (
@@ -245,6 +271,7 @@ def bench_official(
 BENCHES: dict[str, Callable[..., None]] = {
     "training": bench_training,
     "sampling": bench_sampling,
+    "speed": bench_speed,
     "vae": bench_vae,
     "data": bench_data,
     "simulation": bench_simulation,
