@@ -19,7 +19,8 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo bench bench-training bench-simulation bench-features bench-metrics clean
+.PHONY: help install format lint types test test-all notebooks demo clean bench bench-training \
+	bench-sampling bench-vae bench-data bench-simulation bench-features bench-metrics bench-gpu
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
@@ -67,10 +68,19 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 	$(BIN)/r3dpa test --config $(OUT)/joint/config.yaml \
 		--ckpt_path $(OUT)/joint/checkpoints/last.ckpt
 
-bench: bench-training bench-simulation bench-features bench-metrics ## all of the following
+bench: bench-training bench-sampling bench-vae bench-data bench-simulation bench-features bench-metrics ## all of the following
 
 bench-training: $(READY) ## one full-size training step of each stage: time and peak memory
 	$(BIN)/r3dpa bench training
+
+bench-sampling: $(READY) ## what accuracy costs in time, for an exact velocity: minutes
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench sampling --quick --out runs/bench_sampling
+
+bench-vae: $(READY) ## reconstruction against decode time of the VAE layouts
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench vae
+
+bench-data: $(READY) ## scans per second from simulation to batches
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench data
 
 bench-simulation: $(READY) ## what a simulated scan costs on one core, by part and effect
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench simulation
@@ -80,6 +90,16 @@ bench-features: $(READY) ## what feature grids cost: building, reading, one pass
 
 bench-metrics: $(READY) ## what metrics cost: networks, histograms, matching, sparse convolution
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench metrics
+
+# A checkpoint that fits, for the picture of a trained model: make bench-gpu CKPT=...
+CKPT ?=
+bench-gpu: $(READY) ## on a GPU: speed of full-size networks, training steps, VAEs; half an hour
+	mkdir -p runs/bench_gpu
+	$(BIN)/r3dpa bench speed --device cuda --out runs/bench_gpu/speed.json
+	$(BIN)/r3dpa bench training --device cuda --precision bf16-mixed --batch_size 32 --steps 10 \
+		--out runs/bench_gpu/training.json
+	$(BIN)/r3dpa bench vae --device cuda --batch_size 16 --rounds 10 --out runs/bench_gpu/vae.json
+	$(if $(CKPT),$(BIN)/r3dpa bench sampling --device cuda --ckpt $(CKPT) --out runs/bench_gpu/sampling)
 
 clean: ## remove caches and runs, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

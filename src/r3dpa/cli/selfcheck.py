@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import machine, versions
+from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.data.scans import Scan, evenly, find_scans, read_scan
 from r3dpa.metrics.corruption import Corruption, Step, corruptions, steps
 from r3dpa.metrics.distances import Resampling, histogram_rows, matching_rows
@@ -166,7 +166,7 @@ class SelfCheck:
 
     Args:
         tables: Against other real scans, and against the same ones.
-        about: Data, counts, protocol, versions and machine.
+        about: Command, data, counts, protocol, versions and machine.
     """
 
     tables: tuple[CorruptionTable, ...]
@@ -250,6 +250,7 @@ def selfcheck(
         CorruptionTable(f"Against the same scans, {len(tried)}", tuple(of_same), labels),
     )
     about = {
+        "command": command(),
         "data": data.name,
         "against": None if against is None else against.name,
         "notes": notes,
