@@ -73,6 +73,7 @@ def sampling(
     scenes: int | None = None,
     batch_size: int | None = None,
     rounds: int | None = None,
+    nfe: Sequence[int] | None = None,
     tuned: Sequence[Path] = (),
     autoguided: bool = False,
     about: Mapping[str, Any] | None = None,
@@ -95,6 +96,7 @@ def sampling(
         scenes: Of the model, solved by each row; 256, or 8 with ``quick``.
         batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
         rounds: Of the timing; 20, or 3 with ``quick``.
+        nfe: Evaluations of the model's rows; 2 to 256, or 4 to 32 with ``quick``.
         tuned: Files of tuned solvers, each a row.
         autoguided: Whether ``make`` can guide: one more solver in the picture.
         about: What a reader must know of the model, such as its name, stage and step.
@@ -111,6 +113,8 @@ def sampling(
             f"scenes must be at least 2, rounds and batch_size at least 1, got {scenes}, {rounds} "
             f"and {batch_size}"
         )
+    if nfe is not None and (not nfe or min(nfe) < 1):
+        raise ValueError(f"nfe must be numbers of evaluations, got {list(nfe)}")
     if data is not None and make is None:
         raise ValueError(f"data {data} tell nothing without a checkpoint to compare with them")
     found = {}
@@ -123,6 +127,8 @@ def sampling(
     if make is not None:
         device = make(Setting(SamplerConfig("euler", 1))).device
         effort = _effort("model", quick, scenes, batch_size or _BATCH[device.type], rounds)
+        if nfe is not None:
+            effort = replace(effort, evaluations=tuple(sorted(set(nfe))))
         problem = ModelProblem(make, effort.batch)
         real = None
         if data is not None:

@@ -142,6 +142,7 @@ def bench_sampling(
     scenes: int | None = None,
     batch_size: int | None = None,
     rounds: int | None = None,
+    nfe: list[int] | None = None,
     tuned: list[Path] | None = None,
     autoguidance: Path | None = None,
     guidance_scale: float = 2.0,
@@ -159,6 +160,7 @@ def bench_sampling(
         scenes: Solved by each way to sample; 256, or 8 with ``--quick``.
         batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
         rounds: Of the timing; 20, or 3 with ``--quick``.
+        nfe: Network evaluations a scene; 2 to 256, or 4 to 32 with ``--quick``.
         tuned: Files of ``r3dpa tune-solver``, each one more way.
         autoguidance: Snapshot of a weaker model: one more way is guided away from it.
         guidance_scale: Strength of autoguidance.
@@ -180,7 +182,9 @@ def bench_sampling(
         raise ValueError("--autoguidance and --tuned belong to a model; give its --ckpt")
     guided = autoguidance is not None
     print_text(
-        sampling(out, make, data, quick, scenes, batch_size, rounds, tuned or (), guided, about)
+        sampling(
+            out, make, data, quick, scenes, batch_size, rounds, nfe, tuned or (), guided, about
+        )
     )
 
 
