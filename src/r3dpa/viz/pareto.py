@@ -70,6 +70,7 @@ class ParetoPlot:
         limits: Seconds that NFE evaluations take at the peak of the device, by NFE.
         peak_flop_s: Of the device; tells the second axis.
         sentences: Under the picture: what each further second buys.
+        line: What the line is.
     """
 
     title: str
@@ -80,6 +81,7 @@ class ParetoPlot:
     limits: Mapping[int, float]
     peak_flop_s: float
     sentences: tuple[str, ...]
+    line: str = "Pareto front (95 %)"
 
 
 def solver_colours(points: Sequence[ParetoPoint]) -> dict[str, str]:
@@ -219,7 +221,7 @@ def _legend(axes: Axes, colours: Mapping[str, str], plot: ParetoPlot) -> None:
                markerfacecolor="white" if not _any_filled(plot, solver) else colour, label=solver)
         for place, (solver, colour) in enumerate(colours.items())
     ]  # fmt: skip
-    entries.append(Line2D([], [], color="#222222", label="Pareto front (95 %)"))
+    entries.append(Line2D([], [], color="#222222", label=plot.line))
     for style, (name, value) in zip(_LINE_STYLES, plot.levels.items(), strict=False):
         entries.append(Line2D([], [], color="#555555", linestyle=style, label=_level(name, value)))
     if plot.limits:
