@@ -235,7 +235,7 @@ def _distance_plot(
         limits,
         found.peak.flop_s,
         tuple(told),
-        "least distance so far, by more than the floor",
+        "least distance so far",
     )
 
 
