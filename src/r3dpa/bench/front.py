@@ -35,7 +35,9 @@ _LEVEL = 0.975  # of one side: 95 % for both
 _RESAMPLES = 1000
 #: Error of the latents, which have unit variance, that counts as nothing where bf16 tells none.
 _SMALL_ERROR = 0.01
-_GOOD, _DRAFT = 2.0, 20.0
+#: Largest error of a level, in units of the smallest that matters.
+_LEVELS = {"draft": 10.0, "good": 4.0, "best": 1.0}
+_AS_CHEAP = 1.1
 
 
 @dataclass(frozen=True)
@@ -210,11 +212,9 @@ def quality_levels(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
     Only deterministic rows of the usual solvers count, at the batch size and precision that most
     of them have. With ``small`` the larger of what bf16 alone changes in the latents (0.01 where
-    no row tells) and the smallest error:
-
-    - ``best`` is the row of the smallest error,
-    - ``good`` the cheapest whose error is at most 2 ``small``,
-    - ``draft`` the cheapest whose error is at most 20 ``small``.
+    no row tells) and the smallest error, ``best`` has an error of at most ``small``, ``good`` of 4
+    and ``draft`` of 10 times that. It is the cheapest such row, or the one with the smallest error
+    among those that take at most a tenth longer.
 
     Returns:
         By level: ``solver``, ``steps``, ``shift``, ``error``, and ``seconds_share``, its time over
@@ -230,21 +230,22 @@ def quality_levels(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         raise ValueError("no deterministic row has an error: there is nothing to choose from")
     usual = max(kinds, key=kinds.count)
     candidates = [row for row, kind in zip(known, kinds, strict=True) if kind == usual]
-    best = min(candidates, key=lambda row: _error(row))
     bf16 = [row.precision_error for row in rows if row.precision == "bf16" and row.precision_error]
-    small = max(min(bf16) if bf16 else _SMALL_ERROR, _error(best))
+    small = max(min(bf16) if bf16 else _SMALL_ERROR, min(map(_error, candidates)))
 
-    def cheapest(limit: float) -> Row:
-        return min((row for row in candidates if _error(row) <= limit), key=lambda r: r.seconds)
+    def chosen(limit: float) -> Row:
+        enough = [row for row in candidates if _error(row) <= limit]
+        longest = _AS_CHEAP * min(row.seconds for row in enough)
+        return min((row for row in enough if row.seconds <= longest), key=_error)
 
-    levels = {"draft": cheapest(_DRAFT * small), "good": cheapest(_GOOD * small), "best": best}
+    levels = {level: chosen(factor * small) for level, factor in _LEVELS.items()}
     return {
         level: {
             "solver": row.solver,
             "steps": row.steps,
             "shift": row.shift,
             "error": row.error,
-            "seconds_share": row.seconds / best.seconds,
+            "seconds_share": row.seconds / levels["best"].seconds,
         }
         for level, row in levels.items()
     }

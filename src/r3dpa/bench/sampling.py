@@ -35,7 +35,7 @@ __all__ = ["Effort", "run_problem", "sampling", "settings_of"]
 
 #: Solvers of the picture, with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
-    *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 2.0)),
+    *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.5), ("ab2", 2.0)),
     *(("ab3", 1.0), ("dpmpp_2m", 1.0), ("unipc", 1.0)),
 )
 _RESTARTS = (16, 32, 64)  # steps, of those that the evaluations have room for
@@ -74,6 +74,7 @@ def sampling(
     batch_size: int | None = None,
     rounds: int | None = None,
     nfe: Sequence[int] | None = None,
+    reference_steps: int | None = None,
     tuned: Sequence[Path] = (),
     autoguided: bool = False,
     about: Mapping[str, Any] | None = None,
@@ -97,6 +98,8 @@ def sampling(
         batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
         rounds: Of the timing; 20, or 3 with ``quick``.
         nfe: Evaluations of the model's rows; 2 to 256, or 4 to 32 with ``quick``.
+        reference_steps: Heun steps of the model's converged solution, an even number; 1000, or 200
+            with ``quick``.
         tuned: Files of tuned solvers, each a row.
         autoguided: Whether ``make`` can guide: one more solver in the picture.
         about: What a reader must know of the model, such as its name, stage and step.
@@ -115,6 +118,8 @@ def sampling(
         )
     if nfe is not None and (not nfe or min(nfe) < 1):
         raise ValueError(f"nfe must be numbers of evaluations, got {list(nfe)}")
+    if reference_steps is not None and (reference_steps < 2 or reference_steps % 2):
+        raise ValueError(f"reference_steps must be even and at least 2, got {reference_steps}")
     if data is not None and make is None:
         raise ValueError(f"data {data} tell nothing without a checkpoint to compare with them")
     found = {}
@@ -129,6 +134,8 @@ def sampling(
         effort = _effort("model", quick, scenes, batch_size or _BATCH[device.type], rounds)
         if nfe is not None:
             effort = replace(effort, evaluations=tuple(sorted(set(nfe))))
+        if reference_steps is not None:
+            effort = replace(effort, reference_steps=reference_steps)
         problem = ModelProblem(make, effort.batch)
         real = None
         if data is not None:

@@ -143,6 +143,7 @@ def bench_sampling(
     batch_size: int | None = None,
     rounds: int | None = None,
     nfe: list[int] | None = None,
+    reference_steps: int | None = None,
     tuned: list[Path] | None = None,
     autoguidance: Path | None = None,
     guidance_scale: float = 2.0,
@@ -161,6 +162,7 @@ def bench_sampling(
         batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
         rounds: Of the timing; 20, or 3 with ``--quick``.
         nfe: Network evaluations a scene; 2 to 256, or 4 to 32 with ``--quick``.
+        reference_steps: Heun steps of the converged solution; 1000, or 200 with ``--quick``.
         tuned: Files of ``r3dpa tune-solver``, each one more way.
         autoguidance: Snapshot of a weaker model: one more way is guided away from it.
         guidance_scale: Strength of autoguidance.
@@ -180,10 +182,20 @@ def bench_sampling(
         make, about = generators_of(ckpt, guide, device)
     elif autoguidance is not None or tuned:
         raise ValueError("--autoguidance and --tuned belong to a model; give its --ckpt")
-    guided = autoguidance is not None
     print_text(
         sampling(
-            out, make, data, quick, scenes, batch_size, rounds, nfe, tuned or (), guided, about
+            out,
+            make,
+            data,
+            quick,
+            scenes=scenes,
+            batch_size=batch_size,
+            rounds=rounds,
+            nfe=nfe,
+            reference_steps=reference_steps,
+            tuned=tuned or (),
+            autoguided=autoguidance is not None,
+            about=about,
         )
     )
 
