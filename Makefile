@@ -19,7 +19,8 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint types test test-all notebooks demo clean bench bench-training \
+.PHONY: help install format lint types test test-all test-numerics \
+	test-faults test-torture test-nodes fuzz notebooks demo clean bench bench-training \
 	bench-sampling bench-vae bench-data bench-simulation bench-features bench-metrics bench-gpu
 
 help: ## list the targets
@@ -50,6 +51,21 @@ test: $(READY) ## default tests, a few minutes on two cores
 
 test-all: $(READY) ## every test that this machine can run
 	$(BIN)/pytest
+
+test-numerics: $(READY) ## hard numerical cases, and the table of them
+	$(BIN)/pytest -m numerics --numerics-list runs/numerics.md
+
+test-faults: $(READY) ## kill, fill, cut: what is lost, and the table of it
+	$(BIN)/pytest tests/faults --fault-table runs/faults.md
+
+test-torture: $(READY) ## 30 bad steps of each stage; exact resume with two processes
+	$(BIN)/pytest tests/modules/test_torture.py tests/modules/test_exact_resume.py
+
+test-nodes: $(READY) ## two nodes on one machine, in network namespaces
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/scale_out
+
+fuzz: $(READY) ## 100000 damaged files for all readers: about 6 minutes
+	nice -n 15 env OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/fuzz_readers.py --inputs 100000
 
 notebooks: $(READY) ## run the notebooks, keeping their outputs
 	$(BIN)/pytest --nbmake --nbmake-timeout=300 --overwrite notebooks

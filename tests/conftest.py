@@ -18,6 +18,12 @@ def pytest_addoption(parser):
         help="folder with cases.json and the .npz files of golden numbers "
         "(default: the shared folder where it is present, else the synthetic files)",
     )
+    parser.addoption(
+        "--numerics-list",
+        type=Path,
+        default=None,
+        help="file for the table of hard numerical cases (with -m numerics)",
+    )
 
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -223,7 +223,7 @@ class TestCheckpoints:
         """The command line decides, not the checkpoint, and config.yaml says what ran."""
         more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
         more += ["--ckpt_path", str(vae_checkpoint), "--trainer.max_steps=4"]
-        more += ["--model.init_args.max_skipped_steps=7"]
+        more += ["--model.init_args.guards.max_skipped_steps=7"]
         main(smoke_args("vae_alignment", tmp_path, *more))
         assert "max_skipped_steps: 7" in (tmp_path / "config.yaml").read_text()
 

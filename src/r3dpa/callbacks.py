@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any, Literal
 
 import lightning as L
 import torch
+from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.utilities import rank_zero_info
@@ -44,23 +47,132 @@ from r3dpa.scoring import (
     save_reports,
 )
 
-__all__ = ["PictureLogger", "ReconstructionWriter", "RunCheckpoint", "SceneScorer"]
+__all__ = [
+    "AtomicCheckpointIO",
+    "PictureLogger",
+    "ReconstructionWriter",
+    "RunCheckpoint",
+    "SceneScorer",
+]
 
 _SAMPLER = SamplerConfig()
 _OPTION = "--scorer.{} true"  # how the SceneScorer of `r3dpa test` is told to allow something
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes checkpoints beside their place, then renames them: no moment has half a file there.
+
+    Lightning's own writes to the system's folder for temporary files. Where that is on another disk
+    than the run, its last move is a copy over the checkpoint before, which a kill or a full disk
+    leaves cut short.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
+    ) -> None:
+        """Writes a checkpoint.
+
+        Args:
+            checkpoint: What to write.
+            path: Its file.
+            storage_options: Refused, as by Lightning's own.
+
+        Raises:
+            OSError: If it cannot be written; names the file and the reason. A checkpoint that was
+                there before stays.
+        """
+        if storage_options is not None:
+            raise TypeError(f"{type(self).__name__} knows no storage_options")
+        # A file object: what torch opens itself fails without telling why.
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            torch.save(checkpoint, file)
 
 
 class RunCheckpoint(ModelCheckpoint):
     """ModelCheckpoint whose ``last.ckpt`` holds the last step, whatever the saving interval.
 
     Lightning's own saves at the end of training only if it has never saved before.
+
+    A SIGTERM, as job systems send it before they end a job, is obeyed after the next optimiser
+    step, or after the next batch of a validation: ``last.ckpt`` is saved and the process ends with
+    status 143. It is enough that one of several training processes gets the signal.
     """
+
+    _stop_asked = False
+    _step = 0  # optimiser steps when a batch ended last
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Has checkpoints written whole, unless a strategy or plugin writes them its own way."""
+        super().setup(trainer, pl_module, stage)
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Takes SIGTERM over from Lightning, which ends training without saving, with status 0."""
+        super().on_train_start(trainer, pl_module)
+        self._stop_asked, self._step = trainer.received_sigterm, trainer.global_step
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._ask_to_stop)  # Lightning restores the one before
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Saves where it is time to; then stops where that was asked for."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if trainer.global_step != self._step:  # else gradients are still to be accumulated
+            self._step = trainer.global_step
+            self._stop_if_asked(trainer)
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Stops where that was asked for: a validation may take longer than a job system waits."""
+        if trainer.state.fn == "fit" and not trainer.sanity_checking:
+            self._stop_if_asked(trainer)
+
+    def _ask_to_stop(self, *_: object) -> None:
+        self._stop_asked = True
+
+    def _stop_if_asked(self, trainer: L.Trainer) -> None:
+        if not trainer.strategy.reduce_boolean_decision(self._stop_asked, all=False):
+            return
+        if not self._should_skip_saving_checkpoint(trainer):
+            self.save_last = True  # else the steps since the last saving would be lost
+            self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
+        rank_zero_info(
+            f"stopped by SIGTERM after step {trainer.global_step}: the same command goes on with "
+            f"--ckpt_path {self.last_model_path}"
+        )
+        raise SystemExit(128 + signal.SIGTERM)  # as a shell reports it
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Saves unless the last step is saved already."""
         if self._last_global_step_saved != trainer.global_step:
             self._last_checkpoint_saved = ""
         super().on_train_end(trainer, pl_module)
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Saves where all steps were trained before, but ``last.ckpt`` is older: of a killed run.
+
+        Lightning ends such a training without calling ``on_train_end``.
+        """
+        super().on_fit_end(trainer, pl_module)
+        resumed = Path(trainer.ckpt_path or "")
+        if resumed.name != f"{self.CHECKPOINT_NAME_LAST}.ckpt" and not (
+            self._should_skip_saving_checkpoint(trainer)
+        ):
+            self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
 
 
 class ReconstructionWriter(L.Callback):

@@ -105,11 +105,9 @@ class SamplerConfig:
             f"quality {quality}: {level['solver']}, {level['steps']} steps, "
             f"shift {level['shift']:g}"
         )
-        if table["measured_on"] is None:
-            return f"{line} (not measured)"
         return (
-            f"{line}: error {level['error']:g}, {level['seconds_share']:.0%} of the time of best "
-            f"({table['measured_on']})"
+            f"{line}: error {level['error']:.2g}, {level['seconds_share']:.0%} of the time of best "
+            f"(measured on: {table['measured_on']})"
         )
 
 

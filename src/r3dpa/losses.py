@@ -115,4 +115,7 @@ def alignment_loss(
 
 
 def _unit(vectors: Tensor, eps: float = 1e-6) -> Tensor:
+    # Beyond 2^64 the squares are infinite and the cosine would be 0.
+    scale = vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
+    vectors = vectors / scale
     return vectors * torch.rsqrt(vectors.square().sum(dim=-1, keepdim=True) + eps**2)

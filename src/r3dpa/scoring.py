@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ import torch
 from tqdm import tqdm
 
 from r3dpa import viz
+from r3dpa.atomic import only_writer
 from r3dpa.data.scans import Scan, read_scan
 from r3dpa.metrics.evaluation import Comparison, evaluate
 from r3dpa.metrics.official_statistics import (
@@ -183,9 +185,23 @@ def complete_reference(
         every: Scans after which the unfinished file is saved.
 
     Raises:
-        ValueError: If the unfinished file is of another job, or a scan cannot be used.
+        ValueError: If the unfinished file is of another job, another process computes ``out``, or
+            a scan cannot be used.
     """
+    with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
+        return _complete(job, scans, spaces, out, every)
+
+
+def _complete(
+    job: ReferenceStatistics,
+    scans: Sequence[Scan],
+    spaces: Sequence[SceneFeatures],
+    out: Path,
+    every: int,
+) -> ReferenceStatistics:
     partial = _partial(out)
+    for path in out.parent.glob(f".{escape(partial.stem)}.*.partial.*"):
+        path.unlink(missing_ok=True)  # of a killed call
     statistics = resume_or_start(job, partial)
     start, sensor = statistics.num_done, statistics.protocol.sensor
 

@@ -37,6 +37,7 @@ COMMANDS = {
         "bench",
         "probe",
         "tune-solver",
+        "replay",
     ),
     *("reference", "evaluate", "selfcheck"),
 }

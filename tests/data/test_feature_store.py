@@ -252,7 +252,7 @@ def in_child(function):
 @pytest.mark.parametrize("moment", range(4))
 def test_killed_at_every_step_of_a_batch(tmp_path, projection, settings, monkeypatch, moment, part):
     """Two batches of a row and a journal each: killed with none, half or all of one written."""
-    append, seen = row_store._append, []
+    append, seen = row_store.append, []
 
     def killing(file, data):
         seen.append(file)
@@ -267,7 +267,7 @@ def test_killed_at_every_step_of_a_batch(tmp_path, projection, settings, monkeyp
                 writer.add(samples(first, last), grids_of(samples(first, last)))
 
     with monkeypatch.context() as patch:
-        patch.setattr(row_store, "_append", killing)
+        patch.setattr(row_store, "append", killing)
         assert in_child(write) == -signal.SIGKILL
     there = 0
     for sample in samples(0, 5):
@@ -287,7 +287,7 @@ def test_killed_at_every_step_of_a_batch(tmp_path, projection, settings, monkeyp
 
 def test_rows_are_on_disk_before_the_journal_names_them(tmp_path, settings, monkeypatch):
     """As a power failure needs it: one flush a batch, in between."""
-    append, sync, calls = row_store._append, os.fdatasync, []
+    append, sync, calls = row_store.append, os.fdatasync, []
 
     def note(name, function):
         return lambda file, *data: (
@@ -295,7 +295,7 @@ def test_rows_are_on_disk_before_the_journal_names_them(tmp_path, settings, monk
             function(file, *data),
         )
 
-    monkeypatch.setattr(row_store, "_append", note("append", append))
+    monkeypatch.setattr(row_store, "append", note("append", append))
     monkeypatch.setattr(os, "fdatasync", note("sync", sync))
     fill(tmp_path, settings(), (0, 5))
     assert calls == [("append", ".rows"), ("sync", ".rows"), ("append", ".jsonl")]

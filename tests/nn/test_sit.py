@@ -55,6 +55,17 @@ def test_a_sample_does_not_depend_on_its_batch():
         torch.testing.assert_close(alone.features, features[one], atol=1e-6, rtol=1e-5)
 
 
+def test_a_single_sample_under_autocast_equals_that_of_a_batch():
+    """One sample has one modulation, which takes another way through the norm."""
+    sit = build()
+    latents, time = inputs(batch=2)[:2]
+    with torch.autocast("cpu", torch.bfloat16):
+        alone, features = sit(latents[:1], time[:1])
+        both, all_features = sit(latents, time)
+    torch.testing.assert_close(alone, both[:1], atol=0.05, rtol=0.05)
+    torch.testing.assert_close(features, all_features[:1], atol=0.05, rtol=0.05)
+
+
 def gradient_names(sit):
     return {name.split(".")[0] for name, p in sit.named_parameters() if p.grad is not None}, {
         int(name.split(".")[1])

@@ -78,11 +78,11 @@ def speed(
         )
     repeat = asdict(timing.repeat) | {"sound": timing.sound, "dropped": timing.dropped}
     gpu = torch.cuda.get_device_name() if device.type == "cuda" else None
-    facts = {
+    facts: dict[str, str | dict[str, Any]] = {
         "command": command(),
         "weights": "random, of the paper's sizes" if not quick else "random, small",
         "first case over itself": repeat,
-        "peaks": {name: asdict(peak) for name, peak in peaks.items()},
+        "peaks": {str(name): asdict(peak) for name, peak in peaks.items()},
         "machine": machine() | {"threads": torch.get_num_threads(), "gpu": gpu},
         "versions": versions(torch),
     }

@@ -21,7 +21,6 @@ from typing import Any, Literal
 import lightning as L
 import torch
 import yaml
-from jsonargparse import ArgumentParser
 from torch import Tensor
 from tqdm import tqdm
 
@@ -33,6 +32,7 @@ from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
+from r3dpa.imports import ConfigParser
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
@@ -99,6 +99,7 @@ class StageCost:
         parts: Cost of each part of a step, run by itself.
         loader_images_per_second: What one process reads.
         variants: Steps with other settings; None where they were not compared.
+        guards: Steps without guards, and with them; None where they were not compared.
     """
 
     stage: str
@@ -111,6 +112,7 @@ class StageCost:
     parts: dict[str, PartCost]
     loader_images_per_second: float
     variants: Comparison | None
+    guards: Comparison | None
 
     @property
     def usual_seconds(self) -> float:
@@ -182,8 +184,8 @@ def training(
         stages: Experiments to measure.
         settings: Size, number, precision and place of the steps.
         out: JSON file for the same figures, without rounding.
-        quick: The small networks of ``<conf>/experiment/<stage>_demo.yaml``, and a comparison of
-            memory format, precision and fused optimiser.
+        quick: The small networks of ``<conf>/experiment/<stage>_demo.yaml``, and comparisons of
+            memory format, precision and fused optimiser, and of steps without and with guards.
 
     Returns:
         A table of costs and one of speeds with a row per stage, and a line each about settings,
@@ -220,7 +222,9 @@ def training(
     lines = [format_table(header, (cost.row() for cost in costs))]
     header = ["stage", "images/s", "loader images/s", "GFLOP/image", "GFLOP/s"]
     lines.append(format_table([*header, "% of the step"], (cost.speed_row() for cost in costs)))
-    lines += [_variants(cost.stage, cost.variants) for cost in costs if cost.variants is not None]
+    for cost in costs:
+        compared = (cost.variants, cost.guards)
+        lines += [_variants(cost.stage, cases) for cases in compared if cases is not None]
     for name, values in about.items():
         lines.append(f"{name}: {one_line(values)}")
     return "\n".join(lines)
@@ -291,6 +295,7 @@ def _measure(
         profile.parts,
         profile.loader_images_per_second,
         profile.variants,
+        profile.guards,
     )
 
 
@@ -312,7 +317,7 @@ def _build(experiments: list[Path], fresh_vae: Path) -> GenerativeModule:
     Stage flow_matching refuses to start without the VAE of another stage. Random weights cost the
     same, so all stages are given such a file.
     """
-    parser = ArgumentParser(exit_on_error=False)
+    parser = ConfigParser(exit_on_error=False)
     parser.add_subclass_arguments(GenerativeModule, "model")
     parser.add_argument("--trainer", type=dict)  # the length of a whole run: not used
     parser.add_argument("--config", action="config")

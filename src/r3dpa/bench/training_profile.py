@@ -19,10 +19,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from r3dpa.bench.timing import Comparison, compare
 from r3dpa.modules import GenerativeModule, JointAlignment
-from r3dpa.modules.base import frozen
+from r3dpa.modules.guards import StepGuard
+from r3dpa.modules.step_losses import frozen
 
 __all__ = ["PartCost", "StepProfile"]
 
+_GUARD_ROUNDS = 5  # as many as of the settings: the difference is small
 _LOADER_EPOCHS = 4  # of one batch; the first one does not count
 
 
@@ -50,6 +52,7 @@ class StepProfile(L.Callback):
             the loop around it.
         loader_images_per_second: Of one loader process.
         variants: Steps with other settings than the first; None where ``rounds`` is 0.
+        guards: Steps without guards, and with them; None where ``rounds`` is 0.
     """
 
     def __init__(self, rounds: int = 0) -> None:
@@ -57,6 +60,7 @@ class StepProfile(L.Callback):
         self.parts: dict[str, PartCost] = {}
         self.loader_images_per_second = 0.0
         self.variants: Comparison | None = None
+        self.guards: Comparison | None = None
 
     def on_train_batch_end(
         self,
@@ -77,6 +81,7 @@ class StepProfile(L.Callback):
         self.loader_images_per_second = _loader_rate(trainer)
         if self.rounds:
             self.variants = compare(_variants(module, batch), self.rounds)
+            self.guards = compare(_guards(module, batch), _GUARD_ROUNDS * self.rounds)
 
 
 def step_parts(module: GenerativeModule, batch: dict[str, Any]) -> dict[str, Callable[[], None]]:
@@ -142,13 +147,7 @@ def _variants(module: GenerativeModule, batch: dict[str, Any]) -> dict[str, Call
     optimizer = cast(torch.optim.Optimizer, module.optimizers(use_pl_optimizer=False))
 
     def case(channels_last: bool, bf16: bool, fused: bool) -> Callable[[], float]:
-        def step() -> None:
-            with torch.autocast(module.device.type, torch.bfloat16, enabled=bf16):
-                loss = cast(Tensor, module.training_step(cast(Any, batch), 0))
-            loss.backward()
-            module.configure_gradient_clipping(optimizer, gradient_clip_val=1.0)
-            optimizer.step()
-            optimizer.zero_grad()
+        step = _step(module, batch, optimizer, bf16)
 
         def run() -> float:
             module.channels_last = channels_last
@@ -166,6 +165,41 @@ def _variants(module: GenerativeModule, batch: dict[str, Any]) -> dict[str, Call
         "bf16, channels last, fused": case(True, True, True),
         "fp32, contiguous, not fused": case(False, False, False),
     }
+
+
+def _guards(module: GenerativeModule, batch: dict[str, Any]) -> dict[str, Callable[[], float]]:
+    """The same step without guards and with them."""
+    optimizer = cast(torch.optim.Optimizer, module.optimizers(use_pl_optimizer=False))
+    guard, step = module.guard, _step(module, batch, optimizer, bf16=False)
+
+    def case(chosen: StepGuard | None) -> Callable[[], float]:
+        def run() -> float:
+            module.guard = chosen
+            return _timed(module, step)
+
+        return run
+
+    return {"without guards": case(None), "with guards": case(guard)}
+
+
+def _step(
+    module: GenerativeModule,
+    batch: dict[str, Any],
+    optimizer: torch.optim.Optimizer,
+    bf16: bool,
+) -> Callable[[], None]:
+    """A whole step as Lightning takes it, but for its loop and the averages."""
+
+    def step() -> None:
+        module.on_train_batch_start(batch, 0)
+        with torch.autocast(module.device.type, torch.bfloat16, enabled=bf16):
+            loss = cast(Tensor, module.training_step(batch, 0))
+        loss.backward()
+        module.configure_gradient_clipping(optimizer, gradient_clip_val=1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
 
 
 def _loader_rate(trainer: L.Trainer) -> float:

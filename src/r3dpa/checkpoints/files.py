@@ -8,6 +8,7 @@ import hashlib
 import json
 import pickle
 import re
+import reprlib
 import subprocess
 import zipfile
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ from r3dpa import __version__
 from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
 from r3dpa.checkpoints.official import from_official, is_official
-from r3dpa.unpickling import UNPICKLING_ERRORS
+from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 __all__ = [
     "official_neighbour",
@@ -217,23 +218,24 @@ def _load_pickle(path: Path) -> Any:
             f"the file would run {forbidden[1]} when loaded; only tensors, plain values and "
             "argparse.Namespace are read"
         ) from error
-    except (*UNPICKLING_ERRORS, OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"the file is damaged or incomplete ({_first_line(error)})") from error
+    except UNPICKLING_ERRORS as error:
+        raise ValueError(f"the file is damaged or incomplete ({first_line(error)})") from error
 
 
 def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
     weights = content.get("state_dict")
-    if not isinstance(weights, Mapping):
+    if not isinstance(weights, Mapping) or not all(isinstance(key, str) for key in weights):
         raise ValueError("the Lightning checkpoint holds no state_dict")
-    arguments = content.get("hyper_parameters", {})
-    about = content.get("r3dpa", {})
+    arguments, about = content.get("hyper_parameters", {}), content.get("r3dpa", {})
+    if not isinstance(arguments, Mapping) or not isinstance(about, Mapping):
+        raise ValueError("its hyper_parameters or entry r3dpa are no tables")
     networks: dict[str, NetworkState] = {}
     for name, (prefix, argument) in _LIGHTNING.items():
         own = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
         if not own:
             continue
         config = arguments.get(argument)
-        if config is None and argument == "latent_norm":
+        if config is None and argument == "latent_norm" and "running_mean" in own:
             config = {
                 "class_path": "r3dpa.nn.latent_norm.LatentNorm",
                 "init_args": {"channels": len(own["running_mean"])},
@@ -262,7 +264,7 @@ def _read_ours(path: Path) -> Checkpoint:
         raise ValueError(f"its description {description.name} is not beside it; copy both files")
     try:
         about = yaml.safe_load(description.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, *UNPICKLING_ERRORS) as error:
         raise ValueError(f"{description.name} is damaged: {error}") from error
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         raise ValueError(f"{description.name} does not describe a {_FORMAT}")
@@ -278,8 +280,10 @@ def _read_ours(path: Path) -> Checkpoint:
         )
     try:
         weights = load_file(path)
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, *UNPICKLING_ERRORS) as error:
         raise ValueError(f"the file is damaged: {error}") from error
+    if not isinstance(about["networks"], dict):
+        raise ValueError(f"{description.name}: networks must be a table of networks by name")
     networks: dict[str, NetworkState] = {}
     for name, config in about["networks"].items():
         own = {
@@ -299,8 +303,8 @@ def _network_state(name: str, config: Any, weights: Mapping[str, Tensor]) -> Net
         raise ValueError(f"unknown network {name!r}; known are {', '.join(NETWORK_NAMES)}")
     if not isinstance(config, Mapping) or "class_path" not in config:
         raise ValueError(
-            f"it does not say which class and arguments its {name} has (found {config!r}); train "
-            "with `r3dpa fit`, which records them"
+            f"it does not say which class and arguments its {name} has (found "
+            f"{reprlib.repr(config)}); train with `r3dpa fit`, which records them"
         )
     state = NetworkState(config["class_path"], config.get("init_args") or {}, weights)
     try:
@@ -333,7 +337,3 @@ def refuse_existing(paths: list[Path], overwrite: bool) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).partition("\n")[0] or type(error).__name__

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Iterable, Mapping
+import itertools
+import reprlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 __all__ = ["NETWORK_NAMES", "Checkpoint", "NetworkState", "format_table", "load_into"]
 
@@ -19,6 +23,12 @@ NETWORK_NAMES = ("vae", "discriminator", "sit", "latent_norm", "ema", "ema_laten
 
 _ALLOWED_PACKAGE = "r3dpa.nn"
 _NUM_LISTED = 10
+# Of constructors that are given numbers or types that make no sense.
+_BUILD_ERRORS = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError),
+    *(NotImplementedError, RuntimeError, TypeError, ValueError),
+)
+_PARAMETERS_PER_TENSOR = 4  # our networks have one, or none; a layer without bias counts it, too
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
 _SHAPELESS_ARGS = {
@@ -37,12 +47,12 @@ def _network_class(class_path: str) -> type[nn.Module]:
         f"{_ALLOWED_PACKAGE}. Edit the class_path if the class was moved; otherwise do not trust "
         f"the file"
     )
-    module_path, _, name = class_path.rpartition(".")
+    module_path, _, name = str(class_path).rpartition(".")
     if module_path != _ALLOWED_PACKAGE and not module_path.startswith(f"{_ALLOWED_PACKAGE}."):
         raise ValueError(refusal)
     try:
         found = getattr(importlib.import_module(module_path), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:
         raise ValueError(f"class {class_path!r} does not exist in this version ({error})") from None
     is_network = isinstance(found, type) and issubclass(found, nn.Module)
     if not is_network or not found.__module__.startswith(f"{_ALLOWED_PACKAGE}."):
@@ -111,11 +121,16 @@ class NetworkState:
         Raises:
             ValueError: If the class is not allowed or does not accept the arguments.
         """
+        kind = self.kind
+        if not isinstance(self.init_args, Mapping):
+            given = type(self.init_args).__name__
+            raise ValueError(f"{self.class_path} needs arguments by name, got a {given}")
         try:
-            return self.kind(**{key: _tuples(value) for key, value in self.init_args.items()})
-        except TypeError as error:
+            return kind(**{str(key): _tuples(value) for key, value in self.init_args.items()})
+        except _BUILD_ERRORS as error:
             raise ValueError(
-                f"{self.class_path} does not accept the arguments {dict(self.init_args)}: {error}"
+                f"{self.class_path} does not accept the arguments "
+                f"{reprlib.repr(dict(self.init_args))}: {error}"
             ) from error
 
     def build(self) -> nn.Module:
@@ -132,10 +147,13 @@ class NetworkState:
     def check(self) -> None:
         """Checks that class and arguments fit the weights, without allocating memory.
 
+        Arguments that ask for far more layers than there are weights end it at once.
+
         Raises:
             ValueError: As :meth:`build`.
         """
-        with torch.device("meta"):
+        most = _PARAMETERS_PER_TENSOR * (len(self.state_dict) + 1)
+        with torch.device("meta"), _at_most(most):
             network = self.new()
         _raise_if_any(self.problems(network), f"the weights do not fit {self.class_path}")
 
@@ -259,6 +277,24 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
             if own != wanted:
                 differences.append(f"{key}: checkpoint {wanted}, network {own}")
     return differences
+
+
+@contextmanager
+def _at_most(count: int) -> Iterator[None]:
+    """Refuses to make more than so many parameters: a file may ask for a billion layers."""
+    left = itertools.count(count, -1)
+
+    def counted(*_: Any) -> None:
+        if next(left) <= 0:
+            raise ValueError(
+                f"it asks for more than {count} parameters, far more than its weights are"
+            )
+
+    handle = register_module_parameter_registration_hook(counted)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def _shortened(lines: list[str]) -> list[str]:

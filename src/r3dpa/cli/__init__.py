@@ -5,6 +5,7 @@ Heavy imports stay inside the commands, so that ``r3dpa --help`` answers at once
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -434,6 +435,19 @@ def convert(
     print_text(result.table())
 
 
+def replay(file: Path, ckpt: Path, device: str = "cpu") -> None:
+    """Run a step that was skipped again, and tell where it stopped to be finite.
+
+    Args:
+        file: Of ``<run_dir>/bad_batches``.
+        ckpt: Weights, best those of the last step before it.
+        device: ``cpu``, ``cuda`` or ``cuda:1``.
+    """
+    from r3dpa.cli.replay import replay as run_again
+
+    print_text(run_again(file, ckpt, device))
+
+
 def report(run: Path) -> None:
     """Draw the loss curves of a run and print where each loss started and ended.
 
@@ -502,7 +516,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
         *(simulate, check, view, realism, probe),
-        *(sample, tune_solver, reference, evaluate, selfcheck, convert, report),
+        *(sample, tune_solver, reference, evaluate, selfcheck, convert, replay, report),
     )
 }
 
@@ -567,7 +581,7 @@ def _run(args: list[str]) -> None:
 
         _run_function(BENCHES, args[1:], "r3dpa bench")
     elif args[0] in _COMMANDS:
-        positional = args[0] in ("check", "view", "convert", "report")
+        positional = args[0] in ("check", "view", "convert", "replay", "report")
         _run_function(_COMMANDS[args[0]], args[1:], f"r3dpa {args[0]}", positional)
     else:
         print_text(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")
@@ -585,6 +599,8 @@ def main(args: list[str] | None = None) -> None:
         _run(args)
         return
     args = sys.argv[1:]
+    # As Ctrl-C does; SIGTERM alone would leave no word, and Lightning would not obey it everywhere.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         _run(args)
     except (ValueError, OSError) as error:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import sys
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.utilities import rank_zero_only
 
+from r3dpa.atomic import atomic_path, delete_unfinished, only_writer
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint, refuse_leak
+from r3dpa.imports import ConfigParser
 from r3dpa.modules import GenerativeModule
 
 __all__ = ["StageCLI", "run"]
@@ -33,6 +37,13 @@ class _SaveFitConfig(SaveConfigCallback):
         if stage == "fit":
             super().setup(trainer, pl_module, stage)
 
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Writes it whole; not to ``trainer.log_dir``, for which the other processes are asked."""
+        text = self.parser.dump(self.config, skip_none=False)
+        path = Path(trainer.default_root_dir) / self.config_filename
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
 
 class _RefuseLeaks(Callback):
     """Refuses to evaluate weights that learned from labels, whatever file they came from."""
@@ -47,7 +58,9 @@ class _RefuseLeaks(Callback):
 class StageCLI(LightningCLI):
     """Wires a stage, a data module and a trainer from YAML files.
 
-    ``run_dir`` is the one place a run writes to: checkpoints, loggers and pictures go below it.
+    ``run_dir`` is the one place a run writes to: checkpoints, loggers and pictures go below it. One
+    process at a time trains there, and one tests. ``--ckpt_path last`` means its newest checkpoint,
+    or none where there is none yet, so that one command starts a job and goes on with it.
     A stage is a LightningModule; one whose batches only some data modules make names their class as
     ``data_class``.
     """
@@ -57,6 +70,7 @@ class StageCLI(LightningCLI):
         parser.add_argument(
             "--run_dir", type=str, default="runs/default", help="folder that the run writes to"
         )
+        cast(ConfigParser, parser).add_allow_imports()
         parser.add_lightning_class_args(RunCheckpoint, "checkpoint")
         parser.add_lightning_class_args(SceneScorer, "scorer")
         parser.set_defaults({"checkpoint.save_last": True, "checkpoint.filename": "{step:07d}"})
@@ -88,9 +102,25 @@ class StageCLI(LightningCLI):
         Lightning would replace class and settings of the model by those of the checkpoint without
         a word. Here the stages are compared in ``GenerativeModule.on_load_checkpoint``.
         """
-        path = self.config[self.config.subcommand].get("ckpt_path")
+        config = self.config[self.config.subcommand]
+        if config.get("ckpt_path") == "last":
+            config.ckpt_path = _newest(Path(config.run_dir))
+        path = config.get("ckpt_path")
         if path and Path(path).is_file():
             read_checkpoint(path)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Runs the command, unless another process does the same in ``run_dir``."""
+        run_dir = Path(self.config[subcommand].run_dir)
+        alone = only_writer(
+            run_dir / f".{subcommand}.lock", f"runs r3dpa {subcommand} in {run_dir}"
+        )
+        first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
+        with alone if first else nullcontext():
+            if subcommand == "fit" and first:
+                self._refuse_earlier_run()
+                delete_unfinished(run_dir / "checkpoints")
+            super()._run_subcommand(subcommand)
 
     def instantiate_classes(self) -> None:
         """Builds stage, data module and trainer; checks that the first two belong together.
@@ -137,17 +167,28 @@ class StageCLI(LightningCLI):
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
-        checkpoints = Path(config.run_dir) / "checkpoints"
-        if self.subcommand == "fit" and config.ckpt_path is None and checkpoints.is_dir():
-            raise ValueError(
-                f"{checkpoints} holds an earlier run: resume it with --ckpt_path, or give another "
-                "--run_dir"
-            )
+        if self.subcommand == "fit":
+            self._refuse_earlier_run()
         Path(config.run_dir).mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
             if hasattr(logger, "init_args") and "save_dir" in logger.init_args:
                 logger.init_args.save_dir = config.run_dir
+
+    def _refuse_earlier_run(self) -> None:
+        run_dir = Path(self.config[self.subcommand].run_dir)
+        if self._ckpt_path is None and _newest(run_dir) is not None:
+            raise ValueError(
+                f"{run_dir / 'checkpoints'} holds an earlier run: resume it with --ckpt_path last, "
+                "or give another --run_dir"
+            )
+
+
+def _newest(run_dir: Path) -> str | None:
+    """The checkpoint of a run that was written last; None if there is none."""
+    found = (run_dir / "checkpoints").glob("*.ckpt")
+    whole = [path for path in found if not path.name.startswith(".")]
+    return str(max(whole, key=lambda path: path.stat().st_mtime_ns)) if whole else None
 
 
 def run(args: list[str]) -> None:
@@ -166,6 +207,7 @@ def run(args: list[str]) -> None:
         save_config_callback=_SaveFitConfig,
         save_config_kwargs={"overwrite": True},
         auto_configure_optimizers=False,
+        parser_class=ConfigParser,
         # Lightning warns where both the process's own command line and a list are given.
         args=None if args == sys.argv[1:] else args,
     )

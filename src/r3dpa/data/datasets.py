@@ -110,7 +110,7 @@ class LidarDataset(Dataset[LidarSample]):
             name=scan.name,
         )
         if self.grids is not None:
-            sample["feature_grid"] = self.grids.read(scan, scan.path.stat().st_size)
+            sample["feature_grid"] = self.grids.read(scan, scan.num_bytes)
         return sample
 
     def _project(self, scan: Scan) -> Tensor:
@@ -147,5 +147,5 @@ class LatentDataset(Dataset[LatentSample]):
             posterior_moments=self.posteriors.read(scan), index=index, name=scan.name
         )
         if self.grids is not None:
-            sample["feature_grid"] = self.grids.read(scan, scan.path.stat().st_size)
+            sample["feature_grid"] = self.grids.read(scan, scan.num_bytes)
         return sample

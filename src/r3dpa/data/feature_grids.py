@@ -113,7 +113,7 @@ def plan(
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
     features_dir, scans = Path(features_dir), sorted(scans)
-    keys = [(scan.name, scan.path.stat().st_size) for scan in scans]
+    keys = [(scan.name, scan.num_bytes) for scan in scans]
     settings, missing, num_bytes = {}, set(), 0
     for h, w in grid_sizes:
         own = GridSettings.of(extractor, projection, (h, w), dtype, precision)

@@ -116,7 +116,7 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
             if path.parent != store_folder(features_dir, settings.grid_size):
                 raise ValueError(f"it is of grid_size {list(settings.grid_size)}")
             _ = settings.row, settings.extractor["name"]  # can be made
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise FeatureGridError(
                 f"{path} is damaged ({error!r}): delete {path.parent} and make its grids again "
                 f"with {REMEDY}."

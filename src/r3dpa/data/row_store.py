@@ -25,6 +25,8 @@ from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
+from r3dpa.names import refuse_name
+
 _log = logging.getLogger(__name__)
 
 RowKey = tuple[str, int]
@@ -106,10 +108,14 @@ class Rows:
             for entry in json.loads(b"[" + b",".join(data[:end].splitlines()) + b"]"):
                 if entry["row"] != len(keys):
                     raise ValueError(f"line {len(keys) + 1} is of row {entry['row']}")
+                if reason := refuse_name(entry["scan"]):
+                    raise ValueError(f"name of scan in line {len(keys) + 1} {reason}")
+                if not isinstance(entry["bytes"], int):
+                    raise TypeError(f"bytes in line {len(keys) + 1} are {entry['bytes']!r:.40}")
                 keys.append((entry["scan"], entry["bytes"]))
             if keys and rows.stat().st_size < len(keys) * row_bytes:
                 raise ValueError(f"{rows.name} has fewer than its {len(keys)} rows")
-        except (KeyError, TypeError, ValueError, FileNotFoundError) as error:
+        except (LookupError, TypeError, ValueError, RecursionError, OSError) as error:
             raise self.error(
                 f"{path} is damaged ({error!r}): delete it and {rows.name} beside it, and make "
                 f"their {self.remedy}."
@@ -171,9 +177,9 @@ class RowWriter:
         try:
             # Not through a memory map: a full disk is an error here and a killed process there.
             with self._kind.writing(self._folder):
-                _append(self._rows, data)
+                append(self._rows, data)
                 os.fdatasync(self._rows)
-                _append(self._journal, "".join(lines).encode())
+                append(self._journal, "".join(lines).encode())
         except BaseException:
             self.close()  # whoever opens the shard next cuts off what is unfinished
             raise
@@ -205,7 +211,7 @@ class RowReader:
     """
 
     def __init__(self, folder: Path, row_bytes: int, rows: Rows, names: set[str]) -> None:
-        self._folder, self._row_bytes = folder, row_bytes
+        self._folder, self._row_bytes, self._kind = folder, row_bytes, rows
         places = rows.places(folder, row_bytes)
         self.places = {key: place for key, place in places.items() if key[0] in names}
         self._maps: dict[int, mmap.mmap] = {}
@@ -218,6 +224,9 @@ class RowReader:
         shard, position = place
         start = position * self._row_bytes
         mapping = self._mapped(shard)
+        # Of the file as it is now: to touch what was cut off since would kill the process.
+        if mapping.size() < start + self._row_bytes:
+            raise self._lost(shard, "was cut short")
         # Asked for as a whole: page by page, as they are touched, a disk is slower than one read.
         page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
         mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + self._row_bytes)
@@ -225,10 +234,20 @@ class RowReader:
 
     def _mapped(self, shard: int) -> mmap.mmap:
         if shard not in self._maps:
-            with _rows_path(self._folder, shard).open("rb") as file:
-                # A private copy that nobody writes: torch takes no memory that is read-only.
-                self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+            try:
+                with _rows_path(self._folder, shard).open("rb") as file:
+                    # A private copy that nobody writes: torch takes no memory that is read-only.
+                    self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+            except (FileNotFoundError, ValueError) as error:  # gone, or empty
+                raise self._lost(shard, "is gone or empty") from error
         return self._maps[shard]
+
+    def _lost(self, shard: int, what: str) -> ValueError:
+        rows, journal = _rows_path(self._folder, shard), _journal_path(self._folder, shard)
+        return self._kind.error(
+            f"{rows} {what} since its journal was read: delete it and {journal.name} beside it, "
+            f"and make their {self._kind.remedy}."
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """State without the open files: each process maps them itself."""
@@ -254,7 +273,8 @@ def _try_lock(file: IO[Any]) -> bool:
     return True
 
 
-def _append(file: FileIO, data: bytes) -> None:
+def append(file: FileIO, data: bytes) -> None:
+    """Write all of the data to a file without a buffer, which may take it in parts."""
     left = memoryview(data)
     while left:  # the system may write a part
         left = left[file.write(left) :]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -19,7 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.scans import ScanError, read_ply, read_scan
+from r3dpa.data.scans import (
+    ARCHIVE_ERRORS,
+    ScanError,
+    check_archive,
+    read_array_header,
+    read_ply,
+    read_scan,
+)
 from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly
 
 SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth", "joblib"]
@@ -36,6 +42,9 @@ SUFFIXES: dict[SampleFormat, tuple[str, ...]] = {
 READABLE = (
     "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth; joblib's samples.pcd"
 )
+
+
+_AT_ONCE = 2**24  # bytes
 
 
 class SampleError(ScanError):
@@ -57,9 +66,12 @@ def _format_of(file: Path) -> SampleFormat:
         return "npy"
     if head.startswith(b"ply"):
         return "ply"
-    if head.startswith(b"PK") and zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            return "npz" if any(n.endswith(".npy") for n in archive.namelist()) else "pth"
+    if head.startswith(b"PK"):
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return "npz" if any(n.endswith(".npy") for n in archive.namelist()) else "pth"
+        except ARCHIVE_ERRORS as error:
+            raise SampleError(f"{file}: is a damaged archive ({error})") from error
     if head[0] == 0x80 and file.suffix.lower() in SUFFIXES["pth"]:
         return "pth"  # torch before 1.6
     if head[0] == 0x80:
@@ -114,7 +126,7 @@ def _archive(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Arrays of a ``.npz`` file, unpacked as they are read."""
     try:
         with zipfile.ZipFile(file) as archive:
-            members = [name for name in archive.namelist() if name.endswith(".npy")]
+            members = check_archive(archive, file)
             if not members:
                 raise SampleError(f"{file}: holds no array")
             for member in members:
@@ -123,20 +135,15 @@ def _archive(file: Path) -> Iterator[tuple[str, np.ndarray]]:
                 with archive.open(member) as stream:
                     for part, array in _numpy_stream(stream, f"{file}, array {key}"):
                         yield "/".join(filter(None, ("" if unnamed else key, part))), array
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
+    except ScanError:
+        raise
+    except ARCHIVE_ERRORS as error:
         raise SampleError(f"{file}: is damaged or no .npz file ({error})") from error
 
 
 def _numpy_stream(stream: IO[bytes], where: str) -> Iterator[tuple[str, np.ndarray]]:
     """A cloud, or each image of a stack, of an array in NumPy's format."""
-    try:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0
-        if version != (1, 0):
-            header = np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = header(stream)
-    except ValueError as error:
-        raise SampleError(f"{where}: is not an array in NumPy's format ({error})") from error
+    shape, fortran, dtype = read_array_header(stream, where)
     _check_array(where, dtype, len(shape), stack=True)
     if len(shape) == 2:
         data = _exactly(stream, math.prod(shape) * dtype.itemsize, where)
@@ -145,6 +152,8 @@ def _numpy_stream(stream: IO[bytes], where: str) -> Iterator[tuple[str, np.ndarr
     if fortran:
         raise SampleError(f"{where}: is in Fortran order; save np.ascontiguousarray of it")
     # A stack without a channel axis holds ranges alone.
+    if shape[0] and not math.prod(shape):  # any number of them would fit
+        raise SampleError(f"{where}: an array {shape} holds no image")
     image_shape = shape[1:] if len(shape) == 4 else (1, *shape[1:])
     size = math.prod(image_shape) * dtype.itemsize
     for index in range(shape[0]):
@@ -162,8 +171,10 @@ def _check_array(where: str, dtype: np.dtype, ndim: int, stack: bool) -> None:
         raise SampleError(f"{where}: has {ndim} axes; needs {expected}")
 
 
-def _exactly(stream: IO[bytes], size: int, where: str) -> bytes:
-    data = stream.read(size)
+def _exactly(stream: IO[bytes], size: int, where: str) -> bytearray:
+    data = bytearray()
+    while part := stream.read(min(size - len(data), _AT_ONCE)):  # no more memory than the file has
+        data += part
     if len(data) < size:
         raise SampleError(f"{where}: ends after {len(data)} of {size} bytes; copy the file again")
     return data
@@ -175,7 +186,7 @@ def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
         content = torch.load(
             file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)
         )
-    except (*UNPICKLING_ERRORS, OSError) as error:
+    except UNPICKLING_ERRORS as error:
         reason = str(error).split("\n")[0]
         raise SampleError(f"{file}: cannot be read as tensors alone ({reason})") from error
     if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
@@ -223,11 +234,7 @@ def _joblib_clouds(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     # Unbuffered, so that the unpickler never reads on into the bytes of an array.
     with file.open("rb", buffering=0) as stream:
         stored = type("_StoredArrayHere", (_StoredArray,), {"file": stream})
-        known = {
-            ("joblib.numpy_pickle", "NumpyArrayWrapper"): stored,
-            ("numpy", "ndarray"): np.ndarray,
-            ("numpy", "dtype"): np.dtype,
-        }
+        known = {("joblib.numpy_pickle", "NumpyArrayWrapper"): stored}
         try:
             clouds = ArraysOnly(stream, known).load()
         except UNPICKLING_ERRORS as error:

@@ -220,4 +220,4 @@ def write_range_images(
 
 
 def _key(scan: Scan) -> tuple[str, int]:
-    return scan.name, scan.path.stat().st_size
+    return scan.name, scan.num_bytes

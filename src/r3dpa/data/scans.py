@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import lzma
+import math
 import os
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import IO, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +21,9 @@ from tqdm import tqdm
 
 from r3dpa.atomic import atomic_path
 from r3dpa.geometry import LidarSensor, in_range
+from r3dpa.names import refuse_name
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
+from r3dpa.unpickling import UNPICKLING_ERRORS, array_header
 
 Split = Literal["train", "val"]
 T = TypeVar("T")
@@ -40,6 +45,12 @@ _PLY_TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
+
+
+#: Bytes of an array in an archive that are read at most: a few packed ones may stand for many.
+MOST_BYTES = 2**32
+#: Of archives that are damaged, or packed or encrypted in a way that is not read.
+ARCHIVE_ERRORS = (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError)
 
 
 class ScanError(ValueError):
@@ -64,6 +75,18 @@ class Scan:
     def name(self) -> str:
         """``drive/frame``, unique within a data set."""
         return f"{self.drive}/{self.frame}"
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the file now.
+
+        Raises:
+            ScanError: If it cannot be told, as when the file is gone; names it.
+        """
+        try:
+            return self.path.stat().st_size
+        except OSError as error:
+            raise ScanError(f"{self.path}: cannot be read ({error.strerror or error})") from error
 
 
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
@@ -236,21 +259,25 @@ def read_ply(path: str | Path) -> np.ndarray:
     lines = head.decode("ascii", errors="replace").split("\n")
     if not separator or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise ScanError(f"{path}: is not a binary little-endian .ply file")
-    words = [line.split() for line in lines[2:] if line and not line.startswith("comment")]
+    words = [line.split() for line in lines[2:] if line.strip() and not line.startswith("comment")]
     elements = [word for word in words if word[0] == "element"]
     properties = [word for word in words if word[0] == "property"]
-    if len(elements) != 1 or elements[0][1] != "vertex":
+    if [word[1:2] for word in elements] != [["vertex"]] or len(elements[0]) != 3:
         raise ScanError(f"{path}: holds other elements than vertex; export the points alone")
-    unknown = [" ".join(word) for word in properties if word[1] not in _PLY_TYPES]
+    unknown = [" ".join(p) for p in properties if len(p) != 3 or p[1] not in _PLY_TYPES]
     if unknown:
         raise ScanError(f"{path}: has {', '.join(unknown)}, but only single numbers can be read")
     names = [word[2] for word in properties]
-    if not {"x", "y", "z"} <= set(names):
-        raise ScanError(f"{path}: needs properties x, y and z; found {', '.join(names)}")
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise ScanError(
+            f"{path}: needs properties x, y and z, each name once; found {', '.join(names)}"
+        )
     layout = np.dtype([(word[2], _PLY_TYPES[word[1]]) for word in properties])
-    count = int(elements[0][2])
-    if len(body) != count * layout.itemsize:
-        raise ScanError(f"{path}: holds {len(body)} bytes for {count} points of {layout.itemsize}")
+    count = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 20 else -1
+    if count < 0 or len(body) != count * layout.itemsize:
+        raise ScanError(
+            f"{path}: holds {len(body)} bytes for {elements[0][2]:.20} points of {layout.itemsize}"
+        )
     table = np.frombuffer(body, dtype=layout)
     wanted = ["x", "y", "z"] + ["intensity"] * ("intensity" in names)
     return np.stack([table[name].astype(np.float32) for name in wanted], axis=1)
@@ -282,9 +309,60 @@ def write_npz(
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Scans of a ``.npz`` file by name, each ``(P, 3)`` or ``(P, 4)`` float32, metres."""
-    with np.load(Path(path), allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+    """Scans of a ``.npz`` file by name, each ``(P, 3)`` or ``(P, 4)`` float32, metres.
+
+    Raises:
+        ScanError: If the file is damaged, or holds what :func:`check_archive` refuses.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            check_archive(archive, path)
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except ScanError:
+        raise
+    except ARCHIVE_ERRORS as error:
+        raise ScanError(f"{path}: is damaged or no .npz file of scans ({error})") from error
+
+
+def check_archive(archive: zipfile.ZipFile, path: Path) -> list[str]:
+    """Names of the arrays of a ``.npz`` file, after a look at what reading them would take.
+
+    Raises:
+        ScanError: If a name leads out of a folder, an array holds objects, is larger than its
+            member says, or than any scan or stack of images; file and member are named.
+    """
+    members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+    for info in members:
+        where = f"{path}, member {info.filename!r:.80}"
+        if reason := refuse_name(info.filename):
+            raise ScanError(f"{where}: its name {reason}; write the file again with other names")
+        with archive.open(info) as stream:
+            shape, _, dtype = read_array_header(stream, where)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject:
+            raise ScanError(f"{where}: holds objects, which are not unpickled")
+        if not 0 <= size <= min(info.file_size, MOST_BYTES):
+            raise ScanError(
+                f"{where}: an array {shape} of {dtype} needs {size} bytes, but the member has "
+                f"{info.file_size}, and at most {MOST_BYTES} are read"
+            )
+    return [info.filename for info in members]
+
+
+def read_array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether in Fortran order, and type of an array in NumPy's format.
+
+    Raises:
+        ScanError: If it is none.
+    """
+    try:
+        return array_header(stream)
+    except zipfile.BadZipFile:  # what holds the array is damaged
+        raise
+    except UNPICKLING_ERRORS as error:
+        raise ScanError(f"{where}: is not an array in NumPy's format ({error})") from error
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,18 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
+from r3dpa.atomic import atomic_path, delete_unfinished, only_writer
+from r3dpa.data.row_store import append
 from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
@@ -41,7 +44,8 @@ class SceneWriter:
 
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json``, which
     tells what was asked for and how many scenes are written. At most three batches are in memory.
-    An error of the thread is raised by the next calls of :meth:`put` or by :meth:`close`.
+    An error of the thread is raised by the next calls of :meth:`put` or by :meth:`close`. One
+    process at a time writes to a folder.
 
     Args:
         out: Folder.
@@ -55,8 +59,9 @@ class SceneWriter:
         num_done: Scenes written so far, by interrupted runs of the same request too.
 
     Raises:
-        ValueError: If a format is unknown, or ``out`` holds scenes, or unfinished ones of another
-            request.
+        ValueError: If a format is unknown, another process writes to ``out``, or it holds scenes,
+            or unfinished ones of another request.
+        OSError: If ``out`` cannot be written.
     """
 
     def __init__(
@@ -73,18 +78,24 @@ class SceneWriter:
             raise ValueError(
                 f"formats must be some of {', '.join(SCENE_FORMATS)}, got {unknown[0]!r}"
             )
-        if (out / "metadata.json").exists() and not overwrite:
-            raise ValueError(f"{out} holds scenes already; give another --out or --overwrite true")
         self.out, self.num, self.num_done = out, num, 0
         self._projection = projection
         self._formats = tuple(formats)
         self._request = json.loads(json.dumps(request))  # tuples become lists, as in the file
         self._state, self._unfinished = out / ".unfinished.json", out / ".unfinished.npy"
-        if self._state.exists() and not overwrite:
-            self.num_done = self._written_before()
-        else:
-            self._clear()
-        self._file = self._open()
+        with ExitStack() as alone:
+            alone.enter_context(only_writer(out / ".lock", f"writes scenes to {out}"))
+            if (out / "metadata.json").exists() and not overwrite:
+                raise ValueError(
+                    f"{out} holds scenes already; give another --out or --overwrite true"
+                )
+            delete_unfinished(out)
+            if self._state.exists() and not overwrite:
+                self.num_done = self._written_before()
+            else:
+                self._clear()
+            self._file = self._open()
+            self._alone = alone.pop_all()
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scene-writer")
         self._waiting: deque[Future[None]] = deque()
         self._failed = False
@@ -100,8 +111,9 @@ class SceneWriter:
         traceback: TracebackType | None,
     ) -> None:
         """Waits for the scenes that were put; after an interrupt they need not be drawn again."""
-        self._thread.shutdown()
-        self._file.close()
+        with self._alone:
+            self._thread.shutdown()
+            self._file.close()
 
     @property
     def range_path(self) -> Path:
@@ -179,12 +191,12 @@ class SceneWriter:
         for name in _CLOUD_WRITERS:
             shutil.rmtree(self.out / name, ignore_errors=True)
 
-    def _open(self) -> IO[bytes]:
+    def _open(self) -> FileIO:
         """File of the range images, behind those that are written."""
         sensor = self._projection.sensor
         shape = (self.num, sensor.beams, sensor.columns)
         self.out.mkdir(parents=True, exist_ok=True)
-        file = self._unfinished.open("r+b" if self.num_done else "wb")
+        file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         file.seek(4 * self.num_done * sensor.beams * sensor.columns, 1)
@@ -204,8 +216,11 @@ class SceneWriter:
                 if name in _CLOUD_WRITERS:
                     path = self.out / name / f"{index:06d}.{name}"
                     _CLOUD_WRITERS[name](path, points)
-        self._file.write(range_m.numpy().astype("<f4", copy=False).tobytes())
-        self._file.flush()
+        try:
+            append(self._file, range_m.numpy().astype("<f4", copy=False).tobytes())
+        except OSError as error:
+            error.filename = str(self._unfinished)
+            raise
         num_done = self.num_done + len(range_m)
         with atomic_path(self._state) as temporary:
             temporary.write_text(json.dumps({"request": self._request, "num_done": num_done}))

@@ -5,6 +5,7 @@ Letters: B batch, N tokens, F feature width, ``...`` axes of the latents.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -39,7 +40,8 @@ class FeatureGuidance:
     over the selected tokens, in float32 or wider. Solvers step backwards in time, so adding its
     gradient to the velocity raises the similarity. Samples do not influence each other. No token
     selected means no guidance, and a sample whose gradient is not finite goes unguided for that
-    evaluation and is counted.
+    evaluation and is counted. The term of a sample is at most ``max_ratio`` times as long as its
+    velocity, so that the steep gradients of tokens near pure noise cannot carry the state away.
 
     It is used as any velocity function. The same three calls serve the published sampler, which
     differs with ``legacy``::
@@ -59,17 +61,20 @@ class FeatureGuidance:
         target: ``(B, N, F)`` features to reach, any length per vector.
         token_mask: ``(B, N)`` bool, tokens to guide; all of them if left out.
         scale: Strength; the gradient is multiplied by it.
+        max_ratio: Longest term of a sample, as a multiple of the length of its velocity; infinity
+            for any length.
         legacy: Quirks of the official code. The energy is averaged over all selected tokens of
-            the batch, so that the strength depends on batch and mask size; Heun's second slope
-            is unguided; in the SDE the term is added to the drift, multiplied by t, and is absent
-            in the last step.
+            the batch, so that the strength depends on batch and mask size; the term may be of any
+            length; Heun's second slope is unguided; in the SDE the term is added to the drift,
+            multiplied by t, and is absent in the last step.
 
     Attributes:
         velocity: The velocity function without guidance.
         history: One record per guided evaluation, on the device of the latents.
 
     Raises:
-        ValueError: If ``target`` or ``token_mask`` has the wrong shape or dtype.
+        ValueError: If ``target`` or ``token_mask`` has the wrong shape or dtype, or ``max_ratio``
+            is negative or NaN.
     """
 
     def __init__(
@@ -80,6 +85,7 @@ class FeatureGuidance:
         token_mask: Tensor | None = None,
         *,
         scale: float,
+        max_ratio: float = 1.0,
         legacy: bool = False,
     ) -> None:
         if target.dim() != 3:
@@ -91,6 +97,8 @@ class FeatureGuidance:
                 f"token_mask must be bool of shape {tuple(target.shape[:2])}, got "
                 f"{token_mask.dtype} of shape {tuple(token_mask.shape)}"
             )
+        if not max_ratio >= 0:
+            raise ValueError(f"max_ratio of the guidance must be 0 or above, got {max_ratio}")
         self.velocity = velocity
         self._project_features = project_features
         with torch.inference_mode(False):  # autograd cannot save tensors of inference mode
@@ -98,6 +106,7 @@ class FeatureGuidance:
             self._token_mask = token_mask.clone()
             self._num_dropped = torch.zeros((), dtype=torch.long, device=target.device)
         self._scale = scale
+        self._max_ratio = math.inf if legacy else max_ratio
         self._legacy = legacy
         self.history: list[GuidanceRecord] = []
 
@@ -116,12 +125,13 @@ class FeatureGuidance:
         """
         velocity = self.velocity(x, time)
         energy, term = self._evaluate(x, time)
+        term = self._limited(term, velocity)
         guided = velocity + term
         self._record(energy, guided if self._legacy else velocity, term)
         return guided
 
     def term(self, x: Tensor, time: Tensor) -> Tensor:
-        """What guidance adds to the velocity: ``scale`` times the gradient of the energy.
+        """``scale`` times the gradient of the energy: what guidance adds, before it is limited.
 
         Args:
             x: ``(B, ...)`` latents.
@@ -180,6 +190,19 @@ class FeatureGuidance:
         usable = finite.reshape(-1, *[1] * (x.dim() - 1))
         return energy.detach(), torch.where(usable, self._scale * gradient, 0.0)
 
+    def _limited(self, term: Tensor, velocity: Tensor) -> Tensor:
+        """The term of each sample, shortened to ``max_ratio`` times its velocity if longer."""
+        if self._max_ratio == math.inf:
+            return term
+        # float64: the square of a long float32 gradient is infinite.
+        length, allowed = (
+            torch.linalg.vector_norm(values.flatten(1), dim=1, dtype=torch.float64)
+            for values in (term, velocity)
+        )
+        allowed = self._max_ratio * allowed
+        factor = torch.where(length > allowed, allowed / length, 1.0).to(term.dtype)
+        return term * factor.reshape(-1, *[1] * (term.dim() - 1))
+
     def _record(self, energy: Tensor, direction: Tensor, term: Tensor) -> None:
         cosine = torch.cosine_similarity(direction.flatten(1), term.flatten(1), dim=1)
         self.history.append(GuidanceRecord(energy, cosine))
@@ -191,4 +214,7 @@ def _at_least_float32(values: Tensor) -> Tensor:
 
 def _unit(vectors: Tensor) -> Tensor:
     """Unit vectors along the last axis; unlike ``normalize`` the gradient is finite at zero."""
+    # Beyond 2^64 the squares are infinite and the cosine would be 0.
+    scale = vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
+    vectors = vectors / scale
     return vectors * torch.rsqrt(vectors.square().sum(dim=-1, keepdim=True) + _COSINE_EPS**2)

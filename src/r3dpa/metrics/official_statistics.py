@@ -27,7 +27,7 @@ from r3dpa.metrics.protocol import PUBLISHED
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly
+from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly, array_header
 
 __all__ = ["OfficialSplit", "OfficialStatistics", "evaluate_official", "is_official"]
 
@@ -215,35 +215,18 @@ def evaluate_official(
     return Evaluation(label, tuple(rows), about)
 
 
-#: All classes and functions that a pickle of arrays needs.
-_KNOWN = {
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-    # What builds arrays and scalars, as NumPy 1 and 2 call it.
-    **{
-        (f"numpy.{core}.multiarray", name): example.__reduce__()[0]
-        for core in ("core", "_core")
-        for name, example in (("_reconstruct", np.empty(0)), ("scalar", np.float64(0)))
-    },
-}
-
-
 def _read(path: Path) -> dict[Any, Any]:
     """The dictionary of the file."""
     try:
         with path.open("rb") as stream:
-            version = np.lib.format.read_magic(stream)
-            header = np.lib.format.read_array_header_1_0
-            if version != (1, 0):
-                header = np.lib.format.read_array_header_2_0
-            shape, _, dtype = header(stream)
+            shape, _, dtype = array_header(stream)
             if shape != () or not dtype.hasobject:
                 raise ValueError(f"an array {shape} of {dtype} instead of one dictionary")
-            content = ArraysOnly(stream, _KNOWN).load()
+            content = ArraysOnly(stream).load()
         content = content.item() if isinstance(content, np.ndarray) else content
         if not isinstance(content, dict):
             raise ValueError(f"holds a {type(content).__name__} instead of a dictionary")
-    except (*UNPICKLING_ERRORS, OSError) as error:
+    except UNPICKLING_ERRORS as error:
         raise ValueError(
             f"{path}: is no official statistics file ({error}); give its data_statistics.npy"
         ) from error

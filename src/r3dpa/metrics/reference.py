@@ -20,6 +20,8 @@ from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
 from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
+from r3dpa.names import refuse_name
+from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 2
@@ -206,13 +208,15 @@ class ReferenceStatistics:
             if card["version"] != _VERSION:
                 raise ValueError(f"is of version {card['version']}, this is {_VERSION}")
             protocol = Protocol.from_dict(card["protocol"])
+            if refused := [why for why in map(refuse_name, card["names"]) if why]:
+                raise ValueError(f"name of a scan {refused[0]}")
             reference = cls(protocol, card["spaces"], card["names"], card["about"])
             reference.num_done = card["num_done"]
             for index, part in enumerate(reference.halves):
                 _fill(part, tensors, index, card)
-        except (OSError, SafetensorError, LookupError, TypeError, ValueError) as error:
+        except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
-                f"{path} holds no reference statistics ({str(error).splitlines()[0]}): give the "
+                f"{path} holds no reference statistics ({first_line(error)}): give the "
                 "file that `r3dpa reference` wrote"
             ) from error
         return reference

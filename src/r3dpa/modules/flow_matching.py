@@ -16,6 +16,7 @@ from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
 from r3dpa.data.scan_cache import CachedTensors, ScanCache
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
+from r3dpa.modules.step_losses import PathDraws
 from r3dpa.nn import VAE, Posterior, SiT
 
 __all__ = ["FlowMatching"]
@@ -129,16 +130,15 @@ class FlowMatching(GenerativeModule):
         """The SiT alone."""
         return {"sit": self.sit}
 
-    def training_step(self, batch: LidarBatch | LatentBatch, batch_idx: int) -> Tensor:
-        """One step on a batch of range images or posteriors, and feature grids ``(B, N, D)``."""
+    def step_losses(self, batch: LidarBatch | LatentBatch, draws: PathDraws) -> dict[str, Tensor]:
+        """Losses of range images or posteriors, and feature grids ``(B, N, D)``."""
         with torch.no_grad():
             if "posterior_moments" in batch:
                 posterior = Posterior(cast(LatentBatch, batch)["posterior_moments"])
             else:
                 posterior = self.vae.encode(cast(LidarBatch, batch)["range_image"])
-            draws = self.draw_path(len(posterior.mean), self.batch_number)
             latents = posterior.sample(draws.posterior_noise)
-        return self.weigh_and_log(self.flow_losses(latents, batch.get("feature_grid"), draws))
+        return self.flow_losses(latents, batch.get("feature_grid"), draws)
 
 
 def _fingerprint(network: nn.Module) -> str:

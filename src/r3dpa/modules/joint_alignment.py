@@ -7,7 +7,8 @@ from typing import Any
 from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.modules.base import GenerativeModule, frozen
+from r3dpa.modules.base import GenerativeModule
+from r3dpa.modules.step_losses import PathDraws, frozen
 from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
 __all__ = ["JointAlignment"]
@@ -46,10 +47,9 @@ class JointAlignment(GenerativeModule):
             "sit": self.sit,
         }
 
-    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
-        """One step on a batch of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+    def step_losses(self, batch: LidarBatch, draws: PathDraws) -> dict[str, Tensor]:
+        """Losses of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
-        draws = self.draw_path(len(image), self.batch_number)
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
         reconstruction = self.vae.decode(latents)
@@ -57,5 +57,4 @@ class JointAlignment(GenerativeModule):
         with frozen(self.sit):
             losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, reconstruction)
-        losses |= self.flow_losses(latents, features, draws)
-        return self.weigh_and_log(losses)
+        return losses | self.flow_losses(latents, features, draws)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
+from r3dpa.modules.step_losses import PathDraws
 from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
 __all__ = ["VAEAlignment"]
@@ -64,10 +65,9 @@ class VAEAlignment(GenerativeModule):
         }
         return networks | ({"sit": self.sit} if self.needs_features() else {})
 
-    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
-        """One step on a batch of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+    def step_losses(self, batch: LidarBatch, draws: PathDraws) -> dict[str, Tensor]:
+        """Losses of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
-        draws = self.draw_path(len(image), self.batch_number)
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
         reconstruction = self.vae.decode(latents)
@@ -75,4 +75,4 @@ class VAEAlignment(GenerativeModule):
         losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, reconstruction)
         self.latent_norm.update(latents.detach())
-        return self.weigh_and_log(losses)
+        return losses

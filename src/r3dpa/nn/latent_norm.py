@@ -97,7 +97,8 @@ class LatentNorm(nn.Module):
         The batch is that of all processes when ``torch.distributed`` is initialised; gradients
         then flow through the shared statistics too, so every process must call it. The biased
         variance normalises, the unbiased one enters the running statistics. A batch with a
-        non-finite latent anywhere leaves mean, variance and count as they were.
+        non-finite latent anywhere, or whose variance is too large for the running one, leaves mean,
+        variance and count as they were.
 
         Args:
             latents: ``(B, C, h, w)`` raw latents.
@@ -169,10 +170,15 @@ class LatentNorm(nn.Module):
 
     @torch.no_grad()
     def _move_statistics(self, mean: Tensor, variance: Tensor, usable: Tensor) -> None:
-        usable = usable & mean.isfinite().all() & variance.isfinite().all()
-        for running, new in ((self.running_mean, mean), (self.running_var, variance)):
-            moved = running.double().lerp(new, self.momentum).to(running.dtype)
-            running.copy_(torch.where(usable, moved, running))
+        statistics = self.running_mean, self.running_var
+        moved = [
+            running.double().lerp(new, self.momentum).to(running.dtype)
+            for running, new in zip(statistics, (mean, variance), strict=True)
+        ]
+        # After the rounding to float32: latents of 1e20 have a variance of 1e40, infinite there.
+        usable = usable & torch.stack(moved).isfinite().all()
+        for running, value in zip(statistics, moved, strict=True):
+            running.copy_(torch.where(usable, value, running))
         self.num_batches_tracked += usable
 
 

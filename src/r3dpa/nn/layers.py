@@ -253,7 +253,8 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
     keys. Unlike ``nn.SyncBatchNorm`` it also runs on a CPU (gloo), and processes may hold
     batches of different sizes. The variance is computed in two passes around the global mean,
     in float32. Gradients are those of the sum of the losses of all processes, as data-parallel
-    training averages them.
+    training averages them. A batch whose statistics are not finite leaves the running ones as they
+    were: they would never be finite again.
 
     Args:
         channels: Channels of the image.
@@ -271,18 +272,30 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
 
     def forward(self, image: Tensor) -> Tensor:
         """Normalise ``(B, C, H, W)``."""
-        distributed = dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
-        if not (self.training and distributed):
+        if not self.training:
             return super().forward(image)
-        mean, variance, count = _global_moments(image)
-        with torch.no_grad():
+        moved = self.running_mean.clone(), self.running_var.clone()
+        if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
+            mean, variance, count = _global_moments(image)
             unbiased = variance * (count / (count - 1))
-            self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(unbiased, self.momentum)
-            self.num_batches_tracked.add_(1)
-        scale = torch.rsqrt(variance + self.eps) * self.weight
-        centred = at_least_float32(image) - mean.view(-1, 1, 1)
-        return (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
+            for running, value in zip(moved, (mean, unbiased), strict=True):
+                running.lerp_(value.detach(), self.momentum)
+            scale = torch.rsqrt(variance + self.eps) * self.weight
+            centred = at_least_float32(image) - mean.view(-1, 1, 1)
+            result = (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
+        else:
+            result = F.batch_norm(
+                image, *moved, self.weight, self.bias, True, self.momentum, self.eps
+            )
+        self._take_statistics(*moved)
+        return result
+
+    @torch.no_grad()
+    def _take_statistics(self, mean: Tensor, variance: Tensor) -> None:
+        usable = mean.isfinite().all() & variance.isfinite().all()
+        self.running_mean.copy_(torch.where(usable, mean, self.running_mean))
+        self.running_var.copy_(torch.where(usable, variance, self.running_var))
+        self.num_batches_tracked += usable
 
 
 class _SumOverProcesses(torch.autograd.Function):

@@ -462,7 +462,8 @@ def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:
 def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     width = tokens.shape[-1:]
     if len(shift) == 1:  # one modulation for all samples is the affine part of the norm
-        return F.layer_norm(tokens, width, 1 + scale[0], shift[0], _TOKEN_NORM_EPS)
+        weight, bias = (1 + scale[0]).to(tokens.dtype), shift[0].to(tokens.dtype)
+        return F.layer_norm(tokens, width, weight, bias, _TOKEN_NORM_EPS)
     normalised = F.layer_norm(tokens, width, eps=_TOKEN_NORM_EPS)
     return normalised * (1 + scale[:, None]) + shift[:, None]
 

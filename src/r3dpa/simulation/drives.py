@@ -204,7 +204,7 @@ def expected_scans(root: Path) -> dict[str, int] | None:
     request = _read_json(manifest)
     try:
         counts = split_scans(request["scans"], request["drives"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(
             f"{manifest} does not say which scans were simulated ({error!r}); simulate the data "
             f"set again into an empty folder"

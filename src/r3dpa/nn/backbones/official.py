@@ -32,7 +32,7 @@ def read_released(path: Path, released: str = _MODEL) -> Any:
         return torch.load(
             path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
         )
-    except (*UNPICKLING_ERRORS, OSError) as error:
+    except UNPICKLING_ERRORS as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(
             f"is damaged, or holds more than tensors and plain values ({reason}); give {released}, "

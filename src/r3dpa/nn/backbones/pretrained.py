@@ -18,6 +18,7 @@ from r3dpa.nn.backbones.kernel import random_basis
 from r3dpa.nn.backbones.tokens import TokenFeatures, sha256
 from r3dpa.nn.backbones.voxels import PointCloudBatch, ScanGrid
 from r3dpa.nn.backbones.waffleiron import WaffleIron
+from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 _SHIPPED = Path(str(files("r3dpa.nn.backbones"))) / "waffleiron_s.safetensors"
 NORM_EPS = nn.BatchNorm1d(1).eps
@@ -115,9 +116,9 @@ def _read(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
         network.load_state_dict(
             {key.removeprefix(prefix): state[key] for key in state if key.startswith(prefix)}
         )
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (*UNPICKLING_ERRORS, SafetensorError) as error:
         raise ValueError(
-            f"{path} holds no weights of waffleiron-s ({str(error).splitlines()[0]}): give the "
+            f"{path} holds no weights of waffleiron-s ({first_line(error)}): give the "
             "waffleiron_s.safetensors that a training with PointPretraining wrote, or leave "
             "weights out for those of the package."
         ) from error

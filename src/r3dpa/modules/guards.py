@@ -1,0 +1,124 @@
+"""Guards of a training step: judged by one read of the host, undone if it was bad.
+
+A step may span several batches (accumulated gradients); it is good or bad as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from r3dpa.modules.settings import GuardConfig
+
+__all__ = ["SeenBatch", "StepGuard", "Verdict"]
+
+
+@dataclass
+class SeenBatch:
+    """A batch of the step at hand.
+
+    Args:
+        content: What the training step received.
+        number: Number of the batch since the start of training.
+        losses: Its losses by name, without their weights, and ``loss``, their weighted sum.
+    """
+
+    content: Mapping[str, Any]
+    number: int
+    losses: dict[str, Tensor] = field(default_factory=dict)
+
+
+class Verdict(NamedTuple):
+    """What is known of a step.
+
+    Attributes:
+        good: Losses, gradient norms and buffers of all processes are finite.
+        suspect: The fault may lie in a batch of this process: one of its losses is not finite, or
+            all losses of all processes are, so that the fault came with the gradients.
+    """
+
+    good: bool
+    suspect: bool
+
+
+class StepGuard:
+    """Judges each step, and takes back what a bad one did to the buffers.
+
+    Batch norm and latent statistics move in the forward pass, before anything is known of the
+    gradients. So they are copied when a step begins, and copied back if it turns out bad.
+
+    Args:
+        config: Limits.
+
+    Attributes:
+        batches: What the step has seen so far.
+        skipped: Bad steps since the start of training.
+        in_a_row: Bad steps since the last good one.
+        still: Steps since the last one with a gradient norm of at least ``config.collapse_norm``.
+    """
+
+    def __init__(self, config: GuardConfig) -> None:
+        self.config = config
+        self.batches: list[SeenBatch] = []
+        self.skipped = self.in_a_row = self.still = 0
+        self._kept: list[tuple[Tensor, Tensor]] = []
+        self._judged = True
+
+    def begin(self, content: Mapping[str, Any], number: int, buffers: Iterable[Tensor]) -> None:
+        """Notes a batch; copies the buffers if it is the first of a step."""
+        if self._judged:
+            self._kept = [(buffer, buffer.detach().clone()) for buffer in buffers]
+            self.batches, self._judged = [], False
+        self.batches.append(SeenBatch(content, number))
+
+    def saw(self, losses: Mapping[str, Tensor]) -> None:
+        """Notes the losses of the last batch, detached."""
+        if self.batches:
+            self.batches[-1].losses = dict(losses)
+
+    def judge(self, norms: Tensor) -> Verdict:
+        """Ends the step; counts, and restores the buffers if it was bad.
+
+        Args:
+            norms: Gradient norm of each network, ``(n,)``, equal in all processes.
+        """
+        losses = [batch.losses["loss"].to(norms) for batch in self.batches if batch.losses]
+        own = ~torch.stack([norms.new_zeros(()), *losses]).isfinite().all()
+        moved = [buffer for buffer, _ in self._kept if buffer.is_floating_point()]
+        sizes = [norms.max(), *(torch._foreach_norm(moved, torch.inf) if moved else ())]
+        flags = torch.stack([own, ~torch.stack(sizes).isfinite().all()]).int()
+        if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
+            dist.all_reduce(flags, dist.ReduceOp.MAX)  # one process skips: all skip
+        still = norms.max() < self.config.collapse_norm
+        # One number, for each read makes the host wait for the device.
+        code = int(8 * still + 4 * own + (flags * flags.new_tensor([2, 1])).sum())
+        good = not code & 3
+        if good:
+            self.in_a_row = 0
+            self.still = self.still + 1 if code & 8 else 0
+        else:
+            self.skipped += 1
+            self.in_a_row += 1
+            with torch.no_grad():
+                for buffer, before in self._kept:
+                    buffer.copy_(before)
+        self._judged = True
+        return Verdict(good, not good and bool(code & 4 or not code & 2))
+
+    def forget(self) -> None:
+        """Lets go of the batches of a step that was judged."""
+        self.batches, self._kept = [], []
+
+    def state_dict(self) -> dict[str, int]:
+        """The three counts."""
+        return {"skipped": self.skipped, "in_a_row": self.in_a_row, "still": self.still}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Goes on counting from there."""
+        self.skipped, self.in_a_row = int(state["skipped"]), int(state["in_a_row"])
+        self.still = int(state["still"])

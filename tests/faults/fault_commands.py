@@ -1,0 +1,277 @@
+"""Real commands in processes of their own, the faults put into them, and what must hold after.
+
+A command runs in a fork of a server that has imported r3dpa and nothing else: as from the shell,
+without the seconds of the imports. Signals, limits and full disks are those of the system.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import multiprocessing
+import os
+import pkgutil
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from PIL import Image
+from safetensors.torch import load_file
+
+from r3dpa.data.grid_settings import GridSettings
+from r3dpa.data.scans import read_ply, read_scan
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(
+    [f"r3dpa.cli.{name}" for name in ("stages", "features", "scenes", "evaluate")]
+)
+PATIENCE_S = 100
+STEPS = 4
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+class Command:
+    """``r3dpa WORDS`` in a process of its own.
+
+    Args:
+        log: File for what the user sees.
+        words: Command line after ``r3dpa``.
+        faults: Called in the process before the command.
+    """
+
+    def __init__(self, log: Path, words: list, *faults: Callable[[], None]) -> None:
+        self.log = log
+        log.touch()
+        arguments = (log, [str(word) for word in words], faults)
+        self._process = CONTEXT.Process(target=_run, args=arguments)
+        self._process.start()
+        self.pid = self._process.pid
+
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        """Waits until something has happened while the command runs."""
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert self._process.is_alive(), f"ended too soon: {self.log.read_text()}"
+            assert time.monotonic() < end, f"nothing happened: {self.log.read_text()}"
+            time.sleep(0.01)
+
+    def end(self) -> tuple[int, str]:
+        """Exit status, negative for a signal, and what the user saw."""
+        self._process.join(PATIENCE_S)
+        if self._process.exitcode is None:
+            self._process.kill()
+            raise AssertionError(f"hangs: {self.log.read_text()}")
+        return self._process.exitcode, self.log.read_text()
+
+
+def _run(log: Path, words: list[str], faults: tuple[Callable[[], None], ...]) -> None:
+    with log.open("a") as file:
+        for descriptor in (1, 2):
+            os.dup2(file.fileno(), descriptor)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    torch.set_num_threads(1)
+    sys.argv = ["r3dpa", *words]
+    for fault in faults:
+        fault()
+    from r3dpa.cli import main
+
+    main()
+
+
+@dataclass(frozen=True)
+class At:
+    """Something happens when a function is about to be called.
+
+    Args:
+        target: Its full name.
+        do: What happens.
+        call: At which call, the first is 1.
+        match: Calls count where a path among the arguments ends with this.
+    """
+
+    target: str
+    do: Callable[[], None]
+    call: int = 1
+    match: str = ""
+
+    def __call__(self) -> None:
+        owner, _, name = self.target.rpartition(".")
+        holder = pkgutil.resolve_name(owner)
+        original, calls = getattr(holder, name), count(1)
+
+        @functools.wraps(original)
+        def patched(*args, **kwargs):
+            paths = [str(arg) for arg in args if isinstance(arg, str | Path)]
+            fits = not self.match or any(path.endswith(self.match) for path in paths)
+            if fits and next(calls) == self.call:
+                self.do()
+            return original(*args, **kwargs)
+
+        setattr(holder, name, patched)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """This process gets a signal."""
+
+    number: int
+
+    def __call__(self) -> None:
+        os.kill(os.getpid(), self.number)
+
+
+def kill_worker() -> None:
+    """One of the processes that work for this one is killed."""
+    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The system kills this process in the midst of writing any longer file."""
+
+    num_bytes: int
+
+    def __call__(self) -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.num_bytes, resource.RLIM_INFINITY))
+
+
+@dataclass(frozen=True)
+class Fill:
+    """A disk has only so many bytes left."""
+
+    disk: Path
+    left: int
+
+    def __call__(self) -> None:
+        size = shutil.disk_usage(self.disk).free - self.left
+        with suppress(OSError):  # a thread of the command may take some of it first
+            (self.disk / "filler").write_bytes(bytes(max(size, 0)))
+
+
+@dataclass(frozen=True)
+class Change:
+    """A file loses its end; or vanishes, where nothing of it is kept."""
+
+    path: Path
+    kept: int | None = None
+
+    def __call__(self) -> None:
+        if self.kept is None:
+            self.path.unlink()
+        else:
+            os.truncate(self.path, self.kept)
+
+
+@dataclass(frozen=True)
+class Pause:
+    """The command waits, having said so with one file, until there is another."""
+
+    folder: Path
+
+    def __call__(self) -> None:
+        (self.folder / "reached").touch()
+        while not (self.folder / "go").exists():
+            time.sleep(0.01)
+
+
+def assert_whole(folder: Path) -> int:
+    """Opens each file that looks whole, that is, has no hidden name; returns how many there are.
+
+    Rows of a store count where the journal names them.
+    """
+    num_files = 0
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.name.startswith(".") and path.name != "filler":
+            _CHECKS[path.suffix](path)
+            num_files += 1
+    return num_files
+
+
+def _check_rows(path: Path) -> None:
+    journal, settings = path.with_suffix(".jsonl"), path.parent / "settings.json"
+    values = json.loads(settings.read_text())
+    row = GridSettings(**values).row.itemsize
+    whole = journal.read_bytes().rpartition(b"\n")[0].splitlines()
+    assert [json.loads(line)["row"] for line in whole] == list(range(len(whole)))
+    assert path.stat().st_size >= len(whole) * row
+
+
+def _check_beside_scan(path: Path) -> None:
+    num_points = len(read_scan(path.parents[1] / "data" / f"{path.stem}.bin"))
+    assert path.stat().st_size == num_points * {".label": 4, ".origin": 1}[path.suffix]
+
+
+def _check_table(path: Path) -> None:
+    rows = list(csv.reader(path.read_text().splitlines(keepends=True)))
+    assert {len(row) for row in rows} == {len(rows[0])}
+
+
+def _check_yaml(path: Path) -> None:
+    assert isinstance(yaml.safe_load(path.read_text()), dict)
+
+
+def _check_npz(path: Path) -> None:
+    with np.load(path) as archive:
+        assert all(np.isfinite(archive[name]).all() for name in archive.files)
+
+
+def _check_beside(path: Path) -> None:
+    """A label may be there before the points of its scan; then it is no scan yet."""
+    if (path.parents[1] / "data" / f"{path.stem}.bin").exists():
+        _check_beside_scan(path)
+
+
+_CHECKS: dict[str, Callable[[Path], object]] = {
+    ".bin": read_scan,
+    ".ckpt": lambda path: torch.load(path, weights_only=True, map_location="cpu"),
+    ".csv": _check_table,
+    ".json": lambda path: json.loads(path.read_text()),
+    ".jsonl": lambda path: _check_rows(path.with_suffix(".rows")),
+    ".label": _check_beside,
+    ".npy": np.load,
+    ".npz": _check_npz,
+    ".origin": _check_beside,
+    ".ply": read_ply,
+    ".png": lambda path: Image.open(path).verify(),
+    ".rows": _check_rows,
+    ".safetensors": load_file,
+    ".txt": lambda path: path.read_text(),
+    ".yaml": _check_yaml,
+}
+
+
+def fit_words(scans, run_dir, *more):
+    """Four steps of two batches each, saved after every second step."""
+    files = [CONF / name for name in ("trainer.yaml", "experiment/vae_alignment.yaml")]
+    options = {
+        "data.class_path": "r3dpa.data.LidarDataModule",
+        "data.init_args.scans": scans,
+        "data.init_args.val_every": "null",
+        "data.init_args.extractor": "null",
+        "model.init_args.weights": "{vae_alignment: 0, sit_alignment: 0}",
+        "trainer.max_steps": STEPS,
+        "trainer.accumulate_grad_batches": 2,
+        "trainer.limit_val_batches": 0,
+        "trainer.logger": "false",
+        "checkpoint.every_n_train_steps": 2,
+        "run_dir": run_dir,
+    }
+    configs = [word for file in (*files, CONF / "smoke.yaml") for word in ("--config", file)]
+    return ["fit", *configs, *(f"--{key}={value}" for key, value in options.items()), *more]
+
+
+def last(run_dir):
+    return run_dir / "checkpoints" / "last.ckpt"

@@ -1,0 +1,198 @@
+"""Checkpoints, stores, caches and archives that were cut short."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from fault_commands import fit_words, last
+from safetensors.torch import save_file
+from torch import nn
+
+from r3dpa.atomic import atomic_path, only_writer
+from r3dpa.cli import main
+from r3dpa.data.datasets import LidarDataset
+from r3dpa.data.feature_grids import write_feature_grids
+from r3dpa.data.feature_store import FeatureGrids
+from r3dpa.data.grid_settings import FeatureGridError
+from r3dpa.data.scan_cache import (
+    CachedTensors,
+    ScanCacheError,
+    range_image_cache,
+    write_range_images,
+)
+from r3dpa.data.scans import ScanError, find_scans, read_npz, write_npz
+from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection
+
+PROJECTION = SphericalProjection(LidarSensor(beams=8, columns=32))
+
+
+def unchanged(points):
+    return points
+
+
+class PointsThemselves(nn.Module):
+    name, dim, settings, prepare = "points", 4, {}, staticmethod(unchanged)
+
+    def point_features(self, prepared):
+        return list(prepared)
+
+
+READERS = {
+    "fit --ckpt_path": lambda ckpt, out, scans: fit_words(scans, out, "--ckpt_path", ckpt),
+    "fit --ckpt_path last": lambda ckpt, out, scans: fit_words(
+        scans, ckpt.parents[1], "--ckpt_path", "last"
+    ),
+    "fit --model.init_args.init_from": lambda ckpt, out, scans: fit_words(
+        scans, out, "--model.init_args.init_from", ckpt
+    ),
+    "test": lambda ckpt, out, scans: [
+        "test",
+        *fit_words(scans, out, "--ckpt_path", ckpt)[1:],
+    ],
+    "sample": lambda ckpt, out, scans: ["sample", "--ckpt", ckpt, "--out", out],
+    "convert": lambda ckpt, out, scans: ["convert", ckpt, out.with_suffix(".safetensors")],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_checkpoint_cut_short(reader, undisturbed, scans_folder, tmp_path, fault):
+    whole = last(undisturbed).read_bytes()
+    ckpt = last(tmp_path / "earlier")
+    ckpt.parent.mkdir(parents=True)
+    words = READERS[reader](ckpt, tmp_path / "out", scans_folder)
+    for kept in (0, 1000, len(whole) // 2, len(whole) - 1):
+        ckpt.write_bytes(whole[:kept])
+        with pytest.raises(ValueError, match="cannot read") as caught:
+            main([str(word) for word in words])
+        assert str(ckpt) in str(caught.value)
+        assert "damaged" in str(caught.value)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != ckpt]
+    fault(
+        f"a checkpoint cut short: {reader}",
+        "file cut to 0, 1000, half and all but one of its bytes",
+        "nothing: refused before anything is written",
+        "`cannot read .../last.ckpt: the file is damaged ...`",
+    )
+
+
+class TestScanThatIsGone:
+    """The index is of before."""
+
+    @pytest.mark.parametrize(("kept", "says"), [(None, "No such file"), (0, "empty"), (8, "16")])
+    def test_data_set(self, own_scans, kept, says):
+        scans = find_scans(own_scans)
+        dataset = LidarDataset(scans, PROJECTION, RangeCodec())
+        change(scans[3].path, kept)
+        with pytest.raises(ScanError, match=f"{scans[3].path}: .*{says}"):
+            dataset[3]
+
+    def test_cache(self, own_scans, tmp_path):
+        scans, codec = find_scans(own_scans), RangeCodec()
+        write_range_images(scans, PROJECTION, codec, tmp_path / "cache")
+        images = CachedTensors(range_image_cache(tmp_path / "cache", PROJECTION, codec), scans)
+        change(scans[3].path, 160)
+        with pytest.raises(ScanCacheError, match=f"{scans[3].path} was replaced"):
+            images.read(scans[3])
+        change(scans[3].path, None)
+        with pytest.raises(ScanError, match=f"{scans[3].path}: cannot be read .No such file"):
+            images.read(scans[3])
+
+    def test_grids(self, own_scans, tmp_path):
+        grids = grids_of(own_scans, tmp_path)
+        scans = find_scans(own_scans)
+        dataset = LidarDataset(scans, PROJECTION, RangeCodec(), grids)
+        change(scans[3].path, 160)
+        with pytest.raises(FeatureGridError, match=str(scans[3].path)):
+            dataset[3]
+
+
+class TestStoreThatIsCut:
+    """Without the check, the system kills whoever touches what is no longer there (SIGBUS)."""
+
+    @pytest.mark.parametrize("opened", [False, True])
+    @pytest.mark.parametrize("kept", [None, 0, 100])
+    def test_rows(self, opened, kept, own_scans, tmp_path, fault):
+        grids = grids_of(own_scans, tmp_path)
+        scan = find_scans(own_scans)[7]
+        if opened:
+            grids.read(scan, scan.num_bytes)
+        (rows,) = tmp_path.rglob("*.rows")
+        change(rows, kept)
+        if opened and kept is None:  # the system keeps what is open
+            assert grids.read(scan, scan.num_bytes).isfinite().all()
+            return
+        with pytest.raises(FeatureGridError, match=f"{rows} .*make their grids again"):
+            grids.read(scan, scan.num_bytes)
+        if opened and kept:
+            fault(
+                "a store of grids or images is cut short while it is read",
+                "file cut after the journal was read, before and after it was mapped",
+                "the grids: they are to be made again",
+                "`.../shard_00000.rows was cut short since its journal was read: delete it ...`",
+            )
+
+
+def test_an_archive_cut_short(tmp_path):
+    path = tmp_path / "scans.npz"
+    write_npz(path, {"a": np.random.default_rng(0).normal(size=(500, 4)).astype(np.float32)})
+    whole = path.read_bytes()
+    assert read_npz(path)["a"].shape == (500, 4)
+    for kept in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:kept])
+        with pytest.raises(ScanError, match=f"{path}: is damaged or no .npz file"):
+            read_npz(path)
+    np.save(path.with_suffix(".npy"), np.zeros(3))
+    shutil.move(path.with_suffix(".npy"), path)
+    with pytest.raises(ScanError, match="damaged"):
+        read_npz(path)
+    with pytest.raises(ScanError, match="No such file"):
+        read_npz(tmp_path / "none.npz")
+
+
+class TestAtomicPath:
+    @pytest.mark.parametrize("writer", ["bytes", "torch", "safetensors"])
+    def test_a_full_disk_is_told_with_the_name_of_the_file(self, writer, small_disk):
+        path = small_disk(1_000_000) / "file"
+
+        def write():
+            tensors = {"a": torch.zeros(1_000_000)}
+            with atomic_path(path) as temporary, temporary.open("wb") as file:
+                if writer == "bytes":
+                    file.write(bytes(2_000_000))
+                elif writer == "torch":
+                    torch.save(tensors, file)
+                else:
+                    save_file(tensors, temporary)
+
+        with pytest.raises(OSError, match=rf"No space left on device: '{path}'"):
+            write()
+        assert not list(path.parent.iterdir())
+
+    def test_errors_about_other_files_stay(self, tmp_path):
+        with (
+            pytest.raises(FileNotFoundError, match="elsewhere"),
+            atomic_path(tmp_path / "file"),
+        ):
+            (tmp_path / "elsewhere").read_bytes()
+
+    def test_one_writer_after_the_other(self, tmp_path):
+        for _ in range(2):
+            with only_writer(tmp_path / "a" / ".lock", "writes"):
+                assert (tmp_path / "a" / ".lock").exists()
+            assert not list((tmp_path / "a").iterdir())
+
+
+def grids_of(folder, tmp_path):
+    scans, extractor = find_scans(folder), PointsThemselves()
+    write_feature_grids(scans, extractor, PROJECTION, [(2, 8)], tmp_path / "grids")
+    return FeatureGrids(tmp_path / "grids", scans, PROJECTION, (2, 8), extractor)
+
+
+def change(path, kept):
+    if kept is None:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:kept])

@@ -1,0 +1,276 @@
+"""``r3dpa fit`` that is stopped, killed, or whose disk is full, and what goes on from there."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+
+import pytest
+import torch
+from fault_commands import (
+    STEPS,
+    At,
+    Change,
+    Fill,
+    Limit,
+    Pause,
+    Signal,
+    assert_whole,
+    fit_words,
+    kill_worker,
+    last,
+)
+
+STEP = "r3dpa.modules.VAEAlignment.training_step"
+
+
+def flat(content, name=""):
+    """All values of a checkpoint by their place in it."""
+    if isinstance(content, dict | list | tuple):
+        pairs = content.items() if isinstance(content, dict) else enumerate(content)
+        return {k: v for key, value in pairs for k, v in flat(value, f"{name}/{key}").items()}
+    return {name: content}
+
+
+def assert_same_training(run_dir, other):
+    """Weights, averages, buffers and optimiser, bit by bit."""
+    ours, theirs = (torch.load(last(path), weights_only=True) for path in (run_dir, other))
+    assert ours["global_step"] == theirs["global_step"] == STEPS
+    for part in ("state_dict", "optimizer_states"):
+        left, right = flat(ours[part]), flat(theirs[part])
+        assert left.keys() == right.keys()
+        for name, value in left.items():
+            if isinstance(value, torch.Tensor):
+                assert torch.equal(value, right[name]), name
+            else:
+                assert value == right[name], name
+
+
+def step_of(path):
+    return torch.load(path, weights_only=True)["global_step"]
+
+
+@pytest.fixture
+def goes_on(ended, scans_folder, undisturbed):
+    """``goes_on(run_dir)``: the same command, with ``--ckpt_path last``, ends as if undisturbed."""
+
+    def run(run_dir, *more, scans=scans_folder):
+        status, seen = ended(fit_words(scans, run_dir, "--ckpt_path", "last", *more))
+        assert status == 0, seen
+        assert_same_training(run_dir, undisturbed)
+        assert assert_whole(run_dir) >= 2
+        assert not list(run_dir.rglob(".*.partial.*"))
+
+    return run
+
+
+class TestSigterm:
+    def test_between_two_batches_of_a_step(self, scans_folder, tmp_path, ended, goes_on, fault):
+        """In the first of the two batches of step 3: it waits for the second."""
+        words = fit_words(scans_folder, tmp_path / "run")
+        status, seen = ended(words, At(STEP, Signal(signal.SIGTERM), call=5))
+        assert status == 143
+        says = "stopped by SIGTERM after step 3: the same command goes on with --ckpt_path "
+        assert f"{says}{last(tmp_path / 'run')}\n" in seen
+        assert "Traceback" not in seen
+        assert step_of(last(tmp_path / "run")) == 3
+        assert_whole(tmp_path / "run")
+        goes_on(tmp_path / "run")
+        fault(
+            "SIGTERM while training",
+            "signal to the process in the first of the two batches of a step",
+            "nothing: that step is finished and saved; resumed, bitwise as undisturbed",
+            "status 143, `stopped by SIGTERM after step 3: the same command goes on with "
+            "--ckpt_path .../last.ckpt`",
+        )
+
+    def test_while_a_checkpoint_is_written(self, scans_folder, tmp_path, ended, goes_on, fault):
+        words = fit_words(scans_folder, tmp_path / "run")
+        status, seen = ended(words, At("torch.save", Signal(signal.SIGTERM)))
+        assert status == 143, seen
+        assert "stopped by SIGTERM after step 2" in seen
+        assert step_of(last(tmp_path / "run")) == 2
+        goes_on(tmp_path / "run")
+        fault(
+            "SIGTERM while a checkpoint is written",
+            "signal to the process as torch.save begins",
+            "nothing: the checkpoint is written to its end; resumed, bitwise as undisturbed",
+            "status 143 and the line above",
+        )
+
+    @pytest.mark.slow
+    def test_in_a_validation(self, scans_folder, tmp_path, ended, goes_on, fault):
+        """It ends after the next batch, not after minutes; the rest is validated on resuming."""
+        more = ["--trainer.limit_val_batches=4", "--trainer.val_check_interval=6"]
+        more += ["--data.init_args.val_every=2", "--data.init_args.batch_size=1"]
+        calm = tmp_path / "calm"
+        assert ended(fit_words(scans_folder, calm, *more))[0] == 0
+        words = fit_words(scans_folder, tmp_path / "run", *more)
+        validation = "r3dpa.modules.VAEAlignment.validation_step"
+        status, seen = ended(words, At(validation, Signal(signal.SIGTERM), call=2))
+        assert status == 143, seen
+        assert step_of(last(tmp_path / "run")) == 3
+        status, seen = ended([*words, "--ckpt_path", "last"])
+        assert status == 0, seen
+        assert_same_training(tmp_path / "run", calm)
+        fault(
+            "SIGTERM in a validation",
+            "signal to the process in the second batch of a validation",
+            "nothing of the training: saved at once; resumed, bitwise as undisturbed",
+            "status 143 and the line above",
+        )
+
+
+class TestKilled:
+    @pytest.mark.parametrize("call", [pytest.param(1, marks=pytest.mark.slow), 6])
+    def test_between_checkpoints(self, call, scans_folder, tmp_path, ended, goes_on, fault):
+        """Before the first one, too: ``last`` then means from the start."""
+        words = fit_words(scans_folder, tmp_path / "run")
+        status, _ = ended(words, At(STEP, Signal(signal.SIGKILL), call=call))
+        assert status == -signal.SIGKILL
+        assert_whole(tmp_path / "run")
+        assert last(tmp_path / "run").exists() == (call > 1)
+        goes_on(tmp_path / "run")
+        if call > 1:
+            fault(
+                "SIGKILL while training",
+                "signal to the process in a step; also in the first one",
+                "steps since the last checkpoint, which are trained again: bitwise as undisturbed",
+                "what the system says of a killed process; --ckpt_path last goes on",
+            )
+
+    @pytest.mark.parametrize(
+        "save", [*(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2)), 4]
+    )
+    def test_with_half_a_checkpoint_written(
+        self, save, scans_folder, tmp_path, ended, goes_on, fault
+    ):
+        """Each saving writes two files, ``step=...`` and ``last``."""
+        words = fit_words(scans_folder, tmp_path / "run")
+        status, seen = ended(words, At("torch.save", Limit(100_000), call=save))
+        assert status == -signal.SIGXFSZ, seen
+        (half,) = (tmp_path / "run").rglob(".*.partial.ckpt")
+        assert half.stat().st_size == 100_000
+        assert_whole(tmp_path / "run")
+        if save == 4:
+            assert step_of(last(tmp_path / "run")) == 2
+        goes_on(tmp_path / "run")
+        if save == 4:
+            fault(
+                "killed while a checkpoint is written",
+                "the system kills the process at byte 100 000 of the file (RLIMIT_FSIZE, SIGXFSZ)",
+                "steps since the checkpoint before, which stays; resumed, bitwise as undisturbed",
+                "what the system says; the half file is hidden, and the next fit removes it",
+            )
+
+    @pytest.mark.slow
+    def test_before_a_checkpoint_gets_its_name(self, scans_folder, tmp_path, ended, goes_on):
+        words = fit_words(scans_folder, tmp_path / "run")
+        renamed = At("pathlib.Path.replace", Signal(signal.SIGKILL), call=2, match="last.ckpt")
+        assert ended(words, renamed)[0] == -signal.SIGKILL
+        assert step_of(last(tmp_path / "run")) == 2
+        assert_whole(tmp_path / "run")
+        goes_on(tmp_path / "run")
+
+    def test_worker(self, scans_folder, tmp_path, ended, goes_on, fault):
+        words = fit_words(scans_folder, tmp_path / "run")
+        words += ["--data.init_args.num_workers=1"]
+        status, seen = ended(words, At(STEP, kill_worker, call=6))
+        assert status == 1
+        assert "DataLoader worker" in seen
+        assert_whole(tmp_path / "run")
+        goes_on(tmp_path / "run")
+        fault(
+            "a loader process dies",
+            "SIGKILL to the DataLoader worker",
+            "steps since the last checkpoint; resumed, bitwise as undisturbed",
+            "status 1, `DataLoader worker (pid ...) is killed by signal: Killed`",
+        )
+
+
+class TestDisk:
+    def test_full_while_a_checkpoint_is_written(
+        self, scans_folder, small_disk, ended, goes_on, fault
+    ):
+        """The disk of the run, which is not that of temporary files."""
+        disk = small_disk(64_000_000)
+        run_dir = disk / "run"
+        full = At("torch.save", Fill(disk, 100_000), call=4)
+        status, seen = ended(fit_words(scans_folder, run_dir), full)
+        assert status == 1
+        assert f"No space left on device: '{last(run_dir)}'" in seen
+        assert step_of(last(run_dir)) == 2
+        assert_whole(run_dir)
+        assert not list(run_dir.rglob(".*.partial.*"))
+        (disk / "filler").unlink()
+        goes_on(run_dir)
+        fault(
+            "disk full while a checkpoint is written",
+            "disk in memory (tmpfs) filled to 100 kB",
+            "steps since the checkpoint before, which stays; resumed, bitwise as undisturbed",
+            "status 1, `OSError: [Errno 28] No space left on device: '.../last.ckpt'`",
+        )
+
+    def test_read_only(self, scans_folder, small_disk, make_read_only, ended, fault):
+        disk = small_disk(1_000_000)
+        make_read_only(disk)
+        status, seen = ended(fit_words(scans_folder, disk / "run"))
+        assert status == 1
+        assert f"Read-only file system: '{disk / 'run'}'" in seen
+        fault(
+            "run_dir is read-only",
+            "disk in memory mounted read-only",
+            "nothing: refused before training",
+            "status 1, `OSError: [Errno 30] Read-only file system: '...'`",
+        )
+
+
+class TestTwo:
+    def test_the_second_is_refused(self, scans_folder, tmp_path, start, ended, undisturbed, fault):
+        run_dir = tmp_path / "run"
+        first = start(fit_words(scans_folder, run_dir), At(STEP, Pause(tmp_path), call=2))
+        first.wait_for((tmp_path / "reached").exists)
+        for more in ([], ["--ckpt_path", "last"]):
+            status, seen = ended(fit_words(scans_folder, run_dir, *more))
+            assert status == 1
+            assert f"another process ({first.pid} on " in seen
+            assert f"runs r3dpa fit in {run_dir}: wait for it to end" in seen
+        (tmp_path / "go").touch()
+        assert first.end()[0] == 0
+        assert_same_training(run_dir, undisturbed)
+        status, seen = ended(fit_words(scans_folder, run_dir))
+        assert "holds an earlier run: resume it with --ckpt_path last" in seen
+        fault(
+            "two fits into one run_dir",
+            "a second one is started while the first is in a step",
+            "nothing: the first ends bitwise as undisturbed",
+            "the second: status 1, `another process (PID on HOST) runs r3dpa fit in ...`",
+        )
+
+
+class TestScan:
+    @pytest.mark.parametrize(
+        ("kept", "says"),
+        [(None, "No such file"), pytest.param(100, "not a multiple", marks=pytest.mark.slow)],
+    )
+    def test_lost_between_index_and_read(
+        self, kept, says, own_scans, tmp_path, ended, goes_on, fault
+    ):
+        """All of them are, in the step after a checkpoint; then they are back."""
+        saved = tmp_path / "saved"
+        shutil.copytree(own_scans, saved)
+        words = fit_words(own_scans, tmp_path / "run")
+        faults = [At(STEP, Change(path, kept), call=5) for path in own_scans.iterdir()]
+        status, seen = ended(words, *faults)
+        assert status == 1
+        assert f"{own_scans}/0" in seen.splitlines()[-1]
+        assert says in seen.splitlines()[-1]
+        assert_whole(tmp_path / "run")
+        shutil.copytree(saved, own_scans, dirs_exist_ok=True)
+        goes_on(tmp_path / "run", scans=own_scans)
+        fault(
+            f"a scan {'vanishes' if kept is None else 'is cut short'} between index and read",
+            "all scans changed while a step runs",
+            "steps since the last checkpoint; with the scans back, bitwise as undisturbed",
+            f"status 1, `ScanError: .../000003.bin: ... {says} ...`",
+        )

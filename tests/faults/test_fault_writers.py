@@ -1,0 +1,309 @@
+"""Simulation, feature extraction, sampling and reference statistics that are stopped or killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from fault_commands import At, Command, Fill, Limit, Pause, Signal, assert_whole, kill_worker
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+# Measured times, and when and where something was made.
+_NOT_PROMISED = {"timings.csv", "report.json", "metadata.json", "filler"}
+SENSOR = {"class_path": "r3dpa.geometry.LidarSensor", "init_args": {"beams": 16, "columns": 64}}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command that writes.
+
+    Args:
+        words: Before what says where to.
+        place: How that is said.
+        inside: Function that is called for each piece of the work.
+        file: Ending of the file in whose midst it is killed, and the bytes of it that are written.
+        is_file: It writes one file, not a folder.
+    """
+
+    words: list
+    place: str
+    inside: At
+    num_bytes: int
+    stopped: str
+    is_file: bool = False
+
+    def command(self, out, *more):
+        return [*self.words, self.place, out, *more]
+
+
+@pytest.fixture(scope="session")
+def jobs(scans_folder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("jobs")
+    lasers = folder / "lasers.yaml"
+    lasers.write_text("lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]")
+    data = {"class_path": "r3dpa.data.LidarDataModule"}
+    data["init_args"] = {"scans": str(scans_folder), "sensor": SENSOR, "grid_size": [2, 8]}
+    (folder / "data.yaml").write_text(json.dumps({"data": data}))
+    extractor = ["--extractor", "geometric", "--batch_size", 1, "--trainer.accelerator", "cpu"]
+    words = ["fit", *_stage(scans_folder), "--run_dir", folder / "run"]
+    status, seen = Command(folder / ".log", words).end()
+    assert status == 0, seen
+    sampler = ["--steps", 2, "--pictures", 0, "--device", "cpu", "--formats", "bin,ply,npz"]
+    ckpt = folder / "run" / "checkpoints" / "last.ckpt"
+    return {
+        "simulate": Job(
+            ["simulate", "--scans", 6, "--sensor", lasers],
+            "--out",
+            At("pathlib.Path.replace", None, call=2, match=".bin"),
+            1000,
+            "r3dpa simulate: stopped; the same command goes on in {out}\n",
+        ),
+        "features": Job(
+            ["features", "--data", folder / "data.yaml", *extractor],
+            "--out",
+            At("r3dpa.modules.feature_extraction.pooled_grids", None, call=4),
+            5000,
+            "r3dpa features: stopped; the same command goes on in {out}\n",
+        ),
+        "sample": Job(
+            ["sample", "--ckpt", ckpt, "--num", 6, "--batch_size", 1, *sampler],
+            "--out",
+            At("r3dpa.generation.SceneGenerator.generate", None, call=4),
+            5000,
+            "r3dpa sample: stopped; the same command goes on in {out}\n",
+        ),
+        "reference": Job(
+            ["reference", "--data", folder / "data.yaml", "--spaces", "fgeo", "--device", "cpu"],
+            "--out",
+            At("r3dpa.scoring.read_scan", None, call=4),
+            5000,
+            "r3dpa reference: stopped; the same command goes on with {out}\n",
+            is_file=True,
+        ),
+    }
+
+
+def _stage(scans):
+    files = [CONF / name for name in ("trainer.yaml", "experiment/joint.yaml", "smoke.yaml")]
+    options = {
+        "data.class_path": "r3dpa.data.LidarDataModule",
+        "data.init_args.scans": scans,
+        "data.init_args.val_every": "null",
+        "data.init_args.extractor": "null",
+        "model.init_args.weights": "{vae_alignment: 0, sit_alignment: 0}",
+        "trainer.limit_val_batches": 0,
+        "trainer.logger": "false",
+    }
+    configs = [word for file in files for word in ("--config", file)]
+    return [*configs, *(f"--{key}={value}" for key, value in options.items())]
+
+
+def at(job, do):
+    return At(job.inside.target, do, job.inside.call, job.inside.match)
+
+
+def contents(out):
+    """Bytes of all files of which they are promised; of a store those that the journal names."""
+    if out.is_file():
+        return out.read_bytes()
+    files = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
+    kept = {n: p for n, p in files.items() if n.name not in _NOT_PROMISED and n.name[0] != "."}
+    return {str(name): path.read_bytes() for name, path in kept.items()}
+
+
+@pytest.fixture(scope="session")
+def expected(jobs, tmp_path_factory):
+    """``expected(name)``: what an undisturbed run of a job writes."""
+    made = {}
+
+    def make(name):
+        if name not in made:
+            folder = tmp_path_factory.mktemp(name)
+            out = folder / ("out.safetensors" if jobs[name].is_file else "out")
+            status, seen = Command(folder / ".log", jobs[name].command(out)).end()
+            assert status == 0, seen
+            made[name] = contents(out)
+        return made[name]
+
+    return make
+
+
+@pytest.fixture
+def goes_on(jobs, ended, expected):
+    """``goes_on(name, out)``: the same command ends with the bytes of an undisturbed run."""
+
+    def run(name, out):
+        status, seen = ended(jobs[name].command(out))
+        assert status == 0, seen
+        assert contents(out) == expected(name)
+        assert not list(out.parent.rglob(".*.partial.*"))
+        if not jobs[name].is_file:
+            assert_whole(out)
+
+    return run
+
+
+@pytest.fixture
+def out_of(jobs, tmp_path):
+    return lambda name, root=tmp_path: root / ("out.safetensors" if jobs[name].is_file else "out")
+
+
+NAMES = ("simulate", "features", "sample", "reference")
+_LOST = {
+    "simulate": "the scan at hand; the rest is kept, and the end the same bytes",
+    "features": "the batch at hand; the rest is kept, and the end the same bytes",
+    "sample": "the batch at hand; the rest is kept, and the end the same bytes",
+    "reference": "at most the last 2000 scans; the end is the same bytes",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sigterm(name, jobs, ended, out_of, goes_on, fault):
+    out = out_of(name)
+    status, seen = ended(jobs[name].command(out), at(jobs[name], Signal(signal.SIGTERM)))
+    assert status == 130
+    assert seen.endswith(jobs[name].stopped.format(out=out))
+    assert "Traceback" not in seen
+    assert_whole(out.parent)
+    goes_on(name, out)
+    said = jobs[name].stopped.format(out="OUT").strip()
+    fault(f"SIGTERM to {name}", "signal to the process", _LOST[name], f"status 130, `{said}`")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sigkill(name, jobs, ended, out_of, goes_on, fault):
+    out = out_of(name)
+    status, _ = ended(jobs[name].command(out), at(jobs[name], Signal(signal.SIGKILL)))
+    assert status == -signal.SIGKILL
+    assert not out.is_file()
+    assert_whole(out.parent)
+    goes_on(name, out)
+    fault(
+        f"SIGKILL to {name}",
+        "signal to the process in the midst of its work",
+        _LOST[name],
+        "what the system says of a killed process; the same command goes on",
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_killed_with_half_a_file_written(name, jobs, ended, out_of, goes_on, fault):
+    out, job = out_of(name), jobs[name]
+    status, seen = ended(job.command(out), Limit(job.num_bytes))
+    assert status == -signal.SIGXFSZ, seen
+    assert_whole(out.parent)
+    goes_on(name, out)
+    fault(
+        f"{name} is killed amid a file",
+        f"the system kills it at byte {job.num_bytes} of a file (RLIMIT_FSIZE, SIGXFSZ)",
+        _LOST[name],
+        "what the system says; half files have hidden names or are not named by a journal",
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on, fault):
+    disk = small_disk(32_000_000)
+    out, job = out_of(name, disk), jobs[name]
+    status, seen = ended(job.command(out), at(job, Fill(disk, 0)))
+    assert status == 1
+    assert "No space left on device" in seen
+    assert str(out.with_suffix("")) in seen.splitlines()[-1]
+    assert "Traceback" not in seen
+    assert_whole(disk)
+    (disk / "filler").unlink()
+    goes_on(name, out)
+    fault(
+        f"disk full in {name}",
+        "disk in memory (tmpfs) filled while it works",
+        _LOST[name],
+        f"status 1, one line: `{seen.splitlines()[-1].replace(str(disk), '...')}`",
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_read_only(name, jobs, ended, out_of, small_disk, make_read_only, fault):
+    disk = small_disk(1_000_000)
+    make_read_only(disk)
+    out = out_of(name, disk)
+    status, seen = ended(jobs[name].command(out))
+    assert status == 1
+    line = seen.splitlines()[-1]
+    assert line.startswith(f"r3dpa {name}: ")
+    assert "Read-only file system" in line
+    assert str(out.name) in line
+    assert "Traceback" not in seen
+    fault(
+        f"read-only output of {name}",
+        "disk in memory mounted read-only",
+        "nothing: nothing was begun",
+        f"status 1, one line: `{line.replace(str(disk), '...')}`",
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_two_at_once(name, jobs, start, ended, out_of, tmp_path, expected, fault):
+    """Simulation and extraction wait for each other; what cannot be shared is refused."""
+    waits = name in ("simulate", "features")
+    out, job = out_of(name, tmp_path / "two"), jobs[name]
+    first = start(job.command(out), at(job, Pause(tmp_path)))
+    first.wait_for((tmp_path / "reached").exists)
+    second = start(job.command(out))
+    if waits:
+        second.wait_for(lambda: "waiting for another process" in second.log.read_text())
+        (tmp_path / "go").touch()
+        assert second.end()[0] == 0
+    else:
+        status, seen = second.end()
+        assert status == 1
+        assert f"another process ({first.pid} on {os.uname().nodename})" in seen.splitlines()[-1]
+        (tmp_path / "go").touch()
+    assert first.end()[0] == 0
+    assert contents(out) == expected(name)
+    seen = second.log.read_text()
+    line = next(line for line in seen.splitlines() if "another process" in line)
+    fault(
+        f"two {name} into one place",
+        "a second one is started while the first works",
+        "nothing: the same bytes as of one run",
+        f"the second {'waits' if waits else 'has status 1'}: "
+        f"`{line.replace(str(tmp_path), '...')}`",
+    )
+
+
+def test_worker_of_a_simulation(jobs, ended, out_of, goes_on, fault):
+    """Six scans are one or two tasks a drive, for two workers."""
+    out = out_of("simulate")
+    words = jobs["simulate"].command(out, "--workers", 2)
+    status, seen = ended(words, At("r3dpa.simulation.drives.add_timings", kill_worker))
+    assert status == 1
+    assert seen.splitlines()[-1].startswith("r3dpa simulate: a worker process ended before")
+    assert_whole(out)
+    goes_on("simulate", out)
+    fault(
+        "a worker of simulate dies",
+        "SIGKILL to it",
+        _LOST["simulate"],
+        "status 1, `r3dpa simulate: a worker process ended before its work: ...`",
+    )
+
+
+@pytest.mark.slow  # torch notices after five seconds
+def test_loader_of_an_extraction(jobs, ended, out_of, goes_on, fault):
+    out, job = out_of("features"), jobs["features"]
+    words = job.command(out, "--data.init_args.num_workers", 1)
+    status, seen = ended(words, at(job, kill_worker))
+    assert status == 1
+    assert "DataLoader worker" in seen.splitlines()[-1]
+    assert_whole(out)
+    goes_on("features", out)
+    fault(
+        "a loader process of features dies",
+        "SIGKILL to it",
+        _LOST["features"],
+        f"status 1, `{seen.splitlines()[-1]}`",
+    )

@@ -1,0 +1,122 @@
+"""Names in files that would leave a folder are refused wherever such a file is read."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from r3dpa.data import read_samples
+from r3dpa.data.row_store import Rows
+from r3dpa.data.scans import read_npz
+from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.protocol import PROTOCOLS
+from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.names import refuse_name
+from r3dpa.simulation import expected_scans
+from r3dpa.unpickling import ArraysOnly
+
+BAD = ["../../x", "/etc/x", "a/../../x", "a/./x", "a//x", "..", ".", "", "C:x", "c:\\x", "a\\..\\x"]
+BAD += ["a\0b", "a\nb", "x" * 2000]
+POINTS = np.full((3, 4), 5.0, np.float32)
+
+
+@pytest.mark.parametrize("name", [*BAD, 3, None, ["a"]])
+def test_bad_names(name):
+    assert refuse_name(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "a/b", "2013_05_28_drive_0003_sync/0000000000", "..a", "ü 1"]
+)
+def test_good_names(name):
+    assert refuse_name(name) is None
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_journal_of_a_store(name, tmp_path):
+    (tmp_path / "shard_00000.rows").write_bytes(bytes(8))
+    line = json.dumps({"scan": name, "bytes": 16, "row": 0}) + "\n"
+    (tmp_path / "shard_00000.jsonl").write_text(line)
+    rows = Rows("rows", "folder", "rows again", ValueError)
+    with pytest.raises(ValueError, match=r"shard_00000\.jsonl is damaged .*name of scan in line 1"):
+        rows.places(tmp_path, 8)
+
+
+@pytest.mark.parametrize("name", ["../../x", "/etc/x", "a\\..\\x"])
+def test_members_of_archives(name, tmp_path):
+    array = io.BytesIO()
+    np.save(array, POINTS)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr(f"{name}.npy", array.getvalue())
+    with pytest.raises(ValueError, match=r"a\.npz, member .*: its name"):
+        read_npz(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a\.npz, member .*: its name"):
+        list(read_samples(tmp_path / "a.npz", LidarSensor(4, 16)))
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_names_in_a_reference(name, tmp_path):
+    path = tmp_path / "a.safetensors"
+    protocol = PROTOCOLS["default"].with_sensor(LidarSensor(4, 16))
+    ReferenceStatistics(protocol, {}, ["a/0", "b/0"], {}).save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors, about = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    card = json.loads(about["r3dpa_reference"])
+    card["names"][0] = name
+    save_file(tensors, path, {"r3dpa_reference": json.dumps(card)})
+    with pytest.raises(ValueError, match=r"a\.safetensors holds no .*name of a scan"):
+        ReferenceStatistics.load(path)
+
+
+@pytest.mark.parametrize("drive", ["../../x", "/etc", "0003/../..", ""])
+def test_drives_in_a_manifest(drive, tmp_path):
+    (tmp_path / "simulation.json").write_text(json.dumps({"scans": 3, "drives": [drive]}))
+    with pytest.raises(ValueError, match=r"simulation\.json does not say"):
+        expected_scans(tmp_path)
+
+
+def test_few_bytes_that_ask_for_much_memory(tmp_path):
+    head = (
+        b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': '<f4', 'fortran_order': False, 'shape': (%d, 4)}"
+    )
+    for count in (2**40, 2**62):
+        data = head % count
+        data = data.ljust(127) + b"\n" + bytes(64)
+        (tmp_path / "a.npy").write_bytes(data)
+        with pytest.raises(ValueError, match=r"a\.npy.*ends after 64 of"):
+            list(read_samples(tmp_path / "a.npy", LidarSensor(4, 16)))
+        with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+            archive.writestr("a.npy", data)
+        with pytest.raises(ValueError, match=r"needs .* bytes, but the member has 192"):
+            read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x8e" + (2**40).to_bytes(8, "little"),  # BINBYTES8 of a terabyte
+        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(\x8a\x06"
+        + (2**40).to_bytes(6, "little")
+        + b"tU\x01btR.",  # an array of a terabyte
+        pickle.dumps(np.dtype([("a", "f4")])),
+        pickle.dumps(np.dtype("V9")),
+    ],
+)
+def test_pickles_that_ask_for_much_memory_or_odd_types(data):
+    with pytest.raises((pickle.UnpicklingError, EOFError)):
+        ArraysOnly(io.BytesIO(data)).load()
+
+
+def test_arrays_are_unpickled():
+    arrays = [np.arange(6.0).reshape(2, 3).T, np.float32(3), np.array([{"a": 1}], object)]
+    read = ArraysOnly(io.BytesIO(pickle.dumps(arrays))).load()
+    assert np.array_equal(read[0], arrays[0])
+    assert read[1:2] == arrays[1:2]
+    assert read[2][0] == {"a": 1}

@@ -1,0 +1,258 @@
+"""A bad step leaves no trace but a count and a file; collapse stops; processes agree."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+from test_gradients import STAGES, TinyData, stage_module, train
+
+from r3dpa.modules import GuardConfig
+from r3dpa.modules.bad_batches import BadBatch
+from r3dpa.modules.guards import StepGuard
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+    pytest.mark.filterwarnings("ignore:step .* was skipped"),
+    pytest.mark.filterwarnings("ignore:.*barrier.. using the device"),
+    pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork"),
+]
+
+
+class NamedData(TinyData):
+    """Batches whose scans have names; ``left_out`` are not handed out, the others keep theirs."""
+
+    def __init__(self, num, left_out=()):
+        super().__init__([False] * num)
+        for number, batch in enumerate(self.batches):
+            batch["name"] = [f"drive/{number}a", f"drive/{number}b"]
+        self.numbers = [number for number in range(num) if number not in left_out]
+        self.batches = [self.batches[number] for number in self.numbers]
+
+
+def infinite_image(module, batch):
+    batch["range_image"][0, 0, 0, 0] = torch.inf
+
+
+def huge_latents(module, batch):
+    """Finite, as are the batch statistics: only what is computed from them overflows."""
+    hook = module.vae.quant_conv.register_forward_hook(
+        lambda *_: (hook.remove(), torch.full((2, 8, 4, 8), 1e38))[1]
+    )
+
+
+def constant_loss(module, batch):
+    """A loss without a finite value, but with gradients that are."""
+    module.added = torch.inf
+
+
+def guarded(stage, bad=(), fault=infinite_image, numbers=None, **kwargs):
+    """A stage whose batches of these numbers are broken before the step sees them."""
+
+    class Module(STAGES[stage]):
+        added = 0.0
+        batch_number = property(
+            lambda self: (numbers or range(99))[self.trainer.fit_loop.epoch_loop.total_batch_idx]
+        )
+
+        def step_losses(self, batch, draws):
+            if self.batch_number in bad:
+                fault(self, batch)
+            parts = super().step_losses(batch, draws)
+            added, self.added = self.added, 0.0
+            return {name: part + added for name, part in parts.items()}
+
+    module = stage_module(stage, **kwargs)
+    module.__class__ = Module
+    return module
+
+
+FAULTS = [
+    *((stage, fault) for stage in STAGES for fault in (infinite_image, constant_loss)),
+    # Stage flow_matching normalises them before it computes anything.
+    *((stage, huge_latents) for stage in ("vae_alignment", "joint")),
+]
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("accumulate", [1, 2])
+@pytest.mark.parametrize(("stage", "fault"), FAULTS)
+class TestABadStep:
+    def test_is_as_if_it_had_not_been(self, stage, fault, accumulate):
+        """Weights, all buffers, averages and moments equal those of a run without its batches.
+
+        With two batches a step the second one of the middle step is broken; both are then lost.
+        """
+        num, bad = 3 * accumulate, 2 * accumulate - 1
+        lost = range(accumulate, 2 * accumulate)
+        settings = {"accumulate_grad_batches": accumulate, "gradient_clip_val": 1.0}
+        runs = {}
+        for name, data in (("with", NamedData(num)), ("without", NamedData(num, lost))):
+            module = guarded(stage, [bad], fault, data.numbers)
+            steps = len(data.batches) // accumulate
+            runs[name] = train(module, data, max_steps=steps, **settings)
+        with_it, without = runs["with"], runs["without"]
+        assert (with_it.guard.skipped, without.guard.skipped) == (1, 0)
+        assert with_it.trainer.callback_metrics["train/skipped_steps"] == 1
+        assert with_it.global_step == without.global_step + 1 == 3
+        weights, moments = with_it.states[-1]
+        expected, expected_moments = without.states[-1]
+        assert weights.keys() == expected.keys()
+        for key, value in expected.items():
+            assert torch.equal(weights[key], value), key
+        for found, state in zip(moments, expected_moments, strict=True):
+            for key, value in state.items():
+                assert torch.equal(found[key], value), key
+        after_bad, before = (with_it.states[index][0] for index in (bad, accumulate - 1))
+        for key, value in before.items():
+            assert torch.equal(after_bad[key], value), key
+
+    def test_breaks_weights_or_statistics_without_guards(self, stage, fault, accumulate):
+        """The naive way; an infinite loss with finite gradients only moves them on."""
+        module = guarded(stage, [accumulate], fault, guards=None)
+        train(module, NamedData(2 * accumulate), max_steps=2, accumulate_grad_batches=accumulate)
+        sound = all(value.isfinite().all() for value in module.state_dict().values())
+        assert sound == (fault is constant_loss)
+
+
+class TestTheReport:
+    def test_names_the_scans_and_keeps_the_batch(self, tmp_path):
+        module = guarded("joint", [1])
+        data = NamedData(3)
+        with pytest.warns(UserWarning, match="step 1 was skipped") as caught:
+            train(module, data, default_root_dir=tmp_path)
+        (message,) = [str(w.message) for w in caught if "was skipped" in str(w.message)]
+        assert "drive/1a, drive/1b" in message
+        assert re.search(r"reconstruction (nan|inf).*gradient norms vae nan", message)
+        (file,) = (tmp_path / "bad_batches").iterdir()
+        assert str(file) in message
+        kept = BadBatch.read(file)
+        assert kept.names == ["drive/1a", "drive/1b"]
+        assert (kept.step, kept.number, kept.stage, kept.seed) == (1, 1, "joint", 0)
+        assert torch.equal(kept.tensors["feature_grid"], data.batches[1]["feature_grid"])
+        drawn = module.draw_path(2, 1)
+        assert all(map(torch.equal, kept.draws, drawn))
+        assert kept.weights == module.weights
+        assert not torch.tensor(kept.losses["loss"]).isfinite()
+
+    def test_of_two_batches_of_a_step_only_the_broken_one_is_kept(self, tmp_path):
+        train(
+            guarded("joint", [1]),
+            NamedData(2),
+            max_steps=1,
+            accumulate_grad_batches=2,
+            default_root_dir=tmp_path,
+        )
+        (file,) = (tmp_path / "bad_batches").iterdir()
+        assert file.name == "step_0000000_batch_0000001_rank_0.safetensors"
+
+    def test_keeps_a_few_batches_at_most(self, tmp_path):
+        module = guarded("joint", range(4), guards=GuardConfig(saved_batches=2))
+        train(module, NamedData(5), default_root_dir=tmp_path)
+        assert module.guard.skipped == 4
+        assert len(list((tmp_path / "bad_batches").iterdir())) == 2
+
+    def test_a_full_disk_does_not_end_the_training(self, tmp_path, monkeypatch):
+        def full(self, folder, most):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(BadBatch, "save", full)
+        with pytest.warns(UserWarning, match="not kept: .*No space left"):
+            train(guarded("joint", [0]), NamedData(2), default_root_dir=tmp_path)
+
+    @pytest.mark.parametrize("content", [b"", b"{}", b"\x08\0\0\0\0\0\0\0{}      "])
+    def test_another_file_is_refused_by_name(self, content, tmp_path):
+        path = tmp_path / "step.safetensors"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"step\.safetensors is no saved batch"):
+            BadBatch.read(path)
+
+
+def test_statistics_that_overflow_are_put_back_though_the_gradients_are_finite():
+    guard, running, count = StepGuard(GuardConfig()), torch.ones(3), torch.tensor(4)
+    guard.begin({}, 0, [running, count])
+    running[1], count[...] = torch.inf, 5
+    assert not guard.judge(torch.ones(2)).good
+    assert running.tolist() == [1.0, 1.0, 1.0]
+    assert count == 4
+    guard.begin({}, 1, [running, count])
+    running[1] = 1e38
+    assert guard.judge(torch.ones(2)).good
+    assert running[1] == 1e38
+
+
+class TestCollapse:
+    @staticmethod
+    def collapsed(still, config):
+        """Gradients are exactly zero in the steps of these numbers."""
+        module = guarded("joint", guards=config)
+        losses = type(module).step_losses
+
+        def step_losses(self, batch, draws):
+            factor = 0 if self.batch_number in still else 1
+            return {n: factor * part for n, part in losses(self, batch, draws).items()}
+
+        type(module).step_losses = step_losses
+        return module
+
+    def test_stops_after_enough_steps_without_gradients(self):
+        module = self.collapsed({1, 2, 3}, GuardConfig(collapse_steps=3))
+        with pytest.raises(RuntimeError, match=r"below 1e-08 for 3 steps, until step 3.*learning"):
+            train(module, NamedData(5))
+        assert len(module.states) == 3
+
+    def test_a_gradient_in_between_starts_the_count_again(self):
+        module = self.collapsed({0, 1, 3, 4}, GuardConfig(collapse_steps=3))
+        assert len(train(module, NamedData(5)).states) == 5
+
+    @pytest.mark.parametrize(("norms", "still"), [([0.0, 1e-9], 1), ([0.0, 1e-7], 0)])
+    def test_all_networks_must_be_still(self, norms, still):
+        guard = StepGuard(GuardConfig())
+        assert guard.judge(torch.tensor(norms)).good
+        assert guard.still == still
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("max_skipped_steps", 0), ("collapse_steps", 0), ("saved_batches", -1), ("collapse_norm", -1)],
+)
+def test_settings_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=rf"guards\.{name} must be at least .*got {value}"):
+        GuardConfig(**{name: value})
+
+
+@pytest.mark.ddp
+@pytest.mark.parametrize("fault", [infinite_image, constant_loss])
+def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_thread):
+    """With ``constant_loss`` no gradient of any process tells: only the check itself can agree."""
+
+    def only_of_the_second(module, batch):
+        if module.global_rank == 1:
+            fault(module, batch)
+
+    module = guarded("joint", [1], only_of_the_second)
+
+    def keep(self):
+        content = {"guard": self.guard.state_dict(), "weights": self.state_dict()}
+        torch.save(content, tmp_path / f"rank_{self.global_rank}.pt")
+
+    type(module).on_fit_end = keep
+    train(
+        module,
+        NamedData(3),
+        default_root_dir=tmp_path,
+        devices=2,
+        strategy="ddp_fork",
+        use_distributed_sampler=False,
+    )
+    first, second = (torch.load(tmp_path / f"rank_{rank}.pt") for rank in (0, 1))
+    assert first["guard"] == second["guard"] == {"skipped": 1, "in_a_row": 0, "still": 0}
+    for key, value in first["weights"].items():
+        assert value.isfinite().all(), key
+        assert torch.equal(value, second["weights"][key]), key
+    ranks = {path.stem[-1] for path in (tmp_path / "bad_batches").iterdir()}
+    # An infinite image reaches both through the shared latent statistics.
+    assert ranks == ({"1"} if fault is constant_loss else {"0", "1"})

@@ -1,0 +1,113 @@
+"""A kept batch runs again with the numbers of the step, and the layer at fault is named."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from test_gradients import SENSOR, stage_module, train
+from test_guards import NamedData, constant_loss, guarded, infinite_image
+
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
+from r3dpa.cli.replay import replay
+from r3dpa.modules.bad_batches import BadBatch
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+    pytest.mark.filterwarnings("ignore:step .* was skipped"),
+]
+ARGUMENTS = {
+    "vae": {
+        "latent_channels": 4,
+        "channels": 32,
+        "channel_multipliers": [1, 1],
+        "strides": [[2, 2]],
+        "num_res_blocks": 1,
+    },
+    "sit": {
+        "input_size": [4, 8],
+        "in_channels": 4,
+        "hidden_size": 8,
+        "depth": 2,
+        "num_heads": 2,
+        "alignment_depth": 1,
+        "feature_dim": 6,
+        "projector_dim": 8,
+    },
+    "discriminator": {"channels": 4, "num_layers": 1},
+    "latent_norm": {"channels": 4},
+}
+
+
+def save(module, path):
+    networks = {}
+    for name, arguments in ARGUMENTS.items():
+        network = getattr(module, name)
+        if network is not None:
+            kind = type(network)
+            networks[name] = NetworkState(
+                f"{kind.__module__}.{kind.__qualname__}", arguments, network.state_dict()
+            )
+    save_checkpoint(Checkpoint(path, module.stage, networks), path)
+    return path
+
+
+def rows(text):
+    return {line.split("  ")[0]: line.split()[-1] for line in text.splitlines() if "  " in line}
+
+
+@pytest.mark.parametrize("stage", ["vae_alignment", "joint", "flow_matching"])
+def test_the_losses_of_the_step_come_back(stage, tmp_path):
+    """At the first step the weights are the initial ones; the fault itself is no part of them."""
+    ckpt = save(stage_module(stage), tmp_path / "before.safetensors")
+    train(guarded(stage, [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    kept = BadBatch.read(file)
+    text = replay(file, ckpt)
+    assert SENSOR.beams == kept.tensors["range_image"].shape[2]
+    module = train(stage_module(stage), NamedData(1))
+    total = float(torch.stack(list(module.parts[0].values())).sum())
+    table = rows(text)
+    assert table["recorded"] == "inf"
+    assert table["all scans"] == f"{total:.4g}"
+    assert {"drive/0a", "drive/0b"} <= table.keys()
+    assert table["drive/0a"] != table["drive/0b"]
+    assert "everything is finite with these weights" in text
+
+
+def test_a_broken_input_is_told_from_a_broken_layer(tmp_path):
+    ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
+    train(guarded("joint", [0], infinite_image), NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    text = replay(file, ckpt)
+    assert "input range_image: 1 of 256 values are not finite" in text
+    assert rows(text)["drive/0a"] == "nan"
+    assert rows(text)["drive/0b"] != "nan"  # alone, it is sound
+    assert "no layer turned finite inputs into others" in text
+
+
+def test_the_layer_at_fault_is_named(tmp_path):
+    """A bias that overflows: all later layers are as bad, but only this one had sound inputs."""
+    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    module = stage_module("joint")
+    module.sit.blocks[1].mlp.fc1.bias.data[0] = torch.inf
+    text = replay(file, save(module, tmp_path / "broken.safetensors"))
+    assert "weight sit.blocks.1.mlp.fc1.bias: 1 of" in text
+    assert "into others: sit.blocks.1.mlp.fc1" in text
+    (vae,) = [line for line in text.splitlines() if line.startswith("vae ")]
+    assert vae.split()[2:4] == ["0", "-"]
+
+
+def test_networks_of_another_size_are_refused(tmp_path):
+    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    kept = BadBatch.read(file)
+    wide = {**kept.tensors, "feature_grid": torch.zeros(2, 8, 7)}
+    other = dataclasses.replace(kept, tensors=wide, step=1).save(tmp_path / "other", 1)
+    ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
+    with pytest.raises(ValueError, match=r"step_0000001.*cannot be run with the networks of"):
+        replay(other, ckpt)

@@ -1,0 +1,340 @@
+"""Hard cases of the metrics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import jensenshannon
+from tiny import drawn
+
+from r3dpa.metrics import BEVGrid, BEVHistogramDistance, FrechetDistance, MinimumMatchingDistance
+from r3dpa.metrics.bootstrap import bootstrap_interval
+from r3dpa.metrics.functional import (
+    Moments,
+    fd_infinity,
+    frechet_distance,
+    frechet_distance_of,
+    merge_packed,
+    polynomial_mmd,
+    squared_mmd,
+    wasserstein_1_of_values,
+)
+from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance
+from r3dpa.metrics.functional_manifold import precision_recall
+from r3dpa.metrics.results import MetricResult
+
+FEW = settings(derandomize=True, max_examples=15, deadline=None, database=None)
+DTYPES = [torch.float32, torch.bfloat16, torch.float16]
+FINITE = st.floats(-100, 100, width=32)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=8, case="root of a singular covariance product")
+def test_the_distance_of_few_samples_is_real_and_not_negative(dtype, naive):
+    """20 samples of 64 features: rank 19. Eigenvalues of the product itself are not real."""
+    a, b = drawn(0, 20, 64).to(dtype), (2 * drawn(1, 20, 64) + 1).to(dtype)
+    x, y = Moments.of(a), Moments.of(b)
+    distance = frechet_distance_of(a, b)
+    assert math.isfinite(distance)
+    assert distance == pytest.approx(frechet_distance_of(b, a), rel=1e-12)
+    assert 0 <= frechet_distance_of(a, a) < 1e-8
+    covariances = (x.covariance() @ y.covariance()).float()
+    as_if_symmetric = torch.linalg.eigvalsh(covariances)
+    assert as_if_symmetric.min() < -1e-3
+    roots = as_if_symmetric.sqrt().sum()
+    assert roots.isnan()
+    naive(f"eigvalsh of the product: eigenvalue {as_if_symmetric.min():.2g}, its root is NaN")
+
+
+@pytest.mark.numerics(section=8, case="root of a singular covariance product", precision="float64")
+def test_flat_and_empty_covariances(naive):
+    """By hand: |u|^2 + |v|^2 - 2 |u v| of two lines, the trace against a point, 0 of two points."""
+
+    @FEW
+    @given(u=st.lists(FINITE, min_size=5, max_size=5), v=st.lists(FINITE, min_size=5, max_size=5))
+    def check(u, v):
+        u, v, zero = torch.tensor(u).double(), torch.tensor(v).double(), torch.zeros(5).double()
+        lines = torch.outer(u, u), torch.outer(v, v)
+        size = float(u @ u + v @ v)
+        expected = size - 2 * abs(float(u @ v))
+        # A rank-one matrix has four eigenvalues of rounding errors only.
+        found = frechet_distance(zero, lines[0], zero, lines[1]).item()
+        assert found == pytest.approx(expected, abs=1e-6 * size + 1e-12)
+        nothing = torch.zeros(5, 5)
+        assert frechet_distance(zero, lines[0], zero, nothing).item() == pytest.approx(float(u @ u))
+        assert frechet_distance(zero, nothing, zero, nothing) == 0
+
+    check()
+    line = torch.outer(*2 * [torch.arange(1.0, 6.0)])
+    broken = torch.linalg.eigvalsh(line).sqrt()
+    assert broken.isnan().any()
+    naive("the root of an eigenvalue that is 0 but for rounding is NaN")
+
+
+@pytest.mark.numerics(section=8, case="Frechet distance of few samples")
+def test_extrapolation_and_kernel_tell_equal_distributions(naive):
+    """Both sets are of one distribution of 20 features, 400 samples each."""
+    biased, limits, kernels = [], [], []
+    for seed in range(0, 20, 2):
+        a, b = drawn(seed, 400, 20), drawn(seed + 1, 400, 20)
+        found = fd_infinity(a, b, generator(seed))
+        biased.append(found.distances[-1])
+        limits.append(found.value)
+        kernels.append(squared_mmd(a, b).item())
+    for values in (np.array(limits), np.array(kernels)):
+        assert abs(values.mean()) < 2 * values.std(ddof=1) / math.sqrt(len(values))
+    assert min(biased) > 0.3
+    naive(f"Frechet distance of equal distributions {min(biased):.2f} and more, never near 0")
+
+
+@pytest.mark.numerics(section=8, case="Frechet distance of few samples")
+def test_fewer_samples_than_features_are_refused(naive):
+    a, b = drawn(0, 16, 16), drawn(1, 16, 16)
+    metric = FrechetDistance(16)
+    metric.update(a, real=True)
+    metric.update(b, real=False)
+    with pytest.raises(ValueError, match="16 samples for 16 features, at least 17 are needed"):
+        metric.compute()
+    with pytest.raises(ValueError, match="polynomial_mmd, which has no bias"):
+        fd_infinity(a, b, generator())
+    few = frechet_distance_of(a, b)
+    many = frechet_distance_of(drawn(0, 4000, 16), drawn(1, 4000, 16))
+    assert few > 30 * many
+    naive(f"one distribution: distance {few:.1f} of 16 samples, {many:.3f} of 4000")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=8, case="accumulation of moments")
+def test_any_partition_gives_the_moments_of_the_whole(dtype, naive):
+    """Mean 5, deviations down to 0.02, as of normalised features; parts of any sizes."""
+    worst = []
+
+    @FEW
+    @given(
+        sizes=st.lists(st.integers(1, 40), min_size=2, max_size=8),
+        deviation=st.floats(0.02, 1.0),
+        seed=st.integers(0, 100),
+    )
+    def check(sizes, deviation, seed):
+        features = (5 + deviation * drawn(seed, sum(sizes), 3)).to(dtype)
+        parts = [Moments.of(part).pack() for part in features.split(sizes)]
+        merged, whole = Moments.unpack(merge_packed(torch.stack(parts))), Moments.of(features)
+        assert merged.count == sum(sizes)
+        torch.testing.assert_close(merged.mean, whole.mean, rtol=1e-13, atol=0)
+        torch.testing.assert_close(merged.scatter, whole.scatter, rtol=1e-10, atol=1e-12)
+        exact = np.cov(features.double().numpy().T)
+        np.testing.assert_allclose(whole.covariance(), exact, rtol=1e-9, atol=1e-13)
+        # As a streaming metric in the dtype of the features adds them up.
+        total, products = torch.zeros(3, dtype=dtype), torch.zeros(3, 3, dtype=dtype)
+        for one in features:
+            total += one
+            products += torch.outer(one, one)
+        mean = total / len(features)
+        off = products / len(features) - torch.outer(mean, mean)
+        worst.append(np.abs(off.double().numpy() - exact).max() / exact.max())
+
+    check()
+    assert max(worst) > 0.01
+    naive(f"E[xx] - E[x]E[x] is off by up to {max(worst):.0%}")
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, *DTYPES])
+@pytest.mark.numerics(section=8, case="Jensen-Shannon distance and empty counts")
+def test_both_names_of_the_distance_and_no_value_of_nothing(dtype, naive):
+    """Disjoint counts: ln 2 and its root; bins that are empty in both do not matter."""
+    a, b = torch.tensor([4, 2, 0, 0]).to(dtype), torch.tensor([0, 0, 0, 7]).to(dtype)
+    apart = histogram_distance(a, b)
+    assert apart.jsd_divergence == pytest.approx(math.log(2), rel=1e-12)
+    assert apart.jsd_distance == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+    for empty in ((a, 0 * b), (0 * a, b), (0 * a, 0 * b)):
+        with pytest.raises(ValueError, match="histogram is empty"):
+            histogram_distance(*empty)
+    with np.errstate(invalid="ignore"):
+        assert math.isnan(jensenshannon((0 * a).double(), b.double()))
+    published = jensenshannon(a.double(), b.double())
+    assert abs(published - apart.jsd_divergence) > 0.1
+    naive(f"scipy: NaN without counts, and {published:.3f} for a divergence of ln 2 = 0.693")
+
+
+@pytest.mark.numerics(
+    section=8, case="Jensen-Shannon distance and empty counts", precision="float64"
+)
+def test_the_distance_of_any_counts_is_within_its_limits(naive):
+    negative = []
+
+    @FEW
+    @given(
+        counts=st.lists(st.integers(0, 10**6), min_size=3, max_size=30).filter(any),
+        scale=st.integers(1, 1000),
+    )
+    def check(counts, scale):
+        a = torch.tensor(counts)
+        for b in (scale * a, a.flip(0), a.roll(1)):
+            found = histogram_distance(a, b)
+            assert 0 <= found.jsd_distance <= math.sqrt(math.log(2)) + 1e-12
+            assert found.jsd_distance == histogram_distance(b, a).jsd_distance
+        assert histogram_distance(a, scale * a).jsd_distance < 1e-7
+        p, q = (x.float() / x.sum() for x in (a, scale * a))
+        middle = (p + q) / 2
+        terms = [(x * (x / middle).log()).nansum() / 2 for x in (p, q)]
+        negative.append(sum(terms).item())
+
+    check()
+    assert min(negative) < 0
+    naive(f"float32 divergence of equal shares {min(negative):.1e}: its root is NaN")
+
+
+@pytest.mark.numerics(section=8, case="floor of the Jensen-Shannon distance", precision="float64")
+def test_a_difference_within_the_intervals_is_a_tie(naive):
+    """Two models that draw from the very distribution of the real scans: neither is better."""
+    weights = torch.rand(2000, generator=generator())
+
+    def clouds(seed):  # which of 2000 cells 60 clouds occupy
+        return (torch.rand(60, 2000, generator=generator(seed)) < 0.3 * weights).double()
+
+    real, models = clouds(0), (clouds(1), clouds(2))
+
+    def distance(scenes):
+        return histogram_distance(real.sum(0), scenes.sum(0)).jsd_distance
+
+    rows = []
+    for scenes in models:
+        found = bootstrap_interval(
+            lambda drawn, scenes=scenes: distance(scenes[drawn]), [60], generator()
+        )
+        rows.append(MetricResult("JSD", found.value, interval=(found.low, found.high)))
+    assert rows[0].ties_with(rows[1])
+    floor = distance(clouds(3))
+    values = [row.value for row in rows]
+    assert all(abs(value - floor) < 0.1 * floor for value in values)
+    assert values[0] != values[1]
+    assert min(values) > 0.05
+    naive(f"the bare numbers {values[0]:.4f} and {values[1]:.4f} rank two equal models")
+
+
+GRID = BEVGrid((-8.0, 8.0), (-8.0, 8.0), 0.25)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.numerics(section=8, case="empty cloud in a matching")
+def test_an_empty_cloud_is_refused_by_name_wherever_it_stands(place, naive):
+    """A missing scan must neither be the best match nor make the mean NaN."""
+    clouds = [drawn(seed, 30, 3) for seed in range(2)]
+    clouds.insert(place, torch.zeros(0, 3))
+    for metric in (MinimumMatchingDistance(GRID), BEVHistogramDistance(GRID)):
+        with pytest.raises(ValueError, match=f"generated cloud {place} has no point"):
+            metric.update(clouds, real=False)
+    with pytest.raises(ValueError, match="points_b has no point"):
+        chamfer_squared(clouds[(place + 1) % 3], clouds[place])
+
+    reference = drawn(5, 30, 3)
+    means = [torch.cdist(cloud, reference).square().mean().item() for cloud in clouds]
+    orders = min(means), min(reversed(means))
+    wrong = math.isnan(torch.tensor(means).min())
+    assert wrong
+    assert place == 1 or any(map(math.isnan, orders))
+    naive(f"mean of no point NaN; Python's min gives {orders[0]:.2g} or, reversed, {orders[1]:.2g}")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=8, case="padding in the Chamfer distance")
+def test_clouds_of_unequal_size_need_no_padding(dtype, naive):
+    """Also far from the origin, where squared coordinates leave no digits for the distance."""
+    worst = []
+
+    @FEW
+    @given(sizes=st.tuples(st.integers(1, 40), st.integers(1, 40)), shift=st.floats(0, 100))
+    def check(sizes, shift):
+        a, b = ((drawn(n, n, 3) + shift).to(dtype) for n in sizes)
+        apart = (a.double()[:, None] - b.double()).square().sum(-1)
+        exact = (apart.amin(1).mean() + apart.amin(0).mean()).item() / 2
+        assert chamfer_squared(a, b) == pytest.approx(exact, rel=1e-9, abs=1e-12)
+        long, short = sorted((a.float(), b.float()), key=len, reverse=True)
+        padded = torch.cat([short, torch.full((len(long) - len(short), 3), 1e6)])
+        squared = long.square().sum(1)[:, None] + padded.square().sum(1) - 2 * long @ padded.T
+        found = (squared.amin(1).mean() + squared.amin(0).mean()).item() / 2
+        worst.append(abs(found - exact) / max(exact, 1e-6))
+
+    check()
+    assert max(worst) > 1
+    naive(f"padded with 1e6 and summed in float32: {max(worst):.1e} times off")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=8, case="sliced Wasserstein of unequal sizes")
+def test_earth_movers_distance_of_sets_of_unequal_size(dtype, naive):
+    """There is no sliced distance; sorted ranges are compared in one dimension, by quantiles."""
+    cut = []
+
+    @FEW
+    @given(
+        a=st.lists(FINITE, min_size=1, max_size=30),
+        b=st.lists(FINITE, min_size=1, max_size=30),
+        times=st.integers(2, 5),
+    )
+    def check(a, b, times):
+        x, y = torch.tensor(a).to(dtype), torch.tensor(b).to(dtype)
+        there, back = wasserstein_1_of_values(x, y), wasserstein_1_of_values(y, x)
+        assert there == pytest.approx(back, rel=1e-12, abs=1e-12)
+        means = x.double().mean() - y.double().mean()
+        assert there >= abs(means.item()) - 1e-9
+        again = x.repeat(times)  # the same distribution from more samples
+        assert wasserstein_1_of_values(x, again) == pytest.approx(0, abs=1e-12)
+        shorter = again.sort().values[: len(x)]
+        cut.append((x.sort().values - shorter).abs().float().mean().item())
+
+    check()
+    assert max(cut) > 1
+    with pytest.raises(RuntimeError, match="size of tensor"):
+        torch.zeros(3).sort().values - torch.zeros(5).sort().values
+    naive(f"sorted values do not subtract; cut to one length, equal sets are {max(cut):.0f} apart")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.numerics(section=8, case="constant and NaN features")
+def test_a_broken_feature_is_named_by_its_row(value, dtype, naive):
+    good = drawn(0, 30, 4).to(dtype)
+    broken = good.clone()
+    broken[17, 2] = value
+    message = r"1 of 30 rows hold NaN or infinity, the first is row 17; check the scan"
+    for compare in (
+        frechet_distance_of,
+        squared_mmd,
+        precision_recall,
+        lambda a, b: fd_infinity(a, b, generator()),
+        lambda a, b: polynomial_mmd(a, b, generator(), 2, 10),
+    ):
+        with pytest.raises(ValueError, match=f"generated features: {message}"):
+            compare(good, broken)
+        with pytest.raises(ValueError, match=f"real features: {message}"):
+            compare(broken, good)
+    mean = broken.double().mean(0)
+    assert not mean[2].isfinite()
+    naive(f"the mean is {mean[2]:g}, and with it every distance")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=8, case="constant and NaN features")
+def test_constant_features_have_finite_distances(dtype, naive):
+    """A collapsed extractor: covariance 0, all distances between samples 0."""
+    same, other = torch.full((30, 4), 0.7, dtype=dtype), torch.full((30, 4), 2.5, dtype=dtype)
+    gap = (other - same).double().square().sum(1)[0].item()
+    assert frechet_distance_of(same, same) == pytest.approx(0, abs=1e-12)
+    assert frechet_distance_of(same, other) == pytest.approx(gap, rel=1e-2)
+    assert squared_mmd(same, same).item() == pytest.approx(0, abs=1e-12)
+    assert fd_infinity(same, other, generator()).value == pytest.approx(gap, rel=1e-2)
+    for shares in (vars(precision_recall(same, same)), vars(precision_recall(same, other))):
+        assert all(map(math.isfinite, shares.values()))
+    standardised = (same - same.mean(0)) / same.std(0)
+    assert not standardised.isfinite().all()
+    naive("standardised by their deviation of 0, features are NaN")

@@ -1,0 +1,225 @@
+"""Hard cases of the interpolant and the samplers."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r3dpa.flow import (
+    ODE_SOLVERS,
+    GaussianMixture,
+    Interpolant,
+    ab2,
+    euler,
+    euler_maruyama,
+    midpoint,
+    ode_times,
+    sde_times,
+)
+from r3dpa.flow.times import step_pairs
+
+DTYPES = [torch.float32, torch.bfloat16, torch.float16]
+exhaustive = settings(derandomize=True, max_examples=40, deadline=None)
+
+
+def unit_roundoff(dtype):
+    return torch.finfo(dtype).eps / 2
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=1, case="score near the data")
+def test_rounding_of_the_velocity_is_not_divided_by_time(dtype, naive):
+    """With data d and noise n the score is -n / t exactly, and t score never needs the division."""
+    generator = torch.Generator().manual_seed(0)
+    data, noise = torch.randn(2, 8, 256, generator=generator, dtype=torch.float64)
+    times = torch.logspace(0, -7, 8, dtype=torch.float64)
+    path = Interpolant()
+    x, velocity = path.interpolate(data, noise, times), path.target(data, noise, times)
+    answer = velocity.to(dtype)  # what a network in this precision gives
+    drift = path.sde_drift(answer, x.float(), times.float()).double()
+    drift_error = (drift - path.sde_drift(velocity, x, times)).abs().amax(dim=1)
+    bound = 2 * unit_roundoff(dtype) * velocity.abs().max() + 8 * unit_roundoff(torch.float32)
+    assert (drift_error <= bound).all()
+    assert path.sde_drift(answer[:1], x[:1].float(), torch.zeros(1)).isfinite().all()
+
+    score = path.score(answer, x, times)
+    score_error = (score + noise / times[:, None]).abs().amax(dim=1)
+    assert score_error[-1] > 1e5 * drift_error.max()
+    naive(f"score off by {score_error[-1] * times[-1]:.1e} / t")
+
+
+@pytest.mark.parametrize("lengths", [(1.0, 3.0), (4.0, 1.0), (1.0, 2.0, 5.0)])
+@pytest.mark.numerics(section=1, case="multistep solver on unequal steps", precision="float64")
+def test_halving_unequal_steps_quarters_the_error_of_ab2(lengths, naive):
+    start = torch.ones(1, 1, dtype=torch.float64)
+
+    def times_of(repeats):
+        steps = torch.tensor(lengths, dtype=torch.float64).repeat(repeats)
+        return torch.cat([torch.ones(1), 1 - steps.cumsum(0) / steps.sum()])
+
+    def equal_steps_ab2(velocity, x, times):
+        last = None
+        for now, then in step_pairs(times):
+            slope = velocity(x, torch.full((1,), now))
+            x = x + (then - now) * (slope if last is None else 1.5 * slope - 0.5 * last)
+            last = slope
+        return x
+
+    def ratio(solver):
+        errors = [
+            abs(solver(lambda x, time: x, start, times_of(repeats)).item() - math.exp(-1))
+            for repeats in (100, 200)
+        ]
+        return errors[0] / errors[1]
+
+    assert ratio(ab2) == pytest.approx(4, rel=0.15)
+    assert ratio(equal_steps_ab2) < 2.5
+    naive(
+        f"equal-step weights: halving the steps divides the error by {ratio(equal_steps_ab2):.1f}"
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, *DTYPES])
+@pytest.mark.numerics(section=1, case="inversion to noise and back")
+def test_midpoint_steps_invert_what_euler_steps_do_not(dtype, naive):
+    """The velocity is rounded to ``dtype`` as that of a network; the state is at least float32."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(8, 64, generator=generator, dtype=torch.float64)
+    mixture = GaussianMixture(means, 0.2, torch.ones(8))
+    data = mixture.sample(64, generator).to(torch.promote_types(dtype, torch.float32))
+
+    def velocity(x, time):
+        return mixture.velocity(x, time).to(dtype)
+
+    def round_trip(solver, steps):
+        outward = ode_times(steps, start=0.0, stop=1.0)
+        back = solver(velocity, solver(velocity, data, outward), outward.flip(0))
+        return (back - data).square().mean().sqrt().item()
+
+    assert round_trip(midpoint, 25) < 1e-2  # 50 evaluations each way
+    euler_error = round_trip(euler, 50)
+    assert euler_error > 0.1
+    naive(f"Euler round trip off by {euler_error:.2f} RMSE at 50 evaluations")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.numerics(section=1, case="state in half precision")
+def test_velocity_in_half_precision_on_a_float32_state(dtype, naive):
+    """Rounding errors of the velocity average out; those of the state grow with the steps."""
+    mixture = GaussianMixture(torch.zeros(1, 16), 0.3, torch.ones(1))
+    noise = torch.randn(64, 16, generator=torch.Generator().manual_seed(0))
+    exact = euler(mixture.velocity, noise.double(), ode_times(256))
+
+    def error(velocity_dtype, state_dtype):
+        def velocity(x, time):
+            return mixture.velocity(x.double(), time).to(velocity_dtype)
+
+        state = euler(velocity, noise.to(state_dtype), ode_times(256))
+        return (state.double() - exact).square().mean().sqrt().item()
+
+    float32_state = error(dtype, torch.float32)
+    assert float32_state < 2e-1 * unit_roundoff(dtype) + 1e-6
+    half = torch.bfloat16 if dtype == torch.float32 else dtype
+    assert error(half, half) > 3 * float32_state
+    name = str(half).removeprefix("torch.")
+    naive(f"{name} state off by {error(half, half):.1e} RMSE, float32 state by {float32_state:.1e}")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.numerics(section=1, case="cosine path at the data")
+def test_sde_starts_and_ends_with_finite_numbers(path, dtype, naive):
+    """Steps from exactly t = 1, and to exactly t = 0 by ``denoise``, in every precision."""
+    interpolant, generator = Interpolant(path), torch.Generator().manual_seed(0)
+    x = torch.randn(4, 16, generator=generator)
+    velocity = torch.randn(4, 16, generator=generator).to(dtype)
+    for last in ("denoise", "mean"):
+        result = euler_maruyama(
+            lambda x, time: velocity,
+            x.to(dtype),
+            sde_times(4),
+            generator,
+            interpolant=interpolant,
+            last=last,
+        )
+        assert result.isfinite().all()
+    ends = torch.tensor([0.0, 0.0, 1.0, 1.0])
+    assert interpolant.sde_drift(velocity, x, ends).isfinite().all()
+    divided = velocity - ends[:, None] * interpolant.score(velocity, x, ends)
+    assert not divided[:2].isfinite().any()
+    assert divided[2:].isfinite().all()
+    naive(f"{path} path: v - t score has no finite number at t = 0")
+
+
+# Properties.
+
+unit_interval = st.floats(0, 1, width=32)
+coordinates = st.floats(-1e4, 1e4, width=32)
+paths = st.sampled_from(["linear", "cosine"])
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(path=paths, time=unit_interval, data=coordinates, noise=coordinates)
+def test_denoise_returns_the_data(path, time, data, noise):
+    path = Interpolant(path)
+    data, noise, time = (torch.tensor([v], dtype=torch.float64) for v in (data, noise, time))
+    x, velocity = path.interpolate(data, noise, time), path.target(data, noise, time)
+    scale = data.abs() + noise.abs() + 1
+    assert ((path.denoise(velocity, x, time) - data).abs() <= 1e-12 * scale).all()
+    # As with data and noise the ends are met exactly, with rounding of cos(pi / 2) only.
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    met = path.interpolate(data.expand(2), noise.expand(2), ends)
+    assert ((met - torch.cat([data, noise])).abs() <= 1e-15 * scale).all()
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(path=paths, time=unit_interval, velocity=coordinates, x=coordinates)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_sde_drift_is_finite_and_bounded(path, time, velocity, x, dtype):
+    values = (torch.tensor([v]).to(dtype) for v in (velocity, x, time))
+    drift = Interpolant(path).sde_drift(*values).item()
+    assert abs(drift) <= (1 + 2 * torch.finfo(dtype).eps) * (2 * abs(velocity) + abs(x)) * 1.01
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(
+    steps=st.integers(1, 300),
+    ends=st.tuples(unit_interval, unit_interval),
+    shift=st.floats(0.1, 10),
+)
+def test_times_are_strictly_ordered_and_meet_their_ends(steps, ends, shift):
+    start, stop = ends
+    if abs(start - stop) < 1e-6:
+        return
+    times = ode_times(steps, start, stop, shift)
+    assert len(step_pairs(times)) == steps  # raises where times repeat or turn round
+    assert (times[0].item(), times[-1].item()) == (start, stop)
+
+
+@pytest.mark.numerics
+@exhaustive
+@given(
+    name=st.sampled_from(sorted(set(ODE_SOLVERS) - {"dopri5"})),
+    steps=st.integers(1, 12),
+    shift=st.floats(0.3, 3),
+    data=st.floats(-100, 100),
+)
+def test_every_solver_is_exact_for_a_single_point_of_data(name, steps, shift, data):
+    """The paths to one point are straight, so no solver errs, whatever its steps."""
+    x = torch.tensor([[1.5], [-0.5]], dtype=torch.float64)
+
+    def velocity(x, time):
+        return (x - data) / time[:, None]
+
+    solve = partial(ODE_SOLVERS[name], velocity)
+    stop = 0.01
+    expected = (1 - stop) * data + stop * x
+    assert (solve(x, ode_times(steps, 1.0, stop, shift)) - expected).abs().max() < 1e-9

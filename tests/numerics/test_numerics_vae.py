@@ -1,0 +1,258 @@
+"""Hard cases of the VAE and of its adversarial loss."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict
+from itertools import product
+
+import pytest
+import torch
+from tiny import TinyData, batch_of, drawn, module, trainer, vae
+from torch import nn
+
+from r3dpa.losses import discriminator_loss
+from r3dpa.modules import LossWeights, OptimizerConfig
+from r3dpa.nn import PatchDiscriminator, Posterior
+from r3dpa.nn.layers import GroupNorm, SyncedBatchNorm2d
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+]
+HALF = (torch.bfloat16, torch.float16)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.numerics(section=4, case="log variance beyond its clamp")
+def test_the_divergence_pulls_an_escaped_log_variance_back(dtype, naive):
+    """From 25 in steps of at most 0.5, as clipping to 1 with rate 0.5 makes them."""
+
+    def after_50_steps(divergence):
+        moments = torch.zeros(1, 2, 1, 1, dtype=dtype)
+        moments[0, 1] = 25.0
+        moments.requires_grad_()
+        optimiser = torch.optim.SGD([moments], lr=0.5)
+        for _ in range(50):
+            optimiser.zero_grad()
+            (1e-6 * divergence(moments)).sum().backward()
+            nn.utils.clip_grad_norm_(moments, 1.0)
+            optimiser.step()
+        return moments[0, 1].item()
+
+    def with_plain_clamp(moments):
+        mean, logvar = moments.float().chunk(2, dim=1)
+        logvar = logvar.clamp(-30.0, 20.0)
+        return 0.5 * (mean.square() + logvar.exp() - 1 - logvar).sum()
+
+    assert after_50_steps(lambda moments: Posterior(moments).kl()) < 20
+    stuck = after_50_steps(with_plain_clamp)
+    assert stuck == 25
+    naive(f"gradient 0 beyond a plain clamp: log variance {stuck:g} after 50 steps")
+
+
+class Broken(nn.Module):
+    """A network whose numbers are NaN, or which must not be called at all."""
+
+    def __init__(self, may_be_called):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+        self.may_be_called = may_be_called
+
+    def forward(self, image):
+        assert self.may_be_called, "a network whose losses have weight 0 was called"
+        return torch.nan * self.weight * image
+
+
+@pytest.mark.numerics(section=4, case="loss of weight zero")
+def test_networks_of_losses_with_weight_zero_are_not_called(naive):
+    made = module(weights=LossWeights(adversarial=0.0, discriminator=0.0))
+    made.discriminator = Broken(may_be_called=False)
+    image = batch_of(0)["range_image"]
+    posterior = made.vae.encode(image)
+    reconstruction = made.vae.decode(posterior.mean)
+    parts = made.vae_losses(image, posterior, reconstruction)
+    parts |= made.discriminator_losses(image, reconstruction)
+    assert sum(parts.values()).isfinite()
+    total = sum(parts.values()) + 0.0 * Broken(may_be_called=True)(reconstruction).mean()
+    assert total.isnan()
+    naive("0 * NaN = NaN in the sum of the losses")
+
+
+def mean_step(network, gradients, eps):
+    """Mean size of the second AdamW step, without decay, in units of the rate."""
+    settings = asdict(OptimizerConfig()) | {"weight_decay": 0.0, "eps": eps}
+    weights = list(network.parameters())
+    optimiser = torch.optim.AdamW(weights, **settings)
+    for _ in range(2):
+        before = [weight.detach().clone() for weight in weights]
+        for weight, gradient in zip(weights, gradients, strict=True):
+            weight.grad = gradient.clone()
+        optimiser.step()
+    steps = [(a - b).abs().flatten() for a, b in zip(before, weights, strict=True)]
+    return torch.cat(steps).mean().item() / settings["lr"]
+
+
+@pytest.mark.numerics(section=4, case="discriminator loss that is scaled down")
+def test_the_discriminator_learns_alike_at_any_scale_of_its_loss(naive):
+    """Of weight 1, where scans are told from reconstructions but for one patch in a hundred.
+
+    ``LossWeights.discriminator`` is the switch: the official factor 1e-3 keeps Adam's eps in the
+    way of small gradients, and the limit of the gradient's norm from ever being reached.
+    """
+    torch.manual_seed(0)
+    network = PatchDiscriminator(channels=16)
+    logits = network(drawn(0, 2, 1, 32, 64)), network(drawn(1, 2, 1, 32, 64).tanh())
+    outside = drawn(2, *logits[0].shape) > 2.3  # patches that are not told apart yet
+    won = [
+        torch.where(outside, values, 2.0 * sign)
+        for values, sign in zip(logits, (1, -1), strict=True)
+    ]
+    gradients = torch.autograd.grad(discriminator_loss(*won), list(network.parameters()))
+    eps = OptimizerConfig().eps
+
+    def relative_step(factor):
+        scaled = [factor * gradient for gradient in gradients]
+        steps = (mean_step(copy.deepcopy(network), scaled, e) for e in (eps, 1e-20))
+        return next(steps) / next(steps)
+
+    assert relative_step(1.0) > 0.99
+    assert relative_step(1.0) == pytest.approx(relative_step(0.1), abs=0.02)
+    official = relative_step(1e-3)
+    assert official < 0.95
+    norm = torch.stack([g.norm() for g in gradients]).norm().item()
+    naive(f"at factor 1e-3 steps are {official:.0%} as long, and the norm is {1e-3 * norm:.0e}")
+
+
+@pytest.mark.numerics(section=4, case="discriminator loss that is scaled down")
+def test_the_weight_of_the_discriminator_is_a_factor_of_its_loss_alone(naive):
+    """The other losses keep their size, so the factor is no balance between networks."""
+    image = batch_of(0)["range_image"]
+
+    def gradients(weight):
+        made = module(weights=LossWeights(discriminator=weight))
+        posterior = made.vae.encode(image)
+        reconstruction = made.vae.decode(posterior.mean)
+        parts = made.vae_losses(image, posterior, reconstruction)
+        parts |= made.discriminator_losses(image, reconstruction)
+        sum(parts.values()).backward()
+        return [
+            torch.cat([p.grad.flatten() for p in network.parameters()])
+            for network in (made.vae, made.discriminator)
+        ]
+
+    (vae_whole, whole), (vae_official, official) = gradients(1.0), gradients(1e-3)
+    torch.testing.assert_close(vae_official, vae_whole, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(official, 1e-3 * whole, rtol=1e-4, atol=1e-9)
+    small = 100 * OptimizerConfig().eps  # below it Adam's steps are shorter by 1 % and more
+    shares = [(g.abs() < small).float().mean().item() for g in (official, whole)]
+    assert shares[0] > 5 * shares[1]
+    naive(f"at factor 1e-3 {shares[0]:.1%} of the gradients are near eps, else {shares[1]:.1%}")
+
+
+@pytest.mark.numerics(section=4, case="batch norm on real and fake batches")
+def test_the_discriminator_is_asked_in_training_mode_only(naive):
+    """Running statistics are a mixture of scans and reconstructions, and describe neither."""
+    made = module()
+    network = made.discriminator.train()
+    real, fake = 0.5 + 0.1 * drawn(0, 4, 1, 8, 16), -0.5 + 0.4 * drawn(1, 4, 1, 8, 16)
+    for _ in range(50):
+        trained = network(real), network(fake)
+    evaluated = network.eval()(real), network(fake)
+    gaps = [
+        ((a - b).abs().mean() / a.std()).item() for a, b in zip(trained, evaluated, strict=True)
+    ]
+    assert max(gaps) > 0.5
+    naive(f"logits in evaluation mode are off by {max(gaps):.1f} of their deviation")
+
+    made.discriminator = Broken(may_be_called=False)
+    data = TinyData([batch_of(0)])
+    for run in ("validate", "test"):
+        data.test_dataloader = data.val_dataloader
+        found = getattr(trainer(1, limit_val_batches=None), run)(made, data, verbose=False)
+        assert found
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+@pytest.mark.numerics(section=4, case="batch norm on real and fake batches")
+def test_a_broken_reconstruction_leaves_the_running_statistics_alone(value, dtype, naive):
+    ours, plain = SyncedBatchNorm2d(3), nn.BatchNorm2d(3)
+    good, broken = drawn(0, 2, 3, 4, 6).to(dtype), drawn(1, 2, 3, 4, 6).to(dtype)
+    broken[0, 1, 2, 3] = value
+    for layer in (ours, plain):
+        layer(good)
+    before = {key: kept.clone() for key, kept in ours.state_dict().items()}
+    assert not ours(broken).isfinite().all()  # the loss tells, and the step is dropped
+    for key, kept in before.items():
+        assert torch.equal(ours.state_dict()[key], kept), key
+    plain(broken)
+    plain(good)
+    assert not plain.running_var.isfinite().all()
+    naive(f"one {value} leaves running_var {plain.running_var[1]:g} for good")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, *HALF])
+@pytest.mark.numerics(section=4, case="group norm of a constant image")
+def test_group_norm_of_any_constant_is_finite_both_ways(dtype, naive):
+    """A scan of no or of few returns is constant in every layer, but for as many pixels."""
+    broken = 0
+    for constant, returns in product((-1.0, 0.7, 3.3, 31.1, 300.7, 6e4), (0, 1, 15, 100)):
+        image = torch.full((1, 32, 6, 20), constant, dtype=dtype)
+        image.flatten(2)[..., :returns] *= 1.01
+        values = image[0, 0].clone()
+        image.requires_grad_()
+        result = GroupNorm(32).to(dtype)(image)
+        result.square().sum().backward()
+        assert result.dtype == dtype
+        assert result.isfinite().all()
+        assert image.grad.isfinite().all()
+        variance = values.square().mean() - values.mean().square()
+        broken += not torch.rsqrt(variance + 1e-6).isfinite()
+    assert broken
+    naive(f"mean square minus squared mean is below 0 or inf - inf: NaN for {broken} of 24 images")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.numerics(section=4, case="group norm of a constant image")
+def test_an_empty_scan_passes_the_whole_vae(dtype, naive):
+    network, image = vae(), torch.full((1, 1, 8, 16), -1.0)
+    torch.nn.init.zeros_(network.encoder.conv_in.weight)  # the bias alone: constant columns
+    with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
+        posterior = network.encode(image)
+        decoded = network.decode(posterior.mean)
+    (posterior.kl().sum() + decoded.float().square().sum()).backward()
+    assert decoded.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in network.parameters())
+    hidden = network.encoder.conv_in(image)
+    spread = hidden - hidden.mean((2, 3), keepdim=True)
+    assert (spread / hidden.std((2, 3), keepdim=True)).isnan().any()
+    naive("division by a deviation of 0: NaN")
+
+
+@pytest.mark.parametrize("how", ["float32", "weights", "autocast"])
+@pytest.mark.numerics(
+    section=4, case="decoding in half precision", precision="float32 and bfloat16"
+)
+def test_far_latents_decode_to_finite_images(how, naive):
+    """Latents of 10 deviations through layers that, as trained ones do, enlarge them."""
+    torch.manual_seed(0)
+    network = vae()
+    with torch.no_grad():
+        network.decoder.conv_in.weight *= 2e4
+    latents = 10 * drawn(0, 2, 4, 4, 8)
+    with torch.no_grad():
+        expected = network.decode(latents)
+        ours = copy.deepcopy(network)
+        if how == "weights":
+            ours.halve_decoder_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=how == "autocast"):
+            decoded = ours.decode(latents)
+        with torch.autocast("cpu", torch.float16):
+            broken = network.decode(latents)
+    assert decoded.dtype == torch.float32
+    assert decoded.isfinite().all()
+    error = (decoded - expected).norm() / expected.norm()
+    assert error < (1e-6 if how == "float32" else 0.05)
+    share = (~broken.isfinite()).float().mean().item()
+    assert share > 0.5
+    naive(f"{share:.0%} of the pixels not finite in float16")

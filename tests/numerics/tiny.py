@@ -1,0 +1,105 @@
+"""Networks, data and a training run of a second, for tests of whole training steps."""
+
+from __future__ import annotations
+
+import lightning as L
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from r3dpa.data import LidarDataModule
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.modules import JointAlignment, VAEAlignment
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
+
+FEATURE_DIM = 6
+LATENT_CHANNELS = 4
+STAGES = {"joint": JointAlignment, "vae_alignment": VAEAlignment}
+
+
+def drawn(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def batch_of(seed, size=2):
+    return {
+        "range_image": drawn(seed, size, 1, 8, 16).tanh(),
+        "valid_mask": torch.ones(size, 1, 8, 16, dtype=torch.bool),
+        "feature_grid": drawn(seed + 1, size, 8, FEATURE_DIM),
+    }
+
+
+class TinyData(LidarDataModule):
+    """Given batches in place of scans."""
+
+    feature_source = "random"
+    feature_dim = FEATURE_DIM
+    geometry = ScanGeometry(
+        SphericalProjection(LidarSensor(beams=8, columns=16)), RangeCodec(), (2, 4)
+    )
+
+    def __init__(self, batches):
+        L.LightningDataModule.__init__(self)
+        self.features_dir = "random"
+        self.batches = batches
+
+    def prepare_data(self):
+        pass
+
+    def setup(self, stage):
+        pass
+
+    def train_dataloader(self):
+        return DataLoader(self.batches, batch_size=None)
+
+    def val_dataloader(self):
+        return DataLoader(self.batches, batch_size=None)
+
+    def state_dict(self):
+        return {}
+
+
+def vae():
+    return VAE(
+        latent_channels=LATENT_CHANNELS,
+        channels=32,
+        channel_multipliers=(1, 1),
+        strides=((2, 2),),
+        num_res_blocks=1,
+    )
+
+
+def module(stage="joint", **kwargs):
+    """A training module of ``STAGES``, without a stage before it."""
+    torch.manual_seed(0)
+    sit = SiT(
+        input_size=(4, 8),
+        in_channels=LATENT_CHANNELS,
+        hidden_size=8,
+        depth=2,
+        num_heads=2,
+        alignment_depth=1,
+        feature_dim=FEATURE_DIM,
+        projector_dim=8,
+    )
+    for parameter in sit.parameters():  # a fresh one has zero gates: no gradient would pass
+        nn.init.normal_(parameter, std=0.3)
+    discriminator = PatchDiscriminator(channels=4, num_layers=1)
+    norm = LatentNorm(LATENT_CHANNELS)
+    made = STAGES[stage](
+        vae=vae(), sit=sit, discriminator=discriminator, latent_norm=norm, **kwargs
+    )
+    made.load_previous_stage = lambda: None
+    return made
+
+
+def trainer(num_steps, **kwargs):
+    options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    options |= {"accelerator": "cpu", "devices": 1, "enable_model_summary": False}
+    return L.Trainer(max_steps=num_steps, **(options | {"limit_val_batches": 0} | kwargs))
+
+
+def fit(made, batches, **kwargs):
+    """The module after one step per batch."""
+    trainer(len(batches), **kwargs).fit(made, datamodule=TinyData(batches))
+    return made
