@@ -392,3 +392,10 @@ def test_cuda_draws_the_scenes_of_the_cpu(sampler, monkeypatch):
     on_gpu = SceneGenerator(*parts, GEOMETRY, sampler).generate(range(3), seed=1)
     assert on_gpu.range_m.device.type == "cuda"
     torch.testing.assert_close(on_gpu.latents.cpu(), on_cpu.latents, atol=1e-4, rtol=0)
+
+
+def test_a_diverged_network_gives_nan_and_no_empty_scene():
+    scenes = generator()
+    with torch.no_grad():
+        scenes.sit.final_layer.linear.bias[0] = torch.nan
+    assert scenes.generate([0]).range_m.isnan().all()

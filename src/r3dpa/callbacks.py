@@ -427,8 +427,8 @@ class SceneScorer(L.Callback):
             with atomic_path(_part(folder, first)) as temporary:
                 save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
         return {
-            "solver": self.sampler.solver,
-            "steps": self.sampler.steps,
+            "solver": self.sampler.solver if self.sampler.tuned is None else "tuned",
+            "steps": self.sampler.steps if self.sampler.tuned is None else nfe,
             "seed": self.seed,
             "precision": self.precision,
             "feature_source": module.feature_source,

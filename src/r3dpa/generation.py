@@ -118,8 +118,9 @@ def _qualities() -> dict[str, Any]:
 class SceneBatch(NamedTuple):
     """Generated scenes.
 
-    ``range_m`` is ``(B, H, W)`` float32 metres with -1 where there is no return, ``latents`` the
-    normalised ``(B, C, h, w)`` latents, ``nfe`` the network evaluations per scene.
+    ``range_m`` is ``(B, H, W)`` float32 metres with -1 where there is no return, NaN for a scene
+    that the networks gave anything not finite for; ``latents`` the normalised ``(B, C, h, w)``
+    latents, ``nfe`` the network evaluations per scene.
     """
 
     range_m: Tensor
@@ -223,6 +224,7 @@ class SceneGenerator:
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
         self._scheduled: SamplerConfig | None = None
+        self._tuned: TunedSolver | None = None
 
     @property
     def device(self) -> torch.device:
@@ -279,7 +281,9 @@ class SceneGenerator:
         for part in self.latent_norm.denormalise(latents).split(size):
             whole = part if self.batch_size is None else _filled(part, size)
             image = self._decode(whole)[: len(part), 0]
-            parts.append(self.geometry.codec.decode(image.float(), sensor))
+            range_m = self.geometry.codec.decode(image.float(), sensor)
+            finite = image.isfinite().all(dim=(1, 2), keepdim=True)
+            parts.append(torch.where(finite, range_m, torch.nan))
         return torch.cat(parts)
 
     def _schedule(self) -> None:
@@ -289,6 +293,8 @@ class SceneGenerator:
         """
         if self._scheduled == self.sampler:
             return
+        tuned = self.sampler.tuned
+        self._tuned = None if tuned is None else TunedSolver.load(tuned)
         networks = [network for network in (self._strong, self._weak) if network is not None]
         adaptive = self.sampler.solver == "dopri5" and self.sampler.tuned is None
         for network in networks:
@@ -304,7 +310,8 @@ class SceneGenerator:
     def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
         sampler, velocity = self.sampler, self._velocity()
         if sampler.tuned is not None:
-            return TunedSolver.load(sampler.tuned).solve(velocity, noise)
+            assert self._tuned is not None
+            return self._tuned.solve(velocity, noise)
         if sampler.solver == "euler_maruyama":
             return euler_maruyama(
                 velocity,

@@ -190,3 +190,23 @@ def test_1000_scenes_are_never_in_memory_together(tmp_path):
         open_writer.finish({})
     assert most <= 4  # three and the one that is being handed over
     assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 1000
+
+
+def test_files_of_somebody_else_are_never_removed(tmp_path):
+    theirs = tmp_path / "bin" / "000000.bin"
+    theirs.parent.mkdir()
+    theirs.write_bytes(b"a scan")
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match="is in the way and no scenes of this command"):
+            writer(tmp_path, 2, overwrite=overwrite)
+    assert theirs.read_bytes() == b"a scan"
+
+
+def test_a_scene_that_is_not_finite_is_named(tmp_path):
+    broken = scenes(2)
+    broken[1] = torch.nan
+    with writer(tmp_path, 2) as open_writer:
+        open_writer.put(broken)
+        with pytest.raises(ValueError, match=r"scene 000001 .* holds NaN: the networks diverged"):
+            open_writer.close()
+    assert not (tmp_path / "metadata.json").exists()

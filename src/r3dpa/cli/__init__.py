@@ -285,7 +285,8 @@ def sample(
             overwrite=overwrite,
         )
     except KeyboardInterrupt:
-        sys.stderr.write(f"r3dpa sample: stopped; the same command goes on in {out}\n")
+        again = "the same command, without --overwrite," if overwrite else "the same command"
+        sys.stderr.write(f"r3dpa sample: stopped; {again} goes on in {out}\n")
         sys.exit(130)  # as a shell reports an interrupt
     if metadata["drawn_by_last_run"]:
         print_text(

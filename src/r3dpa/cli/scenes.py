@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["WeakGuide", "generator_from", "generators_of", "report", "sample"]
 
 _ON_SHEET = 16
-_PICTURES = ("range", "birds_eye", "scene_3d")
 
 
 @dataclass(frozen=True)
@@ -219,8 +217,6 @@ def sample(
     }
     projection = generator.geometry.projection
     with SceneWriter(out, num, projection, formats, request, overwrite) as writer:
-        for kind in _PICTURES:
-            shutil.rmtree(out / kind, ignore_errors=True)  # of an earlier run with more scenes
         measured = _draw_scenes(generator, writer, batch_size, seed)
         seconds = -time.perf_counter()
         ranges = np.load(writer.range_path, mmap_mode="r")

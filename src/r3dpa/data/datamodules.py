@@ -236,6 +236,7 @@ class LidarDataModule(LightningDataModule):
         Args:
             stage: ``"fit"``, ``"validate"``, ``"test"``, or ``"predict"``, which needs no grids.
         """
+        self._posteriors = None  # of another fit, maybe with another VAE
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":

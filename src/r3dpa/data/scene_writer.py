@@ -29,6 +29,8 @@ SceneFormat = Literal["bin", "ply", "npz"]
 SCENE_FORMATS: tuple[SceneFormat, ...] = ("bin", "ply", "npz")
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
+#: What ``r3dpa sample`` writes beside its metadata; pictures are drawn by the command.
+_WRITTEN = (*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d")
 _MOST_WAITING = 2
 
 
@@ -92,7 +94,7 @@ class SceneWriter:
             delete_unfinished(out)
             if self._state.exists() and not overwrite:
                 self.num_done = self._written_before()
-            else:
+            if not self.num_done:
                 self._clear()
             self._file = self._open()
             self._alone = alone.pop_all()
@@ -128,6 +130,7 @@ class SceneWriter:
                 GPU it is copied behind what it computes now, and nothing waits for it here.
 
         Raises:
+            ValueError: If a scene that was put before holds NaN.
             OSError: Or whatever else went wrong with scenes that were put before.
         """
         while len(self._waiting) >= _MOST_WAITING:
@@ -172,30 +175,42 @@ class SceneWriter:
         differing = [
             key for key in {**found, **self._request} if found.get(key) != self._request.get(key)
         ]
-        if differing:
+        if differing and num_done:
             key = differing[0]
             raise ValueError(
                 f"{self.out} holds {num_done} scenes of an unfinished run with {key} "
                 f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
                 "--overwrite true starts anew"
             )
-        if not self._unfinished.exists():  # stopped between the two last files
+        if num_done and not self._unfinished.exists():  # stopped between the two last files
             self.range_path.replace(self._unfinished)
         return num_done
 
     def _clear(self) -> None:
-        """Removes what earlier runs wrote, first of all what says that it is complete."""
-        for path in (self.out / "metadata.json", self._state, self._unfinished, self.range_path):
-            path.unlink(missing_ok=True)
-        (self.out / "scenes.npz").unlink(missing_ok=True)
-        for name in _CLOUD_WRITERS:
-            shutil.rmtree(self.out / name, ignore_errors=True)
+        """Removes what earlier runs of the same command wrote, and nothing else."""
+        metadata = self.out / "metadata.json"
+        written = [self.out / name for name in _WRITTEN]
+        if not metadata.exists() and not self._state.exists():
+            for path in written:
+                if path.exists():
+                    raise ValueError(
+                        f"{path} is in the way and no scenes of this command lie in {self.out}; "
+                        "give another --out"
+                    )
+        # From here on the folder is known as ours, should this be interrupted.
+        self.out.mkdir(parents=True, exist_ok=True)
+        self._save_state(0)
+        metadata.unlink(missing_ok=True)
+        for path in (self._unfinished, *written):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
 
     def _open(self) -> FileIO:
         """File of the range images, behind those that are written."""
         sensor = self._projection.sensor
         shape = (self.num, sensor.beams, sensor.columns)
-        self.out.mkdir(parents=True, exist_ok=True)
         file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
@@ -211,6 +226,11 @@ class SceneWriter:
         if ready is not None:
             ready.synchronize()
         for index, scene in enumerate(range_m, self.num_done):
+            if scene.isnan().any():
+                raise ValueError(
+                    f"scene {index:06d} of {self.out} holds NaN: the networks diverged; check the "
+                    "checkpoint, or sample in fp32"
+                )
             points = points_of(scene, self._projection)
             for name in self._formats:
                 if name in _CLOUD_WRITERS:
@@ -222,10 +242,13 @@ class SceneWriter:
             error.filename = str(self._unfinished)
             raise
         num_done = self.num_done + len(range_m)
-        with atomic_path(self._state) as temporary:
-            temporary.write_text(json.dumps({"request": self._request, "num_done": num_done}))
+        self._save_state(num_done)
         self.num_done = num_done
         self._failed = False
+
+    def _save_state(self, num_done: int) -> None:
+        with atomic_path(self._state) as temporary:
+            temporary.write_text(json.dumps({"request": self._request, "num_done": num_done}))
 
     def _clouds(self) -> Iterator[tuple[str, Tensor]]:
         for index, range_m in enumerate(np.load(self._unfinished, mmap_mode="r")):
