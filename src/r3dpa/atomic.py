@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
 import socket
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
 __all__ = ["atomic_path", "delete_unfinished", "only_writer"]
+
+#: What network disks without lock servers answer.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -78,8 +83,16 @@ def only_writer(lock: Path, what: str) -> Iterator[None]:
                 file.seek(0)
                 raise ValueError(
                     f"another process ({file.read() or 'just started'}) {what}: wait for it to "
-                    "end, or give another folder"
+                    f"end, or give another folder. If it is gone for sure, remove {lock}"
                 ) from error
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                warnings.warn(
+                    f"the disk of {lock} has no locks ({error.strerror}): see to it that nobody "
+                    f"else {what}",
+                    stacklevel=3,
+                )
             if not _is_file_at(file.fileno(), lock):
                 continue  # whoever had the lock has ended and removed the file in between
             file.truncate(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import threading
@@ -86,6 +87,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         # A file object: what torch opens itself fails without telling why.
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)
+            file.flush()
+            os.fsync(file.fileno())  # else a loss of power could leave an empty file of this name
 
 
 class RunCheckpoint(ModelCheckpoint):
@@ -94,8 +97,8 @@ class RunCheckpoint(ModelCheckpoint):
     Lightning's own saves at the end of training only if it has never saved before.
 
     A SIGTERM, as job systems send it before they end a job, is obeyed after the next optimiser
-    step, or after the next batch of a validation: ``last.ckpt`` is saved and the process ends with
-    status 143. It is enough that one of several training processes gets the signal.
+    step, or by a single process after the next batch of a validation: ``last.ckpt`` is saved and
+    the process ends with status 143. It is enough that one of several gets the signal.
     """
 
     _stop_asked = False
@@ -137,8 +140,11 @@ class RunCheckpoint(ModelCheckpoint):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Stops where that was asked for: a validation may take longer than a job system waits."""
-        if trainer.state.fn == "fit" and not trainer.sanity_checking:
+        """Stops where that was asked for: a validation may take longer than a job system waits.
+
+        Several processes wait for the next step: they may have unequal numbers of batches here.
+        """
+        if trainer.state.fn == "fit" and not trainer.sanity_checking and trainer.world_size == 1:
             self._stop_if_asked(trainer)
 
     def _ask_to_stop(self, *_: object) -> None:

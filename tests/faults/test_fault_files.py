@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 
 import numpy as np
@@ -196,3 +197,15 @@ def change(path, kept):
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:kept])
+
+
+def test_a_disk_without_locks_is_used_with_a_warning(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.lockf", no_locks)
+    with (
+        pytest.warns(UserWarning, match=r"\.lock has no locks .* nobody else writes here"),
+        only_writer(tmp_path / ".lock", "writes here"),
+    ):
+        pass

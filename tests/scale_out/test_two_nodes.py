@@ -248,7 +248,7 @@ def test_slurm_script_trains_and_goes_on(nodes, fit, one, tmp_path):
     )
     fakes = {
         "scontrol": f'[ "$*" = "show hostnames nodes[0-1]" ] || exit 9\n{hosts}',
-        "srun": f'[ "$1" = --kill-on-bad-exit=1 ] || exit 9\nshift\npids=()\n{starts}'
+        "srun": f'[ "$1" = --kill-on-bad-exit=1 ] || exit 9\nshift 2\npids=()\n{starts}'
         'for pid in "${pids[@]}"; do wait "$pid" || exit 1; done\n',
         "r3dpa": f'exec {PYTHON} -m r3dpa "$@"\n',
     }

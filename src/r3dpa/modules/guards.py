@@ -89,7 +89,8 @@ class StepGuard:
         """
         losses = [batch.losses["loss"].to(norms) for batch in self.batches if batch.losses]
         own = ~torch.stack([norms.new_zeros(()), *losses]).isfinite().all()
-        moved = [buffer for buffer, _ in self._kept if buffer.is_floating_point()]
+        kept = [buffer for buffer, _ in self._kept if buffer.numel()]
+        moved = [buffer for buffer in kept if buffer.is_floating_point()]
         sizes = [norms.max(), *(torch._foreach_norm(moved, torch.inf) if moved else ())]
         flags = torch.stack([own, ~torch.stack(sizes).isfinite().all()]).int()
         if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:

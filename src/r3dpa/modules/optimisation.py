@@ -76,7 +76,7 @@ class GuardedOptimisation(StepLosses):
         norms = {
             group["name"]: nn.utils.get_total_norm(
                 [p.grad for p in group["params"] if p.grad is not None]
-            )
+            ).to(self.device)  # without any gradient it is made on the host
             for group in optimizer.param_groups
         }
         values = {f"grad_norm/{name}": norm for name, norm in norms.items()}
@@ -132,7 +132,7 @@ class GuardedOptimisation(StepLosses):
             raise RuntimeError(
                 f"{guard.in_a_row} steps in a row had a non-finite loss or gradient, the last one "
                 f"at step {self.global_step} (gradient norms: {_listed(found)}). For a file of "
-                f"{folder}, `r3dpa replay FILE --ckpt {run_dir}/checkpoints/last.ckpt` tells in "
+                f"{folder}, `r3dpa replay FILE {run_dir}/checkpoints/last.ckpt` tells in "
                 "which layer it starts; look at the scans with `r3dpa check`; if they are sound, "
                 "lower the learning rate, or train in bf16 or fp32 instead of fp16"
             )
