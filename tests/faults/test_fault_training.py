@@ -121,6 +121,7 @@ class TestSigterm:
         )
 
 
+@pytest.mark.slow  # `make test-faults`
 class TestKilled:
     @pytest.mark.parametrize("call", [pytest.param(1, marks=pytest.mark.slow), 6])
     def test_between_checkpoints(self, call, scans_folder, tmp_path, ended, goes_on, fault):
@@ -188,6 +189,7 @@ class TestKilled:
         )
 
 
+@pytest.mark.slow  # `make test-faults`
 class TestDisk:
     def test_full_while_a_checkpoint_is_written(
         self, scans_folder, small_disk, ended, goes_on, fault
@@ -248,6 +250,7 @@ class TestTwo:
         )
 
 
+@pytest.mark.slow  # `make test-faults`
 class TestScan:
     @pytest.mark.parametrize(
         ("kept", "says"),

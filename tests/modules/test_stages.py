@@ -153,7 +153,10 @@ def test_bf16_mixed_keeps_weights_and_average_in_float32(smoke_args, tmp_path):
 
 
 @pytest.mark.ddp
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize(
+    "stage",
+    ["joint", *(pytest.param(s, marks=pytest.mark.slow) for s in STAGES if s != "joint")],
+)
 def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_checkpoint, tmp_path):
     """Same data, same draws, synchronised batch statistics: only the order of sums differs.
 
