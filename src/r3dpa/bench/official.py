@@ -44,7 +44,7 @@ from r3dpa.data.scans import read_scan
 from r3dpa.flow import Interpolant, euler, euler_maruyama, ode_times, sde_times
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import ScanGeometry, range_image
-from r3dpa.nn import SiT
+from r3dpa.nn import VAE, SiT
 
 __all__ = ["PARTS", "OfficialSettings", "official"]
 
@@ -217,7 +217,7 @@ def official(
     }
     for part in settings.parts:
         results += runs[part]()
-    about = {
+    about: dict[str, Any] = {
         "reference": {"repository": "valeoai/R3DPA", "commit": COMMIT},
         "stand-ins": dict(code.stand_ins),
         "patches": "; ".join(PATCHES),
@@ -233,7 +233,7 @@ def official(
     header = ["part", "case", "median s", "min s", "official / ours (95 %)", "differs"]
     lines = [format_table(header, (row for result in results for row in result.rows()))]
     lines += [line for result in results for line in result.lines()]
-    lines += [f"{name}: {one_line(values)}" for name, values in about.items()]  # type: ignore[arg-type]
+    lines += [f"{name}: {one_line(values)}" for name, values in about.items()]
     return "\n".join(lines)
 
 
@@ -245,7 +245,9 @@ def _sampler(
 ) -> list[PartResult]:
     batch, steps = (2 if settings.quick else 4), settings.steps
     nets, samplers = sits(code, networks), code["samplers"]
-    half = networks.network("ema").build().eval().halve_()  # type: ignore[operator]
+    half = networks.network("ema").build().eval()
+    assert isinstance(half, SiT)
+    half.halve_()
     noise = torch.randn(batch, nets.ours.in_channels, *nets.ours.input_size)
     draws = torch.randn(steps - 1, *noise.shape, dtype=torch.float64)
     labels = torch.zeros(batch, dtype=torch.long)
@@ -291,7 +293,9 @@ def _sampler(
 def _decode(code: OfficialCode, settings: OfficialSettings) -> PartResult:
     networks = random_networks(_SMALL_SIT, _SMALL_VAE if settings.quick else {})
     nets = vaes(code, networks)
-    half = networks.network("vae").build().eval().halve_decoder_()  # type: ignore[operator]
+    half = networks.network("vae").build().eval()
+    assert isinstance(half, VAE)
+    half.halve_decoder_()
     sit = networks.network("sit").arguments
     latents = torch.randn(1, sit["in_channels"], *sit["input_size"])
     with torch.inference_mode():

@@ -14,7 +14,7 @@ from r3dpa.bench.official_imports import OfficialCode
 from r3dpa.bench.official_runs import official_sit, official_vae
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, to_official
 from r3dpa.flow import Velocity, ab2, heun, ode_times
-from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.generation import SamplerConfig, scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
 
@@ -136,20 +136,9 @@ def at_times(sit: SiT, times: Tensor) -> Velocity:
 
 def noise_of(networks: Checkpoint, num: int, seed: int) -> Tensor:
     """``(num, C, h, w)``: what the SiT of a :class:`SceneGenerator` meets first for a seed."""
-    sit = networks.network("ema").build()
-    generator = SceneGenerator(
-        networks.network("vae").build(),  # type: ignore[arg-type]
-        sit,  # type: ignore[arg-type]
-        networks.network("ema_latent_norm").build(),  # type: ignore[arg-type]
-        ScanGeometry.from_dict(dict(networks.geometry or {})),
-        SamplerConfig("euler", 1),
-        decode_batch_size=1,
-    )
-    met: list[Tensor] = []
-    embedding = sit.get_submodule("x_embedder")
-    embedding.register_forward_pre_hook(lambda module, given: met.append(given[0].clone()))
-    generator.generate(range(num), seed)
-    return met[0]
+    sit = networks.network("ema").arguments
+    shape = (sit["in_channels"], *sit["input_size"])
+    return torch.stack([torch.randn(shape, generator=scene_random(seed, i)) for i in range(num)])
 
 
 def relative(values: Tensor, reference: Tensor) -> float:

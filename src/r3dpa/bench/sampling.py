@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -234,9 +234,11 @@ def run_problem(
     """
     reference = certified_reference(problem, effort.reference_steps, effort.samples)
     prepared: list[Any] = []
-    look: Callable[[Setting, Solved], None] = lambda setting, solved: None  # noqa: E731
-    if distances is not None:
-        look = lambda setting, solved: prepared.append(distances.prepare(solved))  # noqa: E731
+
+    def look(setting: Setting, solved: Solved) -> None:
+        if distances is not None:
+            prepared.append(distances.prepare(solved))
+
     errors = budget(problem, ways, reference, look)
     labels = _labels(ways, errors, effort.batch)
     with tempfile.TemporaryDirectory(prefix="r3dpa_bench_") as folder:
