@@ -35,8 +35,8 @@ __all__ = ["Effort", "run_problem", "sampling", "settings_of"]
 
 #: Solvers of the picture, with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
-    *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.5), ("ab2", 2.0)),
-    *(("ab3", 1.0), ("dpmpp_2m", 1.0), ("unipc", 1.0)),
+    *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.75), ("ab2", 2.0)),
+    *(("ab3", 1.0), ("ab3", 1.5), ("ab3", 2.5), ("dpmpp_2m", 1.75), ("unipc", 1.0)),
 )
 _RESTARTS = (16, 32, 64)  # steps, of those that the evaluations have room for
 _PRECISION_STEPS = 32
