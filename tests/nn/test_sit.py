@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from r3dpa.nn.sit import SiT, sincos_position_embedding, time_frequencies
+from r3dpa.nn.sit import SiT, sincos_position_embedding
+from r3dpa.nn.velocity_network import time_frequencies
 
 SMALL = {
     "input_size": (4, 8),

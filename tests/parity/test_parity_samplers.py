@@ -8,14 +8,15 @@ from official_sit import build_sit
 
 from r3dpa.flow import (
     FeatureGuidance,
+    FeatureTarget,
     Interpolant,
     euler,
     euler_maruyama,
     heun,
+    invert,
     ode_times,
     pnp_flow_feature,
     sde_times,
-    transport_to_time,
 )
 
 
@@ -37,9 +38,8 @@ def velocity_of(case, sit):
 def guidance_of(case, sit):
     return FeatureGuidance(
         velocity_of(case, sit),
-        lambda x, t: sit.project_features(x.float(), t.float(), case["in/y"][: len(x)]),
-        case["in/zs"],
-        case["in/token_mask"],
+        lambda x, t: sit.aligned_pass(x.float(), t.float(), case["in/y"][: len(x)]),
+        [FeatureTarget(case["in/zs"], case["in/token_mask"])],
         scale=case.config["v_feat_scale"],
         legacy=True,
     )
@@ -127,8 +127,9 @@ def guided_sde(case, sit):
 
 def transport(case, sit):
     time, steps = case.config["transport"]["target_time"], case.config["transport"]["num_steps"]
-    velocity = velocity_of(case, sit)
-    return {f"out/transport_{time}": transport_to_time(velocity, case["in/latents"], time, steps)}
+    times = ode_times(steps, start=time, stop=0.0)
+    way = invert(velocity_of(case, sit), case["in/latents"], times, "euler")
+    return {f"out/transport_{time}": way.states[0]}
 
 
 def inpainting(case, sit):
@@ -136,9 +137,8 @@ def inpainting(case, sit):
     assert config["features"] == f"zs[:{len(latents)}]"
     guidance = FeatureGuidance(
         velocity_of(case, sit),
-        lambda x, t: sit.project_features(x, t, case["in/y"][: len(x)]),
-        case["in/zs"][: len(latents)],
-        case["in/pnp_token_mask"],
+        lambda x, t: sit.aligned_pass(x, t, case["in/y"][: len(x)]),
+        [FeatureTarget(case["in/zs"][: len(latents)], case["in/pnp_token_mask"])],
         scale=config["v_feat_scale"],
         legacy=True,
     )

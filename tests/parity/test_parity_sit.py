@@ -6,9 +6,10 @@ import pytest
 import torch
 from official_sit import build_norm, build_sit, our_name
 
-from r3dpa.flow import FeatureGuidance, Interpolant
+from r3dpa.flow import FeatureGuidance, FeatureTarget, Interpolant
 from r3dpa.losses import alignment_loss, flow_matching_loss
-from r3dpa.nn.sit import SiT, sincos_position_embedding, time_frequencies
+from r3dpa.nn.sit import SiT, sincos_position_embedding
+from r3dpa.nn.velocity_network import time_frequencies
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +108,8 @@ def feature_guidance(case):
     for name, mask in (("nomask", None), ("mask", case["in/token_mask"])):
         guidance = FeatureGuidance(
             lambda x, t: sit.velocity(x, t, labels),
-            lambda x, t: sit.project_features(x, t, labels),
-            case["in/zs"],
-            mask,
+            lambda x, t: sit.aligned_pass(x, t, labels),
+            [FeatureTarget(case["in/zs"], mask)],
             scale=case.config["v_feat_scale"],
             legacy=True,
         )

@@ -378,7 +378,7 @@ class _StepTimer(L.Callback):
 
 def _num_parameters(module: GenerativeModule) -> dict[str, int]:
     sit, discriminator = module.sit, module.discriminator
-    whole = _count({*sit.parameters(), sit.pos_embed})
+    whole = _count((*sit.parameters(), *sit.buffers()))  # a fixed position embedding counts
     return {
         "vae": _count(module.vae.parameters()),
         "sit": whole,

@@ -1,7 +1,7 @@
 """Official R3DPA checkpoints: keys and options of valeoai/R3DPA, translated in both directions.
 
-An official SiT holds the latent batch norm as ``bn.*`` and its projector as ``projectors.0.*``;
-everything else has the same name here.
+An official SiT or UNet holds the latent batch norm as ``bn.*`` and its projector as
+``projectors.0.*``; everything else has the same name here.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from r3dpa.checkpoints.networks import Checkpoint, NetworkState
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
+from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
 
 __all__ = ["from_official", "is_official", "statistics_of", "to_official"]
@@ -30,6 +31,8 @@ Encoding = Literal["linear", "log2"]
 _OFFICIAL_PREFIX, _OUR_PREFIX, _NORM_PREFIX = "projectors.0.", "projector.", "bn."
 _NUM_HEADS = {384: 6, 768: 12, 1024: 16, 1152: 16}  # SiT-S, -B, -L, -XL by token width
 _SIZE_NAMES = {(384, 12): "S", (768, 12): "B", (1024, 24): "L", (1152, 28): "XL"}
+_UNET_NAMES = {256: "UNet_lidm", 160: "UNet_small"}  # by channels
+_UNET_HEAD_CHANNELS = 32  # of both
 _SIT_NETWORKS = {"model": ("sit", "latent_norm"), "ema": ("ema", "ema_latent_norm")}
 _OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
 _STATISTICS = {"latents_scale", "latents_bias"}
@@ -73,7 +76,7 @@ def from_official(
             statistics (``latents_scale``, ``latents_bias``) alone.
         path: File that held it.
         args: Options of the official training script, where ``content`` has no ``args``.
-        sit_args: Arguments of SiT that override what weights and options tell.
+        sit_args: Arguments of SiT or UNet that override what weights and options tell.
         encoding: Encoding of the range image; taken from the options where None.
 
     Returns:
@@ -82,7 +85,7 @@ def from_official(
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
-            can neither be read nor inferred.
+            or UNet can neither be read nor inferred.
     """
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
@@ -145,7 +148,7 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for key, (sit_name, norm_name) in _SIT_NETWORKS.items():
         if sit_name in checkpoint.networks:
-            sit = _official_part(checkpoint, sit_name, SiT)
+            sit = _official_part(checkpoint, sit_name, SiT, UNet)
             norm = checkpoint.networks.get(norm_name) or checkpoint.network("latent_norm")
             content[key] = {
                 _renamed(k, _OUR_PREFIX, _OFFICIAL_PREFIX): v for k, v in sit.state_dict.items()
@@ -174,12 +177,12 @@ def statistics_of(norm: StateDict) -> dict[str, Tensor]:
     return {"latents_scale": scale[None, :, None, None], "latents_bias": bias[None, :, None, None]}
 
 
-def _official_part(checkpoint: Checkpoint, name: str, kind: type[nn.Module]) -> NetworkState:
+def _official_part(checkpoint: Checkpoint, name: str, *kinds: type[nn.Module]) -> NetworkState:
     state = checkpoint.network(name)
-    if state.kind is not kind:
+    if state.kind not in kinds:
         raise ValueError(
             f"{name} of {checkpoint.path} is a {state.class_path}, which has no official "
-            f"counterpart; {_path_of(kind)} has"
+            f"counterpart; {' or '.join(map(_path_of, kinds))} has"
         )
     return state
 
@@ -214,7 +217,7 @@ def _sit(
     sit_args: Mapping[str, Any],
     strides: tuple[int, int] | None,
 ) -> tuple[NetworkState, NetworkState]:
-    """SiT and its latent statistics from an official SiT."""
+    """SiT or UNet and its latent statistics from an official one."""
     norm = {
         key.removeprefix(_NORM_PREFIX): value
         for key, value in weights.items()
@@ -225,14 +228,18 @@ def _sit(
         for key, value in weights.items()
         if not key.startswith(_NORM_PREFIX)
     }
-    init_args = _sit_args(sit, args, sit_args, strides)
+    kind: type[nn.Module] = UNet if any(key.startswith("input_blocks.") for key in sit) else SiT
+    if kind is UNet:
+        init_args = _unet_args(sit, sit_args)
+    else:
+        init_args = _sit_args(sit, args, sit_args, strides)
     norm_args = {
         "channels": init_args["in_channels"],
         "momentum": args.get("bn_momentum", 0.1),
         "legacy_inverse": True,
     }
     return (
-        NetworkState(_path_of(SiT), init_args, sit),
+        NetworkState(_path_of(kind), init_args, sit),
         NetworkState(_path_of(LatentNorm), norm_args, norm),
     )
 
@@ -259,8 +266,8 @@ def _sit_args(
         num_tokens = sit["pos_embed"].shape[1]
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise ValueError(
-            f"the weights are not those of an official SiT ({error}); the official UNet and other "
-            "backbones cannot be read"
+            f"the weights are not those of an official SiT or UNet ({error}); other backbones "
+            "cannot be read"
         ) from error
     num_classes = {**args, **given}.get("num_classes", max(1, num_rows - 1))
     if num_rows not in (num_classes, num_classes + 1):
@@ -281,6 +288,38 @@ def _sit_args(
         raise ValueError(
             f"neither weights nor training options (args, args.json) tell {sorted(unknown)} of "
             f"this SiT with {num_tokens} tokens of width {hidden_size}; give them as sit_args"
+        )
+    return init_args
+
+
+def _unet_args(unet: StateDict, given: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        _, channels, *input_size = unet["ape.bias"].shape
+        num_levels = 1 + sum(key.endswith(".op.weight") for key in unet)
+        num_up = len({key.split(".")[1] for key in unet if key.startswith("output_blocks.")})
+        num_res_blocks = num_up // num_levels - 1
+        # A level is its residual blocks and, but for the last, a step down; first comes the input.
+        last_blocks = [(level + 1) * (num_res_blocks + 1) - 1 for level in range(num_levels)]
+        widths = [len(unet[f"input_blocks.{i}.0.out_layers.3.weight"]) for i in last_blocks]
+        inferred: dict[str, Any] = {
+            "input_size": list(input_size),
+            "in_channels": unet["input_blocks.0.0.weight"].shape[1],
+            "channels": channels,
+            "channel_multipliers": [width // channels for width in widths],
+            "num_res_blocks": num_res_blocks,
+            "feature_dim": len(unet["projector.4.weight"]),
+            "projector_dim": len(unet["projector.0.weight"]),
+            "num_classes": len(unet["label_emb.weight"]),
+        }
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise ValueError(f"the weights are not those of an official UNet ({error})") from error
+    if channels in _UNET_NAMES:
+        inferred["head_channels"] = _UNET_HEAD_CHANNELS
+    init_args = inferred | dict(given)
+    if "head_channels" not in init_args:
+        raise ValueError(
+            f"nothing tells the head_channels of this UNet with {channels} channels; give them as "
+            "sit_args"
         )
     return init_args
 
@@ -376,14 +415,17 @@ def _geometry(
     args: Mapping[str, Any],
     encoding: Encoding | None,
 ) -> dict[str, Any] | None:
-    """Plain values of the official ``ScanGeometry``; None without a SiT or a known encoding."""
+    """Plain values of the official ``ScanGeometry``; None without a network or encoding."""
     if encoding is None and "dataset_config" in args:
         by_config = {config: key for key, config in _DATASET_CONFIGS.items()}
         encoding = by_config.get(Path(str(args["dataset_config"])).name)
     sit = next((networks[name] for name in ("sit", "ema") if name in networks), None)
     if encoding is None or sit is None:
         return None
-    patch_size = sit.init_args["patch_size"]
+    if sit.kind is UNet:
+        patch_size = 2 ** (len(sit.init_args["channel_multipliers"]) - 1)
+    else:
+        patch_size = sit.init_args["patch_size"]
     return {
         "projection": _OFFICIAL_PROJECTION,
         "codec": {"encoding": encoding, "scale": None, "legacy_inverse": False},
@@ -404,14 +446,20 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
         sit = checkpoint.network(sit_name).arguments
         args |= {
             "num_classes": sit["num_classes"],
-            "cfg_prob": 0.1 if sit["class_dropout"] else 0.0,
-            "encoder_depth": sit["alignment_depth"],
-            "qk_norm": sit["qk_norm"],
             "bn_momentum": checkpoint.network("latent_norm").arguments["momentum"],
         }
-        size = _SIZE_NAMES.get((sit["hidden_size"], sit["depth"]))
-        if size is not None:
-            args["model"] = f"SiT-{size}/{sit['patch_size']}"
+        if checkpoint.network(sit_name).kind is UNet:
+            model = _UNET_NAMES.get(sit["channels"])
+        else:
+            args |= {
+                "cfg_prob": 0.1 if sit["class_dropout"] else 0.0,
+                "encoder_depth": sit["alignment_depth"],
+                "qk_norm": sit["qk_norm"],
+            }
+            size = _SIZE_NAMES.get((sit["hidden_size"], sit["depth"]))
+            model = None if size is None else f"SiT-{size}/{sit['patch_size']}"
+        if model is not None:
+            args["model"] = model
     if checkpoint.geometry is not None:
         projection, codec = checkpoint.geometry["projection"], checkpoint.geometry["codec"]
         if all(projection[key] == value for key, value in _OFFICIAL_PROJECTION.items()):

@@ -28,7 +28,7 @@ from r3dpa.modules.guards import StepGuard
 from r3dpa.modules.optimisation import GuardedOptimisation
 from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig, PathName, TimeSampling
 from r3dpa.modules.step_losses import PathDraws, frozen
-from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, SiT
+from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, SiT, VelocityNetwork
 
 __all__ = ["GenerativeModule", "PathDraws", "frozen"]
 
@@ -49,7 +49,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
 
     Args:
         vae: Range-image autoencoder.
-        sit: Flow transformer over its latents.
+        sit: Velocity network over its latents, :class:`r3dpa.nn.SiT` or :class:`r3dpa.nn.UNet`.
         discriminator: Patch discriminator, or None where the stage trains none.
         weights: Loss weights.
         optimizer: Optimiser settings.
@@ -60,7 +60,8 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         latent_norm: Latent statistics; None makes a fresh one.
         init_from: Checkpoint of the stage before.
         init_networks: Which networks are taken from ``init_from``; None means ``default_init``.
-        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours; None starts from random values.
+        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, for a SiT only; None starts from
+            random values.
         keep_projector: Keep the RGB model's projection head where its shape fits.
         seed: Key of the training draws.
         guards: When a step is dropped, and when training stops; None trains without: the first
@@ -68,7 +69,8 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
         compile: Compile the networks for training with ``torch.compile``: VAE, discriminator and
-            each block of the SiT. The first step takes minutes; files have the same names.
+            each block of the velocity network. The first step takes minutes; files have the same
+            names.
     """
 
     stage: str
@@ -79,7 +81,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
     def __init__(
         self,
         vae: VAE,
-        sit: SiT,
+        sit: VelocityNetwork,
         discriminator: PatchDiscriminator | None = None,
         weights: LossWeights = LossWeights(),
         optimizer: OptimizerConfig = OptimizerConfig(),
@@ -139,8 +141,8 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.arrange_networks()
         if self.compiles and self.trainer.state.fn == "fit":
             # In place and part by part: names in checkpoints stay, and equal blocks share a graph.
-            parts = [self.vae.encoder, self.vae.decoder, self.discriminator, *self.sit.blocks]
-            for part in parts:
+            parts = [self.vae.encoder, self.vae.decoder, self.discriminator]
+            for part in [*parts, *self.sit.compiled_parts]:
                 if part is not None:
                     part.compile(dynamic=False)
 
@@ -194,6 +196,11 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             ValueError: Listing everything in the file that does not fit this stage.
         """
         if self.rgb_weights is not None:
+            if not isinstance(self.sit, SiT):
+                raise ValueError(
+                    f"rgb_weights start a SiT, but model.sit is a {type(self.sit).__name__}; "
+                    "leave rgb_weights out"
+                )
             rgb = read_checkpoint(self.rgb_weights)
             self._learned_from.append(rgb.feature_source)
             report = transfer_rgb(
@@ -254,7 +261,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             )
         if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
             raise ValueError(
-                f"feature grids are {geometry.grid_size}, but the SiT has "
+                f"feature grids are {geometry.grid_size}, but the {type(self.sit).__name__} has "
                 f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
             )
         if datamodule.feature_dim != self.sit.feature_dim:

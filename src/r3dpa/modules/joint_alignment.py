@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.step_losses import PathDraws, frozen
-from r3dpa.nn import VAE, PatchDiscriminator, SiT
+from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 
 __all__ = ["JointAlignment"]
 
@@ -25,7 +25,7 @@ class JointAlignment(GenerativeModule):
 
     Args:
         vae: Range-image autoencoder.
-        sit: Flow transformer.
+        sit: Velocity network, :class:`r3dpa.nn.SiT` or :class:`r3dpa.nn.UNet`.
         discriminator: Patch discriminator.
         **kwargs: See :class:`GenerativeModule`; without ``init_from`` training starts from scratch.
     """
@@ -34,7 +34,7 @@ class JointAlignment(GenerativeModule):
     default_init = ("vae", "discriminator", "sit", "latent_norm")
 
     def __init__(
-        self, vae: VAE, sit: SiT, discriminator: PatchDiscriminator, **kwargs: Any
+        self, vae: VAE, sit: VelocityNetwork, discriminator: PatchDiscriminator, **kwargs: Any
     ) -> None:
         super().__init__(vae, sit, discriminator, **kwargs)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.step_losses import PathDraws
-from r3dpa.nn import VAE, PatchDiscriminator, SiT
+from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 
 __all__ = ["VAEAlignment"]
 
@@ -27,7 +27,7 @@ class VAEAlignment(GenerativeModule):
 
     Args:
         vae: Range-image autoencoder, trained from scratch.
-        sit: Flow transformer, frozen but for projector and patch embedding.
+        sit: Velocity network, frozen but for projector and input layer (patch embedding).
         discriminator: Patch discriminator.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
@@ -41,7 +41,7 @@ class VAEAlignment(GenerativeModule):
     def __init__(
         self,
         vae: VAE,
-        sit: SiT,
+        sit: VelocityNetwork,
         discriminator: PatchDiscriminator,
         train_patch_embed: bool = True,
         keep_projector: bool = True,
@@ -51,7 +51,7 @@ class VAEAlignment(GenerativeModule):
         self.sit.requires_grad_(False)
         if self.weights.vae_alignment != 0:
             self.sit.projector.requires_grad_(True)
-            self.sit.x_embedder.requires_grad_(train_patch_embed)
+            self.sit.input_layer.requires_grad_(train_patch_embed)
 
     def needs_features(self) -> bool:
         """Only lambda1 counts: the velocity is not trained in this stage."""

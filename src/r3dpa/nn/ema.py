@@ -9,13 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.nn.latent_norm import LatentNorm
-from r3dpa.nn.sit import SiT
+from r3dpa.nn.velocity_network import VelocityNetwork
 
 __all__ = ["EMA"]
 
 
 class EMA(nn.Module):
-    """Averaged float32 copies of a SiT and of its latent statistics.
+    """Averaged float32 copies of a velocity network and of its latent statistics.
 
     Parameters follow ``average = decay * average + (1 - decay) * weight`` after every optimiser
     step. Buffers (the latent statistics, which are an average already) are copied by default: at
@@ -38,7 +38,7 @@ class EMA(nn.Module):
 
     def __init__(
         self,
-        sit: SiT,
+        sit: VelocityNetwork,
         latent_norm: LatentNorm,
         decay: float = 0.9999,
         buffers: Literal["copy", "decay"] = "copy",
@@ -54,7 +54,7 @@ class EMA(nn.Module):
         self.latent_norm = copy.deepcopy(latent_norm).float().eval().requires_grad_(False)
 
     @torch.no_grad()
-    def update(self, sit: SiT, latent_norm: LatentNorm) -> None:
+    def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
         """Moves the averages one step towards the present weights."""
         for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
             pairs: list[tuple[Tensor, Tensor]] = list(
@@ -72,7 +72,7 @@ class EMA(nn.Module):
                 )
 
     @torch.no_grad()
-    def reset(self, sit: SiT, latent_norm: LatentNorm) -> None:
+    def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
         """Sets the averages to the present weights, as at the start of a training stage."""
         self.sit.load_state_dict(sit.state_dict())
         self.latent_norm.load_state_dict(latent_norm.state_dict())

@@ -169,19 +169,20 @@ def _supported(stride: Size) -> Size:
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group norm with 32 groups and eps 1e-6, whose statistics are never in half precision.
+    """Group norm with 32 groups, whose statistics are never in half precision.
 
     Args:
         channels: Channels of the image, a multiple of 32.
+        eps: Added to the variance.
 
     Raises:
         ValueError: If ``channels`` is not a multiple of 32.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, eps: float = 1e-6) -> None:
         if channels % 32:
             raise ValueError(f"channels must be a multiple of 32 (norm groups), got {channels}")
-        super().__init__(32, channels, eps=1e-6)
+        super().__init__(32, channels, eps=eps)
 
     def forward(self, image: Tensor) -> Tensor:
         """Normalise ``(B, C, H, W)``; the result has the dtype of the input."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple, Self
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -17,47 +17,19 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.nn.attention import SelfAttention
-from r3dpa.nn.layers import at_least_float32, no_autocast
+from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.velocity_network import (
+    TIME_WIDTH,
+    VelocityNetwork,
+    WideLinear,
+    time_frequencies,
+)
 
-__all__ = ["SiT", "SiTOutput", "sincos_position_embedding", "time_frequencies"]
+__all__ = ["SiT", "sincos_position_embedding"]
 
-_TIME_WIDTH = 256
 _MAX_PERIOD = 10_000.0
 _TOKEN_NORM_EPS = 1e-6
 _TABLE_STD = 0.02
-
-
-class SiTOutput(NamedTuple):
-    """What one evaluation of :class:`SiT` predicts.
-
-    Attributes:
-        velocity: ``(B, C, h, w)`` d x_t / d t of the normalised latents.
-        features: ``(B, N, F)`` projected features, not of unit length.
-    """
-
-    velocity: Tensor
-    features: Tensor
-
-
-def time_frequencies(time: Tensor, width: int = _TIME_WIDTH) -> Tensor:
-    """Sinusoidal features of the flow time, cosines before sines.
-
-    The time enters unscaled, so that the features of t in [0, 1] stay those of the official
-    weights. In bfloat16 neighbouring times would coincide: pass float32 or float64.
-
-    Formula: ``cos(t f_k), sin(t f_k)`` with ``f_k = 10000^(-k / (width / 2))``.
-
-    Args:
-        time: ``(B,)`` flow times in [0, 1].
-        width: Even number of features.
-
-    Returns:
-        ``(B, width)`` in [-1, 1], dtype of ``time``.
-    """
-    half = width // 2
-    exponents = torch.arange(half, dtype=time.dtype, device=time.device) / half
-    angles = time[:, None] * torch.exp(-math.log(_MAX_PERIOD) * exponents)
-    return torch.cat([angles.cos(), angles.sin()], dim=1)
 
 
 def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
@@ -97,14 +69,13 @@ def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
     return code[None].float()
 
 
-class SiT(nn.Module):
+class SiT(VelocityNetwork):
     """Scalable interpolant transformer with a feature projection head (REPA).
 
     Tokens are patches of the latents in row-major order. Each block is modulated by the embedding
     of time and class (adaLN-zero). After block ``alignment_depth`` a three-layer MLP projects the
     tokens to the width of the 3D features. SiT-B/2 is the default; SiT-XL/2 has ``hidden_size``
-    1152, ``depth`` 28, ``num_heads`` 16 and ``alignment_depth`` 8. The network only predicts:
-    times, noise, targets and losses live outside.
+    1152, ``depth`` 28, ``num_heads`` 16 and ``alignment_depth`` 8.
 
     Source: SiT (Ma et al. 2024) with the alignment head of REPA (Yu et al. 2025), as used by
     R3DPA (ICRA 2026).
@@ -196,80 +167,20 @@ class SiT(nn.Module):
         )
         self.final_layer = _FinalLayer(hidden_size, patch_size**2 * in_channels)
 
-    def forward(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> SiTOutput:
-        """Velocity and projected features from one pass through all blocks.
+    @property
+    def modulation_width(self) -> int:
+        """Six vectors for each block, two for the output."""
+        return (6 * len(self.blocks) + 2) * self.hidden_size
 
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
+    @property
+    def input_layer(self) -> nn.Module:
+        """The patch embedding."""
+        return self.x_embedder
 
-        Returns:
-            Velocity ``(B, C, h, w)`` and features ``(B, N, F)``.
-
-        Raises:
-            ValueError: If a shape does not fit the network, or a model of several classes gets
-                no labels.
-        """
-        self._check(latents, time, labels)
-        modulations = self.modulations(time, labels)
-        tokens = self._aligned_tokens(latents, modulations)
-        return SiTOutput(self._finish(tokens, modulations), self.projector(tokens))
-
-    def velocity(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Velocity alone; the projection head is not evaluated.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(B, C, h, w)`` d x_t / d t.
-
-        Raises:
-            ValueError: As :meth:`forward`.
-        """
-        self._check(latents, time, labels)
-        modulations = self.modulations(time, labels)
-        return self._finish(self._aligned_tokens(latents, modulations), modulations)
-
-    def velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
-        """Velocity at times whose modulations are known: all of :meth:`velocity` but adaLN.
-
-        A schedule meets the same times for every sample, and a third of the weights do nothing
-        but turn times into modulations: the rows of a whole schedule are computed once.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
-
-        Returns:
-            ``(B, C, h, w)`` d x_t / d t; equal to :meth:`velocity` up to the rounding of another
-            batch size.
-
-        Raises:
-            ValueError: If a shape does not fit the network.
-
-        Example:
-            >>> sit = SiT(hidden_size=32, depth=2, num_heads=2, alignment_depth=1)
-            >>> table = sit.modulations(torch.linspace(1, 0, 9))
-            >>> sit.velocity_at(torch.randn(4, 8, 16, 128), table[3:4]).shape
-            torch.Size([4, 8, 16, 128])
-        """
-        self._check_latents(latents)
-        expected = (6 * len(self.blocks) + 2) * self.hidden_size
-        if modulations.dim() != 2 or modulations.shape[1] != expected:
-            raise ValueError(
-                f"modulations must be rows of {expected} numbers, got {tuple(modulations.shape)}; "
-                "take them from SiT.modulations"
-            )
-        if len(modulations) not in (1, len(latents)):
-            raise ValueError(
-                f"modulations must hold 1 row or one for each of {len(latents)} samples, "
-                f"got {len(modulations)}"
-            )
-        return self._finish(self._aligned_tokens(latents, modulations), modulations)
+    @property
+    def compiled_parts(self) -> list[nn.Module]:
+        """The blocks, which share a graph."""
+        return [*self.blocks]
 
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
         """Shifts, scales and gates of all blocks and of the output layer at some times.
@@ -299,43 +210,25 @@ class SiT(nn.Module):
             block.mlp.bfloat16()
         return self
 
-    def project_features(
-        self, latents: Tensor, time: Tensor, labels: Tensor | None = None
-    ) -> Tensor:
-        """Projected features alone; only the first ``alignment_depth`` blocks are evaluated.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(B, N, F)``, not of unit length.
-
-        Raises:
-            ValueError: As :meth:`forward`.
-        """
-        self._check(latents, time, labels)
-        conditioning = self._conditioning(time, labels)
-        rows = _rows(self.blocks[: self.alignment_depth], conditioning)
-        return self.projector(self._aligned_tokens(latents, rows))
-
     def _conditioning(self, time: Tensor, labels: Tensor | None) -> Tensor:
         """Embedding ``(T, D)`` of times and classes, in the dtype of the modulation layers."""
-        _check_rows(time, labels)
-        if labels is None:
-            if self.num_classes > 1:
-                raise ValueError(f"a model of {self.num_classes} classes needs labels")
-            labels = torch.zeros(len(time), dtype=torch.long, device=time.device)
+        labels = self._labels(time, labels)
         conditioning = self.t_embedder(time) + self.y_embedder(labels)
         return conditioning.to(self.final_layer.linear.weight.dtype)
 
-    def _aligned_tokens(self, latents: Tensor, modulations: Tensor) -> Tensor:
+    def _first_modulations(self, time: Tensor, labels: Tensor | None) -> Tensor:
+        return _rows(self.blocks[: self.alignment_depth], self._conditioning(time, labels))
+
+    def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
         """Tokens ``(B, N, D)`` after block ``alignment_depth``."""
         tokens = self.x_embedder(latents) + self.pos_embed
-        return self._through(range(self.alignment_depth), tokens, modulations)
+        return (self._through(range(self.alignment_depth), tokens, modulations),)
 
-    def _finish(self, tokens: Tensor, modulations: Tensor) -> Tensor:
+    def _project(self, activations: Tensor) -> Tensor:
+        return self.projector(activations)
+
+    def _finish(self, activations: tuple[Tensor, ...], modulations: Tensor) -> Tensor:
+        (tokens,) = activations
         later = range(self.alignment_depth, len(self.blocks))
         tokens = self._through(later, tokens, modulations)
         patches = self.final_layer(tokens, modulations[:, -2 * self.hidden_size :])
@@ -354,36 +247,11 @@ class SiT(nn.Module):
             tokens = block(tokens, modulations[:, index * width : (index + 1) * width])
         return tokens
 
-    def _check(self, latents: Tensor, time: Tensor, labels: Tensor | None) -> None:
-        self._check_latents(latents)
-        if time.shape != latents.shape[:1]:
-            raise ValueError(
-                f"time must hold one value per sample, shape ({len(latents)},), "
-                f"got {tuple(time.shape)}"
-            )
-
-    def _check_latents(self, latents: Tensor) -> None:
-        expected = (self.in_channels, *self.input_size)
-        if latents.shape[1:] != expected:
-            raise ValueError(
-                f"SiT was built for latents of shape (B, {', '.join(map(str, expected))}), "
-                f"got {tuple(latents.shape)}"
-            )
-
 
 def _rows(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
     """Modulations ``(T, M)`` of some layers, one after the other."""
     rows = [layer.get_submodule("adaLN_modulation")(conditioning) for layer in layers]
     return torch.cat(rows, dim=1)
-
-
-def _check_rows(time: Tensor, labels: Tensor | None) -> None:
-    if time.dim() != 1:
-        raise ValueError(f"times must be given as (T,), got {tuple(time.shape)}")
-    if labels is not None and labels.shape != time.shape:
-        raise ValueError(
-            f"labels must hold one class per time, shape ({len(time)},), got {tuple(labels.shape)}"
-        )
 
 
 def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
@@ -411,21 +279,12 @@ class _PatchEmbedding(nn.Module):
         return rearrange(self.proj(latents), "B D row column -> B (row column) D")
 
 
-class _WideLinear(nn.Linear):
-    """Linear layer in at least float32, whatever the rest of the network runs in."""
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        weight, bias = at_least_float32(self.weight), at_least_float32(self.bias)
-        with no_autocast(inputs.device):
-            return F.linear(inputs.to(weight.dtype), weight, bias)
-
-
 class _TimeEmbedding(nn.Module):
     """Time to token width, kept apart from bfloat16, in which neighbouring times coincide."""
 
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
-        first, second = _WideLinear(_TIME_WIDTH, hidden_size), _WideLinear(hidden_size, hidden_size)
+        first, second = WideLinear(TIME_WIDTH, hidden_size), WideLinear(hidden_size, hidden_size)
         for layer in (first, second):
             nn.init.normal_(layer.weight, std=_TABLE_STD)
             nn.init.zeros_(layer.bias)

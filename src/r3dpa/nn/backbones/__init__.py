@@ -1,5 +1,6 @@
 """Frozen extractors: point features to align with, and the networks of the published metrics."""
 
+from r3dpa.nn.backbones.dinov2 import DINOv2
 from r3dpa.nn.backbones.geometric import GeometricFeatures
 from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.masking import MaskedScan, Masking
@@ -23,6 +24,7 @@ from r3dpa.nn.backbones.waffleiron import WaffleIron
 __all__ = [
     "SOURCES",
     "SPVCNN",
+    "DINOv2",
     "GeometricFeatures",
     "LIPLoc",
     "MaskedScan",

@@ -1,0 +1,157 @@
+"""The UNet in the place of the SiT: all stages, who is trained by what, sampling."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+import torch
+import yaml
+from test_gradients import FEATURE_DIM, STAGES, TinyData, train
+from torch import nn
+
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.cli import main
+from r3dpa.cli.scenes import generator_from
+from r3dpa.generation import SamplerConfig, Solver
+from r3dpa.modules import LossWeights
+from r3dpa.nn import VAE, PatchDiscriminator, UNet
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+]
+# In place of the SiT of conf/smoke.yaml: the same latents, grid and features.
+SMOKE = {
+    "input_size": [4, 16],
+    "in_channels": 4,
+    "channels": 32,
+    "channel_multipliers": [1, 2],
+    "num_res_blocks": 1,
+    "feature_dim": 16,
+    "projector_dim": 32,
+}
+
+
+def module_of(stage, **weights):
+    """A stage on the data of test_gradients: latents of 4 x 8, grids of 2 x 4."""
+    torch.manual_seed(0)
+    networks = {
+        "vae": VAE(
+            latent_channels=4,
+            channels=32,
+            channel_multipliers=(1, 1),
+            strides=((2, 2),),
+            num_res_blocks=1,
+        ),
+        "sit": UNet(
+            input_size=(4, 8),
+            in_channels=4,
+            channels=32,
+            channel_multipliers=(1, 2),
+            num_res_blocks=1,
+            feature_dim=FEATURE_DIM,
+            projector_dim=8,
+        ),
+    }
+    if stage != "flow_matching":
+        networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)
+    for parameter in networks["sit"].parameters():
+        if not parameter.any():
+            nn.init.normal_(parameter, std=0.1)
+    module = STAGES[stage](**networks, weights=LossWeights(**weights))
+    module.separates_losses = True
+    return module
+
+
+VAE_PARTS = {"vae.encoder", "vae.quant_conv"}
+DOWN = {f"sit.{part}" for part in ("input_blocks", "ape", "time_embed", "label_emb")} | {
+    "sit.middle_block"
+}
+UP, HEAD = {"sit.output_blocks", "sit.out"}, {"sit.projector"}
+REACH = {
+    "vae_alignment": {"vae_alignment": VAE_PARTS | HEAD | {"sit.input_blocks"}},
+    "joint": {
+        "vae_alignment": VAE_PARTS,
+        "denoising": DOWN | UP,
+        "sit_alignment": DOWN | HEAD,
+    },
+    "flow_matching": {"denoising": DOWN | UP, "sit_alignment": DOWN | HEAD},
+}
+
+
+@pytest.mark.parametrize("stage", REACH)
+def test_each_loss_reaches_exactly_its_part_of_the_unet(stage):
+    module = train(module_of(stage), TinyData())
+    (reached,) = module.reached
+    for part, expected in REACH[stage].items():
+        assert {".".join(name.split(".")[:2]) for name in reached[part]} == expected, part
+    trained = {name for name, p in module.sit.named_parameters() if p.requires_grad}
+    if stage == "vae_alignment":
+        input_layer = {"input_blocks.0.0.weight", "input_blocks.0.0.bias"}
+        assert {n for n in trained if not n.startswith("projector.")} == input_layer
+    else:
+        assert trained == {name for name, _ in module.sit.named_parameters()}
+
+
+@pytest.fixture(scope="module")
+def unet_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("unet") / "unet.yaml"
+    path.write_text(yaml.safe_dump({"class_path": "r3dpa.nn.UNet", "init_args": SMOKE}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def joint_checkpoint(smoke_args, unet_file, tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("unet_joint")
+    more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
+    # Of an untrained network the output is 0, and so is that of its average.
+    more += ["--model.init_args.ema_decay", "0", "--model.init_args.optimizer.lr", "0.01"]
+    main(smoke_args("joint", run_dir, *more))
+    return run_dir / "checkpoints" / "last.ckpt"
+
+
+@pytest.mark.parametrize("stage", ["vae_alignment", "flow_matching"])
+def test_stages_start_and_go_on_from_one_another(
+    stage, smoke_args, unet_file, joint_checkpoint, tmp_path
+):
+    """The joint stage is that of the fixture; flow matching takes its VAE and its UNet."""
+    more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
+    if stage == "flow_matching":
+        more += ["--model.init_args.init_from", str(joint_checkpoint)]
+        more += ["--model.init_args.init_networks", "[vae, sit, latent_norm]"]
+    main(smoke_args(stage, tmp_path, *more))
+    content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+    assert content["global_step"] == 3
+    assert read_checkpoint(tmp_path / "checkpoints" / "last.ckpt").network("sit").kind is UNet
+
+
+@pytest.mark.parametrize("solver", get_args(Solver))
+def test_every_solver_samples_from_it(solver, joint_checkpoint):
+    config = SamplerConfig(solver) if solver == "dopri5" else SamplerConfig(solver, steps=3)
+    if solver == "dopri5":
+        pytest.importorskip("torchdiffeq")
+    checkpoint = read_checkpoint(joint_checkpoint)
+    batches = {
+        precision: generator_from(checkpoint, config, precision=precision).generate([0, 1])
+        for precision in ("fp32", "bf16")
+    }
+    wide, half = batches["fp32"].latents, batches["bf16"].latents
+    assert wide.isfinite().all()
+    assert batches["fp32"].range_m.shape == (2, 16, 64)
+    assert half.dtype == torch.float32
+    assert (half - wide).norm() < 0.05 * wide.norm()
+
+
+def test_a_scene_does_not_depend_on_its_batch(joint_checkpoint):
+    scenes = generator_from(read_checkpoint(joint_checkpoint), SamplerConfig("heun", steps=3))
+    both, alone = scenes.generate([0, 1], seed=3), scenes.generate([1], seed=3)
+    torch.testing.assert_close(alone.latents[0], both.latents[1], atol=1e-5, rtol=0)
+
+
+def test_rgb_weights_are_for_a_sit(smoke_args, unet_file, joint_checkpoint, tmp_path):
+    more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
+    more += ["--model.init_args.rgb_weights", str(joint_checkpoint)]
+    with pytest.raises(ValueError, match=r"rgb_weights start a SiT, but model\.sit is a UNet"):
+        main(smoke_args("joint", tmp_path, *more))

@@ -1,0 +1,189 @@
+"""UNet, latent norm and losses against ``unet.npz`` and ``unet_state_dicts.json``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from r3dpa.checkpoints import from_official, to_official
+from r3dpa.flow import Interpolant
+from r3dpa.losses import alignment_loss, flow_matching_loss
+from r3dpa.nn import LatentNorm, UNet
+
+PATH = Interpolant("linear")
+SIZES = {"UNet_lidm": {}, "UNet_small": {"channels": 160}}
+
+
+def our_name(official):
+    return official.replace("projectors.0.", "projector.")
+
+
+@pytest.fixture(scope="module")
+def case(load_case):
+    return load_case("unet")
+
+
+def build(case):
+    config = case.config
+    (feature_dim,) = config["z_dims"]
+    levels = range(len(config["channel_mult"]))
+    assert {2**level for level in levels} <= set(config["attention_resolutions"])
+    assert config["use_ape"]
+    unet = UNet(
+        input_size=tuple(config["input_size"]),
+        in_channels=config["in_channels"],
+        channels=config["model_channels"],
+        channel_multipliers=config["channel_mult"],
+        num_res_blocks=config["num_res_blocks"],
+        head_channels=config["num_head_channels"],
+        feature_dim=feature_dim,
+        projector_dim=config["projector_dim"],
+        num_classes=config["num_classes"],
+    )
+    weights = case.weights().items()
+    unet.load_state_dict({our_name(k): v for k, v in weights if not k.startswith("bn.")})
+    norm = LatentNorm(config["in_channels"], momentum=config.get("bn_momentum", 0.1))
+    norm.load_state_dict(case.weights("w/bn."))
+    return unet, norm
+
+
+def outputs_of(case, unet, latents):
+    time, noise = case["in/time_input"].flatten(), case["in/noises"]
+    output = unet(PATH.interpolate(latents, noise, time), time, case["in/y"])
+    return {
+        "zs_tilde": output.features,
+        "model_output": output.velocity,
+        "denoising_loss": flow_matching_loss(output.velocity, PATH.target(latents, noise, time)),
+        "proj_loss": alignment_loss(output.features, case["in/zs"]).mean(),
+    }
+
+
+def evaluation(case):
+    unet, norm = build(case)
+    outputs = outputs_of(case, unet, norm.normalise(case["in/x"]))
+    return {f"out/eval/{key}": value for key, value in outputs.items()}
+
+
+def statistics_seen(case, name, moved):
+    """The running statistics that the recorder read.
+
+    That of the shared file read the network it had copied for the training pass, whose statistics
+    are bit for bit those before it; the batch statistics show in the outputs of the pass.
+    """
+    before = case[f"w/bn.{name}"]
+    return before if torch.equal(case[f"out/train/bn.{name}"], before) else moved
+
+
+def training(case):
+    unet, norm = build(case)
+    outputs = outputs_of(case, unet, norm.update(case["in/x"]))
+    loss = outputs["denoising_loss"].mean() + 0.5 * outputs["proj_loss"]
+    loss.backward()
+    for name in case.weights("out/train/grad/"):
+        outputs[f"grad/{name}"] = unet.get_parameter(our_name(name)).grad
+    for name in ("running_mean", "running_var"):
+        outputs[f"bn.{name}"] = statistics_seen(case, name, norm.get_buffer(name))
+    return {f"out/train/{key}": value for key, value in outputs.items()}
+
+
+def alignment_only(case):
+    unet, norm = build(case)
+    time = case["in/time_input"].flatten()
+    noisy = PATH.interpolate(norm.normalise(case["in/x"]), case["in/noises"], time)
+    features = unet.project_features(noisy, time, case["in/y"])
+    return {"out/align_only/proj_loss": alignment_loss(features, case["in/zs"]).mean()}
+
+
+def inference(case):
+    unet, _ = build(case)
+    velocity = unet.velocity(case["in/inference_x"], case["in/inference_t"], case["in/y"])
+    return {"out/inference/v": velocity}
+
+
+GROUPS = [evaluation, training, alignment_only, inference]
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: f"unet-{group.__name__}")
+def test_unet_outputs(case, close, group):
+    for key, value in group(case).items():
+        close(value.detach(), case[key])
+
+
+def test_unet_every_recorded_output_is_compared(case):
+    assert set().union(*(group(case) for group in GROUPS)) == set(case.keys("out/"))
+
+
+def test_unet_train_statistics_are_those_of_torch(case, close):
+    _, norm = build(case)
+    reference = torch.nn.BatchNorm2d(
+        case.config["in_channels"], norm.eps, norm.momentum, affine=False
+    )
+    reference.load_state_dict(case.weights("w/bn."))
+    close(norm.update(case["in/x"]), reference(case["in/x"]))
+    for name in ("running_mean", "running_var"):
+        assert not torch.equal(norm.get_buffer(name), case[f"w/bn.{name}"])
+        close(norm.get_buffer(name), reference.get_buffer(name))
+
+
+@pytest.mark.parametrize("name", SIZES, ids=lambda name: f"unet-{name}")
+def test_unet_official_layouts_have_our_keys_and_shapes(official_listing, name):
+    official = official_listing("unet_state_dicts")[name]
+    with torch.device("meta"):
+        unet = UNet(**SIZES[name])
+    ours = {key: list(value.shape) for key, value in unet.state_dict().items()}
+    expected = {our_name(key): shape for key, shape in official["state_dict"].items()}
+    assert ours == {k: shape for k, shape in expected.items() if not k.startswith("bn.")}
+    assert sum(p.numel() for p in unet.parameters()) == official["param_count_total"]
+    projector = sum(p.numel() for p in unet.projector.parameters())
+    assert projector == official["param_count_projectors"]
+
+
+@pytest.mark.parametrize("name", SIZES, ids=lambda name: f"unet-{name}")
+def test_unet_official_checkpoints_come_and_go_key_by_key(official_listing, name):
+    """Each tensor has one value of its own and one element of memory."""
+    listing = official_listing("unet_state_dicts")
+    shapes = listing[name]["state_dict"]
+    weights = {
+        key: torch.tensor(float(i)).expand(shape) if shape else torch.tensor(i)
+        for i, (key, shape) in enumerate(shapes.items())
+    }
+    args = argparse.Namespace(model=name, vae="h2p4d8", dataset_config="configs/kitti.yaml")
+    official = {"model": weights, "ema": weights, "steps": 5, "args": args}
+    checkpoint = from_official(official, Path("official.pt"))
+    state = checkpoint.network("sit")
+    with torch.device("meta"):
+        unet = state.new()
+    assert isinstance(unet, UNet)
+    assert {key: state.arguments[key] for key in SIZES[name]} == SIZES[name]
+    assert list(unet.grid_size) == listing["_notes"]["grid_for_h2p4d8"]
+    assert checkpoint.geometry["grid_size"] == list(unet.grid_size)
+    unet.load_state_dict(state.state_dict, strict=True, assign=True)
+    for checkpoint_ in (checkpoint, dataclasses.replace(checkpoint, official_args={})):
+        back = to_official(checkpoint_)
+        assert back["args"].model == name
+        assert set(back["model"]) == set(weights)
+        for key, value in weights.items():
+            assert torch.equal(back["ema"][key], value), key
+
+
+def test_unet_of_another_size_comes_from_an_official_file(case, close):
+    official = {"ema": case.weights("w/")}
+    with pytest.raises(ValueError, match="head_channels"):
+        from_official(official, Path("official.pt"))
+    sit_args = {"head_channels": case.config["num_head_channels"]}
+    checkpoint = from_official(official, Path("official.pt"), sit_args=sit_args)
+    unet = checkpoint.network("ema").build()
+    velocity = unet.velocity(case["in/inference_x"], case["in/inference_t"], case["in/y"])
+    close(velocity.detach(), case["out/inference/v"])
+
+
+def test_unet_official_file_without_a_key_is_refused(official_listing):
+    shapes = dict(official_listing("unet_state_dicts")["UNet_small"]["state_dict"])
+    del shapes["middle_block.1.qkv.bias"]
+    weights = {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}
+    with pytest.raises(ValueError, match=r"middle_block\.1\.qkv\.bias"):
+        from_official({"model": weights}, Path("official.pt"))
