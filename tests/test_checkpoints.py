@@ -186,7 +186,7 @@ class TestOurFiles:
             "r3dpa.modules.JointAlignment",
             "r3dpa.nn.sit.nn.Linear",
             "r3dpa.nn.sit.nn",
-            "r3dpa.nn.sit.SiTOutput",
+            "r3dpa.nn.velocity_network.VelocityOutput",
             "r3dpa.nn.vae.math",
             "SiT",
         ],
@@ -528,7 +528,43 @@ class TestTransfer:
     def test_positions_of_another_grid_with_as_many_tokens_are_fresh(self):
         source = self.source(input_size=(8, 4))
         report = transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
-        assert self.fates(report)["pos_embed"] == "fresh"
+        assert self.fates(report)["pos_embed"] == "resized"
+
+    @pytest.mark.parametrize(
+        ("rows_there", "rows_here", "expected"),
+        [
+            (1001, 1, [0]),
+            (2, 1, [0]),
+            (1, 1, [0]),
+            (1001, 2, [0, 1000]),  # the last row is that of no class
+            (2, 2, [0, 1]),
+            (1, 2, [0, None]),
+        ],
+    )
+    def test_label_tables_of_other_lengths(self, rows_there, rows_here, expected):
+        def labels(rows):
+            return {"num_classes": max(1, rows - 1), "class_dropout": rows > 1}
+
+        source = self.source(**labels(rows_there))
+        sit = randomised(SiT(**SIT_ARGS | labels(rows_here)))
+        key = "y_embedder.embedding_table.weight"
+        before, table = sit.state_dict()[key].clone(), source.network("sit").state_dict[key]
+        report = transfer_rgb(source, sit, LatentNorm(4), keep_projector=False)
+        wanted = [before[i] if row is None else table[row] for i, row in enumerate(expected)]
+        assert torch.equal(sit.state_dict()[key], torch.stack(wanted))
+        fate = {0: "kept", 1: "truncated", -1: "extended"}
+        sign = (rows_there > rows_here) - (rows_there < rows_here)
+        assert self.fates(report)["y_embedder"] == fate[sign]
+
+    def test_another_patch_size_needs_another_embedding_and_output(self):
+        source, sit = self.source(patch_size=1), randomised(SiT(**SIT_ARGS))
+        before = {key: value.clone() for key, value in sit.state_dict().items()}
+        report = transfer_rgb(source, sit, LatentNorm(4), keep_projector=False)
+        fates = self.fates(report)
+        assert (fates["x_embedder"], fates["final_layer.linear"]) == ("fresh", "fresh")
+        assert (fates["pos_embed"], fates["blocks"]) == ("resized", "kept")
+        for key in ("x_embedder.proj.weight", "final_layer.linear.weight", "pos_embed"):
+            assert torch.equal(sit.state_dict()[key], before[key])
 
     @pytest.mark.parametrize(
         ("changes", "message"),

@@ -11,6 +11,9 @@ from r3dpa.cli import main
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 STAGES = ("vae_alignment", "joint", "flow_matching")
+# Started by tests/cli/test_rgb_stages.py.
+RGB_DATA = ("dead_leaves", "images")
+RGB_STAGES = ("image_vae", "rgb_pretraining", "rgb_pretraining_demo")
 
 
 def parsed(capsys, *configs):
@@ -22,7 +25,7 @@ def parsed(capsys, *configs):
 
 
 @pytest.mark.parametrize(
-    "data", sorted({path.stem for path in (CONF / "data").iterdir()} - {"points"})
+    "data", sorted({path.stem for path in (CONF / "data").iterdir()} - {"points", *RGB_DATA})
 )
 def test_data_config(data, capsys):
     config = parsed(capsys, "trainer", f"data/{data}", "experiment/joint")
@@ -42,7 +45,7 @@ def test_demo_of_a_stage(stage, capsys):
 
 def test_no_experiment_is_left_out():
     names = {path.stem for path in (CONF / "experiment").iterdir()}
-    assert names == {*STAGES, *(f"{stage}_demo" for stage in STAGES), "waffleiron_s"}
+    assert names == {*STAGES, *(f"{stage}_demo" for stage in STAGES), "waffleiron_s", *RGB_STAGES}
 
 
 def test_teacher_config(capsys):

@@ -2,6 +2,7 @@
 
 from r3dpa.checkpoints.convert import ConversionReport, convert
 from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint, source_commit
+from r3dpa.checkpoints.fingerprint import weights_sha256
 from r3dpa.checkpoints.leaks import leaks_labels, refuse_leak
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
 from r3dpa.checkpoints.official import from_official, to_official
@@ -24,4 +25,5 @@ __all__ = [
     "source_commit",
     "to_official",
     "transfer_rgb",
+    "weights_sha256",
 ]

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from r3dpa import __version__
 from r3dpa.atomic import atomic_path
+from r3dpa.checkpoints.diffusers import from_diffusers, is_diffusers
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
 from r3dpa.checkpoints.official import from_official, is_official
 from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
@@ -81,9 +82,10 @@ def read_checkpoint(
     """Reads a checkpoint of any layout without running code from it.
 
     Known are ours (``.safetensors`` with its ``.yaml``), Lightning checkpoints of the training
-    stages (``.ckpt``) and official ``.pt`` files. Beside an official VAE ``<name>.pt`` its
-    ``<name>-latents-stats.pt`` and ``<name>-discriminator-ckpt.pt`` are read if they exist; where a
-    file has no ``args``, ``args.json`` in its folder, or above a folder ``checkpoints``, is.
+    stages (``.ckpt``), official ``.pt`` files, and image VAEs of diffusers (``.safetensors``).
+    Beside an official VAE ``<name>.pt`` its ``<name>-latents-stats.pt`` and
+    ``<name>-discriminator-ckpt.pt`` are read if they exist; where a file has no ``args``,
+    ``args.json`` in its folder, or above a folder ``checkpoints``, is.
 
     Args:
         path: File to read.
@@ -100,7 +102,9 @@ def read_checkpoint(
         raise FileNotFoundError(f"no checkpoint file {path}; give an existing file")
     try:
         if path.suffix == ".safetensors":
-            return _read_ours(path)
+            described = path.with_suffix(".yaml").is_file()
+            foreign = not described and is_diffusers(path)
+            return from_diffusers(path) if foreign else _read_ours(path)
         content = _load_pickle(path)
         if isinstance(content, dict) and "pytorch-lightning_version" in content:
             return _from_lightning(content, path)

@@ -37,6 +37,7 @@ _SHAPELESS_ARGS = {
     "alignment_depth": "alignment_depth",
     "legacy_upsample": "legacy",
     "eps": "eps",
+    "norm_groups": "num_groups",
 }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from r3dpa.checkpoints.networks import Checkpoint, format_table, load_into
@@ -16,7 +17,7 @@ from r3dpa.nn.sit import SiT
 
 __all__ = ["TransferReport", "TransferRow", "transfer_rgb"]
 
-Fate = Literal["kept", "fresh", "truncated"]
+Fate = Literal["kept", "fresh", "resized", "truncated", "extended"]
 Groups = Mapping[str, Mapping[str, Tensor]]
 
 _NORM = "latent_norm."
@@ -29,7 +30,9 @@ class TransferRow:
     Args:
         group: Common beginning of the keys.
         num_tensors: Number of tensors of the group in the receiving network.
-        fate: ``kept``, ``fresh`` (initial value of this run) or ``truncated``.
+        fate: ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
+            ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
+            ``extended`` (label table).
         source: Shape of the group's largest tensor in the RGB checkpoint, ``-`` if absent.
         target: The same in the receiving network.
         reason: Why.
@@ -70,12 +73,14 @@ def transfer_rgb(
     """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
 
     Patch embedding, output layer and latent statistics stay fresh if the number of latent channels
-    differs, the position table if the latent size differs, the projector if it is not asked for or
-    does not fit. A label table of several rows is cut to the first if this run has one. All other
-    weights must fit.
+    differs, the former two also if the patch size does; the position table is that of this run if
+    the token grid differs; the projector stays fresh if it is not asked for or does not fit. A
+    label table is cut to its first rows; if this run has one for "no class", that is the last row
+    of the file, where it has more rows. Rows that the file lacks stay fresh. All other weights must
+    fit.
 
-    Source: tuning stages of valeoai/R3DPA, which keep the position table of another latent size if
-    it has as many tokens.
+    Source: tuning stages of valeoai/R3DPA, which always cut the label table to one row and keep the
+    position table of another latent size if it has as many tokens.
 
     Args:
         checkpoint: RGB checkpoint, official or ours.
@@ -92,16 +97,17 @@ def transfer_rgb(
     rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
     theirs = _grouped({**rgb.state_dict, **_prefixed(statistics.state_dict)})
     ours = _grouped({**sit.state_dict(), **_prefixed(latent_norm.state_dict())})
-    same_grid = tuple(rgb.arguments["input_size"]) == tuple(sit.input_size)
+    patch = rgb.arguments["patch_size"]
+    same_grid = tuple(side // patch for side in rgb.arguments["input_size"]) == sit.grid_size
     rows: list[TransferRow] = []
     merged: dict[str, Tensor] = {}
     for group in dict.fromkeys((*ours, *theirs)):
         rgb_part, own_part = theirs.get(group, {}), ours.get(group, {})
         fate, reason = _fate(group, theirs, ours, keep_projector, same_grid)
-        if fate == "fresh":
+        if fate in ("fresh", "resized"):
             merged |= own_part
-        elif fate == "truncated":
-            merged |= {key: value[:1] for key, value in rgb_part.items()}
+        elif fate in ("truncated", "extended"):
+            merged |= {key: _rows(rgb_part[key], value) for key, value in own_part.items()}
         else:
             merged |= rgb_part
         shapes = _largest_shape(rgb_part), _largest_shape(own_part)
@@ -130,15 +136,35 @@ def _fate(
     of_channels = group in ("x_embedder", "final_layer.linear", "latent_norm")
     if of_channels and _length(theirs, "x_embedder", 1) != _length(ours, "x_embedder", 1):
         return "fresh", "other number of latent channels"
+    of_patches = group in ("x_embedder", "final_layer.linear")
+    if of_patches and _length(theirs, "x_embedder", 2) != _length(ours, "x_embedder", 2):
+        return "fresh", "other patch size"
     if group == "pos_embed" and not same_grid:
-        return "fresh", "other latent size"
+        return "resized", "other token grid: computed for that of this run"
     if group == "projector" and not keep_projector:
         return "fresh", "not asked for"
     if group == "projector" and _shapes(theirs.get(group, {})) != _shapes(ours[group]):
         return "fresh", "asked for, but its shapes differ"
-    if group == "y_embedder" and _length(ours, group, 0) == 1 < _length(theirs, group, 0):
-        return "truncated", "one row here: the first is taken"
+    if group == "y_embedder":
+        return _fate_of_labels(_length(theirs, group, 0), _length(ours, group, 0))
     return "kept", "fits"
+
+
+def _fate_of_labels(theirs: int, ours: int) -> tuple[Fate, str]:
+    if theirs == ours:
+        return "kept", "fits"
+    if theirs < ours:
+        return "extended", f"{ours} rows here: the last {ours - theirs} stay fresh"
+    if ours == 1:
+        return "truncated", "one row here: the first is taken"
+    return "truncated", f"{ours} rows here: the first {ours - 1} and the last, of no class"
+
+
+def _rows(theirs: Tensor, ours: Tensor) -> Tensor:
+    """Label table as long as ours, see :func:`_fate_of_labels`."""
+    if len(theirs) < len(ours):
+        return torch.cat([theirs, ours[len(theirs) :].to(theirs)])
+    return theirs[:1] if len(ours) == 1 else torch.cat([theirs[: len(ours) - 1], theirs[-1:]])
 
 
 def _grouped(weights: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:

@@ -15,6 +15,7 @@ from r3dpa.data.datasets import (
     LidarDataset,
     LidarSample,
 )
+from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import (
     Extractor,
     GridPlan,
@@ -30,6 +31,7 @@ from r3dpa.data.feature_store import (
     stored_source,
 )
 from r3dpa.data.grid_settings import FeatureGridError, GridSettings
+from r3dpa.data.images import ImageFolder, ImageSource, TarImages
 from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
 from r3dpa.data.scan_cache import (
@@ -58,6 +60,7 @@ from r3dpa.data.scans import (
 
 if TYPE_CHECKING:
     from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
+    from r3dpa.data.image_datamodule import ImageDataModule
     from r3dpa.data.point_datamodule import PointDataModule
 
 __all__ = [
@@ -65,12 +68,16 @@ __all__ = [
     "Augmentation",
     "CachedTensors",
     "CheckReport",
+    "DeadLeaves",
     "Extractor",
     "FeatureGridError",
     "FeatureGridWriter",
     "FeatureGrids",
     "GridPlan",
     "GridSettings",
+    "ImageDataModule",
+    "ImageFolder",
+    "ImageSource",
     "KITTI360DataModule",
     "LatentBatch",
     "LatentDataset",
@@ -90,6 +97,7 @@ __all__ = [
     "ScanCacheError",
     "ScanError",
     "SimulatedDataModule",
+    "TarImages",
     "View",
     "check",
     "default_features_dir",
@@ -118,6 +126,8 @@ def __getattr__(name: str) -> Any:
     """Load the data modules on first use."""
     if name in {"KITTI360DataModule", "LidarDataModule", "SimulatedDataModule"}:
         return getattr(import_module("r3dpa.data.datamodules"), name)
+    if name == "ImageDataModule":
+        return import_module("r3dpa.data.image_datamodule").ImageDataModule
     if name == "PointDataModule":
         return import_module("r3dpa.data.point_datamodule").PointDataModule
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,8 +3,10 @@
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
 from r3dpa.modules.flow_matching import FlowMatching
+from r3dpa.modules.image_vae_training import ImageVAETraining
 from r3dpa.modules.joint_alignment import JointAlignment
 from r3dpa.modules.point_pretraining import PointPretraining
+from r3dpa.modules.rgb_pretraining import RGBPretraining
 from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig
 from r3dpa.modules.vae_alignment import VAEAlignment
 
@@ -13,10 +15,12 @@ __all__ = [
     "FlowMatching",
     "GenerativeModule",
     "GuardConfig",
+    "ImageVAETraining",
     "JointAlignment",
     "LossWeights",
     "MissingScans",
     "OptimizerConfig",
     "PointPretraining",
+    "RGBPretraining",
     "VAEAlignment",
 ]

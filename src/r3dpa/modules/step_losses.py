@@ -15,7 +15,7 @@ from r3dpa import losses
 from r3dpa.flow import Interpolant, sample_time
 from r3dpa.modules.guards import StepGuard
 from r3dpa.modules.settings import LossWeights, TimeSampling
-from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, Posterior, SiT
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, Posterior, VelocityNetwork
 
 __all__ = ["PathDraws", "StepLosses", "frozen"]
 
@@ -61,7 +61,7 @@ class StepLosses(L.LightningModule):
 
     stage: str
     vae: VAE
-    sit: SiT
+    sit: VelocityNetwork
     discriminator: PatchDiscriminator | None
     latent_norm: LatentNorm
     weights: LossWeights
@@ -85,6 +85,11 @@ class StepLosses(L.LightningModule):
         draws = self.draw_path(len(scans), self.batch_number)
         return self.weigh_and_log(self.step_losses(batch, draws))
 
+    @property
+    def latent_size(self) -> tuple[int, int]:
+        """Rows and columns ``(h, w)`` of the latents."""
+        return self.sit.input_size
+
     def draw_path(self, num_scans: int, batch_number: int, stream: int = 0) -> PathDraws:
         """Posterior noise, times and path noise for this process's part of a global batch.
 
@@ -97,7 +102,7 @@ class StepLosses(L.LightningModule):
         key = np.random.SeedSequence([self.seed, stream, batch_number]).generate_state(1)
         generator = torch.Generator(self.device).manual_seed(int(key[0]))
         total = num_scans * world
-        shape = (total, self.vae.latent_channels, *self.sit.input_size)
+        shape = (total, self.vae.latent_channels, *self.latent_size)
         drawn = PathDraws(
             torch.randn(shape, generator=generator, device=self.device),
             sample_time(total, self.time_sampling, generator=generator),
@@ -182,7 +187,7 @@ class StepLosses(L.LightningModule):
 
     @staticmethod
     def _predict(
-        sit: SiT, noisy: Tensor, time: Tensor, velocity: bool, features: bool
+        sit: VelocityNetwork, noisy: Tensor, time: Tensor, velocity: bool, features: bool
     ) -> tuple[Tensor | None, Tensor | None]:
         """Velocity and projected features, what is not asked for being None and not computed."""
         if velocity and features:

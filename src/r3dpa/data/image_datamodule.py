@@ -1,0 +1,123 @@
+"""Data module of RGB images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningDataModule
+from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
+from torch.utils.data import DataLoader
+
+from r3dpa.data.image_latents import ImagePosteriors
+from r3dpa.data.images import ImageDataset, ImageSource
+from r3dpa.data.loaders import training_loader
+
+
+class ImageDataModule(LightningDataModule):
+    """Square RGB images of a source, or what a VAE made of them, shuffled and resumable.
+
+    Args:
+        source: Folder, tar shards or generator of images.
+        image_size: Side of the images, pixels.
+        batch_size: Images per batch **per process**.
+        num_workers: Loader processes per training process.
+        seed: Seed of the order.
+        val_every: Every this many images, one is held out.
+        mirrored: Also train on the mirror image of each image. Off, as in REPA-E, which caches
+            latents of centre crops as they are.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        source: ImageSource,
+        image_size: int = 256,
+        batch_size: int = 32,
+        num_workers: int = 0,
+        seed: int = 0,
+        val_every: int = 100,
+        mirrored: bool = False,
+    ) -> None:
+        super().__init__()
+        for name, value, least in (
+            ("image_size", image_size, 1),
+            ("batch_size", batch_size, 1),
+            ("num_workers", num_workers, 0),
+            ("seed", seed, 0),
+            ("val_every", val_every, 2),
+        ):
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}.")
+        self.source, self.image_size, self.batch_size = source, image_size, batch_size
+        self.num_workers, self.seed = num_workers, seed
+        self.val_every, self.mirrored = val_every, mirrored
+        self.train_set: ImageDataset | None = None
+        self.val_set: ImageDataset | None = None
+
+    def setup(self, stage: str) -> None:
+        """Index the images.
+
+        Raises:
+            ImageError: If there are none, or a file is damaged.
+        """
+        entries = self.source.entries()
+        train = [entry for place, entry in enumerate(entries) if place % self.val_every]
+        if self.mirrored:
+            train = [view for entry in train for view in (entry, entry.mirror())]
+        self.train_set = ImageDataset(self.source, train, self.image_size)
+        self.val_set = ImageDataset(self.source, entries[:: self.val_every], self.image_size)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the pixels of an entry depend on beside the entry, as JSON values."""
+        kind = type(self.source).__qualname__
+        return {"source": kind, "image_size": self.image_size, **self.source.settings()}
+
+    def use_posteriors(self, posteriors: ImagePosteriors, with_images: bool) -> None:
+        """Train on cached posteriors of a frozen VAE.
+
+        Args:
+            posteriors: Moments of all training images.
+            with_images: Give the images as well, as a teacher needs them.
+        """
+        entries = _ready(self.train_set).entries
+        size = self.image_size
+        self.train_set = ImageDataset(self.source, entries, size, posteriors, with_images)
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Shuffled, resumable loader of full batches."""
+        trainer = self.trainer
+        return training_loader(
+            _ready(self.train_set),
+            self.batch_size,
+            num_workers=self.num_workers,
+            seed=self.seed,
+            num_replicas=1 if trainer is None else trainer.world_size,
+            rank=0 if trainer is None else trainer.global_rank,
+            limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Held-out images in order, none twice."""
+        trainer, dataset = self.trainer, _ready(self.val_set)
+        replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
+        return DataLoader(
+            dataset,
+            self.batch_size,
+            sampler=UnrepeatedDistributedSampler(dataset, replicas, rank, shuffle=False),
+            num_workers=self.num_workers,
+            pin_memory=torch.cuda.is_available(),
+            generator=torch.Generator(),  # the default would draw from the global random state
+        )
+
+    test_dataloader = val_dataloader
+
+
+def _ready(dataset: ImageDataset | None) -> ImageDataset:
+    if dataset is None:
+        raise ValueError("Call setup('fit') before asking for a loader.")
+    return dataset

@@ -1,0 +1,286 @@
+"""RGB images from folders and tar shards, cropped to squares.
+
+Letters: H x W image size, S side of a square image.
+"""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from r3dpa.names import refuse_name
+
+if TYPE_CHECKING:
+    from r3dpa.data.image_latents import ImagePosteriors
+
+__all__ = [
+    "ImageBatch",
+    "ImageDataset",
+    "ImageEntry",
+    "ImageError",
+    "ImageFolder",
+    "ImageSource",
+    "TarImages",
+    "center_crop",
+]
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+_MIRRORED = ".mirrored"  # end of the name of an entry that is seen from the other side
+
+
+class ImageError(ValueError):
+    """An image or shard that cannot be used; the message names the file."""
+
+
+class ImageSample(TypedDict):
+    """One image: the shapes of :class:`ImageBatch` without B, ``index`` and ``name`` single."""
+
+    image: NotRequired[Tensor]
+    posterior_moments: NotRequired[Tensor]
+    index: int
+    name: str
+
+
+class ImageBatch(TypedDict):
+    """What the stages on RGB images receive.
+
+    ``image`` ``(B, 3, S, S)`` float32 red, green, blue in [-1, 1], absent where only the posteriors
+    of the image VAE are needed; ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then
+    log-variances of the raw latents, where they are cached; ``index`` ``(B,)`` int64 position in
+    the data set; ``name`` list of B names.
+    """
+
+    image: NotRequired[Tensor]
+    posterior_moments: NotRequired[Tensor]
+    index: Tensor
+    name: list[str]
+
+
+@dataclass(frozen=True)
+class ImageEntry:
+    """One image of a source.
+
+    Args:
+        name: Unique within the source.
+        path: File or shard that holds it, for messages.
+        num_bytes: Size of the encoded image; 0 if it is computed.
+        offset: Where in ``path`` it starts.
+        mirrored: Whether left and right are exchanged.
+    """
+
+    name: str
+    path: Path
+    num_bytes: int
+    offset: int = 0
+    mirrored: bool = False
+
+    def mirror(self) -> ImageEntry:
+        """The same image, seen from the other side."""
+        values = self.name + _MIRRORED, self.path, self.num_bytes, self.offset
+        return ImageEntry(*values, mirrored=not self.mirrored)
+
+
+class ImageSource(ABC):
+    """Images by entry."""
+
+    @abstractmethod
+    def entries(self) -> list[ImageEntry]:
+        """All images, sorted by name.
+
+        Raises:
+            ImageError: If there is none, or a file is damaged.
+        """
+
+    @abstractmethod
+    def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
+        """Square image ``(S, S, 3)`` of one entry, not mirrored.
+
+        Raises:
+            ImageError: If it cannot be read; names the file.
+        """
+
+    def settings(self) -> dict[str, Any]:
+        """What the pixels depend on beside the entry, as JSON values."""
+        return {}
+
+
+class ImageFolder(ImageSource):
+    """Images below a folder, at any depth: ImageNet's ``<split>/<class>/<image>.JPEG`` or others.
+
+    Args:
+        root: The folder.
+    """
+
+    def __init__(self, root: str) -> None:
+        self.root = root
+
+    def entries(self) -> list[ImageEntry]:
+        """All images below the folder but hidden ones, by their path relative to it."""
+        root = Path(self.root)
+        if not root.is_dir():
+            raise ImageError(f"no folder {root}: give one that holds images.")
+        found = [
+            ImageEntry(str(path.relative_to(root)), path, path.stat().st_size)
+            for path in root.rglob("*")
+            if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
+        ]
+        if not found:
+            raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}).")
+        return sorted(found, key=lambda entry: entry.name)
+
+    def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
+        """Square image ``(S, S, 3)`` of a file."""
+        try:
+            data = entry.path.read_bytes()
+        except OSError as error:
+            raise ImageError(f"{entry.path}: cannot be read ({error.strerror or error})") from error
+        return _decoded(data, str(entry.path), size)
+
+
+class TarImages(ImageSource):
+    """Images of tar shards, as WebDataset writes them: any tar file that is not compressed.
+
+    The headers of all shards are read once; an image is then one read at a known place, so that
+    shuffling needs no unpacking.
+
+    Args:
+        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file.
+    """
+
+    def __init__(self, root: str) -> None:
+        self.root = root
+
+    def entries(self) -> list[ImageEntry]:
+        """All images of all shards, as ``<shard>/<member>``."""
+        root = Path(self.root)
+        shards = [root] if root.is_file() else sorted(root.rglob("*.tar"))
+        base = root.parent if root.is_file() else root
+        found = [
+            entry
+            for shard in shards
+            for entry in _members(shard, str(shard.relative_to(base).with_suffix("")))
+        ]
+        if not found:
+            raise ImageError(f"no image ({', '.join(_SUFFIXES)}) in a .tar file of {root}.")
+        found.sort(key=lambda entry: entry.name)
+        for before, entry in pairwise(found):
+            if before.name == entry.name:
+                raise ImageError(f"{entry.path} holds {entry.name!r} twice: pack it again.")
+        return found
+
+    def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
+        """Square image ``(S, S, 3)`` of a member."""
+        name = f"{entry.path}: {entry.name}"
+        try:
+            with entry.path.open("rb") as file:
+                file.seek(entry.offset)
+                data = file.read(entry.num_bytes)
+        except OSError as error:
+            raise ImageError(f"{name}: cannot be read ({error.strerror or error})") from error
+        return _decoded(data, name, size)
+
+
+def _members(shard: Path, prefix: str) -> list[ImageEntry]:
+    found = []
+    try:
+        with tarfile.open(shard, "r:") as file:  # not compressed, or nothing could be found fast
+            for member in file:
+                if not member.isfile() or Path(member.name).suffix.lower() not in _SUFFIXES:
+                    continue
+                name = f"{prefix}/{member.name.removeprefix('./')}"
+                if reason := refuse_name(name):
+                    raise ImageError(f"{shard}: name of member {reason}")
+                found.append(ImageEntry(name, shard, member.size, member.offset_data))
+    except (tarfile.TarError, OSError) as error:
+        raise ImageError(f"{shard} is no uncompressed tar file, or damaged ({error}).") from error
+    return found
+
+
+def _decoded(data: bytes, name: str, size: int) -> NDArray[np.uint8]:
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return center_crop(image.convert("RGB"), size)
+    except (OSError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{name}: is no image that can be read ({error}); remove it.") from error
+
+
+def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
+    """Largest centred square of an image, resized.
+
+    While the shorter side is at least twice ``size`` it is halved by averaging 2 x 2 pixels, so
+    that the bicubic resizing after it does not alias.
+
+    Source: preprocessing of ADM (Dhariwal and Nichol, 2021), which REPA-E and R3DPA use.
+
+    Args:
+        image: RGB image of any size.
+        size: Side S of the square.
+
+    Returns:
+        ``(S, S, 3)`` uint8.
+    """
+    while min(image.size) >= 2 * size:
+        image = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
+    scale = size / min(image.size)
+    width, height = (max(size, round(side * scale)) for side in image.size)
+    image = image.resize((width, height), Image.Resampling.BICUBIC)
+    left, top = (width - size) // 2, (height - size) // 2
+    return np.asarray(image)[top : top + size, left : left + size]
+
+
+class ImageDataset(Dataset[ImageSample]):
+    """Square images of some entries, or the cached posteriors of a VAE, or both.
+
+    Args:
+        source: Where the images come from.
+        entries: Those that are used, in the order of the indices.
+        size: Side S of the images.
+        posteriors: Cached moments of all entries, if any.
+        with_images: Whether the images are read.
+    """
+
+    def __init__(
+        self,
+        source: ImageSource,
+        entries: Sequence[ImageEntry],
+        size: int,
+        posteriors: ImagePosteriors | None = None,
+        with_images: bool = True,
+    ) -> None:
+        self.source, self.entries, self.size = source, list(entries), size
+        self.posteriors, self.with_images = posteriors, with_images
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self.entries)
+
+    def __getitem__(self, index: int) -> ImageSample:
+        """Image and posterior of one entry.
+
+        Raises:
+            ImageError: If the image cannot be used; the message names the file.
+        """
+        entry = self.entries[index]
+        sample = ImageSample(index=index, name=entry.name)
+        if self.with_images:
+            pixels = self.source.read(entry, self.size)
+            if entry.mirrored:
+                pixels = pixels[:, ::-1]
+            values = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+            sample["image"] = values.float() / 127.5 - 1.0
+        if self.posteriors is not None:
+            sample["posterior_moments"] = self.posteriors.read(entry)
+        return sample

@@ -1,0 +1,243 @@
+"""Variational autoencoder of RGB images, in the architecture of Stable Diffusion.
+
+Letters: B batch, C latent channels, H x W image size, h x w latent size.
+"""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+
+from r3dpa.nn.posterior import Posterior
+
+__all__ = ["ImageVAE"]
+
+_NORM_EPS = 1e-6
+_RGB = 3
+
+
+class ImageVAE(nn.Module):
+    """Convolutional autoencoder of RGB images; the defaults are Stable Diffusion's, f8d4.
+
+    Level i has ``channels[i]`` channels, and half as many rows and columns as the one before.
+    Latents are not scaled: :class:`r3dpa.nn.LatentNorm` takes the place of the usual factor
+    0.18215.
+
+    Source: Rombach et al., "High-resolution image synthesis with latent diffusion models" (CVPR
+    2022). State-dict keys are those of ``AutoencoderKL`` in diffusers, whose safetensors files
+    :func:`r3dpa.checkpoints.read_checkpoint` reads.
+
+    Args:
+        latent_channels: Channels C of the latents.
+        channels: Width of each level, multiples of ``norm_groups``.
+        num_res_blocks: Residual blocks per encoder level; decoder levels have one more.
+        norm_groups: Groups of all group norms.
+
+    Raises:
+        ValueError: If a width is not a multiple of ``norm_groups``.
+    """
+
+    def __init__(
+        self,
+        latent_channels: int = 4,
+        channels: tuple[int, ...] = (128, 256, 512, 512),
+        num_res_blocks: int = 2,
+        norm_groups: int = 32,
+    ) -> None:
+        super().__init__()
+        if not channels or any(width % norm_groups for width in channels):
+            raise ValueError(
+                f"channels must be multiples of norm_groups {norm_groups}, got {channels}"
+            )
+        self.latent_channels = latent_channels
+        self.stride = 2 ** (len(channels) - 1)
+        self.encoder = _Encoder(2 * latent_channels, list(channels), num_res_blocks, norm_groups)
+        self.decoder = _Decoder(latent_channels, list(channels), num_res_blocks + 1, norm_groups)
+        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
+
+    def latent_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image.
+
+        Raises:
+            ValueError: If the stride does not divide the image.
+        """
+        rows, columns = image_size
+        if rows % self.stride or columns % self.stride:
+            raise ValueError(f"image sides must be multiples of {self.stride}, got {image_size}")
+        return rows // self.stride, columns // self.stride
+
+    def encode(self, image: Tensor) -> Posterior:
+        """Distribution of the raw latents of images.
+
+        Args:
+            image: ``(B, 3, H, W)`` red, green, blue in [-1, 1].
+
+        Raises:
+            ValueError: If ``image`` has another shape, or sides that the stride does not divide.
+        """
+        if image.dim() != 4 or image.shape[1] != _RGB:
+            raise ValueError(f"image must be (B, 3, H, W), got {tuple(image.shape)}")
+        self.latent_size((image.shape[-2], image.shape[-1]))
+        return Posterior(self.quant_conv(self.encoder(image)))
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Images ``(B, 3, H, W)`` of raw latents ``(B, C, h, w)``, not limited to [-1, 1]."""
+        return self.decoder(self.post_quant_conv(latents))
+
+
+class _Encoder(nn.Module):
+    def __init__(self, out_channels: int, widths: list[int], num_blocks: int, groups: int) -> None:
+        super().__init__()
+        self.conv_in = nn.Conv2d(_RGB, widths[0], 3, padding=1)
+        before = [widths[0], *widths[:-1]]
+        last = len(widths) - 1
+        self.down_blocks = nn.ModuleList(
+            _DownLevel(before[i], widths[i], num_blocks, groups, shrinks=i < last)
+            for i in range(len(widths))
+        )
+        self.mid_block = _Middle(widths[-1], groups)
+        self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
+        self.conv_out = nn.Conv2d(widths[-1], out_channels, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        hidden = self.conv_in(image)
+        for level in self.down_blocks:
+            hidden = level(hidden)
+        return self.conv_out(F.silu(self.conv_norm_out(self.mid_block(hidden))))
+
+
+class _Decoder(nn.Module):
+    def __init__(self, in_channels: int, widths: list[int], num_blocks: int, groups: int) -> None:
+        super().__init__()
+        widths = widths[::-1]  # up_blocks.0 is the lowest resolution
+        self.conv_in = nn.Conv2d(in_channels, widths[0], 3, padding=1)
+        self.mid_block = _Middle(widths[0], groups)
+        before = [widths[0], *widths[:-1]]
+        last = len(widths) - 1
+        self.up_blocks = nn.ModuleList(
+            _UpLevel(before[i], widths[i], num_blocks, groups, grows=i < last)
+            for i in range(len(widths))
+        )
+        self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
+        self.conv_out = nn.Conv2d(widths[-1], _RGB, 3, padding=1)
+
+    def forward(self, latents: Tensor) -> Tensor:
+        hidden = self.mid_block(self.conv_in(latents))
+        for level in self.up_blocks:
+            hidden = level(hidden)
+        return self.conv_out(F.silu(self.conv_norm_out(hidden)))
+
+
+class _Level(nn.Module):
+    """Residual blocks of one resolution."""
+
+    def __init__(self, in_channels: int, out_channels: int, num_blocks: int, groups: int) -> None:
+        super().__init__()
+        self.resnets = nn.ModuleList(
+            _ResBlock(out_channels if index else in_channels, out_channels, groups)
+            for index in range(num_blocks)
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        for block in self.resnets:
+            hidden = block(hidden)
+        return hidden
+
+
+class _DownLevel(_Level):
+    def __init__(
+        self, in_channels: int, out_channels: int, num_blocks: int, groups: int, shrinks: bool
+    ) -> None:
+        super().__init__(in_channels, out_channels, num_blocks, groups)
+        self.downsamplers = nn.ModuleList([_Downsample(out_channels)] if shrinks else [])
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        hidden = super().forward(hidden)
+        for layer in self.downsamplers:
+            hidden = layer(hidden)
+        return hidden
+
+
+class _UpLevel(_Level):
+    def __init__(
+        self, in_channels: int, out_channels: int, num_blocks: int, groups: int, grows: bool
+    ) -> None:
+        super().__init__(in_channels, out_channels, num_blocks, groups)
+        self.upsamplers = nn.ModuleList([_Upsample(out_channels)] if grows else [])
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        hidden = super().forward(hidden)
+        for layer in self.upsamplers:
+            hidden = layer(hidden)
+        return hidden
+
+
+class _Downsample(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, stride=2)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.conv(F.pad(hidden, (0, 1, 0, 1)))  # below and to the right alone
+
+
+class _Upsample(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.conv(F.interpolate(hidden, scale_factor=2, mode="nearest"))
+
+
+class _Middle(nn.Module):
+    """Two residual blocks around attention, at the lowest resolution."""
+
+    def __init__(self, channels: int, groups: int) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList([_Attention(channels, groups)])
+        self.resnets = nn.ModuleList(_ResBlock(channels, channels, groups) for _ in range(2))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.resnets[1](self.attentions[0](self.resnets[0](hidden)))
+
+
+class _ResBlock(nn.Module):
+    def __init__(self, in_channels: int, out_channels: int, groups: int) -> None:
+        super().__init__()
+        self.norm1 = nn.GroupNorm(groups, in_channels, _NORM_EPS)
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, padding=1)
+        self.norm2 = nn.GroupNorm(groups, out_channels, _NORM_EPS)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1)
+        self.conv_shortcut = (
+            nn.Identity()
+            if in_channels == out_channels
+            else nn.Conv2d(in_channels, out_channels, 1)
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        change = self.conv1(F.silu(self.norm1(hidden)))
+        change = self.conv2(F.silu(self.norm2(change)))
+        return self.conv_shortcut(hidden) + change
+
+
+class _Attention(nn.Module):
+    """Attention with one head between all pixels, added to the input."""
+
+    def __init__(self, channels: int, groups: int) -> None:
+        super().__init__()
+        self.group_norm = nn.GroupNorm(groups, channels, _NORM_EPS)
+        self.to_q = nn.Linear(channels, channels)
+        self.to_k = nn.Linear(channels, channels)
+        self.to_v = nn.Linear(channels, channels)
+        self.to_out = nn.ModuleList([nn.Linear(channels, channels)])
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        pixels = rearrange(self.group_norm(hidden), "b c h w -> b 1 (h w) c")
+        mixed = F.scaled_dot_product_attention(
+            self.to_q(pixels), self.to_k(pixels), self.to_v(pixels)
+        )
+        mixed = rearrange(self.to_out[0](mixed), "b 1 (h w) c -> b c h w", h=hidden.shape[-2])
+        return hidden + mixed

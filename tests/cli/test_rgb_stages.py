@@ -1,0 +1,163 @@
+"""Stage 0 through the real command line: image VAE, pretraining, and what may start from it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.cli import main
+from r3dpa.nn.backbones import DINOv2
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SIT = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]["init_args"]
+QUIET = {
+    "trainer.accelerator": "cpu",
+    "trainer.precision": "32-true",
+    "trainer.enable_progress_bar": "false",
+    "trainer.enable_model_summary": "false",
+    "trainer.logger": "false",
+    "trainer.log_every_n_steps": 1,
+}
+LEAVES = {
+    "data.init_args.source.init_args.num_images": 9,
+    "data.init_args.image_size": 16,
+    "data.init_args.batch_size": 2,
+    "data.init_args.num_workers": 0,
+    "data.init_args.val_every": 4,
+}
+VAE = {
+    "model.init_args.vae.init_args.channels": "[8, 16]",
+    "model.init_args.vae.init_args.num_res_blocks": 1,
+    "model.init_args.vae.init_args.norm_groups": 4,
+}
+TINY = {
+    **{f"model.init_args.sit.init_args.{key}": value for key, value in SIT.items()},
+    "model.init_args.sit.init_args.input_size": [8, 8],
+}
+
+
+def fit(run_dir, configs, *settings, **more):
+    words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
+    values = {key: value for setting in (QUIET, *settings) for key, value in setting.items()}
+    words += [f"--{key}={value}" for key, value in values.items()]
+    words += [f"--{key}={value}" for key, value in more.items()]
+    main(["fit", *words, f"--run_dir={run_dir}"])
+    return run_dir / "checkpoints" / "last.ckpt"
+
+
+def steps(number):
+    every = {"trainer.val_check_interval": number, "checkpoint.every_n_train_steps": 2}
+    return {"trainer.max_steps": number, "checkpoint.save_top_k": -1, **every}
+
+
+@pytest.fixture(scope="module")
+def image_vae(tmp_path_factory):
+    configs = ["trainer", "trainer_demo", "data/dead_leaves", "experiment/image_vae"]
+    return fit(tmp_path_factory.mktemp("image_vae"), configs, LEAVES, VAE, steps(2))
+
+
+DEMO = ("trainer", "trainer_demo", "data/dead_leaves")
+RGB = (*DEMO, "experiment/rgb_pretraining", "experiment/rgb_pretraining_demo")
+
+
+@pytest.fixture(scope="module")
+def rgb(image_vae, tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("rgb")
+    start = {"model.init_args.init_from": image_vae}
+    return fit(run_dir, RGB, LEAVES, VAE, TINY, steps(4), start)
+
+
+def test_the_vae_is_frozen_and_the_sit_trained_from_data_statistics(image_vae, rgb):
+    before = torch.load(image_vae, weights_only=True)["state_dict"]
+    content = torch.load(rgb, weights_only=True)
+    after = content["state_dict"]
+    for key, value in before.items():
+        assert torch.equal(after[key], value), key
+    assert content["r3dpa"]["stage"] == "rgb_pretraining"
+    assert after["latent_norm.num_batches_tracked"] == 1 + 4
+    assert after["sit.final_layer.linear.weight"].abs().max() > 0
+    (group,) = content["optimizer_states"][0]["param_groups"]
+    projector = [key for key in after if key.startswith("sit.projector.")]
+    sit = [key for key in after if key.startswith("sit.") and key != "sit.pos_embed"]
+    assert len(group["params"]) == len(sit) - len(projector)
+
+
+def test_a_resumed_run_ends_with_the_same_weights(image_vae, rgb, tmp_path):
+    middle = rgb.with_name("step=0000002.ckpt")
+    start = {"model.init_args.init_from": image_vae, "ckpt_path": middle}
+    resumed = fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(4), start)
+    one, other = (torch.load(path, weights_only=True)["state_dict"] for path in (rgb, resumed))
+    assert one.keys() == other.keys()
+    for key, value in one.items():
+        assert torch.equal(value, other[key]), key
+
+
+def test_vae_alignment_starts_from_it(rgb, smoke_args, tmp_path, caplog):
+    still = ["--model.init_args.optimizer.lr=0", "--trainer.logger=false"]
+    main(smoke_args("vae_alignment", tmp_path, f"--model.init_args.rgb_weights={rgb}", *still))
+    state = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    source = read_checkpoint(rgb).network("sit").state_dict
+    for key, value in source.items():
+        if key.startswith(("blocks.", "t_embedder.", "y_embedder.")):
+            assert torch.equal(state[f"sit.{key}"], value), key
+    assert "resized" in caplog.text
+
+
+def test_images_of_a_folder_are_aligned_with_a_teacher(image_vae, tmp_path):
+    torch.manual_seed(0)
+    for index in range(6):
+        path = tmp_path / "imagenet" / f"{index}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (20, 24), (40 * index, 100, 20)).save(path)
+    sizes = {"dim": 16, "depth": 1, "num_heads": 2, "grid_size": 2}
+    torch.save(DINOv2(**sizes).state_dict(), tmp_path / "dino.pth")
+    teacher = {f"model.init_args.teacher.init_args.{key}": value for key, value in sizes.items()}
+    folder = {
+        "data.init_args.source.init_args.root": tmp_path / "imagenet",
+        "data.init_args.mirrored": "true",
+        **{key: value for key, value in LEAVES.items() if "source" not in key},
+    }
+    start = {
+        "model.init_args.init_from": image_vae,
+        "model.init_args.teacher.init_args.weights": tmp_path / "dino.pth",
+    }
+    configs = ("trainer", "data/images", "experiment/rgb_pretraining")
+    path = fit(tmp_path / "run", configs, folder, VAE, TINY, teacher, steps(2), start)
+    content = torch.load(path, weights_only=True)
+    assert not any("teacher" in key or "cls_token" in key for key in content["state_dict"])
+    moments = content["optimizer_states"][0]["state"]
+    (group,) = content["optimizer_states"][0]["param_groups"]
+    assert len(moments) == len(group["params"])  # the projector too has gradients
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "give model.init_from a checkpoint of stage image_vae"),
+        ({"model.init_args.weights.sit_alignment": 0.5}, "go together"),
+        ({"data.init_args.image_size": 32}, r"give \(16, 16\) latents"),
+        ({"model.init_args.sit.init_args.in_channels": 8}, "sit.in_channels is 8, but the VAE"),
+    ],
+)
+def test_what_does_not_fit_is_said(settings, message, tmp_path, capsys):
+    with pytest.raises((ValueError, SystemExit)) as stop:
+        fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(1), settings)
+    assert re.search(message, str(stop.value) + capsys.readouterr().err)
+
+
+def test_shipped_demo_configs_start_as_they_are(tmp_path):
+    """At their own sizes, on few images."""
+    few = {
+        "data.init_args.source.init_args.num_images": 40,
+        "data.init_args.val_every": 2,
+        "data.init_args.num_workers": 0,
+    }
+    vae = fit(tmp_path / "vae", (*DEMO, "experiment/image_vae"), few, steps(1))
+    start = {"model.init_args.init_from": vae, "trainer.fast_dev_run": "true"}
+    fit(tmp_path / "rgb", RGB, few, start)

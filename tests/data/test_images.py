@@ -1,0 +1,186 @@
+"""Images from folders and tar shards, their cached latents, and dead leaves."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder, TarImages
+from r3dpa.data.dead_leaves import dead_leaves
+from r3dpa.data.image_latents import ImageLatents, ImagePosteriors
+from r3dpa.data.images import ImageEntry, ImageError, center_crop
+
+
+def encoded(pixels):
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def pictures():
+    generator = np.random.default_rng(0)
+    return {
+        f"n01/{index}.png": generator.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+        for index in range(4)
+    }
+
+
+@pytest.fixture
+def folder(pictures, tmp_path):
+    for name, pixels in pictures.items():
+        path = tmp_path / "folder" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encoded(pixels))
+    (tmp_path / "folder" / "notes.txt").write_text("no image")
+    return tmp_path / "folder"
+
+
+@pytest.fixture
+def shards(pictures, tmp_path):
+    root = tmp_path / "shards"
+    root.mkdir()
+    for number, (name, pixels) in enumerate(pictures.items()):
+        with tarfile.open(root / f"{number % 2:03d}.tar", "a") as file:
+            for suffix, data in ((name, encoded(pixels)), (name + ".cls", b"7")):
+                member = tarfile.TarInfo(suffix)
+                member.size = len(data)
+                file.addfile(member, io.BytesIO(data))
+    return root
+
+
+def test_folder_and_shards_hold_the_same_images(folder, shards, pictures):
+    for source in (ImageFolder(str(folder)), TarImages(str(shards))):
+        entries = source.entries()
+        assert len(entries) == len(pictures)
+        for entry in entries:
+            wanted = pictures["/".join(entry.name.split("/")[-2:])]
+            assert np.array_equal(source.read(entry, 8), wanted)
+
+
+def test_damaged_files_are_named(folder, shards):
+    source = ImageFolder(str(folder))
+    entry = source.entries()[0]
+    entry.path.write_bytes(entry.path.read_bytes()[:40])
+    with pytest.raises(ImageError, match=r"n01/0\.png: is no image"):
+        source.read(entry, 8)
+    (shards / "000.tar").write_bytes(b"\x1f\x8b" + bytes(600))
+    with pytest.raises(ImageError, match=r"000\.tar is no uncompressed tar file"):
+        TarImages(str(shards)).entries()
+    with pytest.raises(ImageError, match="holds no image"):
+        ImageFolder(str(shards)).entries()
+
+
+def test_names_that_leave_the_folder_are_refused(tmp_path):
+    with tarfile.open(tmp_path / "a.tar", "w") as file:
+        file.addfile(tarfile.TarInfo("../../evil.png"), io.BytesIO())
+    with pytest.raises(ImageError, match="leads out of its folder"):
+        TarImages(str(tmp_path)).entries()
+
+
+def test_the_crop_is_the_centre():
+    """A 4 x 12 image: columns 4..7 remain; halved exactly where it is twice as large."""
+    pixels = np.zeros((4, 12, 3), np.uint8)
+    pixels[:, 4:8] = 200
+    assert np.array_equal(center_crop(Image.fromarray(pixels), 4), pixels[:, 4:8])
+    large = pixels.repeat(2, axis=0).repeat(2, axis=1)
+    assert np.array_equal(center_crop(Image.fromarray(large), 4), pixels[:, 4:8])
+    assert center_crop(Image.fromarray(pixels), 7).shape == (7, 7, 3)
+
+
+def test_splits_mirrors_and_range(folder):
+    module = ImageDataModule(
+        ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4, mirrored=True
+    )
+    module.setup("fit")
+    assert (len(module.train_set), len(module.val_set)) == (6, 1)
+    assert {e.name for e in module.val_set.entries}.isdisjoint(
+        e.name.removesuffix(".mirrored") for e in module.train_set.entries
+    )
+    plain, mirrored = module.train_set[0], module.train_set[1]
+    assert mirrored["name"] == plain["name"] + ".mirrored"
+    assert torch.equal(mirrored["image"], plain["image"].flip(-1))
+    pixels = module.source.read(module.train_set.entries[0], 8)
+    expected = torch.from_numpy(pixels.copy()).permute(2, 0, 1) / 127.5 - 1
+    torch.testing.assert_close(plain["image"], expected)
+
+
+def test_dead_leaves_depend_on_seed_and_number_alone():
+    long, short = DeadLeaves(50), DeadLeaves(3)
+    entry = short.entries()[2]
+    assert entry == long.entries()[2]
+    image = short.read(entry, 16)
+    assert image.shape == (16, 16, 3)
+    assert np.array_equal(image, long.read(entry, 16))
+    assert not np.array_equal(image, DeadLeaves(3, seed=1).read(entry, 16))
+    assert not np.array_equal(image, short.read(short.entries()[1], 16))
+    assert short.settings() == long.settings() != DeadLeaves(3, seed=1).settings()
+
+
+def test_dead_leaves_have_the_spectrum_and_the_edges_of_photographs():
+    """Power of photographs falls as f^-2 to f^-3; their derivatives have heavy tails."""
+    size = 64
+    images = [dead_leaves(np.random.default_rng(i), size).mean(axis=2) for i in range(24)]
+    grey = np.stack(images)
+    centred = grey - grey.mean(axis=(1, 2), keepdims=True)
+    power = np.square(np.abs(np.fft.fft2(centred))).mean(axis=0)
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.fftfreq(size)[None])
+    band = (frequency > 1.5 / size) & (frequency < 0.3)
+    slope = np.polyfit(np.log(frequency[band]), np.log(power[band]), 1)[0]
+    assert -3.2 < slope < -1.8
+    steps = np.diff(grey, axis=2).ravel()
+    kurtosis = np.mean((steps - steps.mean()) ** 4) / steps.var() ** 2
+    assert kurtosis > 6  # a Gaussian field has 3
+
+
+@pytest.mark.parametrize("args", [{"num_images": 0}, {"seed": -1}, {"smallest": 0.6}])
+def test_dead_leaves_out_of_range(args):
+    with pytest.raises(ValueError, match="needed"):
+        DeadLeaves(**args)
+
+
+@pytest.fixture
+def latents(tmp_path):
+    entries = [ImageEntry(str(i), tmp_path / "x", i) for i in range(5)]
+    return ImageLatents(tmp_path, {"vae": "a"}, (4, 2, 3)), entries
+
+
+def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
+    cache, entries = latents
+    moments = torch.randn(5, 4, 2, 3)
+    with cache.writer(0) as add:
+        add(entries[:2], moments[:2])
+    assert cache.missing(entries) == entries[2:]
+    with pytest.raises(ImageError, match="lacks 3 of 5 images"):
+        ImagePosteriors(cache, entries)
+    with cache.writer(0) as add:
+        add(entries, moments)  # those known are left as they are
+    posteriors = ImagePosteriors(cache, entries)
+    for entry, expected in zip(entries, moments, strict=True):
+        assert torch.equal(posteriors.read(entry), expected)
+    mean, variance = posteriors.statistics()
+    means, logvars = moments.chunk(2, dim=1)
+    torch.testing.assert_close(mean, means.mean(dim=(0, 2, 3)))
+    # Law of total variance: of the means, plus the mean of the posteriors' own.
+    spread = means.var(dim=(0, 2, 3), unbiased=False) + logvars.exp().mean(dim=(0, 2, 3))
+    torch.testing.assert_close(variance, spread)
+
+
+def test_other_settings_have_another_place_and_broken_latents_none(latents):
+    cache, entries = latents
+    other = ImageLatents(cache.root, {"vae": "b"}, cache.shape)
+    assert other.folder != cache.folder
+    broken = torch.zeros(2, 4, 2, 3)
+    broken[1, 0] = torch.inf
+    with cache.writer(0) as add, pytest.raises(ImageError, match="x: 1: its latents are not"):
+        add(entries[:2], broken)
+    replaced = ImageEntry("0", entries[0].path, 99)
+    with cache.writer(0) as add:
+        add(entries[:1], broken[:1])
+    with pytest.raises(ImageError, match="was replaced"):
+        ImagePosteriors(cache, entries[:1]).read(replaced)
