@@ -3,9 +3,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from r3dpa.flow.editing import pnp_flow_feature, transport_to_time
-from r3dpa.flow.solvers import CountingVelocity
-from r3dpa.flow.times import ode_times
+from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.sde import euler_maruyama
+from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, ode_solver
+from r3dpa.flow.times import ode_times, sde_times
 
 
 def latents():
@@ -30,19 +32,158 @@ def silence(num):
     return torch.zeros(num, 2, 3, 4, 6).double()
 
 
-def test_transport_goes_forward_from_the_data():
-    def velocity(x, time):
-        return 2 * time[:, None, None, None].expand_as(x)
-
-    # Left sum of 2 t over 0, 0.2, 0.4 in steps of 0.2.
-    moved = transport_to_time(velocity, latents(), 0.6, 3)
-    torch.testing.assert_close(moved, latents() + 0.2 * 2 * (0 + 0.2 + 0.4))
+def growth(x, time):
+    return x * (1 + time)[:, None, None, None]
 
 
-@pytest.mark.parametrize(("time", "steps"), [(0.0, 3), (1.2, 3), (0.5, 0)])
-def test_impossible_transport_is_refused(time, steps):
-    with pytest.raises(ValueError, match="got"):
-        transport_to_time(still, latents(), time, steps)
+class TestInvert:
+    def test_euler_steps_by_hand(self):
+        def velocity(x, time):
+            return 2 * time[:, None, None, None].expand_as(x)
+
+        way = invert(velocity, latents(), ode_times(3, start=0.6), "euler")
+        # Left sums of 2 t over 0, 0.2, 0.4 in steps of 0.2, from data to noise.
+        for state, moved in zip(way.states, [0.24, 0.08, 0.0, 0.0], strict=True):
+            torch.testing.assert_close(state, latents() + moved)
+        assert torch.equal(way.states[-1], latents())
+        assert way.times.tolist() == ode_times(3, start=0.6).tolist()
+
+    @pytest.mark.parametrize("solver", ODE_SOLVERS)
+    def test_first_state_is_that_of_the_solver_on_the_mirrored_grid(self, solver):
+        times = ode_times(6, shift=2.0)
+        way = invert(growth, latents(), times, solver)
+        assert torch.equal(way.states[0], ode_solver(solver)(growth, latents(), times.flip(0)))
+        assert way.states.shape == (7, 2, 3, 4, 6)
+
+    @pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("heun", 2), ("midpoint", 2)])
+    def test_round_trip_has_the_order_of_the_solver(self, solver, order):
+        """To the exact noise x exp(3 / 2), and back."""
+
+        def errors(steps):
+            way = invert(growth, latents(), ode_times(steps), solver)
+            back = ode_solver(solver)(growth, way.states[0], way.times)
+            exact = latents() * torch.tensor(1.5).double().exp()
+            return [
+                (a - b).abs().max().item() for a, b in ((way.states[0], exact), (back, latents()))
+            ]
+
+        for coarse, fine in zip(errors(40), errors(80), strict=True):
+            assert coarse / fine > 0.85 * 2**order
+
+    def test_path_reaches_the_solvers_that_use_it(self):
+        cosine = Interpolant("cosine")
+        way = invert(growth, latents(), ode_times(5), "unipc", interpolant=cosine)
+        assert not torch.equal(way.states, invert(growth, latents(), ode_times(5), "unipc").states)
+
+    def test_grids_and_solvers_that_do_not_exist_are_refused(self):
+        with pytest.raises(ValueError, match="from noise to data; got"):
+            invert(still, latents(), ode_times(3).flip(0))
+        with pytest.raises(ValueError, match="got 'dopri5'"):
+            invert(still, latents(), ode_times(3), "dopri5")
+
+
+class TestKept:
+    @pytest.mark.parametrize("start", [1.0, 0.6])
+    @pytest.mark.parametrize("solver", [*ODE_SOLVERS, "euler_maruyama"])
+    def test_latents_outside_the_mask_come_back_bit_by_bit(self, solver, start):
+        """And at every time on the way they are those of the inversion, whatever the velocity."""
+        times = sde_times(6) if solver == "euler_maruyama" else ode_times(6, start=start)
+        way = invert(growth, latents(), times, "euler")
+        noise = latents().flip(0)
+        put_back, seen = kept(way, edit_mask()), []
+
+        def after_step(x, time, index):
+            x = put_back(x, time, index)
+            seen.append(torch.where(edit_mask(), way.states[index], x))
+            return x
+
+        def elsewhere(x, time):
+            return 3 * torch.ones_like(x) - growth(x, time)
+
+        begin = renoised(way, edit_mask(), noise)
+        if solver == "euler_maruyama":
+            end = euler_maruyama(
+                elsewhere, begin, times, iter(lambda: noise, None), after_step=after_step
+            )
+        else:
+            end = ode_solver(solver, after_step=after_step)(elsewhere, begin, times)
+        mask = edit_mask().expand_as(end)
+        assert torch.equal(end[~mask], latents()[~mask])
+        assert (end - latents())[mask].abs().min() > 0
+        assert len(seen) == 6
+        assert all(torch.equal(state, way.states[index]) for index, state in enumerate(seen, 1))
+
+    @pytest.mark.parametrize("solver", ODE_SOLVERS)
+    def test_without_other_influence_the_edited_part_is_a_plain_sample(self, solver):
+        """The velocity of a pixel depends on that pixel alone."""
+        way = invert(growth, latents(), ode_times(6), solver)
+        begin = renoised(way, edit_mask(), latents().flip(0))
+        edited = ode_solver(solver, after_step=kept(way, edit_mask()))(growth, begin, way.times)
+        plain = ode_solver(solver)(growth, begin, way.times)
+        expected = torch.where(edit_mask(), plain, latents())
+        assert torch.equal(edited, expected)
+
+    def test_a_solver_on_another_grid_is_refused(self):
+        way = invert(growth, latents(), ode_times(4), "euler")
+        for times in (ode_times(5), ode_times(4, shift=2.0)):
+            solve = ode_solver("euler", after_step=kept(way, edit_mask()))
+            with pytest.raises(ValueError, match="step 1 of the solver ends at t = "):
+                solve(growth, latents(), times)
+        longer = [*ode_times(4).tolist(), -0.25]
+        with pytest.raises(ValueError, match="step 5 of the solver"):
+            solve(growth, latents(), torch.tensor(longer).double())
+
+    @pytest.mark.parametrize("mask", [edit_mask().float(), edit_mask()[0], edit_mask()[..., :2]])
+    def test_masks_that_do_not_fit_are_refused(self, mask):
+        way = invert(growth, latents(), ode_times(2), "euler")
+        with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
+            kept(way, mask)
+        with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
+            renoised(way, mask, latents())
+
+
+class TestRenoised:
+    def test_all_of_the_noise_at_time_1_and_a_part_before(self):
+        noise = latents().flip(0)
+        for start, path in ((1.0, "linear"), (0.25, "linear"), (0.25, "cosine")):
+            way = invert(growth, latents(), ode_times(3, start=start), "euler")
+            state = renoised(way, edit_mask(), noise, Interpolant(path))
+            quarter = torch.tensor(torch.pi / 8).double()
+            data, fresh = (1 - start, start) if path == "linear" else (quarter.cos(), quarter.sin())
+            inside = data * latents() + fresh * noise
+            torch.testing.assert_close(state, torch.where(edit_mask(), inside, way.states[0]))
+
+    def test_noise_of_another_shape_is_refused(self):
+        way = invert(growth, latents(), ode_times(2), "euler")
+        with pytest.raises(ValueError, match=r"shape \(2, 3, 4, 6\), got \(1, 3, 4, 6\)"):
+            renoised(way, edit_mask(), latents()[:1])
+
+
+class TestSphericalMean:
+    def test_by_hand(self):
+        east, north = torch.tensor([[2.0, 0.0]]), torch.tensor([[0.0, 2.0]])
+        third = spherical_mean(east, north, 1 / 3)
+        torch.testing.assert_close(third, 2 * torch.tensor([[3**0.5 / 2, 0.5]]))
+
+    def test_ends_and_equal_noises(self):
+        first, second = latents(), latents().flip(0)
+        torch.testing.assert_close(spherical_mean(first, second, 0.0), first)
+        torch.testing.assert_close(spherical_mean(first, second, 1.0), second)
+        torch.testing.assert_close(spherical_mean(first, first, 0.3), first)
+        opposite = spherical_mean(first, -first, 0.5)
+        assert opposite.abs().max() < 1e-12
+
+    def test_the_length_stays_that_of_noise(self):
+        first, second = torch.randn(2, 3, 4096, generator=torch.Generator().manual_seed(1))
+        half = spherical_mean(first, second, 0.5)
+        assert half.std(dim=1).sub(1).abs().max() < 0.05
+        assert ((first + second) / 2).std(dim=1).max() < 0.75
+
+    def test_impossible_means_are_refused(self):
+        with pytest.raises(ValueError, match=r"share in \[0, 1\], got .* 1.5"):
+            spherical_mean(latents(), latents(), 1.5)
+        with pytest.raises(ValueError, match="one shape"):
+            spherical_mean(latents(), latents()[:1], 0.5)
 
 
 def test_perfect_denoiser_keeps_the_given_region_and_regenerates_the_rest():
@@ -86,11 +227,7 @@ def test_feature_term_sees_the_estimate_and_its_time():
 
 
 def test_edit_that_cannot_run_is_refused():
-    with pytest.raises(ValueError, match=r"\(2, 1, 4, 6\), got torch.bool of shape \(2, 3, 4, 6\)"):
-        pnp_flow_feature(
-            still, no_feature, latents(), edit_mask().expand(2, 3, 4, 6), ode_times(2), silence(3)
-        )
-    with pytest.raises(ValueError, match=r"got torch.float32"):
+    with pytest.raises(ValueError, match=r"\(2, 1, 4, 6\); got torch.float32"):
         pnp_flow_feature(
             still, no_feature, latents(), edit_mask().float(), ode_times(2), silence(3)
         )

@@ -1,13 +1,28 @@
 """Flow matching without networks: paths, solvers, guidance and editing over velocity functions."""
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
-from r3dpa.flow.editing import pnp_flow_feature, transport_to_time
-from r3dpa.flow.guidance import FeatureGuidance, GuidanceRecord
+from r3dpa.flow.editing import (
+    Trajectory,
+    invert,
+    kept,
+    pnp_flow_feature,
+    renoised,
+    spherical_mean,
+)
+from r3dpa.flow.guidance import (
+    AlignedEvaluation,
+    AlignedVelocity,
+    FeatureGuidance,
+    FeatureTarget,
+    GuidanceRecord,
+    aligned_velocity,
+)
 from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
 from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.sde import DriftChange, RestartPlan, euler_maruyama, restart
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
+    AfterStep,
     CountingVelocity,
     OdeSolver,
     Velocity,
@@ -27,18 +42,24 @@ from r3dpa.flow.times import ode_times, sde_times
 
 __all__ = [
     "ODE_SOLVERS",
+    "AfterStep",
+    "AlignedEvaluation",
+    "AlignedVelocity",
     "CountingVelocity",
     "DriftChange",
     "FeatureGuidance",
+    "FeatureTarget",
     "GaussianMixture",
     "GuidanceRecord",
     "Interpolant",
     "OdeSolver",
     "PathCoefficients",
     "RestartPlan",
+    "Trajectory",
     "Velocity",
     "ab2",
     "ab3",
+    "aligned_velocity",
     "autoguided",
     "dopri5",
     "dpm_solver_pp_2m",
@@ -46,16 +67,19 @@ __all__ = [
     "euler_maruyama",
     "evaluations",
     "heun",
+    "invert",
+    "kept",
     "midpoint",
     "ode_solver",
     "ode_times",
     "pnp_flow_feature",
+    "renoised",
     "renormalised",
     "restart",
     "sample_time",
     "sde_times",
+    "spherical_mean",
     "steps_for",
     "toy_mixture",
-    "transport_to_time",
     "unipc",
 ]

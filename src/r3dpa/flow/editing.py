@@ -1,40 +1,193 @@
-"""Editing of given latents: transport towards noise and feature-guided inpainting.
+"""Editing of given latents: inversion to noise, inpainting with what is around it kept.
 
-Letters: B batch, C latent channels, h x w latent size.
+What is kept is put back after every step of a solver::
+
+    trajectory = invert(sit.velocity, latents, ode_times(50), "midpoint")
+    start = renoised(trajectory, edit_mask, noise)
+    solve = ode_solver("midpoint", after_step=kept(trajectory, edit_mask))
+    edited = solve(guidance, start, trajectory.times)
+
+Letters: B batch, C latent channels, h x w latent size, T times, ``...`` axes of the latents.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import Velocity, euler
-from r3dpa.flow.times import ode_times
+from r3dpa.flow.solvers import AfterStep, Velocity, ode_solver
+from r3dpa.flow.times import batch_time, step_pairs
 
-__all__ = ["pnp_flow_feature", "transport_to_time"]
+__all__ = ["Trajectory", "invert", "kept", "pnp_flow_feature", "renoised", "spherical_mean"]
+
+_LINEAR = Interpolant("linear")
 
 
-def transport_to_time(
-    velocity: Velocity, latents: Tensor, target_time: float, num_steps: int
-) -> Tensor:
-    """Carry data along the probability flow from t = 0 to a later time by Euler steps.
+class Trajectory(NamedTuple):
+    """Given latents on their way from noise to data.
+
+    Attributes:
+        times: ``(T,)`` decreasing times.
+        states: ``(T, B, ...)`` latents at these times; the first are the noise, the last the
+            given latents themselves.
+    """
+
+    times: Tensor
+    states: Tensor
+
+
+def invert(
+    velocity: Velocity,
+    latents: Tensor,
+    times: Tensor,
+    solver: str = "midpoint",
+    *,
+    interpolant: Interpolant = _LINEAR,
+) -> Trajectory:
+    """Carry data along the probability flow towards noise, on a sampling grid run backwards.
+
+    Sampling from the first state by the same solver on the same grid gives the data back up to the
+    solver's error, which Euler steps make first order and midpoint steps second order small.
 
     Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        latents: ``(B, ...)`` normalised latents of data.
-        target_time: Time to stop at, in (0, 1].
-        num_steps: Number of steps, one evaluation each.
+        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``, without guidance.
+        latents: ``(B, ...)`` normalised latents at the last of the times.
+        times: ``(T,)`` decreasing times of the sampling to come, see
+            :func:`r3dpa.flow.times.ode_times`; a first time below 1 goes part of the way.
+        solver: A key of :data:`r3dpa.flow.solvers.ODE_SOLVERS`.
+        interpolant: Path of the velocity.
 
     Returns:
-        ``(B, ...)`` noisy latents at ``target_time``.
+        Every state, in the dtype of ``latents``.
 
     Raises:
-        ValueError: If ``target_time`` is outside (0, 1] or there is no step.
+        ValueError: If the times do not decrease or there is no solver of that name.
+
+    Example:
+        >>> times = torch.tensor([1.0, 0.5, 0.0])
+        >>> invert(lambda x, time: x, torch.ones(1, 2), times, "euler").states[:, 0, 0]
+        tensor([2.2500, 1.5000, 1.0000])
     """
-    return euler(velocity, latents, ode_times(num_steps, start=0.0, stop=target_time))
+    if step_pairs(times)[0][0] < times[-1]:
+        raise ValueError(
+            "inversion takes the times of the sampling to come, from noise to data; got "
+            f"{times.tolist()}"
+        )
+    states = [latents]
+
+    def note(x: Tensor, time: float, index: int) -> Tensor:
+        states.append(x)
+        return x
+
+    ode_solver(solver, interpolant, note)(velocity, latents, times.flip(0))
+    return Trajectory(times, torch.stack(states[::-1]))
+
+
+def renoised(
+    trajectory: Trajectory,
+    edit_mask: Tensor,
+    noise: Tensor,
+    interpolant: Interpolant = _LINEAR,
+) -> Tensor:
+    """Start of an edit: fresh noise where it is to happen, the inverted latents elsewhere.
+
+    Where the trajectory starts at a time t below 1, as much of the data is left as a noisy latent
+    of that time has: ``alpha(t) data + sigma(t) noise``.
+
+    Args:
+        trajectory: From data to the time that the edit starts from.
+        edit_mask: Bool, True where latents are generated anew; broadcasts to ``(B, ...)``, such as
+            ``(B, 1, h, w)``.
+        noise: ``(B, ...)`` standard Gaussian draw.
+        interpolant: Path of the velocity.
+
+    Returns:
+        ``(B, ...)`` state at the first time, dtype of the trajectory.
+
+    Raises:
+        ValueError: If the mask is not bool or does not fit, or the noise has another shape.
+    """
+    inverted, data = trajectory.states[0], trajectory.states[-1]
+    _check_mask(edit_mask, data)
+    if noise.shape != data.shape:
+        raise ValueError(f"noise must have shape {tuple(data.shape)}, got {tuple(noise.shape)}")
+    start = batch_time(float(trajectory.times[0]), data)
+    fresh = interpolant.interpolate(data, noise.to(data), start).to(data.dtype)
+    return torch.where(edit_mask, fresh, inverted)
+
+
+def kept(trajectory: Trajectory, edit_mask: Tensor) -> AfterStep:
+    """Hook of a solver that puts the given latents back outside the mask after every step.
+
+    At every time of the grid they are where the inversion was; at the last time they are the given
+    latents bit by bit. Stages between two times (midpoint, Heun) see a state that is a step
+    further on outside. Multistep solvers keep the velocities that they have seen: those outside
+    belong to the states put back, so their history is that of the trajectory, and what they amend
+    afterwards of an earlier step is put back too.
+
+    Args:
+        trajectory: Of the latents to keep, on the grid of the solver.
+        edit_mask: Bool, True where latents are generated anew; broadcasts to ``(B, ...)``.
+
+    Returns:
+        An ``after_step``, see :mod:`r3dpa.flow.solvers`.
+
+    Raises:
+        ValueError: If the mask is not bool or does not fit or, when called, the solver is at
+            another time than the trajectory.
+    """
+    _check_mask(edit_mask, trajectory.states[0])
+    times = trajectory.times.tolist()
+
+    def put_back(x: Tensor, time: float, index: int) -> Tensor:
+        if times[index : index + 1] != [time]:
+            raise ValueError(
+                f"step {index} of the solver ends at t = {time}, but the kept latents were "
+                f"inverted on {times}; use one grid for both"
+            )
+        return torch.where(edit_mask, x, trajectory.states[index].to(x.dtype))
+
+    return put_back
+
+
+def spherical_mean(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """Point on the arc between two noises, whose length stays that of noise.
+
+    Formula, per sample with the angle a between them:
+    ``(sin((1 - s) a) first + sin(s a) second) / sin(a)``.
+
+    Source: Shoemake 1985; for noises of diffusion models DDIM (Song et al. 2021), app. D.5.
+
+    Args:
+        first: ``(B, ...)`` at share 0.
+        second: ``(B, ...)`` at share 1.
+        share: In [0, 1].
+
+    Returns:
+        ``(B, ...)``; the straight mean for noises of one or of opposite direction.
+
+    Raises:
+        ValueError: If the shapes differ or the share is outside [0, 1].
+    """
+    if first.shape != second.shape or not 0 <= share <= 1:
+        raise ValueError(
+            "a mean of two noises needs one shape and a share in [0, 1], got "
+            f"{tuple(first.shape)}, {tuple(second.shape)} and {share}"
+        )
+    flat = first.flatten(1).double(), second.flatten(1).double()
+    angle = torch.cosine_similarity(*flat, dim=1).clamp(-1, 1).acos()
+    arc = angle.sin()
+    straight = arc < 1e-6  # the formula would divide 0 by 0
+    weights = [
+        torch.where(straight, part, (part * angle).sin() / torch.where(straight, 1.0, arc))
+        for part in (1 - share, share)
+    ]
+    mean = sum(weight[:, None] * noise for weight, noise in zip(weights, flat, strict=True))
+    return torch.as_tensor(mean).reshape(first.shape).to(first.dtype)
 
 
 @torch.no_grad()
@@ -66,7 +219,7 @@ def pnp_flow_feature(
         feature_term: Guidance term of the same signature, see
             :meth:`r3dpa.flow.guidance.FeatureGuidance.term`.
         latents: ``(B, C, h, w)`` normalised latents of the scene to edit.
-        edit_mask: ``(B, 1, h, w)`` bool, True where latents are generated anew.
+        edit_mask: Bool, True where latents are generated anew; broadcasts to the latents.
         times: ``(T,)`` decreasing times that include both ends, see
             :func:`r3dpa.flow.times.ode_times`.
         noise: T Gaussian draws ``(B, C, h, w)``, one per time.
@@ -78,23 +231,28 @@ def pnp_flow_feature(
     Raises:
         ValueError: If ``edit_mask`` does not fit the latents or there are not T draws.
     """
-    batch, _, rows, columns = latents.shape
-    if edit_mask.shape != (batch, 1, rows, columns) or edit_mask.dtype != torch.bool:
-        raise ValueError(
-            f"edit_mask must be bool of shape {(batch, 1, rows, columns)}, got "
-            f"{edit_mask.dtype} of shape {tuple(edit_mask.shape)}"
-        )
+    _check_mask(edit_mask, latents)
     draws = list(noise)
     if len(draws) != len(times):
         raise ValueError(f"one draw per time is needed: {len(times)} times, {len(draws)} draws")
-    path = Interpolant("linear")
-    time_dtype = torch.promote_types(latents.dtype, torch.float32)
     x = torch.zeros_like(latents)
     for now, draw in zip(times.tolist(), draws, strict=True):
-        time = torch.full((batch,), now, dtype=time_dtype, device=x.device)
+        time = batch_time(now, x)
         step = now**exponent
         x = x - step * feature_term(x, time).to(x.dtype)
         x = torch.where(edit_mask, x, x - step * (x - latents))
-        noisy = path.interpolate(x, draw.to(x), time)
-        x = path.denoise(velocity(noisy, time), noisy, time).to(x.dtype)
+        noisy = _LINEAR.interpolate(x, draw.to(x), time)
+        x = _LINEAR.denoise(velocity(noisy, time), noisy, time).to(x.dtype)
     return x
+
+
+def _check_mask(edit_mask: Tensor, latents: Tensor) -> None:
+    shape = tuple(latents.shape)
+    fits = edit_mask.dim() == len(shape) and all(
+        size in (1, full) for size, full in zip(edit_mask.shape, shape, strict=True)
+    )
+    if edit_mask.dtype != torch.bool or not fits:
+        raise ValueError(
+            f"edit_mask must be bool and fit latents of shape {shape}, such as "
+            f"{(shape[0], 1, *shape[2:])}; got {edit_mask.dtype} of shape {tuple(edit_mask.shape)}"
+        )

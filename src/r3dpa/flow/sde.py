@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import Velocity, evaluations, ode_solver
+from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unchanged
 from r3dpa.flow.times import batch_time, ode_times, step_pairs
 
 __all__ = ["DriftChange", "RestartPlan", "euler_maruyama", "restart"]
@@ -35,6 +35,7 @@ def euler_maruyama(
     interpolant: Interpolant = _LINEAR,
     last: Literal["denoise", "mean"] = "denoise",
     change_drift: DriftChange | None = None,
+    after_step: AfterStep = unchanged,
 ) -> Tensor:
     """Solve the reverse SDE with diffusion ``w = 2 eta t`` by Euler-Maruyama steps.
 
@@ -60,6 +61,7 @@ def euler_maruyama(
             step of drift, which for ``eta=1`` removes the noise twice and shrinks detail (data of
             standard deviation 0.1 comes out at 0.077 from t = 0.04).
         change_drift: ``(drift, x, time) -> drift`` applied in every step but the last.
+        after_step: See :mod:`r3dpa.flow.solvers`.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
@@ -84,19 +86,21 @@ def euler_maruyama(
         return (1 - eta) * slope + eta * interpolant.sde_drift(slope, x, time)
 
     draws = _draws(noise, x, len(steps))
-    for step_now, step_then in steps:
+    for index, (step_now, step_then) in enumerate(steps, 1):
         time = batch_time(step_now, x)
         drift = drift_of(velocity(x, time), time)
         if change_drift is not None:
             drift = change_drift(drift, x, time)
         step = step_then - step_now
         spread = math.sqrt(2 * eta * step_now * -step)
-        x = x + step * drift.to(x.dtype) + spread * next(draws)
+        x = after_step(x + step * drift.to(x.dtype) + spread * next(draws), step_then, index)
     time = batch_time(now, x)
     final_velocity = velocity(x, time)
     if last == "denoise":
-        return interpolant.denoise(final_velocity, x, time).to(x.dtype)
-    return x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
+        x = interpolant.denoise(final_velocity, x, time).to(x.dtype)
+    else:
+        x = x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
+    return after_step(x, then, len(steps) + 1)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ any dtype. Every solver is called ``(velocity, x, times) -> x`` with
   :func:`r3dpa.flow.times.ode_times`;
 
 returns the ``(B, ...)`` state at the last time, and raises a ``ValueError`` for other times. The
-orders hold on grids whose steps shrink alike.
+orders hold on grids whose steps shrink alike. On a fixed grid ``after_step(x, time, index)`` gets
+the state at ``times[index]`` after every step and returns that to go on from; multistep solvers
+keep the velocities that they have seen.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from r3dpa.flow.times import batch_time, step_pairs
 
 __all__ = [
     "ODE_SOLVERS",
+    "AfterStep",
     "CountingVelocity",
     "OdeSolver",
     "Velocity",
@@ -42,13 +45,20 @@ __all__ = [
     "midpoint",
     "ode_solver",
     "steps_for",
+    "unchanged",
     "unipc",
 ]
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 OdeSolver = Callable[[Velocity, Tensor, Tensor], Tensor]
+AfterStep = Callable[[Tensor, float, int], Tensor]
 
 _LINEAR = Interpolant("linear")
+
+
+def unchanged(x: Tensor, time: float, index: int) -> Tensor:
+    """The :data:`AfterStep` that does nothing."""
+    return x
 
 
 class CountingVelocity:
@@ -78,16 +88,23 @@ class CountingVelocity:
 
 
 @torch.no_grad()
-def euler(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+def euler(
+    velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
+) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by Euler steps; order 1, one evaluation per step."""
-    for now, then in step_pairs(times):
-        x = x + (then - now) * _slope(velocity, x, now)
+    for index, (now, then) in enumerate(step_pairs(times), 1):
+        x = after_step(x + (then - now) * _slope(velocity, x, now), then, index)
     return x
 
 
 @torch.no_grad()
 def heun(
-    velocity: Velocity, x: Tensor, times: Tensor, *, corrector_velocity: Velocity | None = None
+    velocity: Velocity,
+    x: Tensor,
+    times: Tensor,
+    *,
+    corrector_velocity: Velocity | None = None,
+    after_step: AfterStep = unchanged,
 ) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by Heun steps; order 2, two evaluations per step but the last.
 
@@ -99,6 +116,7 @@ def heun(
         x: See the module.
         times: See the module.
         corrector_velocity: Velocity of the second slope, if it is another one.
+        after_step: See the module.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
@@ -108,49 +126,60 @@ def heun(
     """
     corrector_velocity = corrector_velocity or velocity
     *steps, (now, then) = step_pairs(times)
-    for step_now, step_then in steps:
+    for index, (step_now, step_then) in enumerate(steps, 1):
         step = step_then - step_now
         slope = _slope(velocity, x, step_now)
         second = _slope(corrector_velocity, x + step * slope, step_then)
-        x = x + step * 0.5 * (slope + second)
-    return x + (then - now) * _slope(velocity, x, now)
+        x = after_step(x + step * 0.5 * (slope + second), step_then, index)
+    return after_step(x + (then - now) * _slope(velocity, x, now), then, len(steps) + 1)
 
 
 @torch.no_grad()
-def midpoint(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+def midpoint(
+    velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
+) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by the explicit midpoint rule; order 2, two evaluations per step.
 
     The velocity is never asked at the last time.
     """
-    for now, then in step_pairs(times):
+    for index, (now, then) in enumerate(step_pairs(times), 1):
         middle = (now + then) / 2
         halfway = x + (middle - now) * _slope(velocity, x, now)
-        x = x + (then - now) * _slope(velocity, halfway, middle)
+        x = after_step(x + (then - now) * _slope(velocity, halfway, middle), then, index)
     return x
 
 
-def ab2(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+def ab2(
+    velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
+) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 2, one evaluation per step.
 
     With step ``h`` and the step before ``h0``, after one Euler step::
 
         x <- x + h ((1 + h / 2 h0) v_n - (h / 2 h0) v_{n-1})
     """
-    return _adams_bashforth(velocity, x, times, order=2)
+    return _adams_bashforth(velocity, x, times, after_step, order=2)
 
 
-def ab3(velocity: Velocity, x: Tensor, times: Tensor) -> Tensor:
+def ab3(
+    velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
+) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 3, one evaluation per step.
 
     The parabola through the last three velocities is integrated. The first step is an Euler step,
     the second an AB2 step. The error of the Euler step alone would leave order 2; the second
     evaluation amends it to the trapezoidal rule, ``x <- x + h0 / 2 (v_1 - v_0)``.
     """
-    return _adams_bashforth(velocity, x, times, order=3)
+    return _adams_bashforth(velocity, x, times, after_step, order=3)
 
 
 def dpm_solver_pp_2m(
-    velocity: Velocity, x: Tensor, times: Tensor, *, interpolant: Interpolant = _LINEAR
+    velocity: Velocity,
+    x: Tensor,
+    times: Tensor,
+    *,
+    interpolant: Interpolant = _LINEAR,
+    after_step: AfterStep = unchanged,
 ) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by DPM-Solver++(2M); order 2, one evaluation per step.
 
@@ -178,6 +207,7 @@ def dpm_solver_pp_2m(
         x: See the module.
         times: See the module.
         interpolant: Path of the velocity.
+        after_step: See the module.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
@@ -185,11 +215,16 @@ def dpm_solver_pp_2m(
     Raises:
         ValueError: If ``times`` are not those of a solver.
     """
-    return _data_prediction(velocity, x, times, interpolant, correct=False)
+    return _data_prediction(velocity, x, times, interpolant, after_step, correct=False)
 
 
 def unipc(
-    velocity: Velocity, x: Tensor, times: Tensor, *, interpolant: Interpolant = _LINEAR
+    velocity: Velocity,
+    x: Tensor,
+    times: Tensor,
+    *,
+    interpolant: Interpolant = _LINEAR,
+    after_step: AfterStep = unchanged,
 ) -> Tensor:
     """Solve ``dx/dt = v(x, t)`` by UniPC-2 with ``B_2(h)``; one evaluation per step.
 
@@ -206,6 +241,7 @@ def unipc(
         x: See the module.
         times: See the module.
         interpolant: Path of the velocity.
+        after_step: See the module.
 
     Returns:
         ``(B, ...)`` state at the last time, dtype of ``x``.
@@ -213,7 +249,7 @@ def unipc(
     Raises:
         ValueError: If ``times`` are not those of a solver.
     """
-    return _data_prediction(velocity, x, times, interpolant, correct=True)
+    return _data_prediction(velocity, x, times, interpolant, after_step, correct=True)
 
 
 @torch.no_grad()
@@ -264,7 +300,7 @@ def dopri5(
     return solution[-1].to(x.dtype)
 
 
-ODE_SOLVERS: dict[str, OdeSolver] = {
+ODE_SOLVERS: dict[str, Callable[..., Tensor]] = {
     "euler": euler,
     "heun": heun,
     "midpoint": midpoint,
@@ -275,12 +311,15 @@ ODE_SOLVERS: dict[str, OdeSolver] = {
 }
 
 
-def ode_solver(name: str, interpolant: Interpolant = _LINEAR) -> OdeSolver:
+def ode_solver(
+    name: str, interpolant: Interpolant = _LINEAR, after_step: AfterStep = unchanged
+) -> OdeSolver:
     """The solver of that name, for velocities of that path.
 
     Args:
         name: A key of :data:`ODE_SOLVERS`.
         interpolant: Path of the velocity, which only ``dpmpp_2m`` and ``unipc`` use.
+        after_step: See the module.
 
     Returns:
         ``(velocity, x, times) -> x``.
@@ -290,10 +329,10 @@ def ode_solver(name: str, interpolant: Interpolant = _LINEAR) -> OdeSolver:
     """
     _check_name(name)
     if name == "dpmpp_2m":
-        return partial(dpm_solver_pp_2m, interpolant=interpolant)
+        return partial(dpm_solver_pp_2m, interpolant=interpolant, after_step=after_step)
     if name == "unipc":
-        return partial(unipc, interpolant=interpolant)
-    return ODE_SOLVERS[name]
+        return partial(unipc, interpolant=interpolant, after_step=after_step)
+    return partial(ODE_SOLVERS[name], after_step=after_step)
 
 
 def evaluations(solver: str, steps: int) -> int:
@@ -336,16 +375,19 @@ def steps_for(solver: str, nfe: int) -> int:
 
 
 @torch.no_grad()
-def _adams_bashforth(velocity: Velocity, x: Tensor, times: Tensor, *, order: int) -> Tensor:
+def _adams_bashforth(
+    velocity: Velocity, x: Tensor, times: Tensor, after_step: AfterStep, *, order: int
+) -> Tensor:
     nodes: deque[float] = deque(maxlen=order)
     slopes: deque[Tensor] = deque(maxlen=order)
-    for now, then in step_pairs(times):
+    for index, (now, then) in enumerate(step_pairs(times), 1):
         nodes.appendleft(now)
         slopes.appendleft(_slope(velocity, x, now))
         if order == 3 and len(slopes) == 2:
             x = x + (nodes[0] - nodes[1]) / 2 * (slopes[0] - slopes[1])
         weights = _adams_bashforth_weights(list(nodes), then)
         x = x + sum(weight * slope for weight, slope in zip(weights, slopes, strict=True))
+        x = after_step(x, then, index)
     return x
 
 
@@ -364,7 +406,13 @@ def _adams_bashforth_weights(nodes: list[float], then: float) -> list[float]:
 
 @torch.no_grad()
 def _data_prediction(
-    velocity: Velocity, x: Tensor, times: Tensor, interpolant: Interpolant, *, correct: bool
+    velocity: Velocity,
+    x: Tensor,
+    times: Tensor,
+    interpolant: Interpolant,
+    after_step: AfterStep,
+    *,
+    correct: bool,
 ) -> Tensor:
     """Multistep method in the expected data, see :func:`dpm_solver_pp_2m` and :func:`unipc`.
 
@@ -380,7 +428,7 @@ def _data_prediction(
     widths = log_snr.diff().tolist()
     ratio = bend_factor = 0.0
     data = change = bend = torch.zeros_like(x)
-    for index, (now, _) in enumerate(steps):
+    for index, (now, then) in enumerate(steps):
         slope = _slope(velocity, x, now)
         # x = alpha D + sigma N and v = alpha' D + sigma' N, solved for D and N.
         determinant = alpha[index] * d_sigma[index] - d_alpha[index] * sigma[index]
@@ -400,6 +448,7 @@ def _data_prediction(
             alpha[index + 1] - alpha[index] * sigma[index + 1] / sigma[index] if now else 0.0
         )
         x = alpha[index + 1] * data + sigma[index + 1] * noise + bend_factor * bend
+        x = after_step(x, then, index + 1)
     return x
 
 

@@ -7,6 +7,7 @@ pictures of different scenes can be compared. Dark means that there is no return
 """
 
 from r3dpa.viz.curves import Series, loss_curves, read_metrics
+from r3dpa.viz.edits import EditRow, edit_page, edit_sheet
 from r3dpa.viz.evaluation import MatchedPair, bev_histograms, matches_figure, range_histogram
 from r3dpa.viz.features import (
     FeatureColours,
@@ -24,6 +25,7 @@ from r3dpa.viz.sheets import birds_eye_sheet, range_strips
 
 __all__ = [
     "Category",
+    "EditRow",
     "FeatureColours",
     "MatchedPair",
     "PageScan",
@@ -32,6 +34,8 @@ __all__ = [
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
+    "edit_page",
+    "edit_sheet",
     "encoded_picture",
     "feature_figure",
     "feature_grid_picture",

@@ -1,0 +1,175 @@
+"""What a scan lacks of a field of view: refused, or interpolated.
+
+Letters: H beams, W columns, P points.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from r3dpa.geometry.projection import Projection, in_range
+from r3dpa.geometry.range_codec import EMPTY_RANGE_M
+from r3dpa.geometry.rays import angles_of
+
+__all__ = ["Gaps", "check_view", "filled", "range_error_m", "refined"]
+
+Gaps = Literal["inverse", "linear", "nearest"]
+_LEAST_ROWS = 0.5  # of the field of view, that a scan of the same sensor fills
+_LEAST_COLUMNS = 0.75
+_MOST_OUTSIDE = 0.2  # share of points beyond the vertical field of view
+_MARGIN_DEG = 1.5  # that some lasers of a real sensor look further up or down than its limits
+_NEAR_ROWS = 4  # how far known beams tell of missing ones
+_ONE_SURFACE = 1.3  # ratio of ranges up to which two beams are taken to meet one surface
+
+
+def check_view(
+    points: Tensor, range_m: Tensor, projection: Projection, missing: Tensor | None = None
+) -> None:
+    """Refuse a scan that does not fill the field of view that a model was trained on.
+
+    Args:
+        points: ``(P, 3)`` metres, those of the scan.
+        range_m: ``(H, W)`` their range image.
+        projection: That of the model.
+        missing: ``(H, W)`` bool, pixels that need not be filled.
+
+    Raises:
+        ValueError: If fewer than half of the rows or three quarters of the columns hold a return,
+            or more than a fifth of the points lie above or below the field of view.
+    """
+    sensor = projection.sensor
+    expected = torch.ones_like(range_m, dtype=torch.bool) if missing is None else ~missing
+    kept_points = points[in_range(points, sensor)]
+    inclination = angles_of(kept_points)[0].rad2deg()
+    lowest, highest = (v.rad2deg().item() for v in projection.ray_angles()[0].aminmax())
+    outside = (inclination < lowest - _MARGIN_DEG) | (inclination > highest + _MARGIN_DEG)
+    if outside.double().mean() > _MOST_OUTSIDE:
+        low, high = inclination.quantile(torch.tensor([0.01, 0.99]).double()).tolist()
+        raise ValueError(
+            f"{outside.double().mean():.0%} of the points lie outside the field of view of the "
+            f"checkpoint, {lowest:.1f} to {highest:.1f} degrees above the horizon: those of the "
+            f"scan reach from {low:.1f} to {high:.1f}. It is of another sensor; use a checkpoint "
+            "that was trained on scans of this one"
+        )
+    returns = (range_m > 0) & expected
+    for name, axis, least in (("beams", 1, _LEAST_ROWS), ("columns", 0, _LEAST_COLUMNS)):
+        asked = expected.any(dim=axis)
+        share = returns.any(dim=axis)[asked].double().mean().item()
+        if share < least:
+            raise ValueError(
+                f"the scan fills {share:.0%} of the {int(asked.sum())} {name} that the checkpoint "
+                f"was trained on ({sensor.beams} x {sensor.columns} pixels, {lowest:.1f} to "
+                f"{highest:.1f} degrees above the horizon): it is of another sensor, or a part of "
+                "a scan; `r3dpa complete` fills what is missing"
+            )
+
+
+def filled(range_m: Tensor, missing: Tensor, how: Gaps = "inverse") -> Tensor:
+    """Range image whose gaps are interpolated: between beams, and between columns where none is.
+
+    Args:
+        range_m: ``(H, W)`` metres, -1 without a return.
+        missing: ``(H, W)`` bool.
+        how: Between two returns ``inverse`` is linear in 1 / range, which is exact on planes up to
+            the curvature of the angles; ``linear`` is so in range. Where one neighbour has no
+            return, and with ``nearest``, the nearest one, the upper or left one of two.
+
+    Returns:
+        ``(H, W)``; pixels that are not missing are unchanged.
+    """
+    between, found = _neighbours(range_m.T, ~missing.T)
+    range_m = torch.where(missing & found.T, between.mean(how).T, range_m)
+    known = ~missing | found.T
+    width = range_m.shape[1]
+    turns = range_m.repeat(1, 3), known.repeat(1, 3)  # as columns wrap around
+    between, _ = _neighbours(*turns)
+    return torch.where(known, range_m, between.mean(how)[:, width : 2 * width])
+
+
+def refined(made_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
+    """A generated range image with its ranges as known beams have them.
+
+    Between two known beams on one surface the range is interpolated, between two without a return
+    there is none; elsewhere near a known beam it is moved by the error there.
+
+    Args:
+        made_m: ``(H, W)`` metres, not above 0 without a return.
+        range_m: ``(H, W)`` of the scan.
+        missing: ``(H, W)`` bool, pixels that the scan does not know.
+
+    Returns:
+        ``(H, W)``, -1 without a return; as ``made_m`` far from known beams.
+    """
+    made = made_m > 0
+    between, found = _neighbours(range_m.T, ~missing.T)
+    low, high = torch.minimum(*between[:2]), torch.maximum(*between[:2])
+    smooth = found & (low > 0) & (high < _ONE_SURFACE * low) & _near(~missing.T)
+    made &= ~(found & (high <= 0) & _near(~missing.T)).T
+    usable = ~missing & made & (range_m > 0)
+    error = torch.where(usable, range_m - made_m, 0.0)
+    errors, _ = _neighbours(error.T, usable.T)
+    moved = made_m + errors.first.lerp(errors.second, errors.share).T
+    # A correction that would carry a return behind the sensor tells nothing of it.
+    moved = torch.where(_near(usable.T).T & (moved > 0), moved, made_m)
+    ranges = torch.where(smooth.T, between.mean("inverse").T, moved)
+    return torch.where(made, ranges, EMPTY_RANGE_M)
+
+
+def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = None) -> float:
+    """Mean absolute difference of range images over pixels with a return in both, metres.
+
+    Args:
+        first_m: ``(..., H, W)`` metres, -1 without a return.
+        second_m: Likewise.
+        pixels: ``(H, W)`` bool, those that count; all where None.
+
+    Returns:
+        NaN where there are none.
+    """
+    both = (first_m > 0) & (second_m > 0)
+    if pixels is not None:
+        both = both & pixels
+    return (first_m.double() - second_m.double()).abs()[both].mean().item()
+
+
+class _Neighbours(NamedTuple):
+    """Nearest known values on both sides of a pixel, and where it lies between them, in [0, 1]."""
+
+    first: Tensor
+    second: Tensor
+    share: Tensor
+
+    def mean(self, how: Gaps) -> Tensor:
+        nearest = torch.where(self.share <= 0.5, self.first, self.second)
+        if how == "nearest":
+            return nearest
+        if how == "linear":
+            mean = self.first.lerp(self.second, self.share)
+        else:
+            mean = 1 / (1 / self.first).lerp(1 / self.second, self.share)
+        return torch.where((self.first > 0) & (self.second > 0), mean, nearest)
+
+
+def _neighbours(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:
+    """Neighbours along the last axis, one twice at an end; and where there is any."""
+    length = values.shape[-1]
+    place = torch.arange(length).expand(values.shape)
+    before = torch.where(known, place, -1).cummax(dim=-1).values
+    after = torch.where(known, place, length).flip(-1).cummin(dim=-1).values.flip(-1)
+    found = (before >= 0) | (after < length)
+    before = torch.where(before >= 0, before, after).clamp(max=length - 1)
+    after = torch.where(after < length, after, before)
+    share = ((place - before).to(values) / (after - before).clamp(min=1)).clamp(0, 1)
+    return _Neighbours(values.gather(-1, before), values.gather(-1, after), share), found
+
+
+def _near(known: Tensor) -> Tensor:
+    """Within some steps of known ones along the last axis."""
+    near = known.clone()
+    for step in range(1, _NEAR_ROWS + 1):
+        near[..., step:] |= known[..., :-step]
+        near[..., :-step] |= known[..., step:]
+    return near

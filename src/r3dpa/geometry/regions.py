@@ -1,0 +1,439 @@
+"""Which pixels of a range image, and which tokens, an edit takes: True is generated anew.
+
+Angles are given as users draw them, in degrees: azimuth 0 looks forward and grows to the left
+(counter-clockwise seen from above), so that 180 and -180 look backwards, where the range image has
+its seam; inclination grows upwards from the horizon. A pixel stands for its ray, which passes its
+centre. A mask that selects no pixel, or all of them, is refused with the reason.
+Letters: H beams, W columns, h x w cells, N = h * w tokens, S sources.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from einops import rearrange, repeat
+from torch import Tensor
+
+from r3dpa.geometry.projection import Projection
+from r3dpa.geometry.rays import column_azimuths
+
+__all__ = [
+    "angle_box",
+    "box3d",
+    "check_mask",
+    "dilated",
+    "dropped_beams",
+    "mask_of_tokens",
+    "sector",
+    "sector_weights",
+    "sensor_pair",
+    "token_mask",
+]
+
+_TURN_DEG = 360.0
+_LEAST_BLEND_DEG = 1e-6  # a narrower seam is hard: its shares would be rounding alone
+_DECIMALS = 9  # of degrees, so that rounding moves no ray across a border it lies on
+
+
+def angle_box(
+    projection: Projection,
+    azimuth_from_deg: float,
+    azimuth_to_deg: float,
+    inclination_min_deg: float,
+    inclination_max_deg: float,
+) -> Tensor:
+    """Pixels between two azimuths and two inclinations.
+
+    Azimuths count from the first border to the left until the second, so that ``170, -170`` are the
+    20 degrees across the seam behind the sensor and ``-10, 10`` the 20 degrees ahead. Of each pair,
+    the first border belongs to the box and the second does not.
+
+    Args:
+        projection: That of the range image.
+        azimuth_from_deg: Right border, within -360..360.
+        azimuth_to_deg: Left border, likewise.
+        inclination_min_deg: Lower border.
+        inclination_max_deg: Upper border.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        ValueError: If a pair of borders is empty, the box lies outside the field of view or
+            between two rays, or all pixels are selected.
+    """
+    what = (
+        f"box of azimuth {azimuth_from_deg:g}..{azimuth_to_deg:g} and inclination "
+        f"{inclination_min_deg:g}..{inclination_max_deg:g} degrees"
+    )
+    if not inclination_min_deg < inclination_max_deg:
+        raise ValueError(f"{what} is empty: give the lower inclination first")
+    columns = _between(projection, azimuth_from_deg, azimuth_to_deg, what)
+    inclination = _inclinations_deg(projection)
+    rows = (inclination >= inclination_min_deg) & (inclination < inclination_max_deg)
+    if not rows.any():
+        raise ValueError(_missed(projection, what, inclination_min_deg, inclination_max_deg))
+    return check_mask(rows[:, None] & columns, what)
+
+
+def sector(projection: Projection, azimuth_from_deg: float, azimuth_to_deg: float) -> Tensor:
+    """All pixels between two azimuths, which count as in :func:`angle_box`.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        ValueError: If the sector is empty, lies between two columns, or is a full turn.
+    """
+    what = f"sector of azimuth {azimuth_from_deg:g}..{azimuth_to_deg:g} degrees"
+    columns = _between(projection, azimuth_from_deg, azimuth_to_deg, what)
+    return check_mask(columns.repeat(projection.sensor.beams, 1), what)
+
+
+def box3d(
+    projection: Projection,
+    centre_m: Sequence[float],
+    size_m: Sequence[float],
+    yaw_deg: float = 0.0,
+) -> Tensor:
+    """Pixels whose ray meets a box within the range limits of the sensor.
+
+    Whatever stands before the box is selected with it: to see the box it must go.
+
+    Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
+    axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
+    ``t_i = (c_i -+ s_i) / d_i``.
+
+    Args:
+        projection: That of the range image; its rays may be those of laser rings.
+        centre_m: x forward, y left, z up of the middle of the box, in the sensor frame.
+        size_m: Length (along x before the turn), width and height.
+        yaw_deg: Turn about the vertical axis, counter-clockwise seen from above.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        ValueError: If a value is no size or place, the box holds the sensor, or no ray meets it:
+            out of range, outside the field of view, or between rays. The numbers are given.
+    """
+    sensor = projection.sensor
+    what = (
+        f"box at ({', '.join(f'{v:g}' for v in centre_m)}) m of size "
+        f"{' x '.join(f'{v:g}' for v in size_m)} m, yaw {yaw_deg:g} degrees"
+    )
+    if len(centre_m) != 3 or len(size_m) != 3:
+        raise ValueError(f"{what}: needs x, y, z of the centre and length, width, height")
+    if not all(map(math.isfinite, (*centre_m, *size_m, yaw_deg))) or min(size_m) <= 0:
+        raise ValueError(f"{what}: needs finite numbers, and a size above 0 on every axis")
+    yaw = math.radians(yaw_deg)
+    axes = torch.tensor(
+        [[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    centre = axes @ torch.tensor(centre_m, dtype=torch.float64)
+    half = torch.tensor(size_m, dtype=torch.float64) / 2
+    if (centre.abs() <= half).all():
+        raise ValueError(f"{what} holds the sensor, so that every ray meets it: move it away")
+    directions = projection.ray_directions(dtype=torch.float64) @ axes.T
+    # A ray in the plane of a face gives 0 / 0: it touches the slab everywhere.
+    low = ((centre - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)
+    high = ((centre + half) / directions).nan_to_num(math.inf, math.inf, -math.inf)
+    entry = torch.minimum(low, high).amax(dim=-1)
+    end = torch.maximum(low, high).amin(dim=-1)
+    met = (entry <= end) & (entry < sensor.range_max_m) & (end > sensor.range_min_m)
+    if met.any():
+        return check_mask(met, what)
+    nearest = (centre.abs() - half).clamp(min=0)
+    farthest = centre.abs() + half
+    from_m, to_m = nearest.norm().item(), farthest.norm().item()
+    if from_m >= sensor.range_max_m or to_m <= sensor.range_min_m:
+        raise ValueError(
+            f"{what} lies {from_m:.1f} to {to_m:.1f} m away, but the range limits of the sensor "
+            f"are {sensor.range_min_m:g} to {sensor.range_max_m:g} m"
+        )
+    bottom, top = (centre[2] - half[2]).item(), (centre[2] + half[2]).item()
+    near, far = nearest[:2].norm().item(), farthest[:2].norm().item()
+    lowest = math.degrees(math.atan2(bottom, near if bottom < 0 else far))
+    highest = math.degrees(math.atan2(top, far if top < 0 else near))
+    raise ValueError(_missed(projection, what, lowest, highest))
+
+
+def dropped_beams(projection: Projection, kept: int | Sequence[int]) -> Tensor:
+    """Pixels of the beams that a scan with fewer beams lacks.
+
+    Args:
+        projection: That of the range image.
+        kept: How many beams remain, evenly spread from the first row on, as 32 or 16 of 64; or
+            their rows.
+
+    Returns:
+        ``(H, W)`` bool, True in the rows that are missing.
+
+    Raises:
+        ValueError: If the number does not divide H, a row does not exist, or none or all remain.
+    """
+    beams = projection.sensor.beams
+    if isinstance(kept, int):
+        if kept < 1 or beams % kept:
+            raise ValueError(f"the number of beams that remain must divide {beams}, got {kept}")
+        kept = range(0, beams, beams // kept)
+    if outside := [row for row in kept if not 0 <= row < beams]:
+        raise ValueError(f"rows of beams must lie in 0..{beams - 1}, got {outside}")
+    missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
+    missing[list(kept)] = False
+    return check_mask(missing, f"{len(set(kept))} of {beams} beams kept: the mask of the others")
+
+
+def sensor_pair(projection: Projection, other: Projection) -> Tensor:
+    """Pixels that another sensor at the same place does not fill.
+
+    Each ray of the other sensor that lies in our field of view fills the pixel whose ray is
+    nearest, the upper and left one of two.
+
+    Args:
+        projection: That of the range image.
+        other: Of the sensor with fewer beams or columns, or another field of view.
+
+    Returns:
+        ``(H, W)`` bool, True where the other sensor sees nothing.
+
+    Raises:
+        ValueError: If it sees no pixel, or all.
+    """
+    sensor = projection.sensor
+    beams = _inclinations_deg(other)
+    in_view = (beams < sensor.inclination_max_deg) & (beams >= sensor.inclination_min_deg)
+    apart = beams[in_view, None] - _inclinations_deg(projection)
+    seen_rows = torch.zeros(sensor.beams, dtype=torch.bool)
+    if in_view.any():
+        seen_rows[_nearest(apart)] = True
+    apart = _azimuths_deg(other)[:, None] - _azimuths_deg(projection)
+    seen_columns = torch.zeros(sensor.columns, dtype=torch.bool)
+    seen_columns[_nearest((apart + _TURN_DEG / 2) % _TURN_DEG - _TURN_DEG / 2)] = True
+    return check_mask(
+        ~(seen_rows[:, None] & seen_columns),
+        f"what a sensor of {other.sensor.beams} beams and {_view(other)} does not see in one of "
+        f"{sensor.beams} beams and {_view(projection)}",
+    )
+
+
+def check_mask(mask: Tensor, what: str) -> Tensor:
+    """The mask, if it selects something and leaves something.
+
+    Args:
+        mask: Bool, of pixels, tokens or latents.
+        what: Names it in the error.
+
+    Raises:
+        ValueError: If nothing or everything is selected.
+    """
+    if not mask.any():
+        raise ValueError(f"{what}: selects nothing, so that nothing would change; make it larger")
+    if mask.all():
+        raise ValueError(
+            f"{what}: selects all of {' x '.join(map(str, mask.shape))}, so that nothing of the "
+            "scan would be kept; make it smaller, or draw a new scene"
+        )
+    return mask
+
+
+def token_mask(
+    pixel_mask: Tensor,
+    grid_size: tuple[int, int],
+    rule: Literal["any", "all"] = "any",
+    dilation: int = 0,
+) -> Tensor:
+    """Tokens that a mask of pixels takes.
+
+    Args:
+        pixel_mask: ``(H, W)`` bool.
+        grid_size: Rows and columns (h, w) of the tokens, dividing H and W.
+        rule: Take a token with ``any`` pixel of its cell selected, or only with ``all``.
+        dilation: Steps of :func:`dilated` on the tokens afterwards.
+
+    Returns:
+        ``(N,)`` bool, row after row, as feature grids are.
+
+    Raises:
+        ValueError: If the grid does not divide the mask, the rule is unknown, or no or every token
+            is selected.
+    """
+    (height, width), (rows, columns) = pixel_mask.shape, grid_size
+    if height % rows or width % columns:
+        raise ValueError(
+            f"a grid of {rows} x {columns} tokens does not divide a mask of {height} x {width}"
+        )
+    if rule not in ("any", "all"):
+        raise ValueError(f"rule must be 'any' or 'all', got {rule!r}")
+    cells = rearrange(pixel_mask, "(h p) (w q) -> h w (p q)", h=rows, w=columns)
+    tokens = cells.any(dim=-1) if rule == "any" else cells.all(dim=-1)
+    what = f"tokens with {rule} of their {height // rows} x {width // columns} pixels selected"
+    return check_mask(dilated(tokens, dilation).flatten(), what)
+
+
+def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, int]) -> Tensor:
+    """Mask of tokens as one of latents or pixels, each token a patch.
+
+    Args:
+        tokens: ``(..., N)``, bool or weights.
+        grid_size: Rows and columns (h, w) of the tokens.
+        size: Rows and columns of the latents, or of the range image; multiples of h and w.
+
+    Returns:
+        ``(..., rows, columns)``.
+
+    Raises:
+        ValueError: If the sizes do not fit each other.
+    """
+    (rows, columns), (height, width) = grid_size, size
+    if tokens.shape[-1] != rows * columns or height % rows or width % columns:
+        raise ValueError(
+            f"{tokens.shape[-1]} tokens in a grid of {rows} x {columns} do not fill {height} x "
+            f"{width} with equal patches"
+        )
+    return repeat(
+        tokens,
+        "... (h w) -> ... (h p) (w q)",
+        h=rows,
+        p=height // rows,
+        q=width // columns,
+    )
+
+
+def dilated(mask: Tensor, steps: int) -> Tensor:
+    """Mask grown by its neighbours, the diagonal ones too; the first column is beside the last.
+
+    Args:
+        mask: ``(..., rows, columns)`` bool, of pixels, latents or tokens.
+        steps: How often, at least 0.
+
+    Returns:
+        ``(..., rows, columns)`` bool.
+
+    Raises:
+        ValueError: If ``steps`` is negative.
+    """
+    if steps < 0:
+        raise ValueError(f"dilation must be 0 or greater, got {steps}")
+    for _ in range(steps):
+        wide = mask | mask.roll(1, dims=-1) | mask.roll(-1, dims=-1)
+        mask = wide.clone()
+        mask[..., 1:, :] |= wide[..., :-1, :]
+        mask[..., :-1, :] |= wide[..., 1:, :]
+    return mask
+
+
+def sector_weights(
+    layout: Sequence[tuple[float, int]], grid_size: tuple[int, int], blend_deg: float = 0.0
+) -> Tensor:
+    """Share that each source has in each token, where scenes are mixed by azimuth.
+
+    A sector reaches from its azimuth to the left until the next one. Its weight at an azimuth is
+    the part of the surrounding ``blend_deg`` that lies in it: linear ramps centred on the seams,
+    which sum to 1 for any layout, the seam behind the sensor among them::
+
+        weight_i(a) = |[a - blend / 2, a + blend / 2] in sector i| / blend
+
+    Args:
+        layout: Azimuth in degrees and number of the source of each sector, in any order; a source
+            may have several. The left half of 0 and the right half of 1: ``[(0, 0), (180, 1)]``.
+        grid_size: Rows and columns (h, w) of the tokens, which stand for the middle of their cell.
+        blend_deg: Width of the seams, in [0, 360].
+
+    Returns:
+        ``(S, N)`` float32, row after row; the sum over S is 1.
+
+    Raises:
+        ValueError: If two sectors start at one azimuth, the sources are not numbered from 0 without
+            gaps or are fewer than two, or a number is out of its range.
+    """
+    if not 0 <= blend_deg <= _TURN_DEG:
+        raise ValueError(f"blend must be 0 to 360 degrees, got {blend_deg:g}")
+    sources = sorted({source for _, source in layout})
+    if len(sources) < 2 or sources != list(range(len(sources))):
+        raise ValueError(
+            f"a layout of sectors needs two or more sources, numbered from 0; got {sources}"
+        )
+    if not all(math.isfinite(start) for start, _ in layout):
+        raise ValueError(f"azimuths of a layout must be finite, got {list(layout)}")
+    ordered = sorted((start % _TURN_DEG, source) for start, source in layout)
+    starts = [start for start, _ in ordered]
+    if len(set(starts)) < len(starts):
+        raise ValueError(f"two sectors start at one azimuth: {list(layout)}; leave one out")
+    azimuth = _degrees(column_azimuths(grid_size[1], corner=False))
+    weights = torch.zeros(len(sources), grid_size[1], dtype=torch.float64)
+    for (start, source), end in zip(ordered, [*starts[1:], starts[0] + _TURN_DEG], strict=True):
+        place, width = azimuth - start, end - start
+        if blend_deg > _LEAST_BLEND_DEG:
+            inside = _covered(place + blend_deg / 2, width) - _covered(place - blend_deg / 2, width)
+            weights[source] += inside / blend_deg
+        else:
+            weights[source] += place % _TURN_DEG < width
+    return repeat(weights.float(), "s w -> s (h w)", h=grid_size[0])
+
+
+def _covered(place: Tensor, width: float) -> Tensor:
+    """Length of a sector ``[0, width]`` that repeats every turn, from 0 to a place; degrees."""
+    return (place / _TURN_DEG).floor() * width + (place % _TURN_DEG).clamp(max=width)
+
+
+def _between(projection: Projection, from_deg: float, to_deg: float, what: str) -> Tensor:
+    """Columns ``(W,)`` bool whose rays lie between two azimuths."""
+    if not max(abs(from_deg), abs(to_deg)) <= _TURN_DEG:  # NaN too
+        raise ValueError(f"{what}: azimuths must lie in -360..360 degrees")
+    if from_deg == to_deg:
+        raise ValueError(f"{what} is empty: for a full turn give -180 and 180")
+    if to_deg - from_deg > _TURN_DEG:
+        raise ValueError(f"{what} is more than a turn: give at most 360 degrees")
+    width = _TURN_DEG if to_deg - from_deg == _TURN_DEG else (to_deg - from_deg) % _TURN_DEG
+    columns = (_azimuths_deg(projection) - from_deg) % _TURN_DEG < width
+    if not columns.any():
+        pitch = _TURN_DEG / projection.sensor.columns
+        raise ValueError(f"{what} lies between two columns, which are {pitch:.3g} degrees apart")
+    return columns
+
+
+def _missed(projection: Projection, what: str, lowest_deg: float, highest_deg: float) -> str:
+    """Why no ray meets what lies between two inclinations and within range."""
+    inclination = _inclinations_deg(projection)
+    bottom, top = inclination.min().item(), inclination.max().item()
+    if lowest_deg > top or highest_deg < bottom:
+        return (
+            f"{what} lies outside the field of view: it reaches from {lowest_deg:.1f} to "
+            f"{highest_deg:.1f} degrees above the horizon, the rays of the sensor from "
+            f"{bottom:.1f} to {top:.1f}"
+        )
+    rows, columns = (top - bottom) / max(len(inclination) - 1, 1), projection.sensor.columns
+    return (
+        f"{what}: no ray meets it within the range limits. Rays are {rows:.2g} degrees apart in "
+        f"inclination and {_TURN_DEG / columns:.2g} in azimuth; make it larger"
+    )
+
+
+def _view(projection: Projection) -> str:
+    sensor = projection.sensor
+    return (
+        f"{sensor.columns} columns, {sensor.inclination_min_deg:g}..{sensor.inclination_max_deg:g} "
+        "degrees"
+    )
+
+
+def _inclinations_deg(projection: Projection) -> Tensor:
+    return _degrees(projection.ray_angles()[0])
+
+
+def _azimuths_deg(projection: Projection) -> Tensor:
+    return _degrees(projection.ray_angles()[1])
+
+
+def _nearest(apart_deg: Tensor) -> Tensor:
+    """Column of the smallest angle of each row; the first where rounding alone tells two apart."""
+    return apart_deg.abs().round(decimals=_DECIMALS).argmin(dim=1)
+
+
+def _degrees(angle: Tensor) -> Tensor:
+    return angle.rad2deg().round(decimals=_DECIMALS)

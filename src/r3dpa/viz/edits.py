@@ -1,0 +1,150 @@
+"""Edits of scans: what was there, what was to change, and what came of it.
+
+Letters: H beams, W columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from r3dpa.geometry import Projection, points_of
+from r3dpa.viz.page import PALETTE, Category, PageScan, scan_page
+from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy
+from r3dpa.viz.scans import RANGE_MAP, range_image_picture, range_scale
+from r3dpa.viz.sheets import range_ticks
+
+__all__ = ["EditRow", "edit_page", "edit_sheet"]
+
+_TINT = 0.45  # share of the colour of a part
+_KEPT, _GREY = "kept", "#8a8f98"
+_AXES = ("H", "W")
+
+
+class EditRow(NamedTuple):
+    """A range image of a sheet.
+
+    Attributes:
+        name: Shown above it.
+        range_m: ``(H, W)`` metres, not above 0 without a return.
+        parts: ``(H, W)`` number of the part that each pixel belongs to, shown as a tint; none
+            where None.
+    """
+
+    name: str
+    range_m: Array
+    parts: NDArray[np.integer] | None = None
+
+
+def _part_colours(names: Sequence[str]) -> list[str]:
+    """A colour ``#rrggbb`` for each part; grey for the first of a scan that is kept in part."""
+    free = iter(("#ff6b6b", *PALETTE))
+    return [_GREY if name == _KEPT else next(free) for name in names]
+
+
+def edit_sheet(
+    rows: Sequence[EditRow], part_names: Sequence[str], projection: Projection
+) -> Figure:
+    """Range images one below the other under their names, those with parts tinted.
+
+    Args:
+        rows: At least one.
+        part_names: Names of the parts by number; empty where no row has any. ``kept`` is clear.
+        projection: Gives the limits of the colour scale.
+
+    Returns:
+        Figure, 13 inches wide and about 1.2 inches high per row.
+
+    Raises:
+        ValueError: If there is no row, or an image has other than two axes.
+    """
+    if not rows:
+        raise ValueError("edit_sheet got no range image; give at least one")
+    height_in = 1.2 * len(rows) + (0.9 if part_names else 0.6)
+    figure = Figure(figsize=(13.0, height_in), dpi=110, layout="constrained")
+    sensor = projection.sensor
+    colours = _part_colours(part_names)
+    cells = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    for row, axes in zip(rows, cells, strict=True):
+        picture = range_image_picture(row.range_m, sensor)
+        if row.parts is not None:
+            picture = _tinted(picture, row.parts, part_names)
+        axes.imshow(picture, aspect="auto", interpolation="nearest")
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(row.name, loc="left", fontsize=10, parse_math=False)
+    figure.colorbar(
+        ScalarMappable(range_scale(sensor), RANGE_MAP),
+        ax=list(cells),
+        label="range (m)",
+        ticks=range_ticks(sensor),
+        format="%g",
+        pad=0.01,
+        aspect=9 * len(rows),
+    )
+    if part_names:
+        handles = [Patch(color=c, label=n) for n, c in zip(part_names, colours, strict=True)]
+        figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
+def edit_page(
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+    parts: NDArray[np.integer] | None,
+    part_names: Sequence[str],
+    projection: Projection,
+    title: str,
+) -> str:
+    """Page with the results beside the first scan, their points coloured by part if wanted.
+
+    Args:
+        before: Range images ``(H, W)`` of the scans by name; may be none.
+        after: Those of the results; those without a return are left out.
+        parts: ``(H, W)`` number of the part of each pixel; None for none.
+        part_names: Names of the parts by number.
+        projection: Makes the points.
+        title: Of the page.
+
+    Returns:
+        HTML, see :func:`r3dpa.viz.scan_page`.
+
+    Raises:
+        ValueError: If nothing holds a return.
+    """
+    order = projection.column_order().numpy()
+
+    def scan(name: str, range_m: Array) -> PageScan:
+        image = torch.as_tensor(range_m)
+        labels = None
+        if parts is not None:
+            labels = parts[:, order][(image[:, order] > 0).numpy()].astype(np.uint32)
+        return PageScan(name, points_of(image, projection), labels)
+
+    images = {**before, **after}
+    shown = [
+        scan(name, image) for name, image in images.items() if (as_numpy(image, _AXES) > 0).any()
+    ]
+    colours = _part_colours(part_names)
+    categories = {
+        number: Category(name, colour)
+        for number, (name, colour) in enumerate(zip(part_names, colours, strict=True))
+    }
+    first = next((one for one in shown if one.name in before), None)
+    reference = None if first is None else replace(first, name=f"before: {first.name}")
+    return scan_page(shown, title, categories, {}, reference, projection.sensor)
+
+
+def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
+    """The picture with the colour of each pixel's part over it; what is kept stays clear."""
+    over = np.array([to_rgb(colour) for colour in _part_colours(names)])[parts]
+    share = np.array([0.0 if name == _KEPT else _TINT for name in names])[parts][..., None]
+    return as_bytes((1 - share) * picture / 255 + share * over)

@@ -1,0 +1,306 @@
+"""``r3dpa inpaint`` and its like: files they write, and what they refuse before networks run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
+from r3dpa.cli import main
+from r3dpa.cli.edits import EDITS, joined_numbers
+from r3dpa.data import read_scan, write_bin, write_npz, write_ply
+from r3dpa.editing import SceneEditor
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, range_image
+from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.simulation import simulate
+
+SENSOR = LidarSensor(beams=16, columns=64)
+PROJECTION = SphericalProjection(SENSOR)
+VAE_ARGS = {
+    "latent_channels": 4,
+    "channels": 32,
+    "channel_multipliers": [1, 1, 1],
+    "strides": [[2, 2], [2, 2]],
+    "num_res_blocks": 1,
+}
+SIT_ARGS = {
+    "input_size": [4, 16],
+    "in_channels": 4,
+    "hidden_size": 32,
+    "depth": 2,
+    "num_heads": 2,
+    "alignment_depth": 1,
+    "feature_dim": 16,
+    "projector_dim": 8,
+}
+
+
+def checkpoint(folder, feature_source="geometric"):
+    torch.manual_seed(0)
+    sit, norm = SiT(**SIT_ARGS), LatentNorm(4)
+    with torch.no_grad():
+        for parameter in sit.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    norm.update(torch.randn(8, 4, 4, 16))
+    networks = {
+        "vae": NetworkState.of(VAE(**VAE_ARGS), VAE_ARGS),
+        "ema": NetworkState.of(sit, SIT_ARGS),
+        "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
+    }
+    geometry = ScanGeometry(PROJECTION, RangeCodec(), (2, 8)).to_dict()
+    content = Checkpoint(
+        Path("tiny"), "joint", networks, geometry=geometry, feature_source=feature_source
+    )
+    return save_checkpoint(content, folder / f"{feature_source}.safetensors")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Folder with checkpoints, two simulated scans and a library of their objects."""
+    folder = tmp_path_factory.mktemp("desk")
+    simulate(folder / "data", 2, drives=["0000"])
+    for number, path in enumerate(sorted((folder / "data").rglob("data/*.bin"))):
+        (folder / f"{'ab'[number]}.bin").symlink_to(path)
+    checkpoint(folder)
+    checkpoint(folder, "waffleiron-s")
+    checkpoint(folder, None)
+    data = sorted((folder / "data").rglob("velodyne_points/data"))[0]
+    words = ["--data", data, "--out", folder / "lib.safetensors"]
+    main(["objects", *map(str, [*words, "--like", folder / "geometric.safetensors"])])
+    return folder
+
+
+def edit(desk, command, out, *more, num=2, ckpt="geometric"):
+    words = ["--ckpt", desk / f"{ckpt}.safetensors", "--out", out, "--steps", 2, "--device", "cpu"]
+    if command != "interpolate":
+        words += ["--num", num]
+    main([command, *map(str, [*words, "--pictures", 1, *more])])
+    return json.loads((out / "metadata.json").read_text())
+
+
+def images(desk, name="a"):
+    points = torch.from_numpy(read_scan(desk / f"{name}.bin"))
+    return range_image(points[:, :3], PROJECTION)[0]
+
+
+class TestFiles:
+    def test_inpaint_writes_everything_and_leaves_the_rest_of_the_scan(self, desk, tmp_path):
+        scan = ["--scan", desk / "a.bin", "--box", "-40", "40", "-20", "0"]
+        library = ["--objects", desk / "lib.safetensors", "--object", "car"]
+        about = edit(desk, "inpaint", tmp_path / "o", *scan, *library)
+        names = {path.name for path in (tmp_path / "o").iterdir()}
+        assert names == {
+            *("range_m.npy", "bin", "range", "birds_eye", "scene_3d", "metadata.json"),
+            *("before.npy", "mask.png", "edit.png", "edit.html"),
+        }
+        made = torch.from_numpy(np.load(tmp_path / "o" / "range_m.npy"))
+        mask = torch.from_numpy(np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0)
+        assert mask.shape == (16, 64)
+        assert made.shape == (2, 16, 64)
+        assert all(one[~mask].equal(images(desk)[~mask]) for one in made)
+        assert about["command"] == "inpaint"
+        assert about["box"] == [-40, 40, -20, 0]
+        assert about["object"] == "car"
+        assert about["feature_source"] == "geometric"
+        assert about["nfe"] == 8  # two midpoint steps there, two back
+        assert len(about["cosine"]) == 2
+        page = (tmp_path / "o" / "edit.html").read_text()
+        assert "before: a" in page
+        assert "inpaint 1" in page
+
+        # The mask that was written is one that can be read.
+        again = ["--scan", desk / "a.bin", "--mask", tmp_path / "o" / "mask.png"]
+        edit(desk, "inpaint", tmp_path / "again", *again, *library)
+        assert np.array_equal(np.load(tmp_path / "again" / "range_m.npy"), made.numpy())
+
+    @pytest.mark.parametrize("source", [["--label", "car"], ["--features_box3d"]])
+    def test_an_object_of_another_scan_guides(self, desk, tmp_path, source):
+        if source[0] == "--features_box3d":
+            points = read_scan(desk / "b.bin", SENSOR)
+            near = points[np.linalg.norm(points[:, :3], axis=1) > 5][0]
+            source = [*source, *map(float, near[:3]), 2, 2, 2, 30]
+        box = ["--scan", desk / "a.bin", "--box3d", 10, 0, -0.5, 4, 3, 2, 0]
+        other = next((desk / "data").rglob("data/*.bin"))
+        about = edit(
+            desk, "inpaint", tmp_path, *box, "--features_from", other.parent / "0000000001.bin"
+            if source[0] == "--label" else desk / "b.bin", *source, num=1,
+        )  # fmt: skip
+        assert about["guided"]
+        assert about["cosine"]
+
+    def test_mix_of_two_halves_is_that_of_a_layout(self, desk, tmp_path):
+        sides = ["--left", desk / "a.bin", "--right", desk / "b.bin", "--split", "30"]
+        edit(desk, "mix", tmp_path / "sides", *sides)
+        layout = f"[[30, {desk / 'a.bin'}], [210, {desk / 'b.bin'}]]"
+        about = edit(desk, "mix", tmp_path / "layout", "--layout", layout)
+        made = [np.load(tmp_path / name / "range_m.npy") for name in ("sides", "layout")]
+        assert np.array_equal(*made)
+        assert list(about["scans"]) == ["0: a", "1: b"]
+        mask = np.asarray(Image.open(tmp_path / "sides" / "mask.png"))
+        assert set(np.unique(mask)) == {0, 255}
+
+    @pytest.mark.parametrize("suffix", ["bin", "ply", "npz"])
+    def test_complete_takes_any_file_and_measures_what_was_left_out(self, desk, tmp_path, suffix):
+        points = read_scan(desk / "a.bin")
+        path = tmp_path / f"scan.{suffix}"
+        if suffix == "npz":
+            write_npz(path, {"scan": points})
+        else:
+            {"bin": write_bin, "ply": write_ply}[suffix](path, points)
+        more = ["--scan", path, "--keep_every", 2, "--sector", 170, -170]
+        about = edit(desk, "complete", tmp_path / "out", *more, num=1)
+        made = torch.from_numpy(np.load(tmp_path / "out" / "range_m.npy"))[0]
+        missing = torch.from_numpy(np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 0)
+        assert missing[1::2].all()
+        assert missing[:, [0, 63]].all()
+        assert made[~missing].equal(images(desk)[~missing])
+        assert set(about["held_out"]) == {"completed", "nearest", "linear"}
+        assert about["held_out"]["linear"]["mae_m"] < about["held_out"]["nearest"]["mae_m"]
+
+    def test_beams_that_are_empty_are_missing(self, desk, tmp_path):
+        range_m = images(desk)
+        range_m[1::2] = -1
+        from r3dpa.geometry import points_of
+
+        write_bin(tmp_path / "sparse.bin", points_of(range_m, PROJECTION))
+        edit(desk, "complete", tmp_path / "o", "--scan", tmp_path / "sparse.bin", "--empty_beams")
+        assert (np.asarray(Image.open(tmp_path / "o" / "mask.png"))[1::2] == 255).all()
+
+    def test_vary_and_interpolate(self, desk, tmp_path):
+        about = edit(desk, "vary", tmp_path / "v", "--scan", desk / "a.bin", "--start", 0.3)
+        assert about["nfe"] == 4
+        assert "strength" not in about["settings"]
+        ends = ["--first", desk / "a.bin", "--second", desk / "b.bin", "--frames", 3]
+        about = edit(desk, "interpolate", tmp_path / "i", *ends)
+        assert np.load(tmp_path / "i" / "range_m.npy").shape == (3, 16, 64)
+        assert not (tmp_path / "i" / "mask.png").exists()
+
+    def test_a_second_edit_needs_overwrite_and_leaves_nothing_of_the_first(self, desk, tmp_path):
+        scan = ["--scan", desk / "a.bin"]
+        edit(desk, "inpaint", tmp_path, *scan, "--box", -40, 40, -20, 0)
+        with pytest.raises(ValueError, match="holds scenes already"):
+            edit(desk, "vary", tmp_path, *scan)
+        edit(desk, "vary", tmp_path, *scan, "--overwrite")
+        assert not (tmp_path / "mask.png").exists()
+
+
+def picture(path, size=(64, 16), value=255):
+    image = Image.new("L", size)
+    image.putpixel((20, 8), value)
+    image.save(path)
+    return path
+
+
+REFUSED = {
+    "no part": ("inpaint", [], "one of --box, --box3d and --mask"),
+    "two parts": ("inpaint", ["--box", 0, 9, -9, 0, "--mask", "m.png"], "one of --box, --box3d"),
+    "outside the view": ("inpaint", ["--box", 0, 20, 10, 20], "outside the field of view.*2.1"),
+    "beyond range": (
+        *("inpaint", ["--box3d", 90, 0, 0, 4, 2, 2, 0]),
+        r"lies 88.0 to 92.\d m away.*1 to 56 m",
+    ),
+    "mask of another size": (
+        *("inpaint", ["--mask", "other.png"]),
+        "has 32 x 128 pixels .* but the range image 16 x 64",
+    ),
+    "empty mask": ("inpaint", ["--mask", "empty.png"], "empty.png: selects nothing"),
+    "unknown class": (
+        *("inpaint", ["--mask", "m.png", "--objects", "lib", "--object", "tram"]),
+        "no 'tram' among the objects; there are .*car",
+    ),
+    "class without library": (
+        *("inpaint", ["--mask", "m.png", "--object", "car"]),
+        "--objects FILE and --object NAME go together",
+    ),
+    "strength without guidance": (
+        *("inpaint", ["--mask", "m.png", "--strength", 0.3]),
+        "say nothing without",
+    ),
+    "strength": (
+        *("inpaint", ["--mask", "m.png", "--objects", "lib", "--object", "car", "--strength", 2]),
+        "strength must lie in 0..1",
+    ),
+    "no number": ("inpaint", ["--mask", "m.png", "--num", 0], "num must be at least 1"),
+    "nothing missing": ("complete", [], "nothing is missing"),
+    "all missing": ("complete", ["--sector", -180, 180], "selects all"),
+    "keep every beam": ("complete", ["--keep_every", 1], "2 or greater, got 1"),
+    "start": ("vary", ["--start", 0], "start must be a time above 0"),
+    "one frame": ("interpolate", ["--frames", 1], "at least 2"),
+    "one side": ("mix", ["--left", "a.bin"], "--left and --right, or a --layout"),
+}
+
+
+@pytest.mark.parametrize(("command", "more", "message"), REFUSED.values(), ids=list(REFUSED))
+def test_bad_input_is_refused_before_networks_run(
+    desk, tmp_path, monkeypatch, command, more, message
+):
+    picture(tmp_path / "m.png")
+    picture(tmp_path / "other.png", (128, 32))
+    picture(tmp_path / "empty.png", value=0)
+    files = {"lib": desk / "lib.safetensors", "a.bin": desk / "a.bin"}
+    words = [files.get(word, tmp_path / word if str(word).endswith(".png") else word)
+             for word in more]  # fmt: skip
+    if command == "interpolate":
+        words += ["--first", desk / "a.bin", "--second", desk / "b.bin"]
+    elif command != "mix":
+        words += ["--scan", desk / "a.bin"]
+    monkeypatch.setattr(SceneEditor, "encode", lambda *_: pytest.fail("a network ran"))
+    with pytest.raises(ValueError, match=message):
+        edit(desk, command, tmp_path / "out", *words)
+    assert not (tmp_path / "out").exists()
+
+
+class TestScansAndCheckpoints:
+    def refused(self, desk, tmp_path, scan, message, ckpt="geometric", more=()):
+        box = ["--scan", scan, "--box", -40, 40, -20, 0, *more]
+        with pytest.raises(ValueError, match=message):
+            edit(desk, "inpaint", tmp_path / "out", *box, ckpt=ckpt)
+
+    def test_a_scan_of_another_sensor(self, desk, tmp_path):
+        points = read_scan(desk / "a.bin", SENSOR)
+        level = points[points[:, 2] > -0.03 * np.linalg.norm(points[:, :3], axis=1)]
+        write_bin(tmp_path / "level.bin", level)
+        self.refused(desk, tmp_path, tmp_path / "level.bin", r"level.bin: .*of the 16 beams")
+        ahead = points[points[:, 0] > np.abs(points[:, 1])]
+        write_bin(tmp_path / "ahead.bin", ahead)
+        self.refused(desk, tmp_path, tmp_path / "ahead.bin", r"ahead.bin: .*of the 64 columns")
+        tilted = points[:, [2, 1, 0, 3]]
+        write_bin(tmp_path / "tilted.bin", tilted)
+        self.refused(desk, tmp_path, tmp_path / "tilted.bin", r"tilted.bin: .*outside the field")
+
+    def test_files_that_are_no_single_scan(self, desk, tmp_path):
+        points = read_scan(desk / "a.bin")
+        write_npz(tmp_path / "two.npz", {"x": points, "y": points})
+        self.refused(desk, tmp_path, tmp_path / "two.npz", r"holds 2 scans \(x, y\)")
+        (tmp_path / "scan.pcd").write_bytes(b"VERSION")
+        self.refused(desk, tmp_path, tmp_path / "scan.pcd", "scan.pcd: is no scan")
+        self.refused(desk, tmp_path, tmp_path / "gone.bin", "gone.bin")
+
+    def test_features_that_the_checkpoint_was_not_aligned_with(self, desk, tmp_path):
+        library = ["--objects", desk / "lib.safetensors", "--object", "car"]
+        self.refused(
+            desk, tmp_path, desk / "a.bin", "'geometric'.*'waffleiron-s'", "waffleiron-s", library
+        )
+        self.refused(desk, tmp_path, desk / "a.bin", "without 3D features", "None", library)
+
+
+def test_numbers_after_an_option_are_one_list():
+    words = ["--box", "-10", "1e1", "-20", "0", "--num", "3", "--mask", "a", "--flag"]
+    assert joined_numbers(words) == [
+        *("--box", "[-10, 1e1, -20, 0]", "--num", "3", "--mask", "a", "--flag"),
+    ]
+    assert joined_numbers(["--sector", "1", "2"]) == ["--sector", "[1, 2]"]
+
+
+@pytest.mark.parametrize("command", EDITS)
+def test_every_command_lists_its_options(command, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert "--out OUT" in text
+    assert "(required" in text

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from r3dpa.data import Scan, ScanError, find_scans, write_bin
+from r3dpa.data.objects import ObjectClass, ObjectLibrary, object_library
+from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
+
+CAR, ROAD = 26, 7
+SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
+PROJECTION = SphericalProjection(SENSOR)
+
+
+def write_scan(root, frame, points, labels):
+    folder = root / "velodyne_points"
+    path = folder / "data" / f"{frame}.bin"
+    write_bin(path, np.asarray(points, dtype=np.float32))
+    (folder / "labels").mkdir(exist_ok=True)
+    (folder / "labels" / f"{frame}.label").write_bytes(np.array(labels, "<u4").tobytes())
+    return Scan("drive", frame, path)
+
+
+# Ahead, left, and right of the sensor; one behind that is out of range.
+AHEAD, LEFT, RIGHT, FAR = (10, 1, 0, 0.5), (-1, 10, 0, 0.25), (1, -20, 0, 1.0), (-99, 1, 0, 0.0)
+
+
+@pytest.fixture
+def library(tmp_path, scaled_points):
+    points = [AHEAD, AHEAD, AHEAD, AHEAD, LEFT, FAR, RIGHT]
+    labels = [CAR | 1 << 16, CAR, CAR, ROAD, CAR | 2 << 16, CAR, 0]
+    scans = [write_scan(tmp_path, "0", points, labels)]
+    return object_library(scans, scaled_points(gain=2.0), PROJECTION, (2, 4))
+
+
+def test_a_cell_counts_by_the_share_of_its_points_that_are_of_the_class(library):
+    ahead, left = 2 * torch.tensor(AHEAD), 2 * torch.tensor(LEFT)
+    assert library.names == ("road", "car")
+    # Three of four points ahead are of the car, and the only one to the left.
+    expected = (0.75 * ahead + left) / 1.75
+    torch.testing.assert_close(library.feature("car"), expected)
+    torch.testing.assert_close(library.feature("road"), ahead)
+    cosine = torch.nn.functional.cosine_similarity
+    near = 0.75 * cosine(ahead, expected, dim=0) + cosine(left, expected, dim=0)
+    road, car = library.classes
+    assert (car.num_scans, car.num_cells, car.num_points) == (1, 2, 4)
+    assert car.spread == pytest.approx(1 - near.item() / 1.75, abs=1e-6)
+    assert (road.num_scans, road.num_cells, road.num_points) == (1, 1, 1)
+    assert road.spread == pytest.approx(0, abs=1e-6)
+
+
+def test_scans_add_up(tmp_path, scaled_points):
+    scans = [
+        write_scan(tmp_path, "0", [AHEAD, LEFT], [CAR, ROAD]),
+        write_scan(tmp_path, "1", [RIGHT, RIGHT], [CAR, CAR]),
+    ]
+    library = object_library(scans, scaled_points(), PROJECTION, (2, 4), ["car"])
+    expected = (torch.tensor(AHEAD) + torch.tensor(RIGHT)) / 2
+    torch.testing.assert_close(library.feature("car"), expected)
+    assert (library.classes[0].num_scans, library.classes[0].num_points) == (2, 3)
+    assert library.names == ("car",)
+
+
+def test_rings_are_found_in_whole_scans(tmp_path, scaled_points):
+    """Of the points of one class alone, the rows could not be told."""
+    rings = RingProjection(SENSOR, (15.0, 5.0, -5.0, -15.0))
+    inclination, azimuth = np.meshgrid(
+        np.deg2rad(rings.ring_inclinations_deg), np.linspace(0.01, 6.27, 40), indexing="ij"
+    )
+    x, y = np.cos(inclination) * np.cos(azimuth), np.cos(inclination) * np.sin(azimuth)
+    points = 10 * np.stack([x, y, np.sin(inclination), 0 * x], axis=-1)
+    labels = np.full((4, 40), ROAD)
+    labels[2, :5] = CAR
+    scan = write_scan(tmp_path, "0", points.reshape(-1, 4), labels.ravel())
+    library = object_library([scan], scaled_points(), rings, (4, 1))
+    # A cell is a ring; of that of the car, an eighth is car.
+    torch.testing.assert_close(
+        library.feature("car"), torch.from_numpy(points[2, :5].mean(axis=0)).float()
+    )
+    assert {entry.name: entry.num_cells for entry in library.classes} == {"car": 1, "road": 4}
+
+
+class Labelled(torch.nn.Module):
+    """Needs labels, and lifts its features to twice their width."""
+
+    name, dim, settings, needs_labels = "labelled", 4, {"pair": (1, 2)}, True
+
+    def prepare(self, points, labels):
+        return torch.stack([points[:, 0], labels.float()], dim=1)
+
+    def point_features(self, prepared):
+        return prepared
+
+    def lift(self, values):
+        return torch.cat([values, -values], dim=1)
+
+
+def test_labels_and_the_linear_step_reach_the_extractor(tmp_path):
+    scan = write_scan(tmp_path, "0", [AHEAD], [CAR | 2 << 16])
+    library = object_library([scan], Labelled(), PROJECTION, (2, 4))
+    label = float(CAR | 2 << 16)
+    assert library.feature("car").tolist() == [10, label, -10, -label]
+    assert library.source == "labelled"
+    assert library.extractor["settings"] == {"pair": [1, 2]}  # as it comes back from a file
+
+
+def test_features_may_be_targets_of_a_backward_pass(library):
+    weight = torch.ones(4, requires_grad=True)
+    (library.feature("car") * weight).sum().backward()
+    assert weight.grad.equal(library.feature("car"))
+
+
+def test_library_comes_back_from_its_file(tmp_path, library):
+    path = tmp_path / "new" / "objects.safetensors"
+    library.save(path)
+    loaded = ObjectLibrary.load(path)
+    assert loaded.features.equal(library.features)
+    assert replace(loaded, features=library.features) == library
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_an_unknown_object_lists_those_there_are(library):
+    with pytest.raises(ValueError, match="no 'tram' among the objects; there are road, car"):
+        library.feature("tram")
+
+
+def test_features_of_another_source_are_refused(library):
+    library.check_source("scaled", 4)
+    for source, dim in (("scalr", 4), (None, 4), ("scaled", 768)):
+        with pytest.raises(ValueError, match=f"of 'scaled' of width 4, .* of {source!r} of width"):
+            library.check_source(source, dim)
+
+
+def test_what_the_scans_do_not_show_is_refused(tmp_path, scaled_points):
+    scans = [write_scan(tmp_path, "0", [AHEAD, FAR], [CAR, ROAD])]
+
+    def make(classes, extractor=None):
+        object_library(scans, extractor or scaled_points(), PROJECTION, (2, 4), classes)
+
+    with pytest.raises(ValueError, match=r"no class tram; there are .*car"):
+        make(["car", "tram"])
+    with pytest.raises(ValueError, match="no labelled point of road within range; they show car"):
+        make(["car", "road"])
+    with pytest.raises(ValueError, match="different names"):
+        make(["car", "car"])
+    with pytest.raises(ValueError, match=r"0\.bin: extractor scaled gave NaN or infinite"):
+        make(None, scaled_points(gain=float("nan")))
+    scans = [write_scan(tmp_path, "1", [AHEAD], [0])]
+    with pytest.raises(ValueError, match=r"no labelled point of .*they show none of these"):
+        make(None)
+    scans[0].path.parents[1].joinpath("labels", "1.label").unlink()
+    with pytest.raises(ScanError, match=r"1\.bin has no labels"):
+        make(None)
+
+
+def test_parts_that_do_not_fit_are_refused(library):
+    car = ObjectClass("car", 1, 1, 1, 0.0)
+    with pytest.raises(ValueError, match="different classes"):
+        replace(library, classes=(car, car))
+    with pytest.raises(ValueError, match="different classes"):
+        replace(library, classes=(car,))
+    with pytest.raises(ValueError, match="NaN"):
+        replace(library, features=library.features * torch.nan)
+
+
+def test_a_file_of_something_else_is_named(tmp_path, library):
+    path = tmp_path / "objects.safetensors"
+    library.save(path)
+    content = path.read_bytes()
+    damaged = {"cut": content[:40], "empty": b"", "text": b"no library"}
+    for name, data in damaged.items():
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=rf"{name}\.safetensors holds no objects"):
+            ObjectLibrary.load(path)
+    with pytest.raises(ValueError, match=r"absent\.safetensors holds no objects"):
+        ObjectLibrary.load(tmp_path / "absent.safetensors")
+    for card in ({}, {"version": 2}, {"version": 1, "classes": [{"name": "car"}]}):
+        metadata = {"r3dpa_objects": json.dumps(card)}
+        save_file({"features": torch.ones(1, 2)}, path, metadata)
+        with pytest.raises(ValueError, match="holds no objects"):
+            ObjectLibrary.load(path)
+    save_file({"features": torch.ones(1, 2)}, path)  # without a card
+    with pytest.raises(ValueError, match="holds no objects"):
+        ObjectLibrary.load(path)
+
+
+def test_objects_of_the_real_scans(real_scans_dir, scaled_points):
+    scans = find_scans(real_scans_dir / "kitti_object_vis" / "velodyne")
+    projection = SphericalProjection(LidarSensor())
+    library = object_library(scans, scaled_points(), projection, (8, 64), ["person", "car"])
+    # The mean place of the pedestrian is that of its box: 8.41 m ahead of the camera, 1.84 m right.
+    x, y, _, _ = library.feature("person").tolist()
+    assert (x, y) == pytest.approx((8.41 + 0.27, -1.84), abs=0.4)

@@ -1,0 +1,233 @@
+"""Edits with tiny random networks: what must stay stays, seeds are independent of their batch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from r3dpa.editing import EditSettings, SceneEditor
+from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.geometry.regions import angle_box, dropped_beams, sector_weights, token_mask
+from r3dpa.nn import VAE, LatentNorm, SiT
+
+SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
+GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
+MASK = angle_box(GEOMETRY.projection, -60, 20, -20, 0)
+SETTINGS = EditSettings(steps=6)
+
+
+@pytest.fixture(scope="module")
+def generator():
+    torch.manual_seed(0)
+    vae = VAE(
+        latent_channels=4,
+        channels=32,
+        channel_multipliers=(1, 1, 1),
+        strides=((2, 2), (2, 2)),
+        num_res_blocks=1,
+    )
+    sit = SiT(
+        input_size=(4, 16),
+        in_channels=4,
+        hidden_size=32,
+        depth=2,
+        num_heads=2,
+        alignment_depth=1,
+        feature_dim=8,
+        projector_dim=8,
+    )
+    with torch.no_grad():
+        for parameter in sit.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+        vae.decoder.conv_out.weight.mul_(3)
+    norm = LatentNorm(4)
+    norm.update(1.0 + 2.0 * torch.randn(8, 4, 4, 16))
+    return SceneGenerator(vae, sit, norm, GEOMETRY, SamplerConfig("heun", steps=3))
+
+
+@pytest.fixture(scope="module")
+def editor(generator):
+    return SceneEditor(generator, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def scan():
+    random = torch.Generator().manual_seed(1)
+    range_m = 5 + 20 * torch.rand(16, 64, generator=random)
+    return torch.where(torch.rand(16, 64, generator=random) < 0.2, -1.0, range_m)
+
+
+FEATURE = torch.eye(8)[0]
+
+
+class TestInpaint:
+    def test_outside_the_mask_the_scan_stays_bit_by_bit(self, editor, scan):
+        result = editor.inpaint(scan, MASK, range(2), feature=FEATURE)
+        assert result.range_m.shape == (2, 16, 64)
+        for made in result.range_m:
+            assert made[~MASK].equal(scan[~MASK])
+            assert not made[MASK].equal(scan[MASK])
+
+    def test_tokens_outside_keep_the_latents_of_the_scan(self, editor, scan):
+        result = editor.inpaint(scan, MASK, [0])
+        latents = editor.encode(scan[None])
+        kept = ~token_mask(MASK, (2, 8)).view(2, 8)
+        kept = kept.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        assert result.latents[0][:, kept].equal(latents[0][:, kept])
+        assert not result.latents[0][:, ~kept].equal(latents[0][:, ~kept])
+
+    def test_guidance_raises_the_cosine_and_none_is_none(self, generator, scan):
+        cosines = {}
+        for strength in (0.0, 0.8):
+            own = SceneEditor(generator, EditSettings(steps=6, strength=strength))
+            cosines[strength] = own.inpaint(scan, MASK, range(3), feature=FEATURE)
+        assert (cosines[0.8].cosine > cosines[0.0].cosine).all()
+        plain = SceneEditor(generator, SETTINGS).inpaint(scan, MASK, range(3))
+        assert plain.latents.equal(cosines[0.0].latents)
+        assert plain.cosine is None
+
+    def test_evaluations_are_those_of_inversion_and_way_back(self, generator, scan):
+        calls = []
+        real = generator.sit.velocity
+        generator.sit.velocity = lambda x, time: calls.append(len(x)) or real(x, time)
+        try:
+            result = SceneEditor(generator, EditSettings("euler", 5)).inpaint(scan, MASK, [0])
+        finally:
+            del generator.sit.velocity
+        assert result.nfe == 10
+        assert len(calls) == 10 + 5  # and the way back without an edit, which is measured
+
+    def test_the_round_trip_shrinks_with_the_steps(self, generator, scan):
+        few, many = (
+            SceneEditor(generator, EditSettings(steps=n)).inpaint(scan, MASK, [0]).round_trip_m
+            for n in (2, 16)
+        )
+        assert many < few / 4
+
+    def test_masks_that_leave_nothing_are_refused(self, editor, scan):
+        for mask in (torch.zeros(16, 64, dtype=torch.bool), torch.ones(16, 64, dtype=torch.bool)):
+            with pytest.raises(ValueError, match=r"selects (nothing|all)"):
+                editor.inpaint(scan, mask, [0])
+
+
+def test_a_scene_does_not_depend_on_its_batch(generator, scan):
+    """Up to rounding of another batch size: 1e-4 in latents of size 1.
+
+    Completions are fitted step by step, which would enlarge it: they are made one by one.
+    """
+    missing = dropped_beams(GEOMETRY.projection, 8)
+    together = SceneEditor(generator, SETTINGS, batch_size=3)
+    alone = SceneEditor(generator, SETTINGS, batch_size=1)
+    for edit, rounding in (
+        (lambda by, indices: by.inpaint(scan, MASK, indices, 5, feature=FEATURE), 1e-4),
+        (lambda by, indices: by.complete(scan, missing, indices, 5), 0),
+        (lambda by, indices: by.vary(scan, indices, 5), 1e-4),
+    ):
+        several, single = edit(together, [0, 1, 2]), edit(alone, [2])
+        torch.testing.assert_close(several.latents[2:], single.latents, atol=rounding, rtol=0)
+        assert not several.latents[0].allclose(several.latents[1], atol=1e-1)
+
+
+class TestMix:
+    def test_each_half_nears_its_own_source(self, generator):
+        """Unit vectors 0 and 1 as the features of everything left and everything right."""
+        sources = [torch.eye(8)[k].expand(16, 8).clone() for k in range(2)]
+        weights = sector_weights([(0, 0), (180, 1)], (2, 8))
+        own = SceneEditor(generator, EditSettings(steps=6, strength=0.8))
+        result = own.mix(sources, weights, range(4))
+        plain = SceneEditor(generator, EditSettings(steps=6, strength=0.0))
+        assert (result.cosine > plain.mix(sources, weights, range(4)).cosine).all()
+        with torch.no_grad():
+            features = generator.sit.project_features(result.latents, torch.zeros(4))
+        cosine = features / features.norm(dim=-1, keepdim=True)
+        toward = cosine[..., 0] - cosine[..., 1]
+        left = weights[0].bool()
+        assert toward[:, left].mean() > toward[:, ~left].mean()
+
+    def test_strength_0_is_the_plain_sampler(self, generator):
+        own = SceneEditor(generator, EditSettings("heun", 3, strength=0.0))
+        sources = [torch.ones(16, 8), torch.eye(8)[0].expand(16, 8)]
+        result = own.mix(sources, sector_weights([(0, 0), (180, 1)], (2, 8)), [3], seed=2)
+        expected = generator.generate([3], seed=2)
+        torch.testing.assert_close(result.latents, expected.latents, atol=1e-5, rtol=0)
+
+
+class TestComplete:
+    def test_known_pixels_stay_and_what_the_scan_holds_elsewhere_is_not_used(self, editor, scan):
+        missing = dropped_beams(GEOMETRY.projection, 8)
+        result = editor.complete(scan, missing, range(2))
+        assert all(made[~missing].equal(scan[~missing]) for made in result.range_m)
+        other = torch.where(missing, 30.0, scan)
+        assert editor.complete(other, missing, range(2)).range_m.equal(result.range_m)
+
+    def test_latents_are_fitted_to_what_is_known(self, editor, scan):
+        codec = GEOMETRY.codec
+        known = (~dropped_beams(GEOMETRY.projection, 8)).float()
+        image, latents = codec.encode(scan), editor.encode(scan[None])
+
+        def error(latents):
+            with torch.no_grad():
+                raw = editor.generator.latent_norm.denormalise(latents)
+                made = editor.generator.vae.decode(raw)[0, 0]
+            return ((made - image).abs() * known).sum()
+
+        fitted = latents
+        for _ in range(5):
+            fitted = editor._fitted(fitted, image, known)
+        assert error(fitted) < 0.9 * error(latents)
+
+
+class TestVaryAndInterpolate:
+    def test_less_noise_leaves_more_of_the_scan(self, editor, scan):
+        latents = editor.encode(scan[None])
+        far = [
+            (editor.vary(scan, range(4), start=start).latents - latents).norm().item()
+            for start in (0.1, 0.5, 1.0)
+        ]
+        assert far[0] < far[1] < far[2]
+
+    def test_all_noise_forgets_the_scan(self, editor, scan):
+        one = editor.vary(scan, [0], start=1.0).latents
+        other = editor.vary(torch.full_like(scan, 9.0), [0], start=1.0).latents
+        assert one.equal(other)
+
+    def test_the_ends_come_back_and_the_middle_lies_between(self, generator, scan):
+        editor = SceneEditor(generator, EditSettings(steps=24))
+        second = scan.roll(17, dims=1)
+        result = editor.interpolate(scan, second, 5)
+        ends = editor.encode(torch.stack([scan, second]))
+        assert (result.latents[[0, -1]] - ends).abs().max() < 1e-2
+        assert result.round_trip_m < 0.05
+        far = (result.latents - ends[:1]).flatten(1).norm(dim=1)
+        assert (far.diff() > 0).all()
+
+    def test_a_single_frame_is_refused(self, editor, scan):
+        with pytest.raises(ValueError, match="at least 2"):
+            editor.interpolate(scan, scan, 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"solver": "euler_maruyama"}, "runs both ways, one of euler"),
+        ({"strength": 1.5}, r"strength must lie in 0..1, got 1.5"),
+        ({"window": (0.8, 0.2)}, "window must be two times"),
+        ({"steps": 0}, "at least one step"),
+        ({"shift": 0.0}, "shift"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        EditSettings(**given)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.5])
+def test_starts_outside_are_refused(editor, scan, start):
+    with pytest.raises(ValueError, match=r"start must be a time above 0"):
+        editor.vary(scan, [0], start=start)
+
+
+def test_noise_is_that_of_the_generator(editor):
+    drawn = next(editor._draws([4], 7))
+    assert drawn[0].equal(torch.randn(4, 4, 16, generator=scene_random(7, 4)))
