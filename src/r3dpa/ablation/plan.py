@@ -1,0 +1,349 @@
+"""What an ablation consists of: tables of rows of stages, each stage known by its content.
+
+A table is a folder with ``table.yaml`` and one YAML file per row::
+
+    # table.yaml
+    caption: What the table shows.
+    better:                       # orders that the paper found, in names of rows
+      - [3_joint, 2_vanilla]      # the first is better than the second
+    alike:
+      - [2_vanilla, 1_none]       # neither is clearly better
+
+    # 2_vanilla.yaml
+    label: vanilla alignment
+    published: {FRID: 7.23, JSD: 4.64}       # as printed in the paper, if it is
+    stages:                                  # in order; the last one is tested
+      - name: vae
+        experiment: vae_alignment            # of the scale
+      - name: flow
+        experiment: flow_matching
+        start: {model.init_args.init_from: vae}   # configuration key: stage
+        set: {model: {init_args: {weights: {sit_alignment: 0.5}}}}
+
+A scale says which configurations an experiment is made of, and how long it trains::
+
+    common: [../../trainer.yaml]             # of all stages, relative to this file
+    data: ../../data/demo.yaml               # of all stages on scans
+    set: {scorer: {num_scenes: 144}}         # what differs from them
+    experiments:
+      vae_alignment:
+        configs: [../../experiment/vae_alignment.yaml]
+        set: {trainer: {max_steps: 400}}
+
+``{out}`` in a value stands for the folder of the ablation. An experiment with ``scans: false`` has
+data of its own, one with ``seeded: false`` is run once for all seeds, and one with ``start:
+{model.init_args.init_from: image_vae}`` needs another experiment before it, whatever the row.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r3dpa.ablation.configs import merged, merged_files, read_config, with_value
+
+__all__ = ["PRIOR", "Plan", "Row", "Scale", "Stage", "Table", "make_plan", "read_scale"]
+
+#: Experiment that a file of RGB-pretrained weights can take the place of.
+PRIOR = "rgb_pretraining"
+
+_DIGITS = 10
+_OPTIONS = ("start", "scans", "seeded")
+_SEED_KEYS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large an ablation is: configurations, data and length of each experiment.
+
+    Args:
+        name: Of its file.
+        folder: That its files are named from.
+        about: One line for the user.
+        common: Merged configuration of all stages.
+        data: Configuration of the scans, with the key ``data``.
+        overrides: What all stages on scans change.
+        experiments: Keys ``configs``, ``set``, ``start``, ``scans``, ``seeded`` by experiment.
+        num_scans: Scans that the budget counts with.
+    """
+
+    name: str
+    folder: Path
+    about: str
+    common: dict[str, Any]
+    data: dict[str, Any]
+    overrides: dict[str, Any]
+    experiments: dict[str, dict[str, Any]]
+    num_scans: int
+
+    @property
+    def scorer(self) -> dict[str, Any]:
+        """How a stage is tested."""
+        return merged(self.common.get("scorer", {}), self.overrides.get("scorer", {}))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A training run, the same one wherever its configuration is the same.
+
+    Args:
+        experiment: What the scale calls it.
+        config: Of ``r3dpa fit``, but for folders, devices and loggers.
+        starts: Stage, or file of weights, whose checkpoint a configuration key gets.
+        name: Experiment and hash of all that training depends on; name of its folder.
+    """
+
+    experiment: str
+    config: dict[str, Any]
+    starts: dict[str, Stage | Path]
+    name: str
+
+    @property
+    def before(self) -> list[Stage]:
+        """Stages that must be run first."""
+        return [start for start in self.starts.values() if isinstance(start, Stage)]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table: its stages by seed, of which the last one is tested."""
+
+    key: str
+    label: str
+    published: dict[str, float]
+    stages: dict[int, tuple[Stage, ...]]
+
+    def tested(self, seed: int) -> Stage:
+        """The stage whose scenes are compared with real scans."""
+        return self.stages[seed][-1]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows in order, and what the paper found: pairs of row keys."""
+
+    name: str
+    caption: str
+    rows: tuple[Row, ...]
+    better: tuple[tuple[str, str], ...]
+    alike: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Tables to be made at a scale, for some seeds."""
+
+    scale: Scale
+    seeds: tuple[int, ...]
+    tables: tuple[Table, ...]
+
+    @property
+    def stages(self) -> list[Stage]:
+        """All stages, each once, after those that it starts from."""
+        found: dict[str, Stage] = {}
+        for table in self.tables:
+            for row in table.rows:
+                for stages in row.stages.values():
+                    found |= {stage.name: stage for stage in stages if stage.name not in found}
+        return list(found.values())
+
+    def on_scans(self, stage: Stage) -> bool:
+        """Whether a stage trains on the scans, not on data of its own."""
+        return self.scale.experiments[stage.experiment].get("scans", True)
+
+    @property
+    def tested(self) -> list[Stage]:
+        """Stages that are tested, each once."""
+        rows = (row for table in self.tables for row in table.rows)
+        tested = (row.tested(seed) for row in rows for seed in self.seeds)
+        return list({stage.name: stage for stage in tested}.values())
+
+
+def read_scale(path: Path) -> Scale:
+    """Scale of a YAML file; see the module.
+
+    Raises:
+        ValueError: If a key is missing or unknown, or a file cannot be read.
+    """
+    if not path.is_file():
+        known = sorted(other.stem for other in path.parent.glob("*.yaml"))
+        raise ValueError(f"{path}: there is no such scale; give one of {', '.join(known) or '-'}")
+    found = _keys(
+        read_config(path),
+        path,
+        ("about", "common", "data", "set", "experiments", "num_scans"),
+    )
+    experiments = {
+        name: _keys(given, f"{path}: experiments.{name}", ("configs",), ("set", *_OPTIONS))
+        for name, given in found["experiments"].items()
+    }
+    return Scale(
+        path.stem,
+        path.parent,
+        found["about"],
+        _files(path.parent, found["common"]),
+        found["data"],
+        found["set"],
+        experiments,
+        found["num_scans"],
+    )
+
+
+def make_plan(
+    folder: Path, scale: Scale, seeds: Sequence[int], rgb_weights: Path | None = None
+) -> Plan:
+    """Plan of a table, or of all tables below a folder.
+
+    Args:
+        folder: With a ``table.yaml``, or with folders that have one.
+        scale: Of :func:`read_scale`.
+        seeds: Different ones, at least one.
+        rgb_weights: RGB-pretrained SiT, instead of pretraining one.
+
+    Raises:
+        ValueError: If there is no table, a file is not as it must be, or a seed occurs twice.
+    """
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ValueError(f"--seeds must be different numbers, at least one, got {list(seeds)}")
+    if rgb_weights is not None and not rgb_weights.is_file():
+        raise ValueError(f"--rgb_weights {rgb_weights}: there is no such file")
+    single = (folder / "table.yaml").is_file()
+    folders = [folder] if single else sorted(path.parent for path in folder.glob("*/table.yaml"))
+    if not folders:
+        raise ValueError(f"{folder}: holds no table.yaml, nor does any folder in it")
+    prior = None if rgb_weights is None else (rgb_weights, _content(rgb_weights))
+    return Plan(scale, tuple(seeds), tuple(_table(path, scale, seeds, prior) for path in folders))
+
+
+def _table(
+    folder: Path, scale: Scale, seeds: Sequence[int], prior: tuple[Path, str] | None
+) -> Table:
+    path = folder / "table.yaml"
+    about = _keys(read_config(path), path, ("caption",), ("better", "alike"))
+    rows = tuple(
+        _row(file, scale, seeds, prior) for file in sorted(set(folder.glob("*.yaml")) - {path})
+    )
+    known = {row.key for row in rows}
+    orders = {name: tuple(map(tuple, about.get(name, ()))) for name in ("better", "alike")}
+    for name, pairs in orders.items():
+        for pair in pairs:
+            if len(pair) != 2 or not known.issuperset(pair):
+                raise ValueError(f"{path}: {name}: {list(pair)} is no pair of {sorted(known)}")
+    if not rows:
+        raise ValueError(f"{folder}: has a table.yaml but no row; add a YAML file for each")
+    return Table(folder.name, about["caption"], rows, orders["better"], orders["alike"])
+
+
+def _row(path: Path, scale: Scale, seeds: Sequence[int], prior: tuple[Path, str] | None) -> Row:
+    row = _keys(read_config(path), path, ("label", "stages"), ("published",))
+    stages = {seed: _stages(row["stages"], path, scale, seed, prior) for seed in seeds}
+    return Row(path.stem, row["label"], row.get("published", {}), stages)
+
+
+def _stages(
+    given: Iterable[Mapping[str, Any]],
+    path: Path,
+    scale: Scale,
+    seed: int,
+    prior: tuple[Path, str] | None,
+) -> tuple[Stage, ...]:
+    known: dict[str, Stage | Path] = {}
+    chain: list[Stage] = []
+    for number, raw in enumerate(given):
+        place = f"{path}: stages[{number}]"
+        stage = _keys(raw, place, ("name", "experiment"), ("start", "set"))
+        if stage["experiment"] == PRIOR and prior is not None:
+            known[stage["name"]] = prior[0]
+            continue
+        starts = {}
+        for key, before in stage.get("start", {}).items():
+            if before not in known:
+                raise ValueError(f"{place}: start: no stage before it is called {before!r}")
+            starts[key] = known[before]
+        overrides = stage.get("set", {})
+        found = _stage(stage["experiment"], starts, overrides, place, scale, seed, prior)
+        known[stage["name"]] = found[-1]
+        chain += [stage for stage in found if stage not in chain]
+    if not chain:
+        raise ValueError(f"{path}: has no stage to train")
+    return tuple(chain)
+
+
+def _stage(
+    experiment: str,
+    starts: dict[str, Stage | Path],
+    overrides: Mapping[str, Any],
+    place: str,
+    scale: Scale,
+    seed: int,
+    prior: tuple[Path, str] | None,
+) -> list[Stage]:
+    """A stage after those that its experiment needs before it."""
+    if experiment not in scale.experiments:
+        raise ValueError(
+            f"{place}: the scale {scale.name} has no experiment {experiment!r}; give one of "
+            f"{', '.join(scale.experiments)}"
+        )
+    chain: list[Stage] = []
+    for key, before in scale.experiments[experiment].get("start", {}).items():
+        chain += _stage(before, {}, {}, place, scale, seed, prior)
+        starts = {key: chain[-1], **starts}
+    config = merged(_config(scale, experiment, seed), overrides)
+    identity = {
+        key: start.name if isinstance(start, Stage) else _content_of(start, prior)
+        for key, start in starts.items()
+    }
+    trained = {key: value for key, value in config.items() if key != "scorer"}
+    text = json.dumps([trained, identity], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+    return [*chain, Stage(experiment, config, starts, f"{experiment}-{digest}")]
+
+
+def _content_of(path: Path, prior: tuple[Path, str] | None) -> str:
+    assert prior is not None
+    assert prior[0] == path
+    return prior[1]
+
+
+def _config(scale: Scale, experiment: str, seed: int) -> dict[str, Any]:
+    given = scale.experiments[experiment]
+    config = scale.common
+    if given.get("scans", True):
+        config = merged(config, scale.data)
+    config = merged(config, _files(scale.folder, given["configs"]))
+    if given.get("scans", True):
+        config = merged(config, scale.overrides)
+    config = merged(config, given.get("set", {}))
+    if given.get("seeded", True):
+        for key in _SEED_KEYS:
+            config = with_value(config, key, seed)
+    return config
+
+
+def _files(folder: Path, names: Iterable[Any]) -> dict[str, Any]:
+    """Configurations that a scale in a folder names, merged."""
+    return merged_files(folder / str(name) for name in names)
+
+
+def _content(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _keys(
+    given: Any, place: Path | str, needed: Sequence[str], more: Sequence[str] = ()
+) -> dict[str, Any]:
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{place}: is {given!r}; give the keys {', '.join(needed)}")
+    missing = [key for key in needed if key not in given]
+    unknown = [key for key in given if key not in (*needed, *more)]
+    if missing or unknown:
+        raise ValueError(
+            f"{place}: lacks the keys {missing} and has the unknown keys {unknown}; "
+            f"needed are {list(needed)}, {list(more)} may be given"
+        )
+    return dict(given)

@@ -1,0 +1,101 @@
+"""Each row of a table as a run of wandb, so that its page shows the table."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from r3dpa import viz
+from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.report import Results
+from r3dpa.ablation.runner import stage_folder
+
+__all__ = ["log_rows"]
+
+
+def log_rows(
+    plan: Plan, table: Table, results: Results, out: Path, mode: Literal["offline", "online"]
+) -> int:
+    """Writes a run for each row and seed: group, configuration, curves, metrics as its summary.
+
+    A run that is there already is not written again. Offline ones lie in ``<out>/wandb``;
+    ``wandb sync`` uploads them.
+
+    Args:
+        plan: The plan that was run.
+        table: Its rows; the group of the runs has its name and that of the scale.
+        results: Of the rows.
+        out: Folder of the ablation.
+        mode: Whether to write to disk or to send.
+
+    Returns:
+        Runs that were written.
+    """
+    written = 0
+    for row in table.rows:
+        for seed, evaluation in results[row.key].items():
+            metrics = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
+            summary: dict[str, Any] = {k: v for k, v in metrics.items() if v is not None}
+            stages = row.stages[seed]
+            told = [table.name, row.key, seed, [stage.name for stage in stages], summary]
+            run_id = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
+            note = out / "wandb" / f"{run_id}.{mode}"
+            if not note.is_file():
+                _log_row(plan, table, row, seed, summary, out, run_id, mode)
+                note.write_text(f"{table.name}, {row.key}, seed {seed}\n", encoding="utf-8")
+                written += 1
+    return written
+
+
+def _log_row(
+    plan: Plan,
+    table: Table,
+    row: Row,
+    seed: int,
+    summary: dict[str, Any],
+    out: Path,
+    run_id: str,
+    mode: Literal["offline", "online"],
+) -> None:
+    import wandb  # seconds, where nothing is logged
+
+    stages = row.stages[seed]
+    config = {
+        "table": table.name,
+        "row": row.key,
+        "label": row.label,
+        "scale": plan.scale.name,
+        "seed": seed,
+        "stages": {stage.experiment: stage.config for stage in stages},
+        "runs": [stage.name for stage in stages],
+    }
+    with wandb.init(
+        project="r3dpa",
+        group=f"{table.name} {plan.scale.name}",
+        job_type="row",
+        name=f"{row.label}, seed {seed}",
+        id=run_id,
+        dir=out,
+        mode=mode,
+        config=config,
+        settings=wandb.Settings(silent=True, console="off"),
+    ) as run:
+        for stage in stages:
+            step_name = f"{stage.experiment}/step"
+            run.define_metric(f"{stage.experiment}/*", step_metric=step_name)
+            for step, values in _curves(out, stage):
+                run.log({step_name: step, **values})
+        run.summary.update(summary)
+
+
+def _curves(out: Path, stage: Stage) -> list[tuple[int, dict[str, float]]]:
+    """Logged values of a stage by step, from all its starts."""
+    found: dict[int, dict[str, float]] = {}
+    paths = stage_folder(out, stage).glob("version_*/metrics.csv")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        for name, (steps, values) in viz.read_metrics(path).items():
+            for step, value in zip(steps, values, strict=True):
+                found.setdefault(int(step), {})[f"{stage.experiment}/{name}"] = float(value)
+    return sorted(found.items())

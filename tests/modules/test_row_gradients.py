@@ -1,0 +1,113 @@
+"""Who is trained, who is frozen and who receives alignment gradients, in each row of the paper.
+
+Class, loss weights and starts are those that ``conf/ablation`` gives the stage; the networks are
+tiny, and so is the UNet.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from test_gradients import FEATURE_DIM, STAGES, group_of, stage_module, train
+from torch import nn
+
+from r3dpa.ablation import make_plan, read_scale
+from r3dpa.modules import LossWeights
+from r3dpa.nn import UNet
+
+TABLES = Path(__file__).resolve().parents[2] / "conf" / "ablation"
+PLAN = make_plan(TABLES, read_scale(TABLES / "scale" / "paper.yaml"), (0,))
+ROWS = {(t.name, row.key): row.stages[0] for t in PLAN.tables for row in t.rows}
+
+VAE_ALONE = {"vae", "discriminator"}
+ALIGNED_VAE = VAE_ALONE | {"sit.projector", "sit.x_embedder"}
+# What is trained in each stage on scans, and what the alignment loss reaches of it.
+EXPECTED = {
+    ("table_2", "1_scratch"): [(VAE_ALONE, set()), ({"sit"}, set())],
+    ("table_2", "2_rgb"): [(VAE_ALONE, set()), ({"sit"}, set())],
+    ("table_2", "3_aligned"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
+    ("table_3", "1_none"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, set())],
+    ("table_3", "2_vanilla"): [(ALIGNED_VAE, {"vae", "sit"}), ({"sit"}, {"sit"})],
+    ("table_3", "3_joint"): [(ALIGNED_VAE, {"vae", "sit"}), ({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+    ("table_4", "1_unet"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+    ("table_4", "2_sit"): [({*VAE_ALONE, "sit"}, {"vae", "sit"})],
+}
+STARTS = {  # networks that the last stage takes from the stage before; from the RGB model
+    ("table_2", "1_scratch"): (["vae", "latent_norm"], False),
+    ("table_2", "2_rgb"): (["vae", "latent_norm"], True),
+    ("table_2", "3_aligned"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "1_none"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "2_vanilla"): (["vae", "sit", "latent_norm"], False),
+    ("table_3", "3_joint"): (None, False),  # all four, the default of the joint stage
+    ("table_4", "1_unet"): (None, False),
+    ("table_4", "2_sit"): (None, False),
+}
+
+
+def on_scans(row):
+    return [stage for stage in ROWS[row] if PLAN.on_scans(stage)]
+
+
+def tiny_module(stage):
+    model = stage.config["model"]
+    kind = {"VAEAlignment": "vae_alignment", "JointAlignment": "joint"}
+    name = kind.get(model["class_path"].rpartition(".")[2], "flow_matching")
+    weights = LossWeights(**model["init_args"].get("weights", {}))
+    if not model["init_args"]["sit"]["class_path"].endswith("UNet"):
+        return stage_module(name, weights=weights)
+    ours = stage_module(name)
+    unet = UNet(
+        input_size=(4, 8), in_channels=4, channels=32, channel_multipliers=(1, 1),
+        num_res_blocks=1, head_channels=16, feature_dim=FEATURE_DIM, projector_dim=8,
+    )  # fmt: skip
+    for parameter in unet.parameters():
+        nn.init.normal_(parameter, std=0.1)
+    return STAGES[name](ours.vae, unet, ours.discriminator, weights=weights)
+
+
+def test_every_row_is_expected():
+    assert set(EXPECTED) == set(STARTS) == set(ROWS)
+
+
+@pytest.mark.parametrize("row", EXPECTED, ids="/".join)
+def test_what_a_row_starts_from(row):
+    *_, last = on_scans(row)
+    networks, rgb = STARTS[row]
+    assert last.config["model"]["init_args"].get("init_networks") == networks
+    assert ("model.init_args.rgb_weights" in last.starts) == rgb
+    assert ("model.init_args.init_from" in last.starts) == (len(on_scans(row)) == 2)
+    if EXPECTED[row][0][0] == ALIGNED_VAE:
+        assert list(on_scans(row)[0].starts) == ["model.init_args.rgb_weights"]
+
+
+@pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of", "ignore:Found .* eval mode")
+@pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated")
+@pytest.mark.parametrize("row", EXPECTED, ids="/".join)
+def test_who_learns_and_who_is_aligned(row):
+    for stage, (trained, aligned) in zip(on_scans(row), EXPECTED[row], strict=True):
+        module = tiny_module(stage)
+        module.separates_losses = True
+        before = {name: value.clone() for name, value in module.named_parameters()}
+        train(module)
+        moved = {
+            name
+            for name, value in module.named_parameters()
+            if not torch.equal(value, before[name]) and not name.startswith("ema.")
+        }
+        parts = {name if name in trained else name.split(".")[0] for name in map(group_of, moved)}
+        assert parts == trained, stage.name
+        reached = {
+            name.split(".")[0]
+            for part, found in module.reached[0].items()
+            if part.endswith("_alignment")
+            for name in found
+        }
+        assert reached == aligned, stage.name
+        if "vae" in aligned:
+            to_vae = module.reached[0]["vae_alignment"]
+            assert {group_of(n) for n in to_vae if n.startswith("vae")} == {
+                "vae.encoder",
+                "vae.quant_conv",
+            }
