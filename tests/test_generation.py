@@ -6,11 +6,13 @@ drawn at random here: scenes then differ from each other, and hold pixels with a
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
 
-from r3dpa.flow import ODE_SOLVERS, euler_maruyama, ode_times, sde_times
+from r3dpa.flow import ODE_SOLVERS, RestartPlan, euler_maruyama, ode_times, sde_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
@@ -339,6 +341,14 @@ def test_unfitted_statistics_are_refused():
         ({"steps": 0}, r"steps >= 1, .* got 0, 1.0 and 1.0"),
         ({"shift": 0.0}, r"shift > 0 .* got 256, 0.0 and 1.0"),
         ({"eta": -1.0}, r"eta >= 0, got 256, 1.0 and -1.0"),
+        ({"solver": "heun", "eta": 0.5}, r"solver heun does not read eta.* for euler_maruyama;"),
+        ({"solver": "ab2", "sde_last": "mean"}, r"solver ab2 does not read sde_last,"),
+        ({"solver": "ab2", "sde_last_time": 0.1}, r"solver ab2 does not read sde_last_time"),
+        ({"shift": 2.0}, r"solver euler_maruyama does not read shift, which is for euler, heun"),
+        ({"solver": "dopri5", "shift": 2.0}, r"solver dopri5 does not read shift"),
+        ({"solver": "dopri5", "steps": 9}, r"solver dopri5 does not read steps"),
+        ({"solver": "heun", "restart": RestartPlan(rounds=3)}, r"heun does not read restart"),
+        ({"tuned": "a.json", "eta": 0.5}, r"tuned solver a\.json does not read eta"),
     ],
 )
 def test_samplers_that_cannot_be_are_refused(options, message):
@@ -399,3 +409,21 @@ def test_a_diverged_network_gives_nan_and_no_empty_scene():
     with torch.no_grad():
         scenes.sit.final_layer.linear.bias[0] = torch.nan
     assert scenes.generate([0]).range_m.isnan().all()
+
+
+def test_preparing_says_what_the_first_scene_would(tmp_path, monkeypatch):
+    """And computes what that would wait for."""
+    with pytest.raises(ValueError, match=r"must lie in \(0, 1\), got 2"):
+        generator(SamplerConfig(sde_last_time=2.0)).prepare()
+    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+        generator(SamplerConfig(tuned=str(tmp_path / "none.json"))).prepare()
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "torchdiffeq", None)
+        with pytest.raises(ImportError, match="pip install"):
+            generator(SamplerConfig("dopri5")).prepare()
+    scenes, asked = generator(ODE), []
+    modulations = scenes.sit.modulations
+    scenes.sit.modulations = lambda time: asked.append(time) or modulations(time)
+    scenes.prepare()
+    scenes.generate([0])
+    assert len(asked) == 1

@@ -24,17 +24,20 @@ ALLOWED = {
     "data": {"geometry", "simulation"},
     "checkpoints": {"nn"},
     "generation": {"geometry", "nn", "flow"},
+    "editing": {"geometry", "nn", "flow", "generation"},
     "modules": CORE | {"data", "checkpoints", "generation"},
     "scoring": {"data", "metrics", "viz"},
     "snapshots": {"checkpoints", "modules", "nn"},
     "callbacks": {"geometry", "data", "generation", "modules", "nn", "viz"}
     | {"checkpoints", "metrics", "scoring"},
+    "ablation": {"imports", "metrics", "modules", "viz"},
     "bench": CORE
-    | {"imports", "simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"},
+    | {"imports", "simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
+    | {"editing"},
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "scoring", "snapshots", "imports"},
+    | {"metrics", "scoring", "snapshots", "imports", "ablation", "editing"},
 }
 
 

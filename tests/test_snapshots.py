@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
-from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint
+from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint, weights_sha256
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -343,3 +345,17 @@ def test_files_that_are_no_snapshots_say_what_to_give(pair, vae_checkpoint, tmp_
     shutil.copy(path, alone)
     with pytest.raises(ValueError, match=r"alone\.yaml is not beside it; copy both"):
         read_snapshot(alone, strong)
+
+
+def test_the_hash_of_weights_knows_their_values_and_names_alone():
+    """By hand: names in order, each before its bytes."""
+    state = {"b": torch.ones(2, dtype=torch.bfloat16), "a": torch.arange(4.0).reshape(2, 2)}
+    expected = hashlib.sha256(b"a")
+    expected.update(np.arange(4, dtype="<f4").tobytes())
+    expected.update(b"b" + b"\x80\x3f" * 2)
+    assert weights_sha256(state) == expected.hexdigest()
+    turned = {"a": state["a"].T.contiguous().T, "b": state["b"]}
+    assert not turned["a"].is_contiguous()
+    assert weights_sha256(turned) == expected.hexdigest()
+    for other in ({"a": state["a"] + 1, "b": state["b"]}, {"a": state["a"], "c": state["b"]}):
+        assert weights_sha256(other) != expected.hexdigest()

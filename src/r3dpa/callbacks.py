@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +19,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.utilities import rank_zero_info
 from matplotlib.figure import Figure
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
@@ -36,6 +38,7 @@ from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
+from r3dpa.modules.guards import StepGuard
 from r3dpa.nn import EMA
 from r3dpa.scoring import (
     AnyReference,
@@ -96,12 +99,16 @@ class RunCheckpoint(ModelCheckpoint):
 
     Lightning's own saves at the end of training only if it has never saved before.
 
-    A SIGTERM, as job systems send it before they end a job, is obeyed after the next optimiser
-    step, or by a single process after the next batch of a validation: ``last.ckpt`` is saved and
-    the process ends with status 143. It is enough that one of several gets the signal.
+    A SIGTERM, as job systems send it before they end a job, and Ctrl-C (SIGINT) are obeyed after
+    the next optimiser step, or by a single process after the next batch of a validation:
+    ``last.ckpt`` is saved and the process ends with status 143 or 130. It is enough that one of
+    several gets the signal. A second Ctrl-C ends a single process at once, without saving.
+
+    Several processes that go on from different checkpoints, as copies on the disks of their own
+    may be, are refused.
     """
 
-    _stop_asked = False
+    _signal = 0  # that asked to stop
     _step = 0  # optimiser steps when a batch ended last
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
@@ -111,11 +118,38 @@ class RunCheckpoint(ModelCheckpoint):
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Takes SIGTERM over from Lightning, which ends training without saving, with status 0."""
+        """Takes the signals over from Lightning, which ends training without saving.
+
+        Raises:
+            ValueError: If the processes are at different steps.
+        """
         super().on_train_start(trainer, pl_module)
-        self._stop_asked, self._step = trainer.received_sigterm, trainer.global_step
+        first = trainer.strategy.broadcast(trainer.global_step)
+        if trainer.global_step != first:
+            raise ValueError(
+                f"process {trainer.global_rank} goes on from step {trainer.global_step} of "
+                f"{trainer.ckpt_path}, the first one from step {first}: give all processes the "
+                "same checkpoint, on a disk that all see, by its full name"
+            )
+        self._step = trainer.global_step
+        self._signal = signal.SIGTERM if trainer.received_sigterm else 0
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, self._ask_to_stop)  # Lightning restores the one before
+            for number in (signal.SIGTERM, signal.SIGINT):  # Lightning restores those before
+
+                def stop(asked: int, _: object) -> None:
+                    if self._signal == asked == signal.SIGINT and trainer.world_size == 1:
+                        raise KeyboardInterrupt  # of several, torchrun sends each another one
+                    self._signal = asked
+
+                signal.signal(number, stop)
+
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Has the guard of the step tell the other processes who asked to stop: no talk more."""
+        guard = getattr(pl_module, "guard", None)
+        if isinstance(guard, StepGuard):
+            guard.stop = self._signal
 
     def on_train_batch_end(
         self,
@@ -147,20 +181,28 @@ class RunCheckpoint(ModelCheckpoint):
         if trainer.state.fn == "fit" and not trainer.sanity_checking and trainer.world_size == 1:
             self._stop_if_asked(trainer)
 
-    def _ask_to_stop(self, *_: object) -> None:
-        self._stop_asked = True
+    def _asked(self, trainer: L.Trainer) -> int:
+        """Signal that asked any process to stop, 0 for none; the same answer in all of them."""
+        guard = getattr(trainer.lightning_module, "guard", None)
+        if trainer.world_size == 1:
+            return self._signal
+        if isinstance(guard, StepGuard):
+            return guard.stop
+        asked = torch.tensor(self._signal, device=trainer.strategy.root_device)
+        return int(trainer.strategy.reduce(asked, reduce_op="max"))
 
     def _stop_if_asked(self, trainer: L.Trainer) -> None:
-        if not trainer.strategy.reduce_boolean_decision(self._stop_asked, all=False):
+        number = self._asked(trainer)
+        if not number:
             return
         if not self._should_skip_saving_checkpoint(trainer):
             self.save_last = True  # else the steps since the last saving would be lost
             self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
         rank_zero_info(
-            f"stopped by SIGTERM after step {trainer.global_step}: the same command goes on with "
-            f"--ckpt_path {self.last_model_path}"
+            f"stopped by {signal.Signals(number).name} after step {trainer.global_step}: the same "
+            f"command goes on with --ckpt_path {self.last_model_path}"
         )
-        raise SystemExit(128 + signal.SIGTERM)  # as a shell reports it
+        raise SystemExit(128 + number)  # as a shell reports it
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Saves unless the last step is saved already."""
@@ -361,7 +403,7 @@ class SceneScorer(L.Callback):
             about = {
                 "data": str(datamodule.scans),
                 "split": "all",
-                "bytes": sum(scan.path.stat().st_size for scan in scans),  # names may stay
+                "scans_sha256": _stamp(scans),  # names may stay
                 "commit": source_commit(),
             }
             scan_names = [scan.name for scan in scans]
@@ -378,10 +420,11 @@ class SceneScorer(L.Callback):
         statistics, spaces, scans = self._job
         self._job = None
         folder = Path(trainer.default_root_dir) / "evaluation"
-        made_with = self._sample(trainer, pl_module, folder)
+        self._sample(trainer, pl_module, folder)
         trainer.strategy.barrier("SceneScorer")
         if not trainer.is_global_zero:
             return
+        made_with = self._made_with(trainer, pl_module, folder)
         if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
             path = folder / "reference.safetensors"
             statistics = cached_reference(statistics, scans, spaces, path)
@@ -415,11 +458,11 @@ class SceneScorer(L.Callback):
         except ValueError as error:
             raise ValueError(f"scorer.reference: {error}") from error
 
-    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> dict[str, Any]:
-        """Writes the batches of this process; returns what made them."""
+    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> None:
+        """Writes the batches of this process."""
         assert module.ema is not None
         generator = _generator(module, module.ema, self.sampler, self.precision)
-        starts, nfe = range(0, self.num_scenes, self.batch_size), None
+        starts = range(0, self.num_scenes, self.batch_size)
         quiet = None if trainer.is_global_zero else True
         for first in tqdm(
             starts[trainer.global_rank :: trainer.world_size],
@@ -429,9 +472,21 @@ class SceneScorer(L.Callback):
         ):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
-            nfe = scenes.nfe
+            part = {"range_m": scenes.range_m.cpu().contiguous(), "nfe": torch.tensor(scenes.nfe)}
             with atomic_path(_part(folder, first)) as temporary:
-                save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
+                save_file(part, temporary)
+
+    def _made_with(
+        self, trainer: L.Trainer, module: GenerativeModule, folder: Path
+    ) -> dict[str, Any]:
+        """What made the scenes; ``nfe`` is the mean over all of them, whoever drew them."""
+        total = 0
+        for first in range(0, self.num_scenes, self.batch_size):
+            with safe_open(_part(folder, first), framework="pt") as file:
+                num = file.get_slice("range_m").get_shape()[0]
+                total += num * int(file.get_tensor("nfe"))
+        nfe = total / self.num_scenes  # whole but for a solver that chooses its steps
+        nfe = int(nfe) if nfe.is_integer() else nfe
         return {
             "solver": self.sampler.solver if self.sampler.tuned is None else "tuned",
             "steps": self.sampler.steps if self.sampler.tuned is None else nfe,
@@ -477,6 +532,13 @@ def _generator(
         module.interpolant.path,
         precision,
     )
+
+
+def _stamp(scans: Sequence[Scan]) -> str:
+    """Hash of names, sizes and times of change: scans replaced by others of their names differ."""
+    stats = [(scan.name, scan.path.stat()) for scan in scans]
+    told = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def _parts(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""From noise to scenes: solver over the SiT, denormalised latents, VAE decoder, range images."""
+"""From noise to scenes: solver over a network, denormalised latents, VAE decoder, range images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.geometry import ScanGeometry
-from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
 __all__ = [
     "Autoguidance",
@@ -47,6 +47,16 @@ Solver = Literal[
 ]
 Quality = Literal["draft", "good", "best"]
 
+_SDE: tuple[Solver, ...] = ("euler_maruyama",)
+#: Settings that only some solvers read. A tuned solver reads none of them.
+_READ_BY: dict[str, tuple[Solver, ...]] = {
+    "eta": _SDE,
+    "sde_last": _SDE,
+    "sde_last_time": _SDE,
+    "shift": tuple(s for s in get_args(Solver) if s not in ("euler_maruyama", "dopri5")),
+    "steps": tuple(s for s in get_args(Solver) if s != "dopri5"),
+    "restart": ("restart",),
+}
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 
 
@@ -57,16 +67,17 @@ class SamplerConfig:
     Args:
         solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``restart`` goes back
             towards noise at times; ``dopri5`` chooses its steps itself.
-        steps: Solver steps.
+        steps: Solver steps; not of ``dopri5``.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
-        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE.
+        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE and ``dopri5``.
         eta: Strength of the noise of the SDE; 1 as published, 0 for none.
         tuned: File of a :class:`r3dpa.flow.tuned.TunedSolver`, which replaces solver and steps.
         restart: Where ``restart`` goes back, how often, and how it solves.
 
     Raises:
-        ValueError: If the solver is unknown or a number out of its range.
+        ValueError: If the solver is unknown, a number out of its range, or a setting other than its
+            default is one that the solver does not read.
     """
 
     solver: Solver = "euler_maruyama"
@@ -89,6 +100,17 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
+        for name, solvers in _READ_BY.items():
+            usual = RestartPlan() if name == "restart" else getattr(type(self), name)
+            if getattr(self, name) == usual:
+                continue
+            if self.tuned is not None and name != "steps":
+                raise ValueError(f"the tuned solver {self.tuned} does not read {name}; drop one")
+            if self.tuned is None and self.solver not in solvers:
+                raise ValueError(
+                    f"solver {self.solver} does not read {name}, which is for "
+                    f"{', '.join(solvers)}; drop one"
+                )
 
     @classmethod
     def of_quality(cls, quality: Quality) -> Self:
@@ -140,7 +162,7 @@ class Autoguidance:
         latent_shift: ``(C,)``, on the same device.
     """
 
-    weak: SiT
+    weak: VelocityNetwork
     scale: float
     interval: tuple[float, float] = (0.0, 1.0)
     latent_scale: float = 1.0
@@ -148,7 +170,7 @@ class Autoguidance:
 
 
 class SceneGenerator:
-    """Draws scenes from a SiT and decodes them.
+    """Draws scenes from a velocity network and decodes them.
 
     The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU:
     a scene is the same whatever the batch size and, up to rounding, the device. The modulations
@@ -162,7 +184,8 @@ class SceneGenerator:
         sampler: Solver and steps.
         path: Interpolant that the SiT was trained on.
         precision: ``bf16`` runs copies of the networks with bfloat16 weights, see
-            :meth:`SiT.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay float32.
+            :meth:`VelocityNetwork.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay
+            float32.
         autoguidance: Weak model and strength; no guidance where None.
         batch_size: Fill up smaller batches, so that the networks meet a single shape; the scenes
             do not depend on what fills it.
@@ -178,7 +201,7 @@ class SceneGenerator:
     def __init__(
         self,
         vae: VAE,
-        sit: SiT,
+        sit: VelocityNetwork,
         latent_norm: LatentNorm,
         geometry: ScanGeometry,
         sampler: SamplerConfig = SamplerConfig(),
@@ -239,6 +262,17 @@ class SceneGenerator:
         return other
 
     @torch.inference_mode()
+    def prepare(self) -> None:
+        """Does now what the first scene would wait for, and says now what cannot be.
+
+        Raises:
+            ValueError: If the numbers of the solver do not fit together, or a tuned one is damaged.
+            FileNotFoundError: If there is no file of the tuned solver.
+            ImportError: If a package that the solver needs is missing.
+        """
+        self._schedule()
+
+    @torch.inference_mode()
     def generate(self, indices: Sequence[int], seed: int = 0) -> SceneBatch:
         """Draws one scene per index.
 
@@ -271,10 +305,12 @@ class SceneGenerator:
             network.calls = 0
         noise = draws()
         latents = self._solve(next(noise), noise)[: len(indices)]
-        range_m = self._ranges(latents)
+        range_m = self.decode(latents)
         return SceneBatch(range_m, latents, sum(network.calls for network in networks))
 
-    def _ranges(self, latents: Tensor) -> Tensor:
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents."""
         size = self.decode_batch_size or self.batch_size or len(latents)
         sensor = self.geometry.projection.sensor
         parts = []
@@ -297,6 +333,8 @@ class SceneGenerator:
         self._tuned = None if tuned is None else TunedSolver.load(tuned)
         networks = [network for network in (self._strong, self._weak) if network is not None]
         adaptive = self.sampler.solver == "dopri5" and self.sampler.tuned is None
+        if adaptive:  # its package may be missing
+            dopri5(lambda x, _: torch.zeros_like(x), torch.zeros(1), ode_times(1))
         for network in networks:
             network.times = None if adaptive else []
             network.table = None
@@ -341,7 +379,7 @@ class SceneGenerator:
 
 
 class _ScheduledNetwork:
-    """A SiT as the velocity function of a solver whose times are known.
+    """A network as the velocity function of a solver whose times are known.
 
     All samples of a call have the same time. It first notes the times of a trial run, then takes
     the modulations of the k-th call from row k of a table: nothing depends on the value of a
@@ -353,7 +391,7 @@ class _ScheduledNetwork:
         calls: Evaluations since it was set to 0.
     """
 
-    def __init__(self, sit: SiT, compile: bool, graphs: bool) -> None:
+    def __init__(self, sit: VelocityNetwork, compile: bool, graphs: bool) -> None:
         self.sit = sit
         self.times: list[Tensor] | None = None
         self.table: Tensor | None = None

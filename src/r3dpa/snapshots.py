@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,9 +13,15 @@ import torch
 from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
-from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
+from r3dpa.checkpoints import (
+    Checkpoint,
+    NetworkState,
+    read_checkpoint,
+    save_checkpoint,
+    weights_sha256,
+)
 from r3dpa.modules import GenerativeModule
-from r3dpa.nn import LatentNorm, SiT
+from r3dpa.nn import LatentNorm, VelocityNetwork
 
 __all__ = ["NORM_TOLERANCE", "EMASnapshots", "WeakModel", "read_snapshot"]
 
@@ -121,7 +126,7 @@ class WeakModel:
     """
 
     path: Path
-    sit: SiT
+    sit: VelocityNetwork
     scale: float
     shift: Tensor
     step: int | None
@@ -194,7 +199,7 @@ def read_snapshot(
             )
         warnings.warn(f"{problem}; allowed: an approximation", stacklevel=2)
     sit = checkpoint.network("ema").build()
-    assert isinstance(sit, SiT)  # _latent_size
+    assert isinstance(sit, VelocityNetwork)  # _latent_size
     sit.eval().requires_grad_(False)
     return WeakModel(Path(path), sit, scale, shift, checkpoint.step, checkpoint.feature_source)
 
@@ -238,17 +243,13 @@ def _vae_note(checkpoint: Checkpoint) -> str | None:
 
 
 def _note(vae: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for key in sorted(vae):
-        digest.update(key.encode())
-        digest.update(vae[key].detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
-    return f"not kept in a snapshot; SHA-256 of its weights: {digest.hexdigest()}"
+    return f"not kept in a snapshot; SHA-256 of its weights: {weights_sha256(vae)}"
 
 
 def _latent_size(checkpoint: Checkpoint, name: str) -> tuple[int, ...]:
     state = checkpoint.network(name)
-    if not issubclass(state.kind, SiT):
-        raise ValueError(f"{checkpoint.path}: {name} is a {state.class_path}, not a SiT")
+    if not issubclass(state.kind, VelocityNetwork):
+        raise ValueError(f"{checkpoint.path}: {name} is a {state.class_path}, no velocity network")
     return (state.arguments["in_channels"], *state.arguments["input_size"])
 
 

@@ -15,10 +15,11 @@ import pytest
 import torch
 from PIL import Image
 
-from r3dpa.checkpoints import read_checkpoint, source_commit
+from r3dpa.checkpoints import read_checkpoint, source_commit, weights_sha256
 from r3dpa.cli import main
 from r3dpa.data.scans import read_npz, read_ply, read_scan
-from r3dpa.flow import RestartPlan
+from r3dpa.flow import RestartPlan, ode_times
+from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
 
@@ -40,6 +41,7 @@ COMMANDS = {
         "replay",
     ),
     *("reference", "evaluate", "selfcheck"),
+    *("inpaint", "mix", "complete", "vary", "interpolate", "objects"),
 }
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
@@ -476,6 +478,62 @@ class TestSample:
         assert metadata["autoguidance"]["scale"] == 3
         assert metadata["autoguidance"]["interval"] == [0, 1]
 
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--solver", "heun", "--eta", 0.5], "solver heun does not read eta"),
+            (["--shift", 2], "solver euler_maruyama does not read shift"),
+            (["--solver", "ab2", "--sde_last", "mean"], "solver ab2 does not read sde_last"),
+            (["--guidance_scale", 2], "--guidance_scale says nothing without --autoguidance"),
+            (["--guidance_interval", "[0, 1]"], "--guidance_interval .* without --autoguidance"),
+            (["--allow_other_latents", "true"], "--allow_other_latents .* --autoguidance"),
+            (["--allow_other_model", "true"], "--allow_other_model says nothing without --tuned"),
+            (["--sde_last_time", 2], r"must lie in \(0, 1\), got 2"),
+            (["--seed", -1], "seed and pictures must be at least 0, got -1 and 64"),
+            (["--pictures", -1], "seed and pictures must be at least 0, got 0 and -1"),
+        ],
+    )
+    def test_options_that_say_nothing_are_refused_and_nothing_is_touched(
+        self, words, message, joint_checkpoint, tmp_path
+    ):
+        """Not even with --overwrite in a folder that holds scenes."""
+        (tmp_path / "metadata.json").write_text("{}")
+        (tmp_path / "range_m.npy").write_bytes(b"scenes")
+        with pytest.raises(ValueError, match=message):
+            sample(joint_checkpoint, tmp_path, *words, "--overwrite", "true")
+        assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
+        assert len(list(tmp_path.iterdir())) == 2
+
+    def test_a_tuned_solver_is_for_the_weights_it_was_tuned_for(self, joint_checkpoint, tmp_path):
+        """Whatever file they are in; for others only where allowed, and nothing is touched."""
+        tuned, out = tmp_path / "tuned.json", tmp_path / "out"
+        read = read_checkpoint(joint_checkpoint)
+        sha256 = weights_sha256(read.network("ema").state_dict)
+        card = {"sit_sha256": sha256, "weights": "ema", "stage": "joint", "step": 3}
+        adams = TunedSolver.from_adams(ode_times(2), 2)
+        TunedSolver(adams.times, adams.coefficients, card).save(tuned)
+        exported = tmp_path / "joint.safetensors"
+        main(["convert", str(joint_checkpoint), str(exported)])
+        words = ["sample", "--ckpt", exported, "--out", out, "--num", 1, "--tuned", tuned]
+        words = list(map(str, [*words, "--pictures", 0]))
+        main(words)
+        kept = (out / "range_m.npy").read_bytes()
+        with pytest.raises(ValueError, match=r"tuned\.json was tuned for the ema .*, not .* last"):
+            main([*words, "--weights", "last", "--overwrite", "true"])
+        assert (out / "range_m.npy").read_bytes() == kept
+        allowed = ["--weights", "last", "--overwrite", "true", "--allow_other_model", "true"]
+        main([*words, *allowed])
+        assert json.loads((out / "metadata.json").read_text())["nfe"] == 2
+
+    def test_metadata_holds_paths_as_they_are_given(self, joint_checkpoint, tmp_path, monkeypatch):
+        monkeypatch.chdir(joint_checkpoint.parent)
+        words = ["--pictures", 0, "--autoguidance", joint_checkpoint.name]
+        out = sample(joint_checkpoint.name, tmp_path / "out", *words)
+        text = (out / "metadata.json").read_text()
+        assert json.loads(text)["checkpoint"] == joint_checkpoint.name
+        for folder in (joint_checkpoint.parent, tmp_path, Path.home()):
+            assert str(folder) not in text
+
     def test_an_interrupted_run_goes_on(self, joint_checkpoint, scenes, tmp_path, monkeypatch):
         def stop(*_):
             raise KeyboardInterrupt
@@ -496,7 +554,18 @@ class TestSample:
             sample(joint_checkpoint, tmp_path, *words, "--seed", 1)
         assert_same_scenes(sample(joint_checkpoint, tmp_path, *words), scenes)
         metadata = json.loads((tmp_path / "metadata.json").read_text())
-        assert metadata["drawn_by_last_run"] == 1
+        assert (metadata["drawn_by_last_run"], metadata["nfe"]) == (1, 3)
+
+    def test_evaluations_are_the_mean_over_all_scenes(
+        self, joint_checkpoint, tmp_path, monkeypatch
+    ):
+        """Batches of 2 and 1 scenes that took 5 and 8: as of a solver that chooses its steps."""
+        generate, nfe = SceneGenerator.generate, iter([5, 8])
+        monkeypatch.setattr(
+            SceneGenerator, "generate", lambda *args: generate(*args)._replace(nfe=next(nfe))
+        )
+        sample(joint_checkpoint, tmp_path, "--batch_size", 2, "--pictures", 0)
+        assert json.loads((tmp_path / "metadata.json").read_text())["nfe"] == (2 * 5 + 8) / 3
 
     def test_fast_path_draws_about_the_same(self, joint_checkpoint, scenes, tmp_path):
         """bf16 moves few ranges by much more than its 0.4 % of the latents; see test_generation."""

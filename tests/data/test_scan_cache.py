@@ -6,6 +6,7 @@ import json
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+import numpy as np
 import pytest
 import torch
 
@@ -68,7 +69,13 @@ def test_the_row_on_disk_by_hand(tmp_path, scans):
     assert len(data) == 5 * cache.row_bytes == 5 * 512
     assert torch.equal(torch.frombuffer(bytearray(data), dtype=torch.float32), values.flatten())
     line = (cache.folder / "shard_00000.jsonl").read_text().splitlines()[2]
-    expected = {"scan": scans[2].name, "bytes": scans[2].path.stat().st_size, "row": 2}
+    file = scans[2].path.stat()
+    expected = {
+        "scan": scans[2].name,
+        "bytes": file.st_size,
+        "mtime_ns": file.st_mtime_ns,
+        "row": 2,
+    }
     assert json.loads(line) == expected
 
 
@@ -113,6 +120,32 @@ def test_a_replaced_scan_is_noticed_and_made_again(tmp_path, scans, projection):
     assert write_range_images(scans, projection, RangeCodec(), tmp_path / "i") == 1
     expected = LidarDataset(scans, projection, RangeCodec())[1]["range_image"]
     assert torch.equal(CachedTensors(cache, scans).read(scans[1]), expected)
+
+
+def test_a_scan_of_the_same_size_is_noticed_too(tmp_path, scans, projection):
+    root = tmp_path / "i"
+    write_range_images(scans, projection, RangeCodec(), root)
+    images = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
+    points = np.fromfile(scans[1].path, "<f4").reshape(-1, 4)
+    (2 * points).tofile(scans[1].path)
+    with pytest.raises(ScanCacheError, match=r"0000000001\.bin was replaced"):
+        images.read(scans[1])
+    assert write_range_images(scans, projection, RangeCodec(), root) == 1
+    again = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
+    expected = LidarDataset(scans, projection, RangeCodec())[1]["range_image"]
+    assert torch.equal(again.read(scans[1]), expected)
+
+
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+def test_what_is_not_finite_is_not_kept(tmp_path, scans, value):
+    """It would cost a step in every epoch; the scans before it stay."""
+    cache, values = posterior_cache(tmp_path), moments(scans)
+    values[3, 0, 1, 2] = value
+    with cache.writer() as add:
+        add(scans[:2], values[:2])
+        with pytest.raises(ScanCacheError, match=r"0000000003\.bin: .* posterior is not finite"):
+            add(scans[2:], values[2:])
+    assert cache.missing(scans) == scans[2:]
 
 
 def test_an_unfinished_row_is_cut_off_and_made_again(tmp_path, scans):

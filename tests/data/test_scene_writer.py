@@ -111,6 +111,57 @@ def test_half_a_batch_is_written_again(tmp_path):
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
 
 
+@pytest.mark.parametrize("damage", ["cut short", "gone"])
+def test_lost_range_images_are_not_made_up(tmp_path, damage):
+    """Two scenes are told of; zeros in their place would be scenes."""
+    with writer(tmp_path, 4) as first:
+        first.put(scenes(2))
+    images = tmp_path / ".unfinished.npy"
+    if damage == "gone":
+        images.unlink()
+    else:
+        with images.open("r+b") as file:
+            file.truncate(images.stat().st_size - 4)
+    before = files(tmp_path)
+    with pytest.raises(
+        ValueError, match=rf"\.npy .*{damage}, but .* of 2 scenes.*--overwrite true"
+    ):
+        writer(tmp_path, 4)
+    assert files(tmp_path) == before
+    write(tmp_path, scenes(4), overwrite=True)
+
+
+def test_evaluations_of_all_scenes_outlive_an_interrupt(tmp_path):
+    with writer(tmp_path, 5) as first:
+        first.put(scenes(2), nfe=7)
+        first.put(scenes(1), nfe=10)
+    with writer(tmp_path, 5) as second:
+        assert second.evaluations == 2 * 7 + 10
+        second.put(scenes(2), nfe=4)
+        second.close()
+        assert second.evaluations == 2 * 7 + 10 + 2 * 4
+    with writer(tmp_path, 5, overwrite=True) as third:
+        assert third.evaluations == 0
+
+
+def test_an_error_of_the_thread_is_told_beside_another_one(tmp_path, caplog):
+    """Drawing fails while a batch that cannot be written is still waiting."""
+    broken = torch.full((1, 4, 8), torch.nan)
+
+    def draw(error=None):
+        with writer(tmp_path, 3) as open_writer:
+            open_writer.put(broken)
+            if error is not None:
+                raise error
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        draw(RuntimeError("out of memory"))
+    assert "scene 000000" in caplog.text
+    assert "NaN" in caplog.text
+    with pytest.raises(ValueError, match="holds NaN"):
+        draw()  # the block ends, and nobody asks for the result
+
+
 def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
     with writer(tmp_path, 4) as first:
         first.put(scenes(2))

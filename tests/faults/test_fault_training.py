@@ -84,6 +84,21 @@ class TestSigterm:
             "--ckpt_path .../last.ckpt`",
         )
 
+    def test_ctrl_c_saves_too(self, scans_folder, tmp_path, ended):
+        words = fit_words(scans_folder, tmp_path / "run")
+        status, seen = ended(words, At(STEP, Signal(signal.SIGINT), call=3))
+        assert status == 130, seen
+        assert "stopped by SIGINT after step 2: the same command goes on" in seen
+        assert "Traceback" not in seen
+        assert step_of(last(tmp_path / "run")) == 2
+
+    def test_a_second_ctrl_c_ends_at_once(self, scans_folder, tmp_path, ended):
+        words = fit_words(scans_folder, tmp_path / "run")
+        twice = At(STEP, Signal(signal.SIGINT), call=3), At(STEP, Signal(signal.SIGINT), call=3)
+        status, seen = ended(words, *twice)
+        assert status == 1, seen  # that of Lightning
+        assert "stopped by" not in seen
+
     def test_while_a_checkpoint_is_written(self, scans_folder, tmp_path, ended, goes_on, fault):
         words = fit_words(scans_folder, tmp_path / "run")
         status, seen = ended(words, At("torch.save", Signal(signal.SIGTERM)))

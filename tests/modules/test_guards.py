@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import signal
 
+import lightning as L
 import pytest
 import torch
+from lightning.pytorch.plugins import MixedPrecision
 from test_gradients import STAGES, TinyData, stage_module, train
 
 from r3dpa.modules import GuardConfig
@@ -184,6 +187,69 @@ def test_statistics_that_overflow_are_put_back_though_the_gradients_are_finite()
     assert running[1] == 1e38
 
 
+class TestScaledLosses:
+    """Float16 scales the losses up and looks for a scale at which no gradient overflows."""
+
+    @staticmethod
+    def judged(norms, scale, loss=1.0, buffer=1.0):
+        guard, kept = StepGuard(GuardConfig()), torch.ones(1)
+        guard.begin({}, 0, [kept])
+        guard.saw({"loss": torch.tensor(loss)})
+        kept.fill_(buffer)
+        return guard, guard.judge(torch.tensor(norms), lambda: scale)
+
+    @pytest.mark.parametrize("norms", [[1.0, torch.inf], [torch.nan, 1.0]])
+    def test_gradients_that_overflow_are_the_business_of_the_scale(self, norms):
+        guard, verdict = self.judged(norms, 65536.0)
+        assert (verdict.good, verdict.overflow, guard.dropped) == (False, True, True)
+        assert (guard.skipped, guard.in_a_row) == (1, 0)
+
+    @pytest.mark.parametrize(
+        "fault", [{"scale": 1.0}, {"loss": torch.nan}, {"buffer": torch.inf}, {"loss": torch.inf}]
+    )
+    def test_another_fault_is_not(self, fault):
+        guard, verdict = self.judged(**{"norms": [torch.inf], "scale": 65536.0, **fault})
+        assert (verdict.good, verdict.overflow) == (False, False)
+        assert (guard.skipped, guard.in_a_row) == (1, 1)
+
+    @staticmethod
+    def fit(num, scale, **kwargs):
+        """In float16 on the processor, from a scale at which the gradients overflow."""
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+        module = guarded("flow_matching", **kwargs)
+        plugin = MixedPrecision("16-mixed", "cpu", scaler)
+        train(module, NamedData(num), plugins=[plugin], precision=None)
+        return module, scaler.get_scale()
+
+    def test_a_fit_finds_its_scale_beyond_the_most_bad_steps_in_a_row(self, recwarn):
+        """2^60 is far above what 16 bits hold; it is halved in each step until it fits."""
+        module, scale = self.fit(60, 2.0**60)
+        assert module.guard.skipped > module.guard.config.max_skipped_steps
+        assert scale == 2.0 ** (60 - module.guard.skipped)
+        assert not module.guard.dropped
+        assert not [w for w in recwarn if "was skipped" in str(w.message)]
+
+    def test_gradients_that_no_scale_mends_stop_it(self):
+        """From 8 on the scale takes three steps to 1; then the usual ten in a row."""
+
+        def infinite_gradient(module, batch):
+            module.sit.final_layer.linear.bias.register_hook(lambda g: g * torch.inf)
+
+        with pytest.raises(RuntimeError, match=r"10 steps in a row .* at step 12"):
+            self.fit(20, 8.0, bad=range(20), fault=infinite_gradient)
+
+
+def test_a_step_passes_on_who_asks_to_stop():
+    guard = StepGuard(GuardConfig())
+    for norm in (1.0, torch.nan):
+        guard.stop = 15
+        guard.judge(torch.tensor([norm]))
+        assert guard.stop == 15
+    guard.stop = 0
+    guard.judge(torch.ones(1))
+    assert guard.stop == 0
+
+
 class TestCollapse:
     @staticmethod
     def collapsed(still, config):
@@ -256,3 +322,32 @@ def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_t
     ranks = {path.stem[-1] for path in (tmp_path / "bad_batches").iterdir()}
     # An infinite image reaches both through the shared latent statistics.
     assert ranks == ({"1"} if fault is constant_loss else {"0", "1"})
+
+
+@pytest.mark.ddp
+def test_a_process_that_is_asked_to_stop_tells_the_other_in_its_step(tmp_path, one_thread):
+    """The second process gets a signal in its second step; both know after that step."""
+
+    class Ask(L.Callback):
+        def __init__(self):
+            self.seen = []
+
+        def on_before_optimizer_step(self, trainer, module, optimizer):
+            asked = trainer.global_rank == 1 and trainer.global_step == 1
+            module.guard.stop = int(signal.SIGTERM) if asked else 0
+
+        def on_train_batch_end(self, trainer, module, *_):
+            self.seen.append(module.guard.stop)
+            torch.save(self.seen, tmp_path / f"rank_{trainer.global_rank}.pt")
+
+    train(
+        stage_module("flow_matching"),
+        NamedData(3),
+        default_root_dir=tmp_path,
+        devices=2,
+        strategy="ddp_fork",
+        use_distributed_sampler=False,
+        callbacks=[Ask()],
+    )
+    for rank in (0, 1):
+        assert torch.load(tmp_path / f"rank_{rank}.pt") == [0, 15, 0]

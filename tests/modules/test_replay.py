@@ -111,3 +111,17 @@ def test_networks_of_another_size_are_refused(tmp_path):
     ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
     with pytest.raises(ValueError, match=r"step_0000001.*cannot be run with the networks of"):
         replay(other, ckpt)
+
+
+@pytest.mark.parametrize(
+    ("precision", "said"), [("16-true", True), ("bf16-mixed", False), ("32-true", False)]
+)
+def test_a_precision_that_is_not_repeated_is_said(precision, said, tmp_path):
+    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
+    (file,) = (tmp_path / "bad_batches").iterdir()
+    kept = dataclasses.replace(BadBatch.read(file), precision=precision, step=1)
+    text = replay(
+        kept.save(tmp_path / "other", 1),
+        save(stage_module("joint"), tmp_path / "before.safetensors"),
+    )
+    assert (f"{precision} is not repeated: run in float32" in text) == said

@@ -59,6 +59,17 @@ class TestCachedLatents:
                 moved = max(moved, (before[key] - value).abs().max().item())
         assert moved > 1e-3
 
+    @pytest.mark.parametrize("rotate", [False, True])
+    def test_a_fast_dev_run_encodes_what_it_needs(
+        self, rotate, smoke_args, vae_checkpoint, tmp_path
+    ):
+        more = ["--trainer.fast_dev_run=2", "--model.init_args.init_from", str(vae_checkpoint)]
+        more += [f"--data.init_args.augmentation.rotate={str(rotate).lower()}"]
+        more += ["--data.init_args.batch_size=1", "--model.init_args.cache_latents=true"]
+        main(smoke_args("flow_matching", tmp_path, *more))
+        (journal,) = tmp_path.glob("latents/posterior_*/shard_*.jsonl")
+        assert len(journal.read_text().splitlines()) == 2
+
     def test_mirrored_scans_are_refused_at_once(self, smoke_args, vae_checkpoint, tmp_path):
         more = ["--trainer.logger=false", "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--data.init_args.augmentation.flip=true"]

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from r3dpa.cli.edits import EDITS, joined_numbers
 from r3dpa.cli.files import check_file, check_folder, print_text
 
 if TYPE_CHECKING:
@@ -95,6 +96,49 @@ def ablate(
 
     check_folder(out)
     print_text(run(out, load_sensor(sensor), scans, seed, weather, reference))
+
+
+def ablate_tables(
+    tables: Path,
+    scale: str = "demo",
+    seeds: str = "0",
+    out: Path | None = None,
+    jobs: int = 1,
+    devices: int = 1,
+    rgb_weights: Path | None = None,
+    wandb: Literal["offline", "online", "off"] = "offline",
+    budget_only: bool = False,
+) -> None:
+    """Train, test and compare the rows of the paper's ablations.
+
+    Prints what it will cost, then trains each stage once, however many rows and tables share it,
+    and writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json``. The same command goes on after an
+    interrupt. A row that fails leaves the others alone; the exit status is then 1.
+
+    Args:
+        tables: Folder of a table, such as ``conf/ablation/table_3``, or of several:
+            ``conf/ablation``.
+        scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
+            file of that kind.
+        seeds: Numbers separated by commas; every row is trained and tested for each.
+        out: Folder for everything; ``runs/ablation/<scale>`` where not given.
+        jobs: Trainings and tests at a time; cores are shared out, a GPU is used by all.
+        devices: GPUs of each training, which share its batch.
+        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
+        wandb: A run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
+            ``online``, where the stages can be watched, too.
+        budget_only: Print what it would cost, and start nothing.
+    """
+    from r3dpa.cli.ablate_tables import ablate_tables as run
+
+    numbers = [int(word) for word in _words(seeds)]
+    try:
+        complete = run(tables, scale, numbers, out, jobs, devices, rgb_weights, wandb, budget_only)
+    except KeyboardInterrupt:
+        sys.stderr.write("r3dpa ablate: stopped; the same command goes on\n")
+        sys.exit(130)  # as a shell reports an interrupt
+    if not complete:
+        sys.exit(1)
 
 
 def check(path: Path) -> None:
@@ -197,12 +241,13 @@ def sample(
     steps: int | None = None,
     shift: float | None = None,
     tuned: Path | None = None,
-    eta: float = 1.0,
-    sde_last: Literal["denoise", "mean"] = "denoise",
-    sde_last_time: float = 0.04,
+    allow_other_model: bool = False,
+    eta: float | None = None,
+    sde_last: Literal["denoise", "mean"] | None = None,
+    sde_last_time: float | None = None,
     autoguidance: Path | None = None,
-    guidance_scale: float = 2.0,
-    guidance_interval: tuple[float, float] = (0.0, 1.0),
+    guidance_scale: float | None = None,
+    guidance_interval: tuple[float, float] | None = None,
     allow_other_latents: bool = False,
     batch_size: int = 8,
     decode_batch_size: int | None = None,
@@ -216,7 +261,8 @@ def sample(
 ) -> None:
     """Generate scenes from a checkpoint.
 
-    The same command completes what was interrupted.
+    The same command completes what was interrupted. An option that the chosen solver does not read
+    is an error. ``metadata.json`` keeps paths as they are given here.
 
     Args:
         ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
@@ -228,13 +274,16 @@ def sample(
         solver: ODE solver; or ``euler_maruyama`` for the SDE, where none is given.
         steps: Solver steps; 256 where not given.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; 1 where not given.
-        tuned: File of a tuned solver, which replaces solver, steps and shift.
-        eta: Strength of the noise of the SDE; 1 as published.
-        sde_last: Last SDE step: ``denoise``, or ``mean`` as in the official sampler.
-        sde_last_time: Time from which the last SDE step starts.
+        tuned: File of a tuned solver, which replaces all other options of the solver.
+        allow_other_model: Accept a solver that was tuned for other weights than these.
+        eta: Strength of the noise of the SDE; 1, as published, where not given.
+        sde_last: Last SDE step: ``denoise``, where not given, or ``mean`` as in the official
+            sampler.
+        sde_last_time: Time from which the last SDE step starts; 0.04 where not given.
         autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
-        guidance_scale: Strength of autoguidance, 1 for none.
-        guidance_interval: Guided times, such as '[0.2, 0.8]'; 0 is data, 1 noise.
+        guidance_scale: Strength of autoguidance, 1 for none; 2 where not given.
+        guidance_interval: Guided times, such as '[0.2, 0.8]'; 0 is data, 1 noise. All where not
+            given.
         allow_other_latents: Accept a snapshot whose latents are only about the same.
         batch_size: Scenes sampled together.
         decode_batch_size: Scenes decoded together; ``batch_size`` where not given.
@@ -251,7 +300,15 @@ def sample(
     from r3dpa.cli.scenes import sample as generate
     from r3dpa.generation import SamplerConfig
 
-    chosen = {"solver": solver, "steps": steps, "shift": shift, "tuned": tuned}
+    chosen = {
+        "solver": solver,
+        "steps": steps,
+        "shift": shift,
+        "eta": eta,
+        "sde_last": sde_last,
+        "sde_last_time": sde_last_time,
+        "tuned": None if tuned is None else str(tuned),
+    }
     given: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
@@ -261,11 +318,20 @@ def sample(
         sampler = SamplerConfig.of_quality(quality)
         print_text(SamplerConfig.quality_line(quality))
     else:
-        given = {name: str(v) if name == "tuned" else v for name, v in given.items()}
-        sampler = SamplerConfig(**given, eta=eta, sde_last=sde_last, sde_last_time=sde_last_time)
+        sampler = SamplerConfig(**given)
+    needs = {
+        "guidance_scale": (guidance_scale is not None, "autoguidance", autoguidance),
+        "guidance_interval": (guidance_interval is not None, "autoguidance", autoguidance),
+        "allow_other_latents": (allow_other_latents, "autoguidance", autoguidance),
+        "allow_other_model": (allow_other_model, "tuned", tuned),
+    }
+    for name, (is_given, other, value) in needs.items():
+        if is_given and value is None:
+            raise ValueError(f"--{name} says nothing without --{other}; give both or none")
     guide = None
     if autoguidance is not None:
-        guide = WeakGuide(autoguidance, guidance_scale, guidance_interval, allow_other_latents)
+        scale = 2.0 if guidance_scale is None else guidance_scale
+        guide = WeakGuide(autoguidance, scale, guidance_interval or (0.0, 1.0), allow_other_latents)
     try:
         metadata = generate(
             ckpt,
@@ -283,6 +349,7 @@ def sample(
             formats=_words(formats),
             pictures=pictures,
             overwrite=overwrite,
+            allow_other_model=allow_other_model,
         )
     except KeyboardInterrupt:
         again = "the same command, without --overwrite," if overwrite else "the same command"
@@ -290,7 +357,7 @@ def sample(
         sys.exit(130)  # as a shell reports an interrupt
     if metadata["drawn_by_last_run"]:
         print_text(
-            f"{num} scenes in {out}: {metadata['nfe']} network evaluations each, "
+            f"{num} scenes in {out}: {metadata['nfe']:.5g} network evaluations each, "
             f"{metadata['device_seconds_per_scene']:.3g} s a scene on the device, "
             f"{metadata['seconds_per_scene']:.3g} s end to end; "
             f"{metadata['threads']['torch']} CPU threads"
@@ -486,7 +553,7 @@ def tune_solver(
         val: Noises to choose by, and as many again that only test it.
         reference_steps: Heun steps of the converged solutions.
         iterations: Of the search.
-        velocities: Past velocities that a step combines.
+        velocities: Past velocities that a step combines, at least 2.
         batch_size: Noises solved together.
         seed: Of the noises.
         weights: Averaged (``ema``) or last weights of the SiT.
@@ -519,7 +586,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
         *(simulate, check, view, realism, probe),
         *(sample, tune_solver, reference, evaluate, selfcheck, convert, replay, report),
     )
-}
+} | {"ablate": ablate_tables}
 
 
 def _words(text: str) -> list[str]:
@@ -529,7 +596,8 @@ def _words(text: str) -> list[str]:
 
 def _help() -> str:
     summaries = _STAGE_COMMANDS | {
-        name: (command.__doc__ or "").splitlines()[0] for name, command in _COMMANDS.items()
+        name: (command.__doc__ or "").splitlines()[0]
+        for name, command in (_COMMANDS | EDITS).items()
     }
     summaries["features"] = "write the feature grids of a data set, on any number of devices"
     summaries["bench"] = "measure what a part costs: r3dpa bench --help lists them"
@@ -581,8 +649,10 @@ def _run(args: list[str]) -> None:
         from r3dpa.cli.benches import BENCHES
 
         _run_function(BENCHES, args[1:], "r3dpa bench")
+    elif args[0] in EDITS:
+        _run_function(EDITS[args[0]], joined_numbers(args[1:]), f"r3dpa {args[0]}")
     elif args[0] in _COMMANDS:
-        positional = args[0] in ("check", "view", "convert", "replay", "report")
+        positional = args[0] in ("check", "view", "convert", "replay", "report", "ablate")
         _run_function(_COMMANDS[args[0]], args[1:], f"r3dpa {args[0]}", positional)
     else:
         print_text(f"r3dpa: unknown command {args[0]!r}\n\n{_help()}")

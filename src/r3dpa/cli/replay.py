@@ -24,6 +24,7 @@ _STAGES: dict[str, type[GenerativeModule]] = {
     stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMatching)
 }
 _AUTOCAST = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
+_REPEATED = (*_AUTOCAST, "32-true")
 
 
 @dataclass
@@ -41,7 +42,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     The step is run as it was, with its own draws, loss weights and precision: on the whole batch,
     where hooks look at what each layer gives and at the gradient of it, and on each scan alone,
     where batch norm and latent statistics are those of this scan. Not repeated are the scaling of
-    the loss in float16 and the other processes of a distributed run.
+    the loss in float16, weights of less than 32 bits and the other processes of a distributed run.
 
     Args:
         file: File of ``<run_dir>/bad_batches``.
@@ -86,6 +87,11 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         f"{file}: stage {saved.stage}, step {saved.step}, batch {saved.number}, process "
         f"{saved.rank} of {saved.world_size}, {saved.precision}",
         f"weights: {ckpt}, stage {weights.stage}, step {weights.step}",
+        *(
+            []
+            if saved.precision in _REPEATED
+            else [f"{saved.precision} is not repeated: run in float32, which may not break"]
+        ),
         *_broken("input", {**saved.tensors, **saved.draws._asdict()}),
         *_broken("weight", state),
         format_table(

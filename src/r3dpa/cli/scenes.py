@@ -18,16 +18,32 @@ from tqdm import tqdm
 
 import r3dpa
 from r3dpa import viz
-from r3dpa.checkpoints import Checkpoint, leaks_labels, read_checkpoint, source_commit
+from r3dpa.checkpoints import (
+    Checkpoint,
+    leaks_labels,
+    read_checkpoint,
+    source_commit,
+    weights_sha256,
+)
 from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
-from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
 if TYPE_CHECKING:
     from r3dpa.bench.problems import Setting
 
-__all__ = ["WeakGuide", "generator_from", "generators_of", "report", "sample"]
+__all__ = [
+    "WeakGuide",
+    "draw_scene",
+    "generator_from",
+    "generators_of",
+    "report",
+    "sample",
+    "sit_sha256",
+    "written",
+]
 
 _ON_SHEET = 16
 
@@ -77,8 +93,12 @@ def generator_from(
         )
     names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
     vae, sit, norm = (checkpoint.network(name).build().to(device) for name in ("vae", *names))
-    if not (isinstance(vae, VAE) and isinstance(sit, SiT) and isinstance(norm, LatentNorm)):
-        raise ValueError(f"{checkpoint.path} holds other classes than VAE, SiT and LatentNorm")
+    if not (
+        isinstance(vae, VAE) and isinstance(sit, VelocityNetwork) and isinstance(norm, LatentNorm)
+    ):
+        raise ValueError(
+            f"{checkpoint.path} holds other classes than VAE, velocity network and LatentNorm"
+        )
     geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
     return SceneGenerator(
         vae,
@@ -102,7 +122,7 @@ def _autoguidance(
     weak = read_snapshot(guide.path, checkpoint, weights, guide.allow)
     about = {
         "checkpoint": str(guide.path),
-        "checkpoint_written": _written(guide.path),
+        "checkpoint_written": written(guide.path),
         "step": weak.step,
         "feature_source": weak.feature_source,
         "scale": guide.scale,
@@ -159,19 +179,24 @@ def sample(
     formats: Sequence[str] = ("bin",),
     pictures: int = 64,
     overwrite: bool = False,
+    allow_other_model: bool = False,
 ) -> dict[str, Any]:
     """Writes scenes, pictures and metadata below ``out``; see ``r3dpa sample --help``.
 
+    What can be refused is refused before anything in ``out`` is written or removed.
+
     Returns:
-        The metadata.
+        The metadata. ``nfe`` is the mean over all scenes, those of interrupted runs too.
 
     Raises:
-        ValueError: If ``out`` holds scenes already, or unfinished ones of another request, or the
-            checkpoint cannot be sampled from.
+        ValueError: If ``out`` holds scenes already, or unfinished ones of another request, the
+            checkpoint cannot be sampled from, or the solver was tuned for another one.
         OSError: If a file cannot be written.
     """
     if num < 1 or batch_size < 1:
         raise ValueError(f"num and batch_size must be at least 1, got {num} and {batch_size}")
+    if seed < 0 or pictures < 0:
+        raise ValueError(f"seed and pictures must be at least 0, got {seed} and {pictures}")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     checkpoint = read_checkpoint(ckpt)
@@ -191,9 +216,12 @@ def sample(
         decode_batch_size=decode_batch_size,
         compile=compile,
     )
+    generator.prepare()
+    if sampler.tuned is not None and not allow_other_model:
+        _refuse_other_model(Path(sampler.tuned), checkpoint, weights)
     request = {
         "checkpoint": str(ckpt),
-        "checkpoint_written": _written(ckpt),
+        "checkpoint_written": written(ckpt),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
         "feature_source": feature_source,
@@ -201,7 +229,7 @@ def sample(
         "num": num,
         "seed": seed,
         "sampler": asdict(sampler),
-        "tuned_written": None if sampler.tuned is None else _written(Path(sampler.tuned)),
+        "tuned_written": None if sampler.tuned is None else written(Path(sampler.tuned)),
         "autoguidance": about_guide,
         "interpolant": checkpoint.interpolant,
         "precision": precision,
@@ -222,7 +250,7 @@ def sample(
         ranges = np.load(writer.range_path, mmap_mode="r")
         drawn = [torch.from_numpy(np.array(range_m)) for range_m in ranges[:pictures]]
         for index, range_m in enumerate(drawn):
-            _draw_scene(out, f"{index:06d}", range_m, generator.geometry)
+            draw_scene(out, f"{index:06d}", range_m, generator.geometry)
         if drawn:
             sheet = viz.scenes_sheet(drawn[:_ON_SHEET], projection)
             viz.save(sheet, out / "scenes.png")
@@ -238,7 +266,7 @@ def _draw_scenes(
 
     Device seconds are those of the networks; on a GPU by its own clock, which nothing waits for.
     """
-    first_index, nfe, clock = writer.num_done, None, _DeviceClock(generator.device)
+    first_index, clock = writer.num_done, _DeviceClock(generator.device)
     start = time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
@@ -248,15 +276,15 @@ def _draw_scenes(
             clock.start()
             batch = generator.generate(indices, seed)
             clock.stop()
-            writer.put(batch.range_m)
-            nfe = batch.nfe
+            writer.put(batch.range_m, batch.nfe)
             progress.update(len(indices))
     writer.close()
     elapsed = time.perf_counter() - start
     device_seconds = clock.seconds()
     drawn = writer.num - first_index
+    nfe = writer.evaluations / writer.num  # whole but for a solver that chooses its steps
     return {
-        "nfe": nfe,
+        "nfe": int(nfe) if nfe.is_integer() else nfe,
         "drawn_by_last_run": drawn,
         "device_seconds_per_scene": sum(device_seconds) / drawn if drawn else None,
         "seconds_per_scene": elapsed / drawn if drawn else None,
@@ -294,12 +322,33 @@ class _DeviceClock:
         return [start.elapsed_time(stop) / 1000 for start, stop in pairs]
 
 
-def _written(path: Path) -> str:
+def sit_sha256(checkpoint: Checkpoint, weights: Literal["ema", "last"]) -> str:
+    """What tells the SiT that is sampled from others, whatever file it is in."""
+    return weights_sha256(checkpoint.network("ema" if weights == "ema" else "sit").state_dict)
+
+
+def _refuse_other_model(
+    tuned: Path, checkpoint: Checkpoint, weights: Literal["ema", "last"]
+) -> None:
+    """Refuses a solver whose card names other weights; one without such a card fits any."""
+    card = TunedSolver.load(tuned).card
+    expected = card.get("sit_sha256")
+    if expected is not None and expected != sit_sha256(checkpoint, weights):
+        raise ValueError(
+            f"{tuned} was tuned for the {card.get('weights')} weights of stage "
+            f"{card.get('stage')}, step {card.get('step')}, not for the {weights} weights of "
+            f"{checkpoint.path}, step {checkpoint.step}; run `r3dpa tune-solver` for these, or "
+            "give --allow_other_model true"
+        )
+
+
+def written(path: Path) -> str:
     """When a file was written last: the same name may hold other weights by now."""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
 
 
-def _draw_scene(out: Path, name: str, range_m: Tensor, geometry: ScanGeometry) -> None:
+def draw_scene(out: Path, name: str, range_m: Tensor, geometry: ScanGeometry) -> None:
+    """Pictures of a scene ``(H, W)``: range image, from above and from behind."""
     sensor, points = geometry.projection.sensor, points_of(range_m, geometry.projection)
     picture = viz.range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
     viz.save(picture, out / "range" / f"{name}.png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.checkpoints.networks import format_table
-from r3dpa.cli.scenes import generator_from
+from r3dpa.cli.scenes import generator_from, sit_sha256
 from r3dpa.flow import ode_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.flow.tuning import (
@@ -53,13 +52,17 @@ def tune(
         noise.
 
     Raises:
-        ValueError: If the checkpoint cannot be sampled from or a count is below 1.
+        ValueError: If the checkpoint cannot be sampled from or a number is out of its range.
     """
-    if min(steps, num, val, batch_size) < 1:
-        raise ValueError(
-            "steps, num, val and batch_size must be at least 1, got "
-            f"{steps}, {num}, {val}, {batch_size}"
-        )
+    counts = {"steps": steps, "num": num, "val": val, "batch_size": batch_size}
+    counts |= {"iterations": iterations, "velocities": velocities}
+    # The search starts from AB2, which combines two velocities.
+    least = {"velocities": 2 if steps > 1 else 1}
+    for name, count in counts.items():
+        if count < least.get(name, 1):
+            raise ValueError(f"{name} must be at least {least.get(name, 1)}, got {count}")
+    if reference_steps < 2 or reference_steps % 2:
+        raise ValueError(f"reference_steps must be even and at least 2, got {reference_steps}")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     checkpoint = read_checkpoint(ckpt)
@@ -109,7 +112,7 @@ def tune(
     }
     card = {
         "solver": best,
-        "checkpoint_sha256": hashlib.sha256(ckpt.read_bytes()).hexdigest(),
+        "sit_sha256": sit_sha256(checkpoint, weights),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
         "weights": weights,

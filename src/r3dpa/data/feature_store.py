@@ -29,7 +29,7 @@ from r3dpa.data.grid_settings import (
     wanted_settings,
     write_settings,
 )
-from r3dpa.data.row_store import RowReader, Rows, RowWriter
+from r3dpa.data.row_store import RowKey, RowReader, Rows, RowWriter
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
 
@@ -142,7 +142,7 @@ class FeatureGrids:
         self.dim, self._row = settings.dim, settings.row
         wanted = {scan.name for scan in scans}
         self._reader = RowReader(self._folder, self._row.itemsize, _GRIDS, wanted)
-        missing = wanted - {name for name, _ in self._reader.places}
+        missing = wanted - {key[0] for key in self._reader.places}
         if missing:
             raise _missing([scan for scan in scans if scan.name in missing], self._folder)
 
@@ -176,7 +176,7 @@ class FeatureGrids:
         return field("codes").mul_(field("scale")[:, None])
 
     def _replaced_or_missing(self, scan: Scan, num_bytes: int) -> FeatureGridError:
-        others = [str(other) for name, other in self._reader.places if name == scan.name]
+        others = [str(key[1]) for key in self._reader.places if key[0] == scan.name]
         if not others:
             return _missing([scan], self._folder)
         return FeatureGridError(
@@ -186,7 +186,7 @@ class FeatureGrids:
         )
 
 
-def known_grids(features_dir: str | Path, settings: GridSettings) -> set[tuple[str, int]]:
+def known_grids(features_dir: str | Path, settings: GridSettings) -> set[RowKey]:
     """Scan name and bytes of each grid of a store; empty if there is no store.
 
     Raises:

@@ -7,7 +7,8 @@ A store is a folder::
 
 A line is written when its row is on disk, so that a process killed at any moment leaves no wrong
 row: rows that the journal does not name and a torn last line do not count. Every writing process
-has a shard of its own. The key of a row is the name of the scan and the size of its file.
+has a shard of its own. The key of a row is the name of the scan and the size of its file; where its
+owner gives one, also the time when the file was changed last, "mtime_ns".
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from r3dpa.names import refuse_name
 
 _log = logging.getLogger(__name__)
 
-RowKey = tuple[str, int]
-"""Name of a scan and the size of its file in bytes."""
+RowKey = tuple[str, int] | tuple[str, int, int]
+"""Name of a scan, size of its file in bytes, and where it counts when that was changed (ns)."""
+
+_KEY_NAMES = ("scan", "bytes", "mtime_ns")  # in a line of the journal
 
 
 @dataclass(frozen=True)
@@ -110,9 +113,10 @@ class Rows:
                     raise ValueError(f"line {len(keys) + 1} is of row {entry['row']}")
                 if reason := refuse_name(entry["scan"]):
                     raise ValueError(f"name of scan in line {len(keys) + 1} {reason}")
-                if not isinstance(entry["bytes"], int):
-                    raise TypeError(f"bytes in line {len(keys) + 1} are {entry['bytes']!r:.40}")
-                keys.append((entry["scan"], entry["bytes"]))
+                stamp = [entry[name] for name in ("bytes", "mtime_ns") if name in entry]
+                if "bytes" not in entry or not all(isinstance(value, int) for value in stamp):
+                    raise TypeError(f"bytes in line {len(keys) + 1} are {stamp!r:.40}")
+                keys.append((entry["scan"], *stamp))
             if keys and rows.stat().st_size < len(keys) * row_bytes:
                 raise ValueError(f"{rows.name} has fewer than its {len(keys)} rows")
         except (LookupError, TypeError, ValueError, RecursionError, OSError) as error:
@@ -171,8 +175,8 @@ class RowWriter:
             ValueError: Of class ``rows.error``, if the disk is full or cannot be written.
         """
         lines = [
-            json.dumps({"scan": name, "bytes": num_bytes, "row": row}) + "\n"
-            for row, (name, num_bytes) in enumerate(keys, start=self._num_rows)
+            json.dumps({**dict(zip(_KEY_NAMES, key, strict=False)), "row": row}) + "\n"
+            for row, key in enumerate(keys, start=self._num_rows)
         ]
         try:
             # Not through a memory map: a full disk is an error here and a killed process there.

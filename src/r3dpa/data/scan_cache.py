@@ -57,7 +57,7 @@ class CachedTensors:
         self.shape, self._folder = cache.shape, cache.folder
         names = {scan.name for scan in scans}
         self._reader = RowReader(cache.folder, cache.row_bytes, _ROWS, names)
-        if missing := names - {name for name, _ in self._reader.places}:
+        if missing := names - {key[0] for key in self._reader.places}:
             raise ScanCacheError(
                 f"{cache.folder} lacks {len(missing)} of {len(names)} scans, such as "
                 f"{min(missing)}: start the run again, which adds them."
@@ -67,8 +67,8 @@ class CachedTensors:
         """Tensor of one scan, a copy.
 
         Raises:
-            ScanCacheError: If the scan was not given to the constructor, or its file has another
-                size than the one that the tensor was made from.
+            ScanCacheError: If the scan was not given to the constructor, or its file was changed
+                since the tensor was made.
         """
         found = self._reader.find(_key(scan))
         if found is None:
@@ -141,7 +141,8 @@ class ScanCache:
         appended before an error or a kill stays.
 
         Raises:
-            ScanCacheError: If the folder cannot be written or is damaged.
+            ScanCacheError: If the folder cannot be written or is damaged, or a tensor is not
+                finite, which would break a training step in every epoch; names the scan.
         """
         about = self.folder / "settings.json"
         with _ROWS.writing(self.folder), atomic_path(about) as temporary:
@@ -155,6 +156,14 @@ class ScanCache:
                 )
             keys = [_key(scan) for scan in scans]
             if new := writer.new(keys):
+                finite = tensors[new].isfinite().flatten(1).all(dim=1).tolist()
+                for place, sound in zip(new, finite, strict=True):
+                    if not sound:
+                        raise ScanCacheError(
+                            f"{scans[place].path}: what is kept of it as {self.name} is not "
+                            "finite; look at it with `r3dpa check`, and leave it out or, if it is "
+                            "sound, train in fp32 or without the cache"
+                        )
                 rows = tensors[new].float().cpu().contiguous().numpy().astype("<f4", copy=False)
                 writer.add([keys[place] for place in new], rows.tobytes())
 
@@ -219,5 +228,9 @@ def write_range_images(
     return done
 
 
-def _key(scan: Scan) -> tuple[str, int]:
-    return scan.name, scan.num_bytes
+def _key(scan: Scan) -> tuple[str, int, int]:
+    """What a row is found by: a file that was written anew has another time, if not another size.
+
+    A copied file has another time as well: its row is made again, which is cheap here.
+    """
+    return scan.name, scan.num_bytes, scan.path.stat().st_mtime_ns

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from io import FileIO
+from io import SEEK_END, FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -25,12 +26,17 @@ from r3dpa.geometry.projection import Projection
 
 __all__ = ["SCENE_FORMATS", "SceneFormat", "SceneWriter"]
 
+_log = logging.getLogger(__name__)
+
 SceneFormat = Literal["bin", "ply", "npz"]
 SCENE_FORMATS: tuple[SceneFormat, ...] = ("bin", "ply", "npz")
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
-#: What ``r3dpa sample`` writes beside its metadata; pictures are drawn by the command.
-_WRITTEN = (*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d")
+#: What ``r3dpa sample`` and the edits write beside their metadata; the commands draw the pictures.
+_WRITTEN = (
+    *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
+    *("before.npy", "mask.png", "edit.png", "edit.html"),
+)
 _MOST_WAITING = 2
 
 
@@ -45,9 +51,10 @@ class SceneWriter:
     ===================== =====================================================================
 
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json``, which
-    tells what was asked for and how many scenes are written. At most three batches are in memory.
-    An error of the thread is raised by the next calls of :meth:`put` or by :meth:`close`. One
-    process at a time writes to a folder.
+    tells what was asked for, how many scenes are written and what they took. At most three batches
+    are in memory. An error of the thread is raised by the next calls of :meth:`put`, by
+    :meth:`close`, or at the end of the block; where that ends with another error, it is logged.
+    One process at a time writes to a folder.
 
     Args:
         out: Folder.
@@ -59,10 +66,11 @@ class SceneWriter:
 
     Attributes:
         num_done: Scenes written so far, by interrupted runs of the same request too.
+        evaluations: Network evaluations that these took, of all scenes together.
 
     Raises:
         ValueError: If a format is unknown, another process writes to ``out``, or it holds scenes,
-            or unfinished ones of another request.
+            unfinished ones of another request, or damaged ones.
         OSError: If ``out`` cannot be written.
     """
 
@@ -80,7 +88,7 @@ class SceneWriter:
             raise ValueError(
                 f"formats must be some of {', '.join(SCENE_FORMATS)}, got {unknown[0]!r}"
             )
-        self.out, self.num, self.num_done = out, num, 0
+        self.out, self.num, self.num_done, self.evaluations = out, num, 0, 0
         self._projection = projection
         self._formats = tuple(formats)
         self._request = json.loads(json.dumps(request))  # tuples become lists, as in the file
@@ -93,7 +101,7 @@ class SceneWriter:
                 )
             delete_unfinished(out)
             if self._state.exists() and not overwrite:
-                self.num_done = self._written_before()
+                self.num_done, self.evaluations = self._written_before()
             if not self.num_done:
                 self._clear()
             self._file = self._open()
@@ -116,18 +124,24 @@ class SceneWriter:
         with self._alone:
             self._thread.shutdown()
             self._file.close()
+        failed = next(filter(None, (one.exception() for one in self._waiting)), None)
+        if failed is not None and error is None:
+            raise failed
+        if failed is not None:  # two things went wrong: the other one is on its way up
+            _log.error("scenes were not written to %s: %s", self.out, failed)
 
     @property
     def range_path(self) -> Path:
         """Range images of all scenes, complete after :meth:`close`."""
         return self.out / "range_m.npy"
 
-    def put(self, range_m: Tensor) -> None:
+    def put(self, range_m: Tensor, nfe: int = 0) -> None:
         """Takes the next scenes and returns at once, unless two batches wait already.
 
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards. From a
                 GPU it is copied behind what it computes now, and nothing waits for it here.
+            nfe: Network evaluations that each of them took.
 
         Raises:
             ValueError: If a scene that was put before holds NaN.
@@ -141,7 +155,7 @@ class SceneWriter:
             range_m = host.copy_(range_m, non_blocking=True)
             ready = torch.cuda.Event()
             ready.record()
-        self._waiting.append(self._thread.submit(self._write, range_m, ready))
+        self._waiting.append(self._thread.submit(self._write, range_m, nfe, ready))
 
     def close(self) -> None:
         """Waits until all scenes are written, and gives ``range_m.npy`` its name.
@@ -164,10 +178,12 @@ class SceneWriter:
             temporary.write_text(json.dumps(metadata, indent=2) + "\n")
         self._state.unlink()
 
-    def _written_before(self) -> int:
+    def _written_before(self) -> tuple[int, int]:
+        """Scenes and evaluations of an interrupted run of the same request."""
         try:
             state = json.loads(self._state.read_text(encoding="utf-8"))
             found, num_done = state["request"], int(state["num_done"])
+            evaluations = int(state["evaluations"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{self._state}: is damaged ({error!r}); give --overwrite true to start anew"
@@ -183,8 +199,16 @@ class SceneWriter:
                 "--overwrite true starts anew"
             )
         if num_done and not self._unfinished.exists():  # stopped between the two last files
+            if not self.range_path.exists():
+                raise ValueError(self._lost(num_done, "is gone"))
             self.range_path.replace(self._unfinished)
-        return num_done
+        return num_done, evaluations
+
+    def _lost(self, num_done: int, what: str) -> str:
+        return (
+            f"{self._unfinished} {what}, but {self._state} tells of {num_done} scenes: give "
+            "--overwrite true to start anew"
+        )
 
     def _clear(self) -> None:
         """Removes what earlier runs of the same command wrote, and nothing else."""
@@ -199,7 +223,7 @@ class SceneWriter:
                     )
         # From here on the folder is known as ours, should this be interrupted.
         self.out.mkdir(parents=True, exist_ok=True)
-        self._save_state(0)
+        self._save_state(0, 0)
         metadata.unlink(missing_ok=True)
         for path in (self._unfinished, *written):
             if path.is_dir():
@@ -214,11 +238,15 @@ class SceneWriter:
         file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
-        file.seek(4 * self.num_done * sensor.beams * sensor.columns, 1)
-        file.truncate()
+        end = file.tell() + 4 * self.num_done * sensor.beams * sensor.columns
+        if file.seek(0, SEEK_END) < end:  # to extend it would make scenes of zeros
+            file.close()
+            raise ValueError(self._lost(self.num_done, "was cut short"))
+        file.truncate(end)
+        file.seek(end)
         return file
 
-    def _write(self, range_m: Tensor, ready: torch.cuda.Event | None) -> None:
+    def _write(self, range_m: Tensor, nfe: int, ready: torch.cuda.Event | None) -> None:
         """Writes one batch; none after one that failed, whose error the next call tells."""
         if self._failed:
             return
@@ -242,13 +270,15 @@ class SceneWriter:
             error.filename = str(self._unfinished)
             raise
         num_done = self.num_done + len(range_m)
-        self._save_state(num_done)
-        self.num_done = num_done
+        evaluations = self.evaluations + nfe * len(range_m)
+        self._save_state(num_done, evaluations)
+        self.num_done, self.evaluations = num_done, evaluations
         self._failed = False
 
-    def _save_state(self, num_done: int) -> None:
+    def _save_state(self, num_done: int, evaluations: int) -> None:
+        state = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
         with atomic_path(self._state) as temporary:
-            temporary.write_text(json.dumps({"request": self._request, "num_done": num_done}))
+            temporary.write_text(json.dumps(state))
 
     def _clouds(self) -> Iterator[tuple[str, Tensor]]:
         for index, range_m in enumerate(np.load(self._unfinished, mmap_mode="r")):

@@ -38,6 +38,7 @@ class Evaluation(StepLosses):
     def evaluate(self, batch: LidarBatch, batch_idx: int, prefix: str) -> None:
         """Logs the losses on held-out scans, and the reconstruction error in metres.
 
+        The error is the mean over all pixels with a return, the losses are means over the scans.
         The SiT is the averaged one where the stage has an average.
         """
         image, mask = batch["range_image"], batch["valid_mask"]
@@ -50,13 +51,20 @@ class Evaluation(StepLosses):
             "reconstruction": losses.reconstruction_loss(
                 reconstruction, image, self.weights.reconstruction_norm
             ),
-            "range_error_m": error_m[mask].mean(),
         }
         if self.trains_velocity or self.needs_features():
             values |= self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
         self.log_dict(
             {f"{prefix}/{name}": value for name, value in values.items()},
             batch_size=image.shape[0],
+            sync_dist=True,
+        )
+        # Weighted by pixels: the mean must not depend on how scans were put into batches.
+        num_returns = int(mask.sum())
+        self.log(
+            f"{prefix}/range_error_m",
+            error_m[mask].sum() / max(1, num_returns),
+            batch_size=num_returns,
             sync_dist=True,
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,13 +10,15 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from r3dpa.checkpoints import weights_sha256
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
 from r3dpa.data.scan_cache import CachedTensors, ScanCache
+from r3dpa.data.scans import Scan
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.settings import LossWeights
 from r3dpa.modules.step_losses import PathDraws
-from r3dpa.nn import VAE, Posterior, SiT
+from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
 __all__ = ["FlowMatching"]
 
@@ -32,7 +33,7 @@ class FlowMatching(GenerativeModule):
 
     Args:
         vae: Range-image autoencoder; its weights come from ``init_from`` and stay fixed.
-        sit: Flow transformer.
+        sit: Velocity network.
         weights: Loss weights; those of the VAE are not used here.
         cache_latents: Encode each training scan once, before the first step, and keep the posterior
             in ``<run_dir>/latents`` (131 kB a scan at 8 x 16 x 128): a step is then the same, to
@@ -47,7 +48,7 @@ class FlowMatching(GenerativeModule):
     def __init__(
         self,
         vae: VAE,
-        sit: SiT,
+        sit: VelocityNetwork,
         weights: LossWeights = LossWeights(sit_alignment=0.0),
         cache_latents: bool = False,
         **kwargs: Any,
@@ -88,19 +89,20 @@ class FlowMatching(GenerativeModule):
 
     @torch.no_grad()
     def _cached_posteriors(self) -> CachedTensors:
-        """Posteriors of all training scans; the processes share the work."""
+        """Posteriors of the training scans; the processes share the work."""
         trainer, datamodule = self.trainer, self._datamodule
         dataset = cast(LidarDataset, datamodule.train_set)
         geometry = self.scan_geometry.to_dict()
         settings = {
-            "vae": _fingerprint(self.vae),
+            "vae": weights_sha256(self.vae.state_dict()),
             "projection": geometry["projection"],
             "codec": geometry["codec"],
             "precision": str(trainer.precision),
         }
         shape = (2 * self.vae.latent_channels, *self.sit.input_size)
         cache = ScanCache(Path(trainer.default_root_dir) / "latents", "posterior", settings, shape)
-        missing = cache.missing(dataset.scans)
+        scans = self._scans_of_this_run(dataset)
+        missing = cache.missing(scans)
         trainer.strategy.barrier("cached latents: all have looked")
         # Where each node has a disk of its own, its processes encode everything.
         place, processes = (
@@ -108,7 +110,7 @@ class FlowMatching(GenerativeModule):
             if datamodule.prepare_data_per_node
             else (trainer.global_rank, trainer.world_size)
         )
-        own = missing[place::processes]
+        own = missing if self._trial_batches else missing[place::processes]
         if own:
             rank_zero_info(f"encoding {len(missing)} scans once, into {cache.folder}")
             loader = DataLoader(
@@ -124,7 +126,22 @@ class FlowMatching(GenerativeModule):
                     moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
                     add([own[index] for index in batch["index"].tolist()], moments)
         trainer.strategy.barrier("cached latents: all are written")
-        return CachedTensors(cache, dataset.scans)
+        return CachedTensors(cache, scans)
+
+    @property
+    def _trial_batches(self) -> int:
+        """Batches of a ``fast_dev_run``, 0 for a training."""
+        return int(cast(Any, self.trainer).fast_dev_run)
+
+    def _scans_of_this_run(self, dataset: LidarDataset) -> list[Scan]:
+        """All training scans; of ``fast_dev_run`` those that this process will ask for."""
+        num_batches = self._trial_batches
+        if not num_batches or self.trainer.ckpt_path:  # a resumed run starts anywhere
+            return dataset.scans
+        loader = self._datamodule.train_dataloader()
+        asked = list(loader.sampler)[: num_batches * self._datamodule.batch_size]
+        # With augmentation the epoch comes with the index.
+        return [dataset.scans[one[-1] if isinstance(one, tuple) else one] for one in asked]
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""
@@ -139,12 +156,3 @@ class FlowMatching(GenerativeModule):
                 posterior = self.vae.encode(cast(LidarBatch, batch)["range_image"])
             latents = posterior.sample(draws.posterior_noise)
         return self.flow_losses(latents, batch.get("feature_grid"), draws)
-
-
-def _fingerprint(network: nn.Module) -> str:
-    """Hash of the names and values of a network's weights."""
-    digest = hashlib.sha256()
-    for name, value in network.state_dict().items():
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()

@@ -62,7 +62,8 @@ class GuardedOptimisation(StepLosses):
     ) -> None:
         """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``.
 
-        A step that :class:`StepGuard` finds bad is dropped.
+        A step that :class:`StepGuard` finds bad is dropped. One whose gradients only overflowed
+        because float16 scales the losses up is counted, but neither reported nor a reason to stop.
 
         Raises:
             RuntimeError: After too many such steps in a row, or without any gradient.
@@ -81,12 +82,16 @@ class GuardedOptimisation(StepLosses):
         }
         values = {f"grad_norm/{name}": norm for name, norm in norms.items()}
         if self.guard is not None:
-            verdict = self.guard.judge(torch.stack(list(norms.values())))
+            # Only the precision of float16 has one; it is the same in all processes.
+            scaler = getattr(self.trainer.precision_plugin, "scaler", None)
+            asked = {} if scaler is None else {"loss_scale": scaler.get_scale}
+            verdict = self.guard.judge(torch.stack(list(norms.values())), **asked)
             # Filled on the device: a copy from the host would make it wait.
             count = next(iter(norms.values())).new_full((), self.guard.skipped)
             values["train/skipped_steps"] = count
             if not verdict.good:
                 optimizer.zero_grad(set_to_none=True)
+            if not (verdict.good or verdict.overflow):
                 self._report(self.guard, verdict, norms)
             self._refuse_collapse(self.guard)
             self.guard.forget()
@@ -99,7 +104,7 @@ class GuardedOptimisation(StepLosses):
     @property
     def _dropped(self) -> bool:
         """Whether the last step was dropped."""
-        return self.guard is not None and self.guard.in_a_row > 0
+        return self.guard is not None and self.guard.dropped
 
     def _report(self, guard: StepGuard, verdict: Verdict, norms: dict[str, Tensor]) -> None:
         """Tells of a dropped step and keeps its batches; stops after too many in a row."""

@@ -1,0 +1,52 @@
+"""What is logged of held-out scans does not depend on how they were put into batches."""
+
+from __future__ import annotations
+
+import lightning as L
+import pytest
+import torch
+from test_gradients import TinyData, stage_module
+from torch.utils.data import DataLoader
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+    pytest.mark.filterwarnings("ignore:The 'val_dataloader' does not have many workers"),
+]
+
+
+class HeldOut(TinyData):
+    """Four scans with 128, 10, 1 and no returns, in batches of one size."""
+
+    def __init__(self, batch_size):
+        super().__init__([False, False])
+        self.batch_size = batch_size
+        both = {key: torch.cat([batch[key] for batch in self.batches]) for key in self.batches[0]}
+        both["valid_mask"] = torch.zeros_like(both["range_image"], dtype=torch.bool)
+        for scan, num_returns in enumerate((128, 10, 1, 0)):
+            both["valid_mask"][scan].flatten()[:num_returns] = True
+        self.whole = both
+        self.scans = [{key: value[i] for key, value in both.items()} for i in range(4)]
+
+    def val_dataloader(self):
+        return DataLoader(self.scans, batch_size=self.batch_size)
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 3, 4])
+def test_the_error_in_metres_is_the_mean_over_pixels(batch_size, tmp_path):
+    module, data = stage_module("vae_alignment"), HeldOut(batch_size)
+    trainer = L.Trainer(
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=tmp_path,
+    )
+    (logged,) = trainer.validate(module, datamodule=data, verbose=False)
+    image, mask = data.whole["range_image"], data.whole["valid_mask"]
+    codec = module.scan_geometry.codec
+    with torch.no_grad():
+        error_m = (codec.to_range(module.reconstruct(image)) - codec.to_range(image)).abs()
+    assert mask.sum() == 139
+    assert logged["val/range_error_m"] == pytest.approx(error_m[mask].mean().item(), rel=1e-5)
