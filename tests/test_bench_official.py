@@ -185,8 +185,8 @@ def test_equal_error_is_found_with_fewer_steps():
 
     torch.manual_seed(0)
     sampler, remarks = equal_error(theirs, field, 30)
-    assert sampler.solver == "ab2"
-    assert 2 <= sampler.steps < 15  # order 2 against order 1
+    assert sampler.solver in ("ab2", "ab3")
+    assert 2 <= sampler.steps < 15  # order 2 or 3 against order 1
     assert remarks[1].endswith(": certified")
 
 
