@@ -21,7 +21,8 @@ FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.ya
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
 	test-faults test-torture test-nodes fuzz notebooks demo clean bench bench-training \
-	bench-sampling bench-vae bench-data bench-simulation bench-features bench-metrics bench-gpu
+	bench-sampling bench-control bench-vae bench-data bench-simulation bench-features bench-metrics \
+	bench-gpu ablations
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
@@ -91,6 +92,15 @@ bench-training: $(READY) ## one full-size training step of each stage: time and 
 
 bench-sampling: $(READY) ## what accuracy costs in time, for an exact velocity: minutes
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench sampling --quick --out runs/bench_sampling
+
+# A checkpoint, the simulated scans that it learned from, and a library of `r3dpa objects`.
+LIBRARY ?= runs/objects.safetensors
+bench-control: $(READY) ## guidance and edits of a trained model: CKPT=..., LIBRARY=...; an hour on a CPU
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench control --ckpt $(CKPT) --data $(OUT)/data \
+		--library $(LIBRARY) --out runs/bench_control
+
+ablations: $(READY) ## tables II, III and IV at the demo's size: less than an hour on two cores
+	OMP_NUM_THREADS=1 $(BIN)/r3dpa ablate conf/ablation --scale demo --jobs 2
 
 bench-vae: $(READY) ## reconstruction against decode time of the VAE layouts
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench vae

@@ -103,4 +103,4 @@ def test_bench_needs_to_know_what_to_measure(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["bench"])
     assert stop.value.code == 2
-    assert "{training,sampling,speed," in capsys.readouterr().err
+    assert "{training,sampling,control,speed," in capsys.readouterr().err

@@ -200,6 +200,79 @@ def bench_sampling(
     )
 
 
+def bench_control(
+    ckpt: Path,
+    data: Path,
+    library: Path,
+    out: Path,
+    quick: bool = False,
+    parts: tuple[
+        Literal["strength", "guided", "mix", "inpaint", "complete", "round_trip", "cost"], ...
+    ] = ("strength", "guided", "mix", "inpaint", "complete", "round_trip", "cost"),
+    scenes: int = 64,
+    cases: int = 32,
+    round_trips: int = 16,
+    solver: Literal["midpoint", "heun", "euler", "ab2", "ab3", "dpmpp_2m", "unipc"] = "midpoint",
+    steps: int = 32,
+    strength: float = 0.5,
+    window: tuple[float, float] = (0.0, 1.0),
+    features_ckpt: Path | None = None,
+    device: str = "auto",
+) -> None:
+    """Measure guidance, mixing, inpainting, completion and inversion of a model; write tables.
+
+    Guided and unguided scenes get the same noise, and features are extracted again from the points
+    that were made. Everything is of the validation drives, but ``strength``, which compares
+    strengths and windows on the training drives.
+
+    Args:
+        ckpt: Checkpoint of stage joint or flow_matching, aligned with features.
+        data: Root of a data set of ``r3dpa simulate``, whose scans have labels.
+        library: File of ``r3dpa objects`` with class car, made with the features of the checkpoint.
+        out: Folder for ``control.md``, ``control.json`` and a sheet for each application; parts are
+            added to those that are in it.
+        quick: Two scenes of each and two steps, only to try it.
+        parts: What to measure.
+        scenes: Scenes of guided and mix.
+        cases: Scans of inpaint and complete.
+        round_trips: Scans of round_trip, and scenes of each row of strength.
+        solver: ODE solver of scenes and edits.
+        steps: Its steps.
+        strength: Guidance in velocities, 0 to 1.
+        window: First and last guided time; 0 data, 1 noise.
+        features_ckpt: Weights of the feature source, where it has none of its own.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+    """
+    import torch
+
+    from r3dpa.bench.control import ControlSettings, control
+    from r3dpa.checkpoints import read_checkpoint
+    from r3dpa.cli.scenes import generator_from
+    from r3dpa.editing import EditSettings
+    from r3dpa.generation import SamplerConfig
+
+    check_folder(out)
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    edit = EditSettings(solver, steps, strength=strength, window=window)
+    settings = ControlSettings(parts, scenes, cases, round_trips, edit=edit)
+    checkpoint = read_checkpoint(ckpt)
+    generator = generator_from(checkpoint, SamplerConfig(), device=device)
+    about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
+    print_text(
+        control(
+            generator,
+            checkpoint.feature_source,
+            data,
+            library,
+            out,
+            settings.quick() if quick else settings,
+            features_ckpt,
+            about,
+        )
+    )
+
+
 def bench_speed(
     device: str = "auto",
     rounds: int = 5,
@@ -287,6 +360,7 @@ def bench_official(
 BENCHES: dict[str, Callable[..., None]] = {
     "training": bench_training,
     "sampling": bench_sampling,
+    "control": bench_control,
     "speed": bench_speed,
     "vae": bench_vae,
     "data": bench_data,
