@@ -1,6 +1,7 @@
 import argparse
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from r3dpa.checkpoints import (
     to_official,
     transfer_rgb,
 )
+from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
@@ -455,6 +457,46 @@ class TestConvert:
             back.network("latent_norm").state_dict["running_var"], norm["running_var"]
         )
         assert back.network("latent_norm").build().fitted
+
+    def test_rgb_weights_into_a_sit_of_range_images(self, checkpoint, tmp_path, capsys):
+        """What was kept, resized and dropped is told, and a stage starts from the result."""
+        rgb_args = {**SIT_ARGS, "in_channels": 3, "input_size": (4, 4)}
+        networks = {
+            "sit": NetworkState.of(randomised(SiT(**rgb_args)), rgb_args),
+            "latent_norm": NetworkState.of(randomised(LatentNorm(3)), {"channels": 3}),
+            "vae": checkpoint.network("vae"),
+        }
+        rgb = replace(checkpoint, networks=networks)
+        source = save_checkpoint(rgb, tmp_path / "rgb.safetensors")
+        config = {"class_path": "r3dpa.nn.SiT", "init_args": {**SIT_ARGS, "input_size": [4, 8]}}
+        into = tmp_path / "sit.yaml"
+        into.write_text(yaml.safe_dump(config))
+        out = tmp_path / "out.safetensors"
+        main(["convert", str(source), str(out), "--into", str(into)])
+        told = capsys.readouterr().out
+        for line in (
+            r"x_embedder +2 +fresh +\(8, 3, 2, 2\) +\(8, 4, 2, 2\) +other number of latent",
+            r"pos_embed +1 +resized .* +other token grid: computed for that of this run",
+            r"blocks +\d+ +kept .* fits",
+            r"not converted: vae \(no part of RGB weights\)",
+        ):
+            assert re.search(line, told), line
+        made = read_checkpoint(out)
+        assert set(made.networks) == {"sit", "latent_norm"}
+        assert made.network("sit").arguments["input_size"] == (4, 8)
+        sit, norm = SiT(**SIT_ARGS | {"input_size": (4, 8)}), LatentNorm(4)
+        again = transfer_rgb(made, sit, norm, keep_projector=True)
+        assert {row.fate for row in again.rows} == {"kept"}
+        rng = torch.get_rng_state()
+        twin = convert(source, tmp_path / "twin.safetensors", into=into).checkpoint
+        assert torch.equal(torch.get_rng_state(), rng)
+        for key, value in made.network("sit").state_dict.items():
+            assert torch.equal(value, twin.network("sit").state_dict[key]), key
+        with pytest.raises(ValueError, match="'r3dpa' checkpoints only"):
+            convert(source, tmp_path / "a.pt", "official", into=into)
+        into.write_text("depth: 3")
+        with pytest.raises(ValueError, match=r"sit.yaml: names no network .*conf/net/sit_b2.yaml"):
+            convert(source, tmp_path / "b.safetensors", into=into)
 
     def test_report_and_refusals(self, checkpoint, official, tmp_path):
         official["opt"] = {"state": {}}

@@ -110,7 +110,8 @@ class SceneEditor:
     used.
 
     Args:
-        generator: Networks and geometry; float32.
+        generator: Networks and geometry; float32. Their weights no longer require gradients:
+            guided edits would keep what those of the weights need.
         settings: Solver and guidance.
         batch_size: Scenes made together.
 
@@ -130,6 +131,8 @@ class SceneEditor:
             raise ValueError(f"edits need networks in fp32, got {generator.precision}")
         self.generator, self.settings, self.batch_size = generator, settings, batch_size
         self._sit = generator.sit
+        for network in (generator.sit, generator.vae):
+            network.requires_grad_(False)
 
     @torch.no_grad()
     def encode(self, range_m: Tensor) -> Tensor:

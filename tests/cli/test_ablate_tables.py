@@ -317,6 +317,7 @@ def wandb_records(path):
             yield record
 
 
+@pytest.mark.slow  # 20 s; its parts are tested below and in test_ablate_stages.py
 def test_two_rows_from_nothing_to_the_tables(table, scale_file, tmp_path, started, capsys):
     out = tmp_path / "out"
     words = ["ablate", str(table), "--scale", str(scale_file), "--out", str(out)]
@@ -340,6 +341,10 @@ def test_two_rows_from_nothing_to_the_tables(table, scale_file, tmp_path, starte
         lines = {(line["label"], line["metric"]): line for line in csv.DictReader(file)}
     stored = json.loads((out / "table_x.json").read_text())
     values = {row["label"]: row["values"]["0"] for row in stored["rows"]}
+    for row in stored["rows"]:
+        vae, flow = (stored["curves"][name] for name in row["stages"]["0"])
+        assert len(vae["train/loss"][0]) == len(vae["train/loss"][1]) == 3
+        assert "train/denoising" in flow
     for (label, metric), line in lines.items():
         if line["value"]:
             assert float(line["value"]) == values[label][metric]

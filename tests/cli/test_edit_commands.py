@@ -110,7 +110,7 @@ class TestFiles:
         assert about["nfe"] == 8  # two midpoint steps there, two back
         assert len(about["cosine"]) == 2
         page = (tmp_path / "o" / "edit.html").read_text()
-        assert "before: a" in page
+        assert "before: scan a" in page
         assert "inpaint 1" in page
 
         # The mask that was written is one that can be read.
@@ -228,7 +228,25 @@ REFUSED = {
     "no number": ("inpaint", ["--mask", "m.png", "--num", 0], "num must be at least 1"),
     "nothing missing": ("complete", [], "nothing is missing"),
     "all missing": ("complete", ["--sector", -180, 180], "selects all"),
-    "keep every beam": ("complete", ["--keep_every", 1], "2 or greater, got 1"),
+    "keep every beam": ("complete", ["--keep_every", 1], "2 to 8, .* 16 beams remain; got 1"),
+    "keep one beam": ("complete", ["--keep_every", 16], "2 to 8, .*got 16"),
+    "device": ("vary", ["--device", "tpu"], "device 'tpu' cannot be used here"),
+    "one scan": ("mix", ["--left", "a.bin", "--right", "a.bin"], "nothing to mix: .*a.bin"),
+    "box of no size": (
+        "inpaint",
+        [
+            *("--mask", "m.png", "--features_from", "a.bin"),
+            "--features_box3d",
+            9,
+            0,
+            0,
+            2,
+            2,
+            -1,
+            0,
+        ],
+        "a size above 0 on every axis, got .*-1",
+    ),
     "start": ("vary", ["--start", 0], "start must be a time above 0"),
     "one frame": ("interpolate", ["--frames", 1], "at least 2"),
     "one side": ("mix", ["--left", "a.bin"], "--left and --right, or a --layout"),
@@ -253,6 +271,20 @@ def test_bad_input_is_refused_before_networks_run(
     with pytest.raises(ValueError, match=message):
         edit(desk, command, tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupt_ends_in_one_line_and_leaves_nothing(desk, tmp_path, monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SceneEditor, "vary", interrupted)
+    with pytest.raises(SystemExit, match="130"):
+        edit(desk, "vary", tmp_path / "out", "--scan", desk / "a.bin")
+    error = capsys.readouterr().err
+    assert error.endswith(f"stopped before {tmp_path / 'out'} was complete; start it again\n")
+    assert not list((tmp_path / "out").rglob("*"))
+    # Nothing is in the way of another edit.
+    edit(desk, "complete", tmp_path / "out", "--scan", desk / "a.bin", "--keep_every", 2)
 
 
 class TestScansAndCheckpoints:

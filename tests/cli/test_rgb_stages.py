@@ -161,3 +161,5 @@ def test_shipped_demo_configs_start_as_they_are(tmp_path):
     vae = fit(tmp_path / "vae", (*DEMO, "experiment/image_vae"), few, steps(1))
     start = {"model.init_args.init_from": vae, "trainer.fast_dev_run": "true"}
     fit(tmp_path / "rgb", RGB, few, start)
+    (rows,) = (tmp_path / "rgb").rglob("*.rows")
+    assert rows.stat().st_size == 16 * 4 * (8 * 16 * 16)  # a batch of the 20, in float32

@@ -151,7 +151,7 @@ def test_what_the_scans_do_not_show_is_refused(tmp_path, scaled_points):
     with pytest.raises(ValueError, match=r"0\.bin: extractor scaled gave NaN or infinite"):
         make(None, scaled_points(gain=float("nan")))
     scans = [write_scan(tmp_path, "1", [AHEAD], [0])]
-    with pytest.raises(ValueError, match=r"no labelled point of .*they show none of these"):
+    with pytest.raises(ValueError, match=r"no labelled point of .*they show no class at all"):
         make(None)
     scans[0].path.parents[1].joinpath("labels", "1.label").unlink()
     with pytest.raises(ScanError, match=r"1\.bin has no labels"):

@@ -26,9 +26,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import yaml
+from PIL import Image
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.data import FeatureGrids, FeatureGridWriter, GridSettings, Scan, read_samples
+from r3dpa.data.labels import read_labels
+from r3dpa.data.mask_files import read_mask
+from r3dpa.data.objects import ObjectClass, ObjectLibrary
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
 from r3dpa.metrics.official_statistics import OfficialStatistics
@@ -140,6 +144,7 @@ def readers(folder: Path) -> dict[str, Reader]:
     _add_stores(folder, add)
     _add_official(folder, add)
     _add_checkpoints(folder, add)
+    _add_edits(folder, points, add)
     return found
 
 
@@ -230,6 +235,41 @@ def _add_checkpoints(folder: Path, add: Callable[..., None]) -> None:
         names[pickled],
         lambda content: archive({**names, pickled: content}),
     )
+
+
+def _add_edits(folder: Path, points: np.ndarray, add: Callable[..., None]) -> None:
+    """Masks, object libraries, and labels of SemanticKITTI and of KITTI's boxes."""
+    mask = folder / "mask.png"
+    Image.new("L", (SENSOR.columns, SENSOR.beams), 255).save(mask)
+    add("mask .png", mask, lambda: read_mask(mask, SENSOR))
+    objects = folder / "objects.safetensors"
+    car = ObjectClass("car", 1, 2, 3, 0.5)
+    projection = json.loads(json.dumps(projection_to_dict(SphericalProjection(SENSOR))))
+    extractor = {"name": "a", "settings": {}}
+    ObjectLibrary(torch.ones(1, 3), (car,), extractor, projection, (2, 4)).save(objects)
+
+    def load() -> None:
+        library = ObjectLibrary.load(objects)
+        for name in library.names:
+            library.feature(name)
+        assert isinstance(library.source, str)
+
+    add("objects .safetensors", objects, load)
+    semantic, boxed = (folder / name / "velodyne" / "0.bin" for name in ("semantic", "boxed"))
+    label = semantic.parents[1] / "labels" / "0.label"
+    boxes, calib = (boxed.parents[1] / name / "0.txt" for name in ("label_2", "calib"))
+    text = "Car 0.0 0 -1.5 0 0 50 50 1.5 1.6 4.0 1.0 1.5 8.0 0.1\n"
+    matrix = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    for file, content in (
+        (label, np.full(len(points), 10, np.uint32).tobytes()),
+        (boxes, text.encode()),
+        (calib, matrix.encode()),
+    ):
+        file.parent.mkdir(parents=True)
+        file.write_bytes(content)
+    add("SemanticKITTI .label", label, lambda: read_labels(semantic, points))
+    add("label_2 .txt", boxes, lambda: read_labels(boxed, points))
+    add("calib .txt", calib, lambda: read_labels(boxed, points))
 
 
 def archive(members: dict[str, bytes]) -> bytes:

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from r3dpa.data import read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
 from r3dpa.geometry.gaps import check_view, filled, range_error_m, refined
 
@@ -107,8 +108,9 @@ class TestView:
             (cloud(-25, 15), r"28% of the points lie outside .*-24.1 to 2.1 .*from -25.0 to 15.0"),
             (cloud(-8, 2.5), r"fills 44% of the 16 beams .*-24.1 to 2.1 degrees"),
             (cloud(-24.5, 2.5, azimuths_deg=(-45, 45)), r"fills 2\d% of the 64 columns"),
+            (cloud(-24.1, 2.1, beams=8), r"only 0% of the returns .*fewer beams"),
         ],
-        ids=["looks up", "looks ahead only", "part of a turn"],
+        ids=["looks up", "looks ahead only", "part of a turn", "fewer beams"],
     )
     def test_others_are_refused_with_the_numbers(self, points, message):
         with pytest.raises(ValueError, match=message):
@@ -126,3 +128,16 @@ def test_error_counts_pixels_with_returns_in_both():
     assert range_error_m(first, second) == 1.5
     assert range_error_m(first, second, torch.tensor([[True, True, True, False]])) == 2
     assert math.isnan(range_error_m(first, -torch.ones(1, 4)))
+
+    def test_real_scans_pass_and_half_their_beams_do_not(self, real_scans_dir):
+        """Of the 64 lasers, stored one after the other, every second one is left out."""
+        projection = SphericalProjection(LidarSensor())
+        paths = sorted(real_scans_dir.rglob("*.bin"))
+        for path in paths:
+            points = torch.from_numpy(read_scan(path)[:, :3])
+            check_view(points, range_image(points, projection)[0], projection)
+        azimuth = torch.atan2(points[:, 1], points[:, 0]) % (2 * math.pi)
+        laser = torch.cat([torch.zeros(1), (azimuth.diff() < -math.pi).cumsum(0)])
+        half = points[laser % 2 == 0]
+        with pytest.raises(ValueError, match="fewer beams than the checkpoint"):
+            check_view(half, range_image(half, projection)[0], projection)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,16 +128,28 @@ def _on_meta(config: Mapping[str, Any]) -> L.LightningModule:
 
 def _flop_per_sample(module: Any, image_size: int | None) -> float:
     """Of the losses of one scan or image, and their gradients."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    module.trainer = L.Trainer(
-        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
-    )
+    with _quiet():
+        module.trainer = L.Trainer(
+            accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+        )
     module.train()
     batch, draws = _batch(module, image_size)
     with FlopCounterMode(display=False) as counter:
         losses = module.step_losses(batch, draws)
         torch.stack(list(losses.values())).sum().backward()
     return counter.get_total_flops()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the lines of a trainer on devices, which is none that trains."""
+    log = logging.getLogger("lightning.pytorch")
+    before = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def _batch(module: Any, image_size: int | None) -> tuple[dict[str, Tensor], PathDraws]:

@@ -13,7 +13,8 @@ from typing import Literal
 
 from scipy.stats import t as student
 
-from r3dpa.ablation.plan import Plan, Table
+from r3dpa.ablation.curves import curves_of
+from r3dpa.ablation.plan import Plan, Stage, Table
 from r3dpa.ablation.runner import evaluation_of
 from r3dpa.atomic import atomic_path
 from r3dpa.metrics.result_table import EvaluationTable
@@ -24,6 +25,7 @@ __all__ = ["OrderResult", "mean_of_seeds", "order_results", "write_table"]
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _LEVEL = 0.95
+_POINTS = 100  # at most, of a curve in the JSON file
 
 Results = Mapping[str, Mapping[int, Evaluation]]
 """Evaluations by row and seed; a failed one is missing."""
@@ -137,7 +139,7 @@ def write_table(
     """Writes ``<out>/<table>.md``, ``.tex``, ``.csv`` and ``.json`` of what is there.
 
     The distances are in the first two; the CSV has every metric, and the JSON every seed, the
-    orders of the paper and the failures.
+    training curves, the orders of the paper and the failures.
 
     Args:
         plan: The plan that was run.
@@ -254,10 +256,31 @@ def _save_json(
             }
             for order in orders
         ],
+        "curves": {
+            stage.name: _thinned(out, stage)
+            for row in table.rows
+            for stages in row.stages.values()
+            for stage in stages
+        },
         "failed": dict(failed),
     }
     with atomic_path(out / f"{table.name}.json") as temporary:
         temporary.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
+
+
+def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
+    """Steps and values of each loss of a stage: running means of up to 100 neighbouring parts."""
+    found = {}
+    for name, curve in curves_of(out, stage).items():
+        if name.startswith(("train/", "val/")):
+            size = math.ceil(len(curve) / _POINTS)
+            points = list(curve.items())
+            parts = [points[start : start + size] for start in range(0, len(points), size)]
+            found[name] = [
+                [fmean(step for step, _ in part) for part in parts],
+                [float(f"{fmean(value for _, value in part):.5g}") for part in parts],
+            ]
+    return found
 
 
 def _published(table: Table) -> list[Evaluation]:

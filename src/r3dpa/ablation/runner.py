@@ -233,6 +233,7 @@ def _settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
         )
     config = with_value(config, "data.init_args.batch_size", batch // settings.devices)
     config = with_value(config, "trainer.devices", settings.devices)
+    config = with_value(config, "trainer.enable_progress_bar", False)  # it would go to a file
     loggers = [{"class_path": "CSVLogger", "init_args": {"save_dir": "runs", "name": ""}}]
     if settings.online:
         init_args = {"project": "r3dpa", "save_dir": "runs", "name": stage.name}

@@ -7,10 +7,9 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa import viz
+from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.report import Results
-from r3dpa.ablation.runner import stage_folder
 
 __all__ = ["log_rows"]
 
@@ -85,17 +84,15 @@ def _log_row(
         for stage in stages:
             step_name = f"{stage.experiment}/step"
             run.define_metric(f"{stage.experiment}/*", step_metric=step_name)
-            for step, values in _curves(out, stage):
+            for step, values in _by_step(out, stage):
                 run.log({step_name: step, **values})
         run.summary.update(summary)
 
 
-def _curves(out: Path, stage: Stage) -> list[tuple[int, dict[str, float]]]:
-    """Logged values of a stage by step, from all its starts."""
+def _by_step(out: Path, stage: Stage) -> list[tuple[int, dict[str, float]]]:
+    """What a stage logged at each step."""
     found: dict[int, dict[str, float]] = {}
-    paths = stage_folder(out, stage).glob("version_*/metrics.csv")
-    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
-        for name, (steps, values) in viz.read_metrics(path).items():
-            for step, value in zip(steps, values, strict=True):
-                found.setdefault(int(step), {})[f"{stage.experiment}/{name}"] = float(value)
+    for name, values in curves_of(out, stage).items():
+        for step, value in values.items():
+            found.setdefault(step, {})[f"{stage.experiment}/{name}"] = value
     return sorted(found.items())

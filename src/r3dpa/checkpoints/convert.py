@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import yaml
 
 from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.files import (
@@ -16,19 +17,23 @@ from r3dpa.checkpoints.files import (
     refuse_existing,
     save_checkpoint,
 )
-from r3dpa.checkpoints.networks import Checkpoint, format_table
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, format_table
 from r3dpa.checkpoints.official import statistics_of, to_official
+from r3dpa.checkpoints.transfer import TransferReport, transfer_rgb
+from r3dpa.nn.latent_norm import LatentNorm
+from r3dpa.nn.sit import SiT
 
 __all__ = ["ConversionReport", "convert"]
 
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What :func:`convert` wrote, network by network."""
+    """What :func:`convert` wrote, network by network, and what became of RGB weights."""
 
     source: Path
     outputs: tuple[Path, ...]
     checkpoint: Checkpoint
+    transfer: TransferReport | None = None
 
     def table(self) -> str:
         """The report as text."""
@@ -42,6 +47,8 @@ class ConversionReport:
         lines += [
             f"not converted: {key} ({reason})" for key, reason in self.checkpoint.left_out.items()
         ]
+        if self.transfer is not None:
+            lines += ["", self.transfer.table()]
         return "\n".join(lines)
 
 
@@ -53,11 +60,16 @@ def convert(
     overwrite: bool = False,
     sit_args: Mapping[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
+    into: str | Path | None = None,
 ) -> ConversionReport:
     """Rewrites a checkpoint of any layout in ours, or in the official one.
 
     Weights stay equal bit for bit; optimisers are left out. A checkpoint without SiT becomes the
     official VAE file with its neighbours for discriminator and latent statistics.
+
+    With ``into`` the result is the start of another SiT from RGB weights, what ``rgb_weights`` of
+    the training stages would make of them; see :func:`transfer_rgb`. Weights that the source does
+    not have are random, the same ones at each call.
 
     Args:
         source: Checkpoint that :func:`read_checkpoint` understands.
@@ -66,6 +78,8 @@ def convert(
         overwrite: Replace existing files.
         sit_args: As for :func:`read_checkpoint`.
         encoding: As for :func:`read_checkpoint`.
+        into: YAML file with ``class_path`` and ``init_args`` of the SiT that RGB weights are put
+            into; to ``r3dpa`` only.
 
     Raises:
         FileNotFoundError: If there is no such source.
@@ -73,7 +87,12 @@ def convert(
             exists already.
     """
     source, out = Path(source), Path(out)
+    if into is not None and to != "r3dpa":
+        raise ValueError(f"convert puts RGB weights into 'r3dpa' checkpoints only, got to {to!r}")
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
+    transfer = None
+    if into is not None:
+        checkpoint, transfer = _transferred(checkpoint, Path(into))
     if to == "r3dpa":
         save_checkpoint(checkpoint, out, overwrite=overwrite)
         outputs = [out, out.with_suffix(".yaml")]
@@ -81,7 +100,35 @@ def convert(
         outputs = _save_official(checkpoint, out, overwrite)
     else:
         raise ValueError(f"convert writes 'r3dpa' or 'official' checkpoints, got {to!r}")
-    return ConversionReport(source, tuple(outputs), checkpoint)
+    return ConversionReport(source, tuple(outputs), checkpoint, transfer)
+
+
+def _transferred(checkpoint: Checkpoint, into: Path) -> tuple[Checkpoint, TransferReport]:
+    """Checkpoint with a SiT for range images that starts from the RGB weights of another."""
+    try:
+        config = yaml.safe_load(into.read_text(encoding="utf-8"))
+        state = NetworkState(config["class_path"], config.get("init_args") or {}, {})
+    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{into}: names no network ({type(error).__name__}: {error}); give a YAML file with "
+            "class_path and init_args of a SiT, such as conf/net/sit_b2.yaml"
+        ) from error
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        sit = state.new()
+    if not isinstance(sit, SiT):
+        raise ValueError(f"{into}: RGB weights are for a SiT, but it names {state.class_path}")
+    norm = LatentNorm(sit.in_channels)
+    report = transfer_rgb(checkpoint, sit, norm, keep_projector=True)
+    networks = {
+        "sit": NetworkState.of(sit, state.init_args),
+        "latent_norm": NetworkState.of(norm, {"channels": sit.in_channels}),
+    }
+    others = dict.fromkeys(checkpoint.networks.keys() - networks.keys(), "no part of RGB weights")
+    left_out = {**checkpoint.left_out, **others}
+    # Options and sensor were those of the source.
+    kept = replace(checkpoint, networks=networks, geometry=None, official_args={})
+    return replace(kept, left_out=left_out), report
 
 
 def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[Path]:

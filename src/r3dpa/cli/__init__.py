@@ -483,6 +483,7 @@ def convert(
     overwrite: bool = False,
     sit_args: dict[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
+    into: Path | None = None,
 ) -> None:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -494,11 +495,13 @@ def convert(
         sit_args: Official files only: SiT arguments that the file does not tell, such as
             ``{alignment_depth: 4}``.
         encoding: Official files only: range encoding, where the file does not tell.
+        into: Put RGB weights into the SiT of this YAML, such as ``conf/net/sit_b2.yaml``, and tell
+            what was kept, resized and dropped; ``--model.init_args.rgb_weights`` takes ``out``.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
     result = convert_checkpoint(
-        source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding
+        source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding, into=into
     )
     print_text(result.table())
 

@@ -21,6 +21,7 @@ from r3dpa import viz
 from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.cli.edits import EditJob
+from r3dpa.cli.objects import usable_device
 from r3dpa.cli.scenes import draw_scene, generator_from, written
 from r3dpa.data import (
     Extractor,
@@ -98,9 +99,7 @@ class EditDesk:
         }
         self.job, self.num = job, num
         self.settings = EditSettings(job.solver, job.steps, job.shift, **given)
-        self.device = job.device
-        if job.device == "auto":
-            self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = usable_device(job.device)
         self.checkpoint = read_checkpoint(job.ckpt)
         generator = generator_from(
             self.checkpoint, SamplerConfig(), job.weights, device=self.device
@@ -182,6 +181,8 @@ class EditDesk:
             library = object_library([scan], extractor, self.projection, self.grid_size, [label])
             return library.feature(label)
         assert box is not None
+        if min(box[3:6]) <= 0:
+            raise ValueError(f"features_box3d needs a size above 0 on every axis, got {list(box)}")
         scan_view = self.read(path)
         points = scan_view.points
         turned = points[:, :3] - torch.tensor(box[:3])
@@ -217,6 +218,10 @@ class EditDesk:
             run: The edit.
             parts: Parts of the range image.
             measure: More figures of the results ``(B, H, W)``.
+
+        Raises:
+            ValueError: If the edit is refused, or ``out`` holds other scenes.
+            OSError: If a file cannot be written.
         """
         job, out = self.job, self.job.out
         settings = asdict(self.settings)
@@ -238,7 +243,13 @@ class EditDesk:
         formats = request["formats"]
         with SceneWriter(out, self.num, self.projection, formats, request, job.overwrite) as writer:
             seconds = -time.perf_counter()
-            result = run()
+            try:
+                result = run()
+            except BaseException:
+                if not writer.num_done:  # there is nothing to go on with
+                    for name in (".unfinished.json", ".unfinished.npy"):
+                        (out / name).unlink(missing_ok=True)
+                raise
             seconds += time.perf_counter()
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
@@ -270,7 +281,7 @@ class EditDesk:
             asked = scans.gather(0, own.long().expand(1, *scans.shape[1:]))[0]
             rows.append(viz.EditRow("mask", asked, parts.numbers))
             viz.save(parts.numbers * np.uint8(255 // (len(names) - 1)), out / "mask.png")
-        rows += [viz.EditRow(name, image) for name, image in after.items()]
+        rows += [viz.EditRow(name, image, outline=numbers) for name, image in after.items()]
         viz.save(viz.edit_sheet(rows, names, self.projection), out / "edit.png")
         page = viz.edit_page(before, after, numbers, names, self.projection, f"r3dpa {command}")
         with atomic_path(out / "edit.html") as temporary:

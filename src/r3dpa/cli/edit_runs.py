@@ -112,7 +112,7 @@ def inpaint(
         )
 
     parts = Parts(mask.numpy().astype(np.uint8), ("kept", name or label or "generated anew"))
-    return desk.write("inpaint", asked, {path.stem: scan.range_m}, run, parts)
+    return desk.write("inpaint", asked, {f"scan {path.stem}": scan.range_m}, run, parts)
 
 
 def mix(
@@ -147,8 +147,10 @@ def mix(
     if left is not None and right is not None:
         layout = [(split, left), (split + 180, right)]
     assert layout is not None
-    desk = EditDesk(job, num, guidance)
     paths = list(dict.fromkeys(path for _, path in layout))
+    if len(paths) < 2:
+        raise ValueError(f"there is nothing to mix: give two scans or more, got {layout}")
+    desk = EditDesk(job, num, guidance)
     grid_size = desk.grid_size
     if picture is not None:
         share = check_mask(read_mask(picture, desk.sensor), str(picture)).float()
@@ -204,8 +206,11 @@ def complete(
     if azimuths is not None:
         masks.append(sector(desk.projection, *azimuths))
     if keep_every is not None:
-        if keep_every < 2:
-            raise ValueError(f"--keep_every must be 2 or greater, got {keep_every}")
+        if not 2 <= keep_every <= desk.sensor.beams // 2:
+            raise ValueError(
+                f"--keep_every must be 2 to {desk.sensor.beams // 2}, so that two or more of the "
+                f"{desk.sensor.beams} beams remain; got {keep_every}"
+            )
         masks.append(dropped_beams(desk.projection, range(0, desk.sensor.beams, keep_every)))
     if beams is not None:
         masks.append(dropped_beams(desk.projection, beams))
@@ -230,7 +235,8 @@ def complete(
     def run() -> EditResult:
         return desk.editor.complete(scan.range_m, missing, range(num), job.seed, start=start)
 
-    shown = {path.stem: scan.range_m, "what is known": torch.where(missing, -1.0, scan.range_m)}
+    known = torch.where(missing, -1.0, scan.range_m)
+    shown = {f"scan {path.stem}": scan.range_m, "what is known": known}
     parts = Parts(missing.numpy().astype(np.uint8), ("kept", "missing"))
     return desk.write("complete", asked, shown, run, parts, _held_out(scan.range_m, missing))
 
@@ -256,7 +262,7 @@ def vary(job: EditJob, path: Path, start: float, num: int) -> str:
     def run() -> EditResult:
         return desk.editor.vary(scan.range_m, range(num), job.seed, start=start)
 
-    return desk.write("vary", asked, {path.stem: scan.range_m}, run)
+    return desk.write("vary", asked, {f"scan {path.stem}": scan.range_m}, run)
 
 
 def interpolate(job: EditJob, first: Path, second: Path, frames: int) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +12,16 @@ from typing import Any, Literal
 from r3dpa.cli.files import check_file, print_text
 
 __all__ = ["EDITS", "EditJob", "joined_numbers"]
+
+
+@contextmanager
+def _stoppable(command: str, out: Path) -> Iterator[None]:
+    """Ends the process with one line after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(f"r3dpa {command}: stopped before {out} was complete; start it again\n")
+        sys.exit(130)  # as a shell reports an interrupt
 
 
 @dataclass(frozen=True)
@@ -90,14 +102,15 @@ def inpaint(
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    from r3dpa.cli.edit_runs import inpaint as run
-
-    source = (objects, object, features_from, label, features_box3d)
     job = EditJob(**options)
-    guidance = strength, window
-    print_text(
-        run(job, scan, (box, box3d, mask), source, features_ckpt, guidance, start, dilation, num)
-    )
+    with _stoppable("inpaint", job.out):
+        from r3dpa.cli.edit_runs import inpaint as run
+
+        regions = box, box3d, mask
+        source = objects, object, features_from, label, features_box3d
+        guidance = strength, window
+        text = run(job, scan, regions, source, features_ckpt, guidance, start, dilation, num)
+    print_text(text)
 
 
 def mix(
@@ -133,11 +146,13 @@ def mix(
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    from r3dpa.cli.edit_runs import mix as run
-
-    scans = (left, right, layout, mask)
     job = EditJob(**options)
-    print_text(run(job, scans, split, blend, features_ckpt, (strength, window), num))
+    with _stoppable("mix", job.out):
+        from r3dpa.cli.edit_runs import mix as run
+
+        scans = left, right, layout, mask
+        text = run(job, scans, split, blend, features_ckpt, (strength, window), num)
+    print_text(text)
 
 
 def complete(
@@ -167,10 +182,12 @@ def complete(
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    from r3dpa.cli.edit_runs import complete as run
+    job = EditJob(**options)
+    with _stoppable("complete", job.out):
+        from r3dpa.cli.edit_runs import complete as run
 
-    gaps = (sector, keep_every, beams, empty_beams, mask)
-    print_text(run(EditJob(**options), scan, gaps, start, num))
+        text = run(job, scan, (sector, keep_every, beams, empty_beams, mask), start, num)
+    print_text(text)
 
 
 def vary(scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> None:
@@ -182,9 +199,12 @@ def vary(scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> None:
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    from r3dpa.cli.edit_runs import vary as run
+    job = EditJob(**options)
+    with _stoppable("vary", job.out):
+        from r3dpa.cli.edit_runs import vary as run
 
-    print_text(run(EditJob(**options), scan, start, num))
+        text = run(job, scan, start, num)
+    print_text(text)
 
 
 def interpolate(first: Path, second: Path, frames: int = 8, **options: Any) -> None:
@@ -196,9 +216,12 @@ def interpolate(first: Path, second: Path, frames: int = 8, **options: Any) -> N
         frames: Number of scenes, both ends among them.
         **options: See :class:`EditJob`.
     """
-    from r3dpa.cli.edit_runs import interpolate as run
+    job = EditJob(**options)
+    with _stoppable("interpolate", job.out):
+        from r3dpa.cli.edit_runs import interpolate as run
 
-    print_text(run(EditJob(**options), first, second, frames))
+        text = run(job, first, second, frames)
+    print_text(text)
 
 
 def objects(
@@ -229,18 +252,18 @@ def objects(
         grid_size: Rows and columns of the cells.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
-    from r3dpa.cli.objects import objects as write
-
     check_file(out)
-    sensor = None
-    if like is not None:
-        from r3dpa.cli.edit_runs import library_settings
-
-        source, dim, sensor, grid_size = library_settings(like)
     names = [] if classes is None else [name.strip() for name in classes.split(",")]
-    print_text(
-        write(data, out, source, features_ckpt, names, limit, dim, sensor, grid_size, device)
-    )
+    with _stoppable("objects", out):
+        from r3dpa.cli.objects import objects as write
+
+        sensor = None
+        if like is not None:
+            from r3dpa.cli.edit_runs import library_settings
+
+            source, dim, sensor, grid_size = library_settings(like)
+        text = write(data, out, source, features_ckpt, names, limit, dim, sensor, grid_size, device)
+    print_text(text)
 
 
 EDITS: dict[str, Callable[..., None]] = {

@@ -15,6 +15,9 @@ from r3dpa.data.objects import ObjectLibrary, object_library
 from r3dpa.data.scans import evenly
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import feature_source
+from r3dpa.unpickling import first_line
+
+__all__ = ["objects", "usable_device"]
 
 
 def objects(
@@ -56,14 +59,30 @@ def objects(
         raise ValueError(f"the library is a .safetensors file, got {out}")
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or greater, got {limit}")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     scans = evenly(find_scans(data), limit)
     extractor: Any = feature_source(source, ckpt, dim).to(device)
     projection = SphericalProjection(sensor or LidarSensor())
     library = object_library(_shown(scans), extractor, projection, grid_size, list(classes) or None)
     library.save(out)
     return f"{_table(library)}\n\n{len(scans)} scans, features of {source}, written to {out}"
+
+
+def usable_device(name: str) -> str:
+    """A device by name, the GPU or else the CPU for ``auto``.
+
+    Raises:
+        ValueError: If there is none of this name.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=name)
+    except (AssertionError, NotImplementedError, RuntimeError) as error:  # whatever torch lacks
+        raise ValueError(
+            f"device {name!r} cannot be used here ({first_line(error)}): give cpu or auto"
+        ) from error
+    return name
 
 
 def _shown(scans: Sequence[Scan]) -> Iterator[Scan]:

@@ -77,15 +77,15 @@ class ImageDataModule(LightningDataModule):
         return {"source": kind, "image_size": self.image_size, **self.source.settings()}
 
     def use_posteriors(self, posteriors: ImagePosteriors, with_images: bool) -> None:
-        """Train on cached posteriors of a frozen VAE.
+        """Train on cached posteriors of a frozen VAE, on those images alone that have one.
 
         Args:
-            posteriors: Moments of all training images.
+            posteriors: Moments of the training images.
             with_images: Give the images as well, as a teacher needs them.
         """
-        entries = _ready(self.train_set).entries
-        size = self.image_size
-        self.train_set = ImageDataset(self.source, entries, size, posteriors, with_images)
+        self.train_set = ImageDataset(
+            self.source, posteriors.entries, self.image_size, posteriors, with_images
+        )
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""

@@ -118,12 +118,15 @@ class ImagePosteriors:
 
     Raises:
         ImageError: If one is missing.
+
+    Attributes:
+        entries: As given.
     """
 
     def __init__(self, latents: ImageLatents, entries: Sequence[ImageEntry]) -> None:
         self.shape, self._folder = latents.shape, latents.folder
         names = {entry.name for entry in entries}
-        self._entries = list(entries)
+        self.entries = list(entries)
         self._reader = RowReader(latents.folder, latents.row_bytes, _ROWS, names)
         if missing := names - {key[0] for key in self._reader.places}:
             raise ImageError(
@@ -155,7 +158,7 @@ class ImagePosteriors:
 
         Of at most 10 000 images, spread evenly. They are written to ``statistics.json`` too.
         """
-        chosen = evenly(self._entries, _IMAGES_TO_MEASURE)
+        chosen = evenly(self.entries, _IMAGES_TO_MEASURE)
         sums = torch.zeros(3, self.shape[0] // 2, dtype=torch.float64)
         for entry in chosen:
             mean, logvar = self.read(entry).double().flatten(1).chunk(2)

@@ -47,6 +47,7 @@ def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
                     )
                 pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: cannot be read as a picture ({error})") from error
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read as a picture ({reason})") from error
     bright = pixels[..., :3].max(axis=2) >= _BRIGHT
     return torch.from_numpy(bright & (pixels[..., 3] >= _BRIGHT))

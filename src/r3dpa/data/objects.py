@@ -240,11 +240,13 @@ def object_library(
     wanted = _wanted(classes)
     lift = getattr(extractor, "lift", torch.nn.Identity())
     sums: dict[str, _Sums] = {}
+    shown: set[int] = set()
     for scan in scans:
         points, labels, values = _features(scan, extractor, projection)
         row, column = projection.pixel_of(points)
         cell = row // cell_rows * grid_size[1] + column // cell_columns
         kept = in_range(points, projection.sensor)
+        shown.update((labels[kept] & 0xFFFF).unique().tolist())
         totals = torch.bincount(cell[kept], minlength=grid_size[0] * grid_size[1])
         for name, number in wanted.items():
             own = (kept & (labels & 0xFFFF == number)).nonzero()[:, 0]
@@ -261,10 +263,10 @@ def object_library(
             counted.add(lifted, counts, counts / totals[cells].double())
     missing = [name for name in wanted if name not in sums]
     if not sums or (classes is not None and missing):
-        found = f"they show {', '.join(n for n in wanted if n in sums) or 'none of these'}"
+        found = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
         raise ValueError(
-            f"the scans have no labelled point of {', '.join(missing)} within range; {found}. Give "
-            "more scans or other classes"
+            f"the scans have no labelled point of {', '.join(missing)} within range; they show "
+            f"{found or 'no class at all'}. Give more scans or other classes"
         )
     results = [sums[name].result(name) for name in wanted if name in sums]
     return ObjectLibrary(

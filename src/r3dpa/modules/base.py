@@ -11,12 +11,10 @@ import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 
-from r3dpa import __version__
 from r3dpa.checkpoints import (
     leaks_labels,
     load_into,
     read_checkpoint,
-    source_commit,
     transfer_rgb,
 )
 from r3dpa.data.augmentation import Augmentation
@@ -73,7 +71,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             names.
     """
 
-    stage: str
     default_init: tuple[str, ...] = ()
     trains_velocity: bool = True
     data_class: type[L.LightningDataModule] = LidarDataModule  # that it works with, see StageCLI
@@ -279,17 +276,12 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         """
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
-        checkpoint["r3dpa"] = {
-            "stage": self.stage,
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["r3dpa"] |= {
             "geometry": self.scan_geometry.to_dict(),
             "augmentation": None if self.augmentation is None else asdict(self.augmentation),
             "feature_source": self.feature_source,
-            "interpolant": self.interpolant.path,
-            "version": __version__,
-            "commit": source_commit(),
         }
-        if self.guard is not None:
-            checkpoint["guards"] = self.guard.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images.
@@ -299,17 +291,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         """
         self.loaded_step = checkpoint.get("global_step", 0)
         self._has_weights = True
-        found = checkpoint.get("r3dpa", {}).get("stage")
-        if found != self.stage:
-            raise ValueError(
-                f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
-                "from another one, give model.init_from instead of ckpt_path"
-            )
-        for state in checkpoint.get("optimizer_states", []):
-            for group in state["param_groups"]:
-                group.update(asdict(self.optimizer_config))  # those of this run, not the old ones
-        if self.guard is not None and "guards" in checkpoint:
-            self.guard.load_state_dict(checkpoint["guards"])
+        super().on_load_checkpoint(checkpoint)
         self._learned_from.append(checkpoint["r3dpa"].get("feature_source"))
         stored = checkpoint["r3dpa"]["geometry"]
         if self.geometry is None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict
 from typing import Any, cast
 
 from torch import Tensor
 
-from r3dpa import __version__
-from r3dpa.checkpoints import source_commit
 from r3dpa.data.image_datamodule import ImageDataModule
 from r3dpa.data.images import ImageBatch
 from r3dpa.flow import Interpolant
@@ -112,16 +109,9 @@ class ImageStage(GuardedOptimisation):
         )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the stage and the images that it was trained with."""
-        checkpoint["r3dpa"] = {
-            "stage": self.stage,
-            "images": self.datamodule.settings,
-            "interpolant": self.interpolant.path,
-            "version": __version__,
-            "commit": source_commit(),
-        }
-        if self.guard is not None:
-            checkpoint["guards"] = self.guard.state_dict()
+        """Adds the images that it was trained with to what every stage adds."""
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["r3dpa"]["images"] = self.datamodule.settings
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage.
@@ -129,15 +119,5 @@ class ImageStage(GuardedOptimisation):
         Raises:
             ValueError: Naming both stages.
         """
-        found = checkpoint.get("r3dpa", {}).get("stage")
-        if found != self.stage:
-            raise ValueError(
-                f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
-                "from another one, give model.init_from instead of ckpt_path"
-            )
+        super().on_load_checkpoint(checkpoint)
         self.resumed = True
-        for state in checkpoint.get("optimizer_states", []):
-            for group in state["param_groups"]:
-                group.update(asdict(self.optimizer_config))  # those of this run, not the old ones
-        if self.guard is not None and "guards" in checkpoint:
-            self.guard.load_state_dict(checkpoint["guards"])

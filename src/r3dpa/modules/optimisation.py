@@ -12,6 +12,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from r3dpa import __version__
+from r3dpa.checkpoints import source_commit
 from r3dpa.modules.bad_batches import BadBatch, tensors_of
 from r3dpa.modules.guards import StepGuard, Verdict
 from r3dpa.modules.settings import OptimizerConfig
@@ -30,8 +32,38 @@ class GuardedOptimisation(StepLosses):
     there, but for ``global_step``, which counts them.
     """
 
+    stage: str
     ema: EMA | None
     optimizer_config: OptimizerConfig
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Adds the stage, the path of its velocities, the version, and what the guard counted."""
+        checkpoint["r3dpa"] = {
+            "stage": self.stage,
+            "interpolant": self.interpolant.path,
+            "version": __version__,
+            "commit": source_commit(),
+        }
+        if self.guard is not None:
+            checkpoint["guards"] = self.guard.state_dict()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses the checkpoint of another stage; optimiser settings stay those of this run.
+
+        Raises:
+            ValueError: Naming both stages.
+        """
+        found = checkpoint.get("r3dpa", {}).get("stage")
+        if found != self.stage:
+            raise ValueError(
+                f"the checkpoint is of stage {found!r}, this is {self.stage!r}; to start a stage "
+                "from another one, give model.init_from instead of ckpt_path"
+            )
+        for state in checkpoint.get("optimizer_states", []):
+            for group in state["param_groups"]:
+                group.update(asdict(self.optimizer_config))
+        if self.guard is not None and "guards" in checkpoint:
+            self.guard.load_state_dict(checkpoint["guards"])
 
     def trainable(self) -> dict[str, nn.Module]:
         """Networks that this stage trains, by name; frozen parameters inside stay frozen."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import torch
 from lightning.pytorch.utilities import rank_zero_info
@@ -160,9 +160,15 @@ class RGBPretraining(ImageStage):
 
     @torch.no_grad()
     def _encoded(self) -> ImagePosteriors:
-        """Posteriors of all training images; the processes share the work."""
+        """Posteriors of all training images; the processes share the work.
+
+        A ``fast_dev_run`` makes those of its batches alone.
+        """
         trainer, datamodule = self.trainer, self.datamodule
-        dataset = cast(ImageDataset, datamodule.train_set)
+        entries = cast(ImageDataset, datamodule.train_set).entries
+        if cast(Any, trainer).fast_dev_run:
+            batches = int(trainer.limit_train_batches)
+            entries = entries[: batches * datamodule.batch_size * trainer.world_size]
         root = Path(self.latents_dir or Path(trainer.default_root_dir) / "latents")
         settings = {
             "vae": weights_sha256(self.vae.state_dict()),
@@ -171,7 +177,7 @@ class RGBPretraining(ImageStage):
         }
         shape = (2 * self.vae.latent_channels, *self.latent_size)
         latents = ImageLatents(root, settings, shape)
-        missing = latents.missing(dataset.entries)
+        missing = latents.missing(entries)
         trainer.strategy.barrier("image latents: all have looked")
         own = missing[trainer.global_rank :: trainer.world_size]
         if own:
@@ -189,7 +195,7 @@ class RGBPretraining(ImageStage):
                     moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
                     add([own[index] for index in batch["index"].tolist()], moments)
         trainer.strategy.barrier("image latents: all are written")
-        return ImagePosteriors(latents, dataset.entries)
+        return ImagePosteriors(latents, entries)
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""

@@ -162,11 +162,13 @@ class VelocityNetwork(nn.Module, ABC):
         self._check(latents, time)
         modulations = self.modulations(time, labels)
         activations = self._begin(latents, modulations)
+        # Else the function would keep the graph alive, long after the gradient was taken.
         detached = tuple(values.detach() for values in activations)
+        told = modulations.detach()
 
         def velocity() -> Tensor:
             with torch.no_grad():
-                return self._finish(detached, modulations)
+                return self._finish(detached, told)
 
         return AlignedPass(self._project(activations[0]), velocity)
 

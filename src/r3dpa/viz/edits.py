@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -25,7 +27,9 @@ from r3dpa.viz.sheets import range_ticks
 
 __all__ = ["EditRow", "edit_page", "edit_sheet"]
 
-_TINT = 0.45  # share of the colour of a part
+_TINT = 0.55  # share of the colour of a part
+_GREY_SHARES = (0.299, 0.587, 0.114)  # of red, green and blue in their brightness
+_MOST_BORDERS = 0.2  # of the pixels: lines between every few beams would hide the picture
 _KEPT, _GREY = "kept", "#8a8f98"
 _AXES = ("H", "W")
 
@@ -36,13 +40,16 @@ class EditRow(NamedTuple):
     Attributes:
         name: Shown above it.
         range_m: ``(H, W)`` metres, not above 0 without a return.
-        parts: ``(H, W)`` number of the part that each pixel belongs to, shown as a tint; none
-            where None.
+        parts: ``(H, W)`` number of the part that each pixel belongs to, shown as a tint of a grey
+            picture; none where None.
+        outline: ``(H, W)`` likewise, but only the borders between the parts are drawn, over the
+            colours of the range.
     """
 
     name: str
     range_m: Array
     parts: NDArray[np.integer] | None = None
+    outline: NDArray[np.integer] | None = None
 
 
 def _part_colours(names: Sequence[str]) -> list[str]:
@@ -57,7 +64,7 @@ def edit_sheet(
     """Range images one below the other under their names, those with parts tinted.
 
     Args:
-        rows: At least one.
+        rows: At least one. Azimuths are written below the last.
         part_names: Names of the parts by number; empty where no row has any. ``kept`` is clear.
         projection: Gives the limits of the colour scale.
 
@@ -78,9 +85,14 @@ def edit_sheet(
         picture = range_image_picture(row.range_m, sensor)
         if row.parts is not None:
             picture = _tinted(picture, row.parts, part_names)
-        axes.imshow(picture, aspect="auto", interpolation="nearest")
+        # One pixel is a unit wide, so that borders of pixels have whole numbers.
+        size = (0, picture.shape[1], picture.shape[0], 0)
+        axes.imshow(picture, aspect="auto", interpolation="nearest", extent=size)
+        if row.outline is not None:
+            axes.add_collection(LineCollection(_borders(row.outline), colors="white", lw=1.2))
         axes.set(xticks=[], yticks=[])
         axes.set_title(row.name, loc="left", fontsize=10, parse_math=False)
+    _azimuth_ticks(cells[-1], projection)
     figure.colorbar(
         ScalarMappable(range_scale(sensor), RANGE_MAP),
         ax=list(cells),
@@ -143,8 +155,28 @@ def edit_page(
     return scan_page(shown, title, categories, {}, reference, projection.sensor)
 
 
+def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
+    """Eighths of a turn below a range image, as they are given to the commands."""
+    azimuth = projection.ray_angles()[1].rad2deg().numpy()
+    wanted = np.arange(135, -180, -45)
+    apart = (azimuth[:, None] - wanted + 180) % 360 - 180
+    columns = np.abs(apart).argmin(axis=0) + 0.5
+    axes.set_xticks(columns, [f"{value}°" for value in wanted], fontsize=8)
+    axes.tick_params(length=2, pad=2)
+
+
+def _borders(parts: NDArray[np.integer]) -> list[list[tuple[int, int]]]:
+    """Lines ``(x, y)`` along the sides of pixels that part others; none if there are too many."""
+    upright, level = parts[:, 1:] != parts[:, :-1], parts[1:] != parts[:-1]
+    if level.mean() > _MOST_BORDERS:
+        return []
+    lines = [[(x + 1, y), (x + 1, y + 1)] for y, x in np.argwhere(upright).tolist()]
+    return lines + [[(x, y + 1), (x + 1, y + 1)] for y, x in np.argwhere(level).tolist()]
+
+
 def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
-    """The picture with the colour of each pixel's part over it; what is kept stays clear."""
+    """The picture in grey with the colour of each pixel's part over it; what is kept has none."""
+    picture = (picture @ np.array(_GREY_SHARES))[..., None]
     over = np.array([to_rgb(colour) for colour in _part_colours(names)])[parts]
     share = np.array([0.0 if name == _KEPT else _TINT for name in names])[parts][..., None]
     return as_bytes((1 - share) * picture / 255 + share * over)

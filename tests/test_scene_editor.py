@@ -87,6 +87,12 @@ class TestInpaint:
         assert plain.latents.equal(cosines[0.0].latents)
         assert plain.cosine is None
 
+    def test_the_weights_get_no_gradients(self, generator, scan):
+        generator.sit.requires_grad_(True)
+        SceneEditor(generator, SETTINGS).inpaint(scan, MASK, [0], feature=FEATURE)
+        weights = [*generator.sit.parameters(), *generator.vae.parameters()]
+        assert all(weight.grad is None and not weight.requires_grad for weight in weights)
+
     def test_evaluations_are_those_of_inversion_and_way_back(self, generator, scan):
         calls = []
         real = generator.sit.velocity
