@@ -25,7 +25,10 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize(
+    "scale",
+    [scale if scale == "demo" else pytest.param(scale, marks=pytest.mark.slow) for scale in SCALES],
+)
 def test_every_stage_steps_at_its_full_size_without_memory(scale):
     """Losses and gradients of the whole networks, on the meta device."""
     plan = plan_of(scale)

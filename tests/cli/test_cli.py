@@ -36,6 +36,7 @@ COMMANDS = {
         "convert",
         "report",
         "bench",
+        "ablate",
         "probe",
         "tune-solver",
         "replay",
