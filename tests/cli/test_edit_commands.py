@@ -171,6 +171,14 @@ class TestFiles:
         edit(desk, "complete", tmp_path / "o", "--scan", tmp_path / "sparse.bin", "--empty_beams")
         assert (np.asarray(Image.open(tmp_path / "o" / "mask.png"))[1::2] == 255).all()
 
+    def test_another_sensor_sees_fewer_beams(self, desk, tmp_path):
+        more = ["--scan", desk / "a.bin", "--other_sensor", "[8, -25, 3]"]
+        about = edit(desk, "complete", tmp_path / "o", *more, num=1)
+        missing = np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0
+        assert missing.all(axis=1).sum() == 8  # of 16 rows; its columns are ours
+        assert missing.any(axis=1).sum() == 8
+        assert about["other_sensor"] == [8, -25.0, 3.0]
+
     def test_vary_and_interpolate(self, desk, tmp_path):
         about = edit(desk, "vary", tmp_path / "v", "--scan", desk / "a.bin", "--start", 0.3)
         assert about["nfe"] == 4
@@ -230,6 +238,7 @@ REFUSED = {
     "all missing": ("complete", ["--sector", -180, 180], "selects all"),
     "keep every beam": ("complete", ["--keep_every", 1], "2 to 8, .* 16 beams remain; got 1"),
     "keep one beam": ("complete", ["--keep_every", 16], "2 to 8, .*got 16"),
+    "sensor apart": ("complete", ["--other_sensor", "[4, 30, 40]"], "selects all"),
     "device": ("vary", ["--device", "tpu"], "device 'tpu' cannot be used here"),
     "one scan": ("mix", ["--left", "a.bin", "--right", "a.bin"], "nothing to mix: .*a.bin"),
     "box of no size": (

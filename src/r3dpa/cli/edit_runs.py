@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from r3dpa.data.mask_files import read_mask
 from r3dpa.data.objects import ObjectLibrary
 from r3dpa.editing import EditResult
 from r3dpa.generation import SamplerConfig
-from r3dpa.geometry import LidarSensor
+from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.geometry.gaps import filled, range_error_m
 from r3dpa.geometry.regions import (
     angle_box,
@@ -28,6 +29,7 @@ from r3dpa.geometry.regions import (
     mask_of_tokens,
     sector,
     sector_weights,
+    sensor_pair,
 )
 
 __all__ = ["complete", "inpaint", "interpolate", "library_settings", "mix", "vary"]
@@ -182,7 +184,14 @@ def mix(
 def complete(
     job: EditJob,
     path: Path,
-    gaps: tuple[Sequence[float] | None, int | None, Sequence[int] | None, bool, Path | None],
+    gaps: tuple[
+        Sequence[float] | None,
+        int | None,
+        Sequence[int] | None,
+        bool,
+        tuple[int, float, float] | None,
+        Path | None,
+    ],
     start: float,
     num: int,
 ) -> str:
@@ -192,7 +201,7 @@ def complete(
         job: What all edits are asked.
         path: The scan.
         gaps: Sector, every how many beams are kept, those that are, whether empty ones are
-            missing, picture.
+            missing, another sensor (beams, lowest and highest inclination in degrees), picture.
         start: First time.
         num: Number of results.
 
@@ -200,7 +209,7 @@ def complete(
         ValueError: If the inputs do not fit each other or the checkpoint; tells which.
         OSError: If a file cannot be read or written.
     """
-    azimuths, keep_every, beams, empty_beams, picture = gaps
+    azimuths, keep_every, beams, empty_beams, other, picture = gaps
     desk = EditDesk(job, num, (None, None))
     masks = []
     if azimuths is not None:
@@ -214,6 +223,12 @@ def complete(
         masks.append(dropped_beams(desk.projection, range(0, desk.sensor.beams, keep_every)))
     if beams is not None:
         masks.append(dropped_beams(desk.projection, beams))
+    if other is not None:
+        count, low, high = other
+        sensor = replace(
+            desk.sensor, beams=count, inclination_min_deg=low, inclination_max_deg=high
+        )
+        masks.append(sensor_pair(desk.projection, SphericalProjection(sensor)))
     if picture is not None:
         masks.append(check_mask(read_mask(picture, desk.sensor), str(picture)))
     scan = desk.read(path, masks, empty_beams)
@@ -222,13 +237,15 @@ def complete(
         masks.append(empty.expand_as(scan.range_m))
     if not masks:
         raise ValueError(
-            "nothing is missing: give --sector, --keep_every, --beams, --empty_beams or --mask"
+            "nothing is missing: give --sector, --keep_every, --beams, --empty_beams, "
+            "--other_sensor or --mask"
         )
     missing = check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     asked = {
         "scans": {"scan": str(path)},
         **{"sector": azimuths, "keep_every": keep_every, "beams": beams},
-        **{"empty_beams": empty_beams, "mask": picture and str(picture), "start": start},
+        **{"empty_beams": empty_beams, "other_sensor": other},
+        **{"mask": picture and str(picture), "start": start},
         "guided": False,
     }
 

@@ -161,6 +161,7 @@ def complete(
     keep_every: int | None = None,
     beams: list[int] | None = None,
     empty_beams: bool = False,
+    other_sensor: tuple[int, float, float] | None = None,
     mask: Path | None = None,
     start: float = 0.3,
     num: int = 8,
@@ -177,6 +178,8 @@ def complete(
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
         beams: Rows of the range image that are kept, such as '[0, 4, 8]'.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
+        other_sensor: Keep what a sensor of so many beams would see, between two inclinations in
+            degrees: '[32, -25, 3]'.
         mask: Picture of one pixel for each of the range image, bright where it is missing.
         start: Time that the completion starts from, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
@@ -186,7 +189,8 @@ def complete(
     with _stoppable("complete", job.out):
         from r3dpa.cli.edit_runs import complete as run
 
-        text = run(job, scan, (sector, keep_every, beams, empty_beams, mask), start, num)
+        gaps = (sector, keep_every, beams, empty_beams, other_sensor, mask)
+        text = run(job, scan, gaps, start, num)
     print_text(text)
 
 
