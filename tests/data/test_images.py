@@ -12,8 +12,9 @@ from PIL import Image
 
 from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder, TarImages
 from r3dpa.data.dead_leaves import dead_leaves
-from r3dpa.data.image_latents import ImageLatents, ImagePosteriors
+from r3dpa.data.image_latents import latent_statistics
 from r3dpa.data.images import ImageEntry, ImageError, center_crop
+from r3dpa.data.tensor_cache import CachedTensors, TensorCache, TensorCacheError
 
 
 def encoded(pixels):
@@ -147,7 +148,7 @@ def test_dead_leaves_out_of_range(args):
 @pytest.fixture
 def latents(tmp_path):
     entries = [ImageEntry(str(i), tmp_path / "x", i) for i in range(5)]
-    return ImageLatents(tmp_path, {"vae": "a"}, (4, 2, 3)), entries
+    return TensorCache(tmp_path, "posterior", {"vae": "a"}, (4, 2, 3)), entries
 
 
 def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
@@ -156,14 +157,14 @@ def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
     with cache.writer(0) as add:
         add(entries[:2], moments[:2])
     assert cache.missing(entries) == entries[2:]
-    with pytest.raises(ImageError, match="lacks 3 of 5 images"):
-        ImagePosteriors(cache, entries)
+    with pytest.raises(TensorCacheError, match="lacks 3 of 5"):
+        CachedTensors(cache, entries)
     with cache.writer(0) as add:
         add(entries, moments)  # those known are left as they are
-    posteriors = ImagePosteriors(cache, entries)
+    posteriors = CachedTensors(cache, entries)
     for entry, expected in zip(entries, moments, strict=True):
         assert torch.equal(posteriors.read(entry), expected)
-    mean, variance = posteriors.statistics()
+    mean, variance = latent_statistics(posteriors)
     means, logvars = moments.chunk(2, dim=1)
     torch.testing.assert_close(mean, means.mean(dim=(0, 2, 3)))
     # Law of total variance: of the means, plus the mean of the posteriors' own.
@@ -173,14 +174,17 @@ def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
 
 def test_other_settings_have_another_place_and_broken_latents_none(latents):
     cache, entries = latents
-    other = ImageLatents(cache.root, {"vae": "b"}, cache.shape)
+    other = TensorCache(cache.root, "posterior", {"vae": "b"}, cache.shape)
     assert other.folder != cache.folder
     broken = torch.zeros(2, 4, 2, 3)
     broken[1, 0] = torch.inf
-    with cache.writer(0) as add, pytest.raises(ImageError, match="x: 1: its latents are not"):
+    with (
+        cache.writer(0) as add,
+        pytest.raises(TensorCacheError, match=r"x: .* 1 as posterior is not"),
+    ):
         add(entries[:2], broken)
     replaced = ImageEntry("0", entries[0].path, 99)
     with cache.writer(0) as add:
         add(entries[:1], broken[:1])
-    with pytest.raises(ImageError, match="was replaced"):
-        ImagePosteriors(cache, entries[:1]).read(replaced)
+    with pytest.raises(TensorCacheError, match="was replaced"):
+        CachedTensors(cache, entries[:1]).read(replaced)

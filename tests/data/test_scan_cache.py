@@ -16,8 +16,8 @@ from r3dpa.data import (
     LatentDataset,
     LidarDataModule,
     LidarDataset,
-    ScanCache,
-    ScanCacheError,
+    TensorCache,
+    TensorCacheError,
     View,
     find_scans,
     range_image_cache,
@@ -42,7 +42,7 @@ def moments(scans, scale=1.0):
 
 
 def posterior_cache(root):
-    return ScanCache(root, "posterior", {"vae": "abc"}, (4, 2, 16))
+    return TensorCache(root, "posterior", {"vae": "abc"}, (4, 2, 16))
 
 
 @pytest.mark.parametrize("codec", [RangeCodec(), RangeCodec("log2")])
@@ -106,7 +106,7 @@ def test_other_settings_never_find_these_rows(tmp_path, scans, projection, proje
     write_range_images(scans, projection, RangeCodec(), tmp_path)
     other = range_image_cache(tmp_path, projection_of(None), codec)
     assert other.missing(scans) == scans
-    with pytest.raises(ScanCacheError, match="lacks 5 of 5 scans"):
+    with pytest.raises(TensorCacheError, match="lacks 5 of 5, such as"):
         CachedTensors(other, scans)
 
 
@@ -115,7 +115,7 @@ def test_a_replaced_scan_is_noticed_and_made_again(tmp_path, scans, projection):
     write_range_images(scans, projection, RangeCodec(), tmp_path / "i")
     images = CachedTensors(cache, scans)
     scans[1].path.write_bytes(scans[1].path.read_bytes() + scans[2].path.read_bytes())
-    with pytest.raises(ScanCacheError, match=r"0000000001\.bin was replaced"):
+    with pytest.raises(TensorCacheError, match=r"0000000001\.bin was replaced"):
         images.read(scans[1])
     assert write_range_images(scans, projection, RangeCodec(), tmp_path / "i") == 1
     expected = LidarDataset(scans, projection, RangeCodec())[1]["range_image"]
@@ -128,7 +128,7 @@ def test_a_scan_of_the_same_size_is_noticed_too(tmp_path, scans, projection):
     images = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
     points = np.fromfile(scans[1].path, "<f4").reshape(-1, 4)
     (2 * points).tofile(scans[1].path)
-    with pytest.raises(ScanCacheError, match=r"0000000001\.bin was replaced"):
+    with pytest.raises(TensorCacheError, match=r"0000000001\.bin was replaced"):
         images.read(scans[1])
     assert write_range_images(scans, projection, RangeCodec(), root) == 1
     again = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
@@ -143,7 +143,7 @@ def test_what_is_not_finite_is_not_kept(tmp_path, scans, value):
     values[3, 0, 1, 2] = value
     with cache.writer() as add:
         add(scans[:2], values[:2])
-        with pytest.raises(ScanCacheError, match=r"0000000003\.bin: .* posterior is not finite"):
+        with pytest.raises(TensorCacheError, match=r"0000000003\.bin: .* posterior is not finite"):
             add(scans[2:], values[2:])
     assert cache.missing(scans) == scans[2:]
 
@@ -198,7 +198,7 @@ def test_wrong_shapes_and_unwritable_folders_are_named(tmp_path, scans):
         add(scans, moments(scans)[..., :8])
     (tmp_path / "file").write_text("")
     cache = posterior_cache(tmp_path / "file")
-    with pytest.raises(ScanCacheError, match="cannot be written to"), cache.writer():
+    with pytest.raises(TensorCacheError, match="cannot be written to"), cache.writer():
         pass
 
 

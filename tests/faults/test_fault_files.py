@@ -18,13 +18,9 @@ from r3dpa.data.datasets import LidarDataset
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.feature_store import FeatureGrids
 from r3dpa.data.grid_settings import FeatureGridError
-from r3dpa.data.scan_cache import (
-    CachedTensors,
-    ScanCacheError,
-    range_image_cache,
-    write_range_images,
-)
+from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import ScanError, find_scans, read_npz, write_npz
+from r3dpa.data.tensor_cache import CachedTensors, TensorCacheError
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection
 
 PROJECTION = SphericalProjection(LidarSensor(beams=8, columns=32))
@@ -95,7 +91,7 @@ class TestScanThatIsGone:
         write_range_images(scans, PROJECTION, codec, tmp_path / "cache")
         images = CachedTensors(range_image_cache(tmp_path / "cache", PROJECTION, codec), scans)
         change(scans[3].path, 160)
-        with pytest.raises(ScanCacheError, match=f"{scans[3].path} was replaced"):
+        with pytest.raises(TensorCacheError, match=f"{scans[3].path} was replaced"):
             images.read(scans[3])
         change(scans[3].path, None)
         with pytest.raises(ScanError, match=f"{scans[3].path}: cannot be read .No such file"):

@@ -20,9 +20,10 @@ from r3dpa.atomic import atomic_path
 from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare, seconds
 from r3dpa.checkpoints.networks import format_table
-from r3dpa.data import CachedTensors, FeatureGrids, ScanCache, read_scan
+from r3dpa.data import CachedTensors, FeatureGrids, TensorCache, read_scan
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarDataset
+from r3dpa.data.scans import Scan
 from r3dpa.geometry import LidarSensor, range_image
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
@@ -122,7 +123,7 @@ def _steps(projecting: LidarDataModule, caching: LidarDataModule, folder: Path) 
     points = [torch.from_numpy(read_scan(scan.path)[:, :3]) for scan in scans]
     sensor = projecting.sensor
     shape = (2 * _LATENT_CHANNELS, sensor.beams // _STRIDE[0], sensor.columns // _STRIDE[1])
-    cache = ScanCache(folder, "posterior", {}, shape)
+    cache: TensorCache[Scan] = TensorCache(folder, "posterior", {}, shape)
     with cache.writer() as add:
         add(scans, torch.zeros(len(scans), *shape))
     posteriors = CachedTensors(cache, scans)

@@ -34,13 +34,7 @@ from r3dpa.data.grid_settings import FeatureGridError, GridSettings
 from r3dpa.data.images import ImageFolder, ImageSource, TarImages
 from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
-from r3dpa.data.scan_cache import (
-    CachedTensors,
-    ScanCache,
-    ScanCacheError,
-    range_image_cache,
-    write_range_images,
-)
+from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     CheckReport,
@@ -62,6 +56,7 @@ if TYPE_CHECKING:
     from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
     from r3dpa.data.image_datamodule import ImageDataModule
     from r3dpa.data.point_datamodule import PointDataModule
+from r3dpa.data.tensor_cache import CachedTensors, TensorCache, TensorCacheError
 
 __all__ = [
     "KITTI360_DRIVES",
@@ -93,11 +88,11 @@ __all__ = [
     "SampleError",
     "Samples",
     "Scan",
-    "ScanCache",
-    "ScanCacheError",
     "ScanError",
     "SimulatedDataModule",
     "TarImages",
+    "TensorCache",
+    "TensorCacheError",
     "View",
     "check",
     "default_features_dir",

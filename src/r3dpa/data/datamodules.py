@@ -19,8 +19,9 @@ from r3dpa.data.feature_grids import Extractor, default_features_dir, write_feat
 from r3dpa.data.feature_store import FeatureGrids, stored_feature_dim, stored_source
 from r3dpa.data.grid_settings import GridSettings
 from r3dpa.data.loaders import training_loader
-from r3dpa.data.scan_cache import CachedTensors, range_image_cache, write_range_images
+from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
+from r3dpa.data.tensor_cache import CachedTensors
 from r3dpa.geometry import (
     LidarSensor,
     Projection,
@@ -262,7 +263,7 @@ class LidarDataModule(LightningDataModule):
         Raises:
             ValueError: If they do not follow the augmentation.
         """
-        self.augmentation.check_latents(posteriors.shape[-1], self.grid_size[1])
+        self.augmentation.check_latents(posteriors.cache.shape[-1], self.grid_size[1])
         self._posteriors = posteriors
 
     def train_dataloader(self) -> DataLoader[Any]:

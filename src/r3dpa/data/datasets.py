@@ -14,7 +14,7 @@ from r3dpa.data.scans import Scan, ScanError, read_scan
 from r3dpa.geometry import Projection, RangeCodec, range_image
 
 if TYPE_CHECKING:
-    from r3dpa.data.scan_cache import CachedTensors
+    from r3dpa.data.tensor_cache import CachedTensors
 
 
 class LidarSample(TypedDict):

@@ -9,9 +9,9 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader
 
-from r3dpa.data.image_latents import ImagePosteriors
-from r3dpa.data.images import ImageDataset, ImageSource
+from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
 from r3dpa.data.loaders import training_loader
+from r3dpa.data.tensor_cache import CachedTensors
 
 
 class ImageDataModule(LightningDataModule):
@@ -76,7 +76,7 @@ class ImageDataModule(LightningDataModule):
         kind = type(self.source).__qualname__
         return {"source": kind, "image_size": self.image_size, **self.source.settings()}
 
-    def use_posteriors(self, posteriors: ImagePosteriors, with_images: bool) -> None:
+    def use_posteriors(self, posteriors: CachedTensors[ImageEntry], with_images: bool) -> None:
         """Train on cached posteriors of a frozen VAE, on those images alone that have one.
 
         Args:
@@ -84,7 +84,7 @@ class ImageDataModule(LightningDataModule):
             with_images: Give the images as well, as a teacher needs them.
         """
         self.train_set = ImageDataset(
-            self.source, posteriors.entries, self.image_size, posteriors, with_images
+            self.source, posteriors.items, self.image_size, posteriors, with_images
         )
 
     def train_dataloader(self) -> DataLoader[Any]:

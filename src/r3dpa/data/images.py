@@ -24,7 +24,7 @@ from torch.utils.data import Dataset
 from r3dpa.names import refuse_name
 
 if TYPE_CHECKING:
-    from r3dpa.data.image_latents import ImagePosteriors
+    from r3dpa.data.tensor_cache import CachedTensors
 
 __all__ = [
     "ImageBatch",
@@ -86,6 +86,11 @@ class ImageEntry:
     num_bytes: int
     offset: int = 0
     mirrored: bool = False
+
+    @property
+    def cache_key(self) -> tuple[str, int]:
+        """Name and size."""
+        return self.name, self.num_bytes
 
     def mirror(self) -> ImageEntry:
         """The same image, seen from the other side."""
@@ -257,7 +262,7 @@ class ImageDataset(Dataset[ImageSample]):
         source: ImageSource,
         entries: Sequence[ImageEntry],
         size: int,
-        posteriors: ImagePosteriors | None = None,
+        posteriors: CachedTensors[ImageEntry] | None = None,
         with_images: bool = True,
     ) -> None:
         self.source, self.entries, self.size = source, list(entries), size

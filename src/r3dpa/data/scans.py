@@ -88,6 +88,17 @@ class Scan:
         except OSError as error:
             raise ScanError(f"{self.path}: cannot be read ({error.strerror or error})") from error
 
+    @property
+    def cache_key(self) -> tuple[str, int, int]:
+        """Name, size and time of change: a file written anew has another time, if not another size.
+
+        A copied file has another time as well: what was cached of it is made again.
+
+        Raises:
+            ScanError: As :attr:`num_bytes`.
+        """
+        return self.name, self.num_bytes, self.path.stat().st_mtime_ns
+
 
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.

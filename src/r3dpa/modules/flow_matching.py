@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 
-from r3dpa.checkpoints import weights_sha256
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
-from r3dpa.data.scan_cache import CachedTensors, ScanCache
 from r3dpa.data.scans import Scan
+from r3dpa.data.tensor_cache import CachedTensors
 from r3dpa.modules.base import GenerativeModule
+from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
 from r3dpa.modules.step_losses import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
@@ -87,46 +85,23 @@ class FlowMatching(GenerativeModule):
     def _datamodule(self) -> LidarDataModule:
         return cast(Any, self.trainer).datamodule
 
-    @torch.no_grad()
-    def _cached_posteriors(self) -> CachedTensors:
+    def _cached_posteriors(self) -> CachedTensors[Scan]:
         """Posteriors of the training scans; the processes share the work."""
-        trainer, datamodule = self.trainer, self._datamodule
-        dataset = cast(LidarDataset, datamodule.train_set)
+        dataset = cast(LidarDataset, self._datamodule.train_set)
         geometry = self.scan_geometry.to_dict()
-        settings = {
-            "vae": weights_sha256(self.vae.state_dict()),
-            "projection": geometry["projection"],
-            "codec": geometry["codec"],
-            "precision": str(trainer.precision),
-        }
-        shape = (2 * self.vae.latent_channels, *self.sit.input_size)
-        cache = ScanCache(Path(trainer.default_root_dir) / "latents", "posterior", settings, shape)
-        scans = self._scans_of_this_run(dataset)
-        missing = cache.missing(scans)
-        trainer.strategy.barrier("cached latents: all have looked")
-        # Where each node has a disk of its own, its processes encode everything.
-        place, processes = (
-            (trainer.local_rank, trainer.num_devices)
-            if datamodule.prepare_data_per_node
-            else (trainer.global_rank, trainer.world_size)
+        return encoded_once(
+            self,
+            self.vae,
+            Path(self.trainer.default_root_dir) / "latents",
+            {"projection": geometry["projection"], "codec": geometry["codec"]},
+            (2 * self.vae.latent_channels, *self.sit.input_size),
+            self._scans_of_this_run(dataset),
+            lambda scans: LidarDataset(
+                scans, dataset.projection, dataset.codec, images=dataset.images
+            ),
+            "range_image",
+            shared=not self._trial_batches,
         )
-        own = missing if self._trial_batches else missing[place::processes]
-        if own:
-            rank_zero_info(f"encoding {len(missing)} scans once, into {cache.folder}")
-            loader = DataLoader(
-                LidarDataset(own, dataset.projection, dataset.codec, images=dataset.images),
-                batch_size=datamodule.batch_size,
-                num_workers=datamodule.num_workers,
-                generator=torch.Generator(),  # the default draws from the global random state
-            )
-            with cache.writer(trainer.global_rank) as add:
-                for batch in loader:
-                    with trainer.precision_plugin.forward_context():
-                        posterior = self.vae.encode(batch["range_image"].to(self.device))
-                    moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
-                    add([own[index] for index in batch["index"].tolist()], moments)
-        trainer.strategy.barrier("cached latents: all are written")
-        return CachedTensors(cache, scans)
 
     @property
     def _trial_batches(self) -> int:

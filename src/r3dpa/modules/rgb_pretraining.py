@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
 import torch
-from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 
 from r3dpa import losses
-from r3dpa.checkpoints import load_into, read_checkpoint, weights_sha256
-from r3dpa.data.image_latents import ImageLatents, ImagePosteriors
-from r3dpa.data.images import ImageBatch, ImageDataset
+from r3dpa.checkpoints import load_into, read_checkpoint
+from r3dpa.data.image_latents import latent_statistics
+from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry
+from r3dpa.data.tensor_cache import CachedTensors
+from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.image_stage import ImageStage
 from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.modules.step_losses import PathDraws
@@ -152,14 +152,13 @@ class RGBPretraining(ImageStage):
         posteriors = self._encoded()
         self.datamodule.use_posteriors(posteriors, with_images=bool(self._teacher))
         if not self.resumed:
-            mean, variance = posteriors.statistics()
+            mean, variance = latent_statistics(posteriors)
             self.latent_norm.running_mean.copy_(mean)
             self.latent_norm.running_var.copy_(variance)
             self.latent_norm.num_batches_tracked.fill_(1)
             self.ema.reset(self.sit, self.latent_norm)
 
-    @torch.no_grad()
-    def _encoded(self) -> ImagePosteriors:
+    def _encoded(self) -> CachedTensors[ImageEntry]:
         """Posteriors of all training images; the processes share the work.
 
         A ``fast_dev_run`` makes those of its batches alone.
@@ -169,33 +168,17 @@ class RGBPretraining(ImageStage):
         if cast(Any, trainer).fast_dev_run:
             batches = int(trainer.limit_train_batches)
             entries = entries[: batches * datamodule.batch_size * trainer.world_size]
-        root = Path(self.latents_dir or Path(trainer.default_root_dir) / "latents")
-        settings = {
-            "vae": weights_sha256(self.vae.state_dict()),
-            "images": datamodule.settings,
-            "precision": str(trainer.precision),
-        }
-        shape = (2 * self.vae.latent_channels, *self.latent_size)
-        latents = ImageLatents(root, settings, shape)
-        missing = latents.missing(entries)
-        trainer.strategy.barrier("image latents: all have looked")
-        own = missing[trainer.global_rank :: trainer.world_size]
-        if own:
-            rank_zero_info(f"encoding {len(missing)} images once, into {latents.folder}")
-            loader = DataLoader(
-                ImageDataset(datamodule.source, own, datamodule.image_size),
-                batch_size=datamodule.batch_size,
-                num_workers=datamodule.num_workers,
-                generator=torch.Generator(),  # the default draws from the global random state
-            )
-            with latents.writer(trainer.global_rank) as add:
-                for batch in loader:
-                    with trainer.precision_plugin.forward_context():
-                        posterior = self.vae.encode(batch["image"].to(self.device))
-                    moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
-                    add([own[index] for index in batch["index"].tolist()], moments)
-        trainer.strategy.barrier("image latents: all are written")
-        return ImagePosteriors(latents, entries)
+        return encoded_once(
+            self,
+            self.vae,
+            Path(self.latents_dir or Path(trainer.default_root_dir) / "latents"),
+            {"images": datamodule.settings},
+            (2 * self.vae.latent_channels, *self.latent_size),
+            entries,
+            lambda some: ImageDataset(datamodule.source, some, datamodule.image_size),
+            "image",
+            shared=True,
+        )
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""

@@ -1,0 +1,85 @@
+"""What a frozen VAE makes of training data, once for all epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import lightning as L
+import torch
+from lightning.pytorch.utilities import rank_zero_info
+from torch.utils.data import DataLoader, Dataset
+
+from r3dpa.checkpoints import weights_sha256
+from r3dpa.data.tensor_cache import Cacheable, CachedTensors, TensorCache
+from r3dpa.nn import VAE, ImageVAE
+
+__all__ = ["encoded_once"]
+
+Item = TypeVar("Item", bound=Cacheable)
+
+
+@torch.no_grad()
+def encoded_once(
+    module: L.LightningModule,
+    vae: VAE | ImageVAE,
+    root: Path,
+    settings: Mapping[str, Any],
+    shape: tuple[int, int, int],
+    items: Sequence[Item],
+    dataset_of: Callable[[Sequence[Item]], Dataset[Any]],
+    image: str,
+    *,
+    shared: bool,
+) -> CachedTensors[Item]:
+    """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
+
+    Args:
+        module: In training, on its device.
+        vae: Frozen autoencoder; its weights and the precision are part of the settings.
+        root: Folder of caches.
+        settings: What else the moments depend on, as JSON values.
+        shape: ``(2C, h, w)``.
+        items: Scans or images, in any order.
+        dataset_of: Dataset of some items, whose samples hold their ``index`` and an image.
+        image: Name of the image in a sample, ``(C', H, W)``.
+        shared: Whether all processes ask for the same items, so that they can share the work.
+
+    Raises:
+        TensorCacheError: If the cache cannot be written or is damaged, or moments are not finite.
+    """
+    trainer = module.trainer
+    datamodule = cast(Any, trainer).datamodule
+    about = {
+        **settings,
+        "vae": weights_sha256(vae.state_dict()),
+        "precision": str(trainer.precision),
+    }
+    cache: TensorCache[Item] = TensorCache(root, "posterior", about, shape)
+    own = missing = cache.missing(items)
+    trainer.strategy.barrier("cached latents: all have looked")
+    if shared:
+        # Where each node has a disk of its own, its processes encode everything.
+        place, processes = (
+            (trainer.local_rank, trainer.num_devices)
+            if datamodule.prepare_data_per_node
+            else (trainer.global_rank, trainer.world_size)
+        )
+        own = missing[place::processes]
+    if own:
+        rank_zero_info(f"encoding {len(missing)} of {len(items)} once, into {cache.folder}")
+        loader = DataLoader(
+            dataset_of(own),
+            batch_size=datamodule.batch_size,
+            num_workers=datamodule.num_workers,
+            generator=torch.Generator(),  # the default draws from the global random state
+        )
+        with cache.writer(trainer.global_rank) as add:
+            for batch in loader:
+                with trainer.precision_plugin.forward_context():
+                    posterior = vae.encode(batch[image].to(module.device))
+                moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
+                add([own[index] for index in batch["index"].tolist()], moments)
+    trainer.strategy.barrier("cached latents: all are written")
+    return CachedTensors(cache, items)
