@@ -11,40 +11,23 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from tiny_networks import SIT_ARGS, tiny_checkpoint, tiny_networks
 
 from r3dpa.bench.control import ControlSettings, Part, control
 from r3dpa.bench.control_report import Finding, mean_of, share_of, sheet_of, write_control
 from r3dpa.bench.control_scans import CAR, ScanDesk, View, cell_cosine, free_place, points_inside
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.data import Scan, kitti360_scans, write_bin
 from r3dpa.data.objects import ObjectLibrary, object_library
 from r3dpa.editing import EditSettings
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
-from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.nn import SiT
 from r3dpa.nn.backbones import feature_source
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
 PROJECTION = SphericalProjection(SENSOR)
 GEOMETRY = ScanGeometry(PROJECTION, RangeCodec(), (2, 8))
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": (1, 1, 1),
-    "strides": ((2, 2), (2, 2)),
-    "num_res_blocks": 1,
-}
-SIT_ARGS = {
-    "input_size": (4, 16),
-    "in_channels": 4,
-    "hidden_size": 32,
-    "depth": 3,
-    "num_heads": 2,
-    "alignment_depth": 1,
-    "feature_dim": 8,
-    "projector_dim": 8,
-}
 ROAD, WALL = 7, 11
 SETTINGS = ControlSettings(edit=EditSettings(steps=4)).quick()
 
@@ -88,14 +71,7 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def networks():
-    torch.manual_seed(0)
-    vae, sit, norm = VAE(**VAE_ARGS), SiT(**SIT_ARGS), LatentNorm(4)
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-        vae.decoder.conv_out.weight.mul_(3)
-    norm.update(1.0 + 2.0 * torch.randn(8, 4, 4, 16))
-    return vae, sit, norm
+    return tiny_networks(spread=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -304,17 +280,10 @@ class TestRefusals:
             control(generator, "geometric", data, tmp_path / "road.safetensors", tmp_path, SETTINGS)
 
 
-def test_command(networks, data, library, tmp_path, capsys):
-    vae, sit, norm = networks
-    states = {
-        "vae": NetworkState.of(vae, VAE_ARGS),
-        "ema": NetworkState.of(sit, SIT_ARGS),
-        "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
-    }
-    content = Checkpoint(
-        Path("tiny"), "joint", states, 7, geometry=GEOMETRY.to_dict(), feature_source="geometric"
+def test_command(data, library, tmp_path, capsys):
+    ckpt = tiny_checkpoint(
+        tmp_path / "tiny.safetensors", GEOMETRY, step=7, feature_source="geometric"
     )
-    ckpt = save_checkpoint(content, tmp_path / "tiny.safetensors")
     words = ["--ckpt", ckpt, "--data", data, "--library", library, "--out", tmp_path / "out"]
     main(["bench", "control", *map(str, words), "--quick", "--parts", "[guided]"])
     assert "Scenes after the features" in capsys.readouterr().out

@@ -11,6 +11,7 @@ from itertools import cycle
 import numpy as np
 import pytest
 import torch
+from tiny_networks import tiny_networks
 
 from r3dpa.bench import sampling as bench
 from r3dpa.bench.distributions import sliced_wasserstein, verdict
@@ -35,7 +36,6 @@ from r3dpa.flow.solvers import evaluations
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.metrics.bootstrap import Interval
-from r3dpa.nn import VAE, LatentNorm, SiT
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 TINY = Effort(samples=4, reference_steps=64, evaluations=(2, 4), rounds=2, batch=2, resamples=40)
@@ -58,30 +58,7 @@ def row(label, seconds, error, **changes):
 @pytest.fixture(scope="module")
 def make():
     """Generators of a SiT and a VAE with random weights."""
-    torch.manual_seed(0)
-    vae = VAE(
-        latent_channels=4,
-        channels=32,
-        channel_multipliers=(1, 1, 1),
-        strides=((2, 2), (2, 2)),
-        num_res_blocks=1,
-    )
-    sit = SiT(
-        input_size=(4, 16),
-        in_channels=4,
-        hidden_size=32,
-        depth=2,
-        num_heads=2,
-        alignment_depth=1,
-        feature_dim=8,
-        projector_dim=8,
-    )
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-        vae.decoder.conv_out.weight.mul_(3)
-    norm = LatentNorm(4)
-    norm.update(1.0 + 2.0 * torch.randn(8, 4, 4, 16))
+    vae, sit, norm = tiny_networks()
     geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
 
     def make(setting):

@@ -11,12 +11,13 @@ import sys
 import numpy as np
 import pytest
 import torch
+from tiny_networks import tiny_networks
 
 from r3dpa.flow import ODE_SOLVERS, RestartPlan, euler_maruyama, ode_times, sde_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
-from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.nn import LatentNorm
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -24,36 +25,8 @@ LATENT_SHAPE = (4, 4, 16)
 ODE, SDE = SamplerConfig("heun", steps=3), SamplerConfig("euler_maruyama", steps=4)
 
 
-def networks():
-    torch.manual_seed(0)
-    vae = VAE(
-        latent_channels=4,
-        channels=32,
-        channel_multipliers=(1, 1, 1),
-        strides=((2, 2), (2, 2)),
-        num_res_blocks=1,
-    )
-    sit = SiT(
-        input_size=LATENT_SHAPE[1:],
-        in_channels=LATENT_SHAPE[0],
-        hidden_size=32,
-        depth=2,
-        num_heads=2,
-        alignment_depth=1,
-        feature_dim=8,
-        projector_dim=8,
-    )
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-        vae.decoder.conv_out.weight.mul_(3)
-    norm = LatentNorm(4)
-    norm.update(1.0 + 2.0 * torch.randn(8, *LATENT_SHAPE))
-    return vae, sit, norm
-
-
 def generator(sampler=ODE, precision="fp32", geometry=GEOMETRY, path="linear"):
-    return SceneGenerator(*networks(), geometry, sampler, path, precision)
+    return SceneGenerator(*tiny_networks(), geometry, sampler, path, precision)
 
 
 def let_move(scenes, velocity):
@@ -151,7 +124,7 @@ def test_an_adaptive_solver_asks_at_times_of_its_own():
 
 def slow_latents(sampler, num, seed):
     """The same scenes from the plain network, with a time per sample; draws as documented."""
-    _, sit, _ = networks()
+    _, sit, _ = tiny_networks()
     keys = [np.random.SeedSequence([seed, i]).generate_state(1, np.uint64)[0] for i in range(num)]
     sources = [torch.Generator().manual_seed(int(key) >> 1) for key in keys]
 
@@ -222,7 +195,7 @@ def test_a_table_is_computed_once():
 def test_a_batch_that_is_filled_up_holds_the_same_scenes(sampler, decode_batch_size):
     """Bitwise: the networks see the same shape, and what fills it does not matter."""
     options = {"batch_size": 5, "decode_batch_size": decode_batch_size}
-    scenes = SceneGenerator(*networks(), GEOMETRY, sampler, **options)
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, **options)
     shapes = set()
     velocity_at, decode = scenes.sit.velocity_at, scenes._decode
     scenes.sit.velocity_at = lambda x, row: shapes.add(("sit", len(x))) or velocity_at(x, row)
@@ -240,14 +213,14 @@ def test_a_batch_that_is_filled_up_holds_the_same_scenes(sampler, decode_batch_s
 
 
 def test_autoguidance_is_the_written_out_formula():
-    weak = networks()[1]
+    weak = tiny_networks()[1]
     with torch.no_grad():
         for parameter in weak.parameters():
             parameter.mul_(0.9)
-    sit = networks()[1]
+    sit = tiny_networks()[1]
     sampler = SamplerConfig("ab2", 6)
     guide = Autoguidance(weak, 2.0)
-    scenes = SceneGenerator(*networks(), GEOMETRY, sampler, autoguidance=guide)
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, autoguidance=guide)
     found = scenes.generate([0, 1], seed=4)
     assert found.nfe == 12
     start = torch.stack([torch.randn(LATENT_SHAPE, generator=scene_random(4, i)) for i in (0, 1)])
@@ -259,7 +232,7 @@ def test_autoguidance_is_the_written_out_formula():
     torch.testing.assert_close(found.latents, expected, atol=1e-5, rtol=0)
 
     half_way = Autoguidance(weak, 2.0, (0.0, 0.5))
-    scenes = SceneGenerator(*networks(), GEOMETRY, sampler, autoguidance=half_way)
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, autoguidance=half_way)
     assert scenes.generate([0]).nfe == 6 + 3  # of the times 1, 5/6, ..., 1/6
 
 
@@ -267,7 +240,7 @@ def test_autoguidance_is_the_written_out_formula():
 def test_compiled_networks_draw_the_same_scenes():
     """Fused kernels round in another order; no shape is met twice, so nothing recompiles."""
     options = {"batch_size": 3, "decode_batch_size": 2, "compile": True}
-    scenes = SceneGenerator(*networks(), GEOMETRY, ODE, **options)
+    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, **options)
     plain = generator(ODE).generate(range(3))
     torch._dynamo.utils.counters.clear()
     for part in (slice(0, 3), slice(0, 2), slice(2, 3)):
@@ -279,9 +252,9 @@ def test_compiled_networks_draw_the_same_scenes():
 
 def test_options_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="give SceneGenerator a batch_size"):
-        SceneGenerator(*networks(), GEOMETRY, ODE, compile=True)
+        SceneGenerator(*tiny_networks(), GEOMETRY, ODE, compile=True)
     with pytest.raises(ValueError, match="decode_batch_size must be at least 1, got 0"):
-        SceneGenerator(*networks(), GEOMETRY, ODE, decode_batch_size=0)
+        SceneGenerator(*tiny_networks(), GEOMETRY, ODE, decode_batch_size=0)
 
 
 @pytest.mark.parametrize("quality", ["draft", "good", "best"])
@@ -329,7 +302,7 @@ def test_the_sde_follows_the_path_of_the_sampler():
 
 
 def test_unfitted_statistics_are_refused():
-    vae, sit, _ = networks()
+    vae, sit, _ = tiny_networks()
     with pytest.raises(ValueError, match=r"never fitted.*joint or flow_matching"):
         SceneGenerator(vae, sit, LatentNorm(4), GEOMETRY)
 
@@ -396,7 +369,7 @@ def test_points_lie_on_the_rays_of_their_pixels():
 def test_cuda_draws_the_scenes_of_the_cpu(sampler, monkeypatch):
     """The draws come from the CPU; other kernels round in another order, without TF32."""
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-    vae, sit, norm = networks()
+    vae, sit, norm = tiny_networks()
     on_cpu = SceneGenerator(vae, sit, norm, GEOMETRY, sampler).generate(range(3), seed=1)
     parts = (part.cuda() for part in (vae, sit, norm))
     on_gpu = SceneGenerator(*parts, GEOMETRY, sampler).generate(range(3), seed=1)

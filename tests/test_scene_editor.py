@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tiny_networks import tiny_networks
 
 from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.geometry.regions import angle_box, dropped_beams, sector_weights, token_mask
-from r3dpa.nn import VAE, LatentNorm, SiT
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -19,31 +19,8 @@ SETTINGS = EditSettings(steps=6)
 
 @pytest.fixture(scope="module")
 def generator():
-    torch.manual_seed(0)
-    vae = VAE(
-        latent_channels=4,
-        channels=32,
-        channel_multipliers=(1, 1, 1),
-        strides=((2, 2), (2, 2)),
-        num_res_blocks=1,
-    )
-    sit = SiT(
-        input_size=(4, 16),
-        in_channels=4,
-        hidden_size=32,
-        depth=2,
-        num_heads=2,
-        alignment_depth=1,
-        feature_dim=8,
-        projector_dim=8,
-    )
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-        vae.decoder.conv_out.weight.mul_(3)
-    norm = LatentNorm(4)
-    norm.update(1.0 + 2.0 * torch.randn(8, 4, 4, 16))
-    return SceneGenerator(vae, sit, norm, GEOMETRY, SamplerConfig("heun", steps=3))
+    networks = tiny_networks(spread=0.05)
+    return SceneGenerator(*networks, GEOMETRY, SamplerConfig("heun", steps=3))
 
 
 @pytest.fixture(scope="module")

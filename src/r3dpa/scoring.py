@@ -15,6 +15,7 @@ from tqdm import tqdm
 from r3dpa import viz
 from r3dpa.atomic import only_writer
 from r3dpa.data.scans import Scan, read_scan
+from r3dpa.devices import usable_device
 from r3dpa.metrics.evaluation import Comparison, evaluate
 from r3dpa.metrics.official_statistics import (
     OfficialSplit,
@@ -77,8 +78,7 @@ def feature_spaces(
             f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
             f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
         )
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
 
 

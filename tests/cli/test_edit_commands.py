@@ -3,60 +3,32 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_networks import tiny_checkpoint
 
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.cli.edits import EDITS, joined_numbers
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.editing import SceneEditor
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, range_image
-from r3dpa.nn import VAE, LatentNorm, SiT
 from r3dpa.simulation import simulate
 
 SENSOR = LidarSensor(beams=16, columns=64)
 PROJECTION = SphericalProjection(SENSOR)
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": [1, 1, 1],
-    "strides": [[2, 2], [2, 2]],
-    "num_res_blocks": 1,
-}
-SIT_ARGS = {
-    "input_size": [4, 16],
-    "in_channels": 4,
-    "hidden_size": 32,
-    "depth": 2,
-    "num_heads": 2,
-    "alignment_depth": 1,
-    "feature_dim": 16,
-    "projector_dim": 8,
-}
 
 
 def checkpoint(folder, feature_source="geometric"):
-    torch.manual_seed(0)
-    sit, norm = SiT(**SIT_ARGS), LatentNorm(4)
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-    norm.update(torch.randn(8, 4, 4, 16))
-    networks = {
-        "vae": NetworkState.of(VAE(**VAE_ARGS), VAE_ARGS),
-        "ema": NetworkState.of(sit, SIT_ARGS),
-        "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
-    }
-    geometry = ScanGeometry(PROJECTION, RangeCodec(), (2, 8)).to_dict()
-    content = Checkpoint(
-        Path("tiny"), "joint", networks, geometry=geometry, feature_source=feature_source
+    return tiny_checkpoint(
+        folder / f"{feature_source}.safetensors",
+        ScanGeometry(PROJECTION, RangeCodec(), (2, 8)),
+        spread=0.05,
+        sit_args={"feature_dim": 16},
+        feature_source=feature_source,
     )
-    return save_checkpoint(content, folder / f"{feature_source}.safetensors")
 
 
 @pytest.fixture(scope="module")

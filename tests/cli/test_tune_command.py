@@ -1,60 +1,23 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
-import torch
+from tiny_networks import tiny_checkpoint
 
-from r3dpa.checkpoints import (
-    Checkpoint,
-    NetworkState,
-    read_checkpoint,
-    save_checkpoint,
-    weights_sha256,
-)
+from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.cli.tune import tune
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.nn import VAE, LatentNorm, SiT
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": [1, 1, 1],
-    "strides": [[2, 2], [2, 2]],
-    "num_res_blocks": 1,
-}
-SIT_ARGS = {
-    "input_size": [4, 16],
-    "in_channels": 4,
-    "hidden_size": 32,
-    "depth": 2,
-    "num_heads": 2,
-    "alignment_depth": 1,
-    "feature_dim": 8,
-    "projector_dim": 8,
-}
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    torch.manual_seed(0)
-    sit, norm = SiT(**SIT_ARGS), LatentNorm(4)
-    with torch.no_grad():
-        for parameter in sit.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    norm.update(torch.randn(8, 4, 4, 16))
-    networks = {
-        "vae": NetworkState.of(VAE(**VAE_ARGS), VAE_ARGS),
-        "ema": NetworkState.of(sit, SIT_ARGS),
-        "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
-    }
     path = tmp_path_factory.mktemp("tune") / "tiny.safetensors"
-    content = Checkpoint(Path("tiny"), "joint", networks, step=30, geometry=GEOMETRY.to_dict())
-    return save_checkpoint(content, path)
+    return tiny_checkpoint(path, GEOMETRY, step=30)
 
 
 def test_the_best_solver_is_saved_with_what_it_was_tuned_on(checkpoint, tmp_path):

@@ -88,6 +88,12 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     assert not [name for name in files(tmp_path) if name.startswith(".")]
 
 
+def test_an_error_before_the_first_scene_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), writer(tmp_path, 2):
+        raise RuntimeError
+    assert files(tmp_path) == []
+
+
 def test_a_run_that_stops_before_its_last_file_only_needs_that(tmp_path):
     range_m = scenes(2)
     with writer(tmp_path, 2) as first:

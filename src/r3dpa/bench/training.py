@@ -31,6 +31,7 @@ from r3dpa.bench.training_profile import PartCost, StepProfile
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor
 from r3dpa.imports import ConfigParser
 from r3dpa.modules import GenerativeModule
@@ -76,9 +77,7 @@ class StepSettings:
     @property
     def accelerator(self) -> str:
         """``cpu`` or ``cuda``."""
-        if self.device != "auto":
-            return self.device
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        return usable_device(self.device)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from r3dpa.checkpoints import NetworkState, read_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import find_scans, read_scan
 from r3dpa.data.scans import evenly
+from r3dpa.devices import usable_device
 from r3dpa.geometry import (
     LidarSensor,
     RangeCodec,
@@ -88,9 +89,7 @@ class VAESettings:
     @property
     def place(self) -> torch.device:
         """Where it is measured."""
-        if self.device != "auto":
-            return torch.device(self.device)
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(usable_device(self.device))
 
 
 @dataclass(frozen=True)

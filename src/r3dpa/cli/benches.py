@@ -243,17 +243,15 @@ def bench_control(
         features_ckpt: Weights of the feature source, where it has none of its own.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
-    import torch
-
     from r3dpa.bench.control import ControlSettings, control
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.scenes import generator_from
+    from r3dpa.devices import usable_device
     from r3dpa.editing import EditSettings
     from r3dpa.generation import SamplerConfig
 
     check_folder(out)
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     edit = EditSettings(solver, steps, strength=strength, window=window)
     settings = ControlSettings(parts, scenes, cases, round_trips, edit=edit)
     checkpoint = read_checkpoint(ckpt)
@@ -289,13 +287,11 @@ def bench_speed(
         quick: Small networks, only to try it.
         out: JSON file for the same figures.
     """
-    import torch
-
     from r3dpa.bench.speed import random_generators, speed
+    from r3dpa.devices import usable_device
 
     check_file(out)
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     print_text(speed(random_generators(device, quick), rounds, out, batch_size, quick))
 
 

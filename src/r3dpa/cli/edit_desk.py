@@ -21,7 +21,6 @@ from r3dpa import viz
 from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.cli.edits import EditJob
-from r3dpa.cli.objects import usable_device
 from r3dpa.cli.scenes import draw_scene, generator_from, written
 from r3dpa.data import (
     Extractor,
@@ -36,6 +35,7 @@ from r3dpa.data import (
 )
 from r3dpa.data.objects import object_library
 from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.devices import usable_device
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import LidarSensor, in_range, range_image
@@ -243,13 +243,7 @@ class EditDesk:
         formats = request["formats"]
         with SceneWriter(out, self.num, self.projection, formats, request, job.overwrite) as writer:
             seconds = -time.perf_counter()
-            try:
-                result = run()
-            except BaseException:
-                if not writer.num_done:  # there is nothing to go on with
-                    for name in (".unfinished.json", ".unfinished.npy"):
-                        (out / name).unlink(missing_ok=True)
-                raise
+            result = run()
             seconds += time.perf_counter()
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()

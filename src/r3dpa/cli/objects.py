@@ -6,18 +6,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
 from r3dpa.data import Scan, find_scans
 from r3dpa.data.objects import ObjectLibrary, object_library
 from r3dpa.data.scans import evenly
+from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import feature_source
-from r3dpa.unpickling import first_line
 
-__all__ = ["objects", "usable_device"]
+__all__ = ["objects"]
 
 
 def objects(
@@ -66,23 +65,6 @@ def objects(
     library = object_library(_shown(scans), extractor, projection, grid_size, list(classes) or None)
     library.save(out)
     return f"{_table(library)}\n\n{len(scans)} scans, features of {source}, written to {out}"
-
-
-def usable_device(name: str) -> str:
-    """A device by name, the GPU or else the CPU for ``auto``.
-
-    Raises:
-        ValueError: If there is none of this name.
-    """
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.empty(0, device=name)
-    except (AssertionError, NotImplementedError, RuntimeError) as error:  # whatever torch lacks
-        raise ValueError(
-            f"device {name!r} cannot be used here ({first_line(error)}): give cpu or auto"
-        ) from error
-    return name
 
 
 def _shown(scans: Sequence[Scan]) -> Iterator[Scan]:

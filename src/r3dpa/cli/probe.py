@@ -18,6 +18,7 @@ from r3dpa.atomic import atomic_path
 from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.data import PointDataset, Scan, kitti360_scans
 from r3dpa.data.scans import evenly
+from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics import SourceProbe, known, probe_source
 from r3dpa.metrics.probe import Labelled
@@ -63,8 +64,7 @@ def probe(
     """
     if not sources or len(set(sources)) < len(sources):
         raise ValueError(f"sources must be different names, at least one, got {','.join(sources)}")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     train = _some(kitti360_scans(data, "train"), train_scans, "train_scans", data)
     test = _some(kitti360_scans(data, "val"), val_scans, "val_scans", data)
     extractors = {name: source.to(device) for name, source in _extractors(sources, ckpt).items()}

@@ -26,6 +26,7 @@ from r3dpa.checkpoints import (
     weights_sha256,
 )
 from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.devices import usable_device
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
@@ -139,8 +140,7 @@ def generators_of(
 
     All share the networks that are read here.
     """
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
     plain = generator_from(checkpoint, SamplerConfig(), device=device)
     guidance = None if guide is None else _autoguidance(checkpoint, guide, "ema", device)[0]
@@ -197,8 +197,7 @@ def sample(
         raise ValueError(f"num and batch_size must be at least 1, got {num} and {batch_size}")
     if seed < 0 or pictures < 0:
         raise ValueError(f"seed and pictures must be at least 0, got {seed} and {pictures}")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
     guidance, about_guide, feature_source = None, None, checkpoint.feature_source
     if guide is not None:

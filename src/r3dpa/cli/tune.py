@@ -11,6 +11,7 @@ from torch import Tensor
 from r3dpa.checkpoints import read_checkpoint, source_commit
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.cli.scenes import generator_from, sit_sha256
+from r3dpa.devices import usable_device
 from r3dpa.flow import ode_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.flow.tuning import (
@@ -63,8 +64,7 @@ def tune(
             raise ValueError(f"{name} must be at least {least.get(name, 1)}, got {count}")
     if reference_steps < 2 or reference_steps % 2:
         raise ValueError(f"reference_steps must be even and at least 2, got {reference_steps}")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
     sit = generator_from(checkpoint, SamplerConfig(), weights, "fp32", device).sit
 

@@ -120,10 +120,16 @@ class SceneWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Waits for the scenes that were put; after an interrupt they need not be drawn again."""
+        """Waits for the scenes that were put; after an interrupt they need not be drawn again.
+
+        Where an error came before the first scene, nothing is left behind.
+        """
         with self._alone:
             self._thread.shutdown()
             self._file.close()
+            if error is not None and not self.num_done:
+                self._unfinished.unlink(missing_ok=True)
+                self._state.unlink(missing_ok=True)
         failed = next(filter(None, (one.exception() for one in self._waiting)), None)
         if failed is not None and error is None:
             raise failed

@@ -1,0 +1,52 @@
+"""Networks with random weights for images of 16 x 64 pixels, and a checkpoint of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
+from r3dpa.nn import VAE, LatentNorm, SiT
+
+VAE_ARGS = {
+    "latent_channels": 4,
+    "channels": 32,
+    "channel_multipliers": [1, 1, 1],
+    "strides": [[2, 2], [2, 2]],
+    "num_res_blocks": 1,
+}
+SIT_ARGS = {
+    "input_size": [4, 16],
+    "in_channels": 4,
+    "hidden_size": 32,
+    "depth": 2,
+    "num_heads": 2,
+    "alignment_depth": 1,
+    "feature_dim": 8,
+    "projector_dim": 8,
+}
+
+
+def tiny_networks(spread=0.1, **sit_args):
+    """``vae, sit, norm``: weights spread at random, so that scenes differ and have holes."""
+    torch.manual_seed(0)
+    vae, sit, norm = VAE(**VAE_ARGS), SiT(**SIT_ARGS | sit_args), LatentNorm(4)
+    with torch.no_grad():
+        for parameter in sit.parameters():
+            parameter.add_(spread * torch.randn_like(parameter))
+        vae.decoder.conv_out.weight.mul_(3)
+    norm.update(1.0 + 2.0 * torch.randn(8, 4, 4, 16))
+    return vae, sit, norm
+
+
+def tiny_checkpoint(path, geometry, spread=0.1, sit_args=None, **fields):
+    """Checkpoint of the joint stage for inference, of :func:`tiny_networks`."""
+    vae, sit, norm = tiny_networks(spread, **sit_args or {})
+    networks = {
+        "vae": NetworkState.of(vae, VAE_ARGS),
+        "ema": NetworkState.of(sit, SIT_ARGS | (sit_args or {})),
+        "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
+    }
+    content = Checkpoint(Path("tiny"), "joint", networks, geometry=geometry.to_dict(), **fields)
+    return save_checkpoint(content, path)
