@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import lightning as L
 import torch
@@ -205,7 +205,9 @@ class RunCheckpoint(ModelCheckpoint):
         raise SystemExit(128 + number)  # as a shell reports it
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Saves unless the last step is saved already."""
+        """Saves unless the last step is saved already, or this is a ``fast_dev_run``."""
+        if cast(Any, trainer).fast_dev_run:
+            return  # Lightning would save here, though nowhere else
         if self._last_global_step_saved != trainer.global_step:
             self._last_checkpoint_saved = ""
         super().on_train_end(trainer, pl_module)

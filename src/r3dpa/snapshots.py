@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import lightning as L
 import torch
@@ -82,6 +82,8 @@ class EMASnapshots(L.Callback):
             rank_zero_info(f"stage {stage} averages no SiT: no snapshots are kept")
             return
         _sit_config(pl_module)
+        if cast(Any, trainer).fast_dev_run:
+            return
         if self.steps is not None:
             self._due = self.steps
         elif trainer.max_steps > 0:

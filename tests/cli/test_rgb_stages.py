@@ -80,7 +80,7 @@ def test_the_vae_is_frozen_and_the_sit_trained_from_data_statistics(image_vae, r
     for key, value in before.items():
         assert torch.equal(after[key], value), key
     assert content["r3dpa"]["stage"] == "rgb_pretraining"
-    assert after["latent_norm.num_batches_tracked"] == 1 + 4
+    assert after["latent_norm.num_batches_tracked"] == 1  # measured once, and fixed
     assert after["sit.final_layer.linear.weight"].abs().max() > 0
     (group,) = content["optimizer_states"][0]["param_groups"]
     projector = [key for key in after if key.startswith("sit.projector.")]

@@ -63,14 +63,21 @@ def test_vae_alignment_freezes_the_blocks(smoke_args, vae_checkpoint):
     assert content["state_dict"]["latent_norm.num_batches_tracked"] == 3
 
 
-def test_flow_matching_leaves_the_vae_alone(smoke_args, vae_checkpoint, tmp_path):
+def test_flow_matching_leaves_vae_and_latent_statistics_alone(smoke_args, vae_checkpoint, tmp_path):
     more = ["--trainer.logger=false", *from_previous("flow_matching", vae_checkpoint)]
     main(smoke_args("flow_matching", tmp_path, *more))
     before, after = torch.load(vae_checkpoint, weights_only=True), load(tmp_path)
-    vae = [key for key in after["state_dict"] if key.startswith("vae.")]
-    assert vae
-    for key in vae:
-        assert torch.equal(before["state_dict"][key], after["state_dict"][key])
+    for prefix in ("vae.", "latent_norm."):
+        keys = [key for key in after["state_dict"] if key.startswith(prefix)]
+        assert keys
+        for key in keys:
+            assert torch.equal(before["state_dict"][key], after["state_dict"][key]), key
+
+
+def test_flow_matching_without_latent_statistics_is_refused(smoke_args, vae_checkpoint, tmp_path):
+    more = ["--trainer.logger=false", *from_previous("flow_matching", vae_checkpoint)]
+    with pytest.raises(ValueError, match="init_networks name latent_norm"):
+        main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.init_networks=[vae]"))
 
 
 def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, tmp_path):

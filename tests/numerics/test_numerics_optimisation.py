@@ -115,7 +115,8 @@ def test_every_trained_parameter_takes_part_in_every_step(weights, one_process, 
             with frozen(made.sit):
                 parts |= made.vae_alignment_losses(latents, features, path)
             parts |= made.discriminator_losses(image, reconstruction)
-            parts |= made.flow_losses(latents, features, path)
+            normalised = made.latent_norm.update(latents.detach())
+            parts |= made.flow_losses(normalised, features, path)
             return made.weigh_and_log(parts)
 
     for parameter in made.parameters():  # what the stage does not train is not waited for

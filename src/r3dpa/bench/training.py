@@ -35,6 +35,7 @@ from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor
 from r3dpa.imports import ConfigParser
 from r3dpa.modules import GenerativeModule
+from r3dpa.nn import LatentNorm
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
 
@@ -325,9 +326,14 @@ def _build(experiments: list[Path], fresh_vae: Path) -> GenerativeModule:
     module = parser.instantiate_classes(config).model
     # Dumped and read again, the arguments are plain values.
     vae = yaml.safe_load(parser.dump(config))["model"]["init_args"]["vae"]
-    state = NetworkState(vae["class_path"], vae["init_args"], module.vae.state_dict())
-    save_checkpoint(Checkpoint(fresh_vae, "untrained", {"vae": state}), fresh_vae)
-    module.init_from, module.init_networks = str(fresh_vae), ("vae",)
+    norm = LatentNorm(module.vae.latent_channels)
+    norm.num_batches_tracked.fill_(1)  # known statistics: 0 and 1
+    states = {
+        "vae": NetworkState(vae["class_path"], vae["init_args"], module.vae.state_dict()),
+        "latent_norm": NetworkState.of(norm, {"channels": norm.channels}),
+    }
+    save_checkpoint(Checkpoint(fresh_vae, "untrained", states), fresh_vae)
+    module.init_from, module.init_networks = str(fresh_vae), tuple(states)
     return module
 
 

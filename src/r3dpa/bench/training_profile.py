@@ -137,7 +137,8 @@ def step_parts(module: GenerativeModule, batch: dict[str, Any]) -> dict[str, Cal
     if trains_vae and module.weights.vae_alignment != 0:
         parts["alignment"] = backward(align)
     if module.trains_velocity:
-        parts["SiT"] = backward(lambda: module.flow_losses(latents, features, draws))
+        normalised = module.latent_norm.normalise(latents)
+        parts["SiT"] = backward(lambda: module.flow_losses(normalised, features, draws))
     parts["optimiser"] = optimise
     return parts
 

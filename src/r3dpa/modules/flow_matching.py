@@ -25,7 +25,8 @@ class FlowMatching(GenerativeModule):
     """FM baseline: the SiT by L_denoise (+ lambda2 L_align) on a frozen, trained VAE.
 
     ``weights.sit_alignment`` 0, the default here, is the row "no alignment" of the paper's
-    table III; 0.5 is "vanilla".
+    table III; 0.5 is "vanilla". The latents are normalised with the statistics that came with the
+    VAE, which stay fixed as it does.
 
     Source: R3DPA (ICRA 2026), section "LiDAR Scene Generation with Flow Matching".
 
@@ -37,11 +38,11 @@ class FlowMatching(GenerativeModule):
             in ``<run_dir>/latents`` (131 kB a scan at 8 x 16 x 128): a step is then the same, to
             rounding, at a tenth of its cost. Scans may be rotated, but not mirrored.
         **kwargs: See :class:`GenerativeModule`. ``init_from`` is needed to fit; to continue from
-            the VAE-alignment stage let ``init_networks`` name ``sit`` and ``latent_norm`` too.
+            the VAE-alignment stage let ``init_networks`` name ``sit`` too.
     """
 
     stage = "flow_matching"
-    default_init = ("vae",)
+    default_init = ("vae", "latent_norm")
 
     def __init__(
         self,
@@ -61,13 +62,18 @@ class FlowMatching(GenerativeModule):
         return self.weights.sit_alignment != 0
 
     def load_previous_stage(self) -> None:
-        """Loads the trained VAE; refuses to start without one."""
+        """Loads the trained VAE and its latent statistics; refuses to start without them."""
         if self.init_from is None:
             raise ValueError(
                 "stage flow_matching trains on the latents of a trained VAE: give "
                 "model.init_from a checkpoint of stage vae_alignment or joint"
             )
         super().load_previous_stage()
+        if not self.latent_norm.fitted:
+            raise ValueError(
+                f"stage flow_matching trains with fixed latent statistics, and {self.init_from} "
+                "gave none: let model.init_networks name latent_norm beside vae"
+            )
 
     def setup(self, stage: str) -> None:
         """Checks data against networks, and cached latents against the augmentation."""
@@ -130,4 +136,5 @@ class FlowMatching(GenerativeModule):
             else:
                 posterior = self.vae.encode(cast(LidarBatch, batch)["range_image"])
             latents = posterior.sample(draws.posterior_noise)
-        return self.flow_losses(latents, batch.get("feature_grid"), draws)
+            normalised = self.latent_norm.normalise(latents)
+        return self.flow_losses(normalised, batch.get("feature_grid"), draws)

@@ -57,4 +57,5 @@ class JointAlignment(GenerativeModule):
         with frozen(self.sit):
             losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, reconstruction)
-        return losses | self.flow_losses(latents, features, draws)
+        normalised = self.latent_norm.update(latents.detach())
+        return losses | self.flow_losses(normalised, features, draws)

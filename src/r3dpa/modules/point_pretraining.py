@@ -160,6 +160,7 @@ class PointPretraining(LightningModule):
 
     def on_fit_end(self) -> None:
         """Write ``waffleiron_s.safetensors`` for ``WaffleIronS`` into the run's folder."""
-        if self.trainer.is_global_zero and self.grid is not None:
+        trial = cast(Any, self.trainer).fast_dev_run
+        if self.trainer.is_global_zero and self.grid is not None and not trial:
             path = Path(self.trainer.default_root_dir) / "waffleiron_s.safetensors"
             save_weights(path, self.network, self.norm, self.grid)

@@ -47,7 +47,7 @@ class RGBPretraining(ImageStage):
     """Stage 0: unconditional SiT on image latents, by L_denoise (+ lambda L_align).
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
-    latent statistics start from those of the data set. As in REPA-E they then follow the batches.
+    latent statistics are those of the data set.
     With a teacher the tokens are aligned with its features of the image (REPA), which are computed
     in each step. The checkpoint is what ``rgb_weights`` of the other stages takes.
 
@@ -187,8 +187,8 @@ class RGBPretraining(ImageStage):
     def step_losses(self, batch: ImageBatch, draws: PathDraws) -> dict[str, Tensor]:
         """Losses of posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
         posterior = Posterior(batch["posterior_moments"])
-        latents = posterior.sample(draws.posterior_noise)
-        return self.flow_losses(latents, self._features(batch), draws)
+        normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        return self.flow_losses(normalised, self._features(batch), draws)
 
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:

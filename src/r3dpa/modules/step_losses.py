@@ -165,11 +165,10 @@ class StepLosses(L.LightningModule):
         return {"vae_alignment": self.weights.vae_alignment * self._aligned(projected, features)}
 
     def flow_losses(
-        self, latents: Tensor, features: Tensor | None, draws: PathDraws
+        self, normalised: Tensor, features: Tensor | None, draws: PathDraws
     ) -> dict[str, Tensor]:
-        """L_denoise + lambda2 L_align on detached latents; updates the latent statistics."""
+        """L_denoise + lambda2 L_align on normalised latents without gradient."""
         weights = self.weights
-        normalised = self.latent_norm.update(latents.detach())
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
         velocity, projected = self._predict(
             self.sit, noisy, draws.time, weights.denoising != 0, weights.sit_alignment != 0
