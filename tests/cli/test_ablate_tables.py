@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import struct
 import subprocess
 import time
@@ -163,6 +164,37 @@ class TestWrongFiles:
             plan_of("huge")
         with pytest.raises(ValueError, match="different numbers"):
             plan_of("demo", (1, 1))
+        with pytest.raises(ValueError, match="from 0 on"):
+            plan_of("demo", (-1,))
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({}, "2 rows have the label 'x'; tell them apart"),
+            ({"published": {"FID": 1.0}}, "2_b.yaml: published: 'FID' is no metric of the paper"),
+        ],
+    )
+    def test_rows_that_no_table_could_show(self, changes, message, tmp_path):
+        (tmp_path / "table.yaml").write_text("caption: c")
+        row = {"label": "x", "stages": [{"name": "a", "experiment": "joint"}]}
+        (tmp_path / "1_a.yaml").write_text(yaml.safe_dump(row))
+        (tmp_path / "2_b.yaml").write_text(yaml.safe_dump(row | changes))
+        with pytest.raises(ValueError, match=message):
+            plan_of("demo", tables=tmp_path)
+
+    def test_weights_that_are_not_there(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(ValueError, match="needs files that are not there: data/weights/dino"):
+            main(["ablate", str(TABLES), "--scale", "paper", "--out", "out"])
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [(["nowhere"], "nowhere: is no folder"), ([str(TABLES), "--seeds", "0,,1"], "whole numb")],
+    )
+    def test_arguments(self, words, message):
+        with pytest.raises(ValueError, match=message):
+            main(["ablate", *words])
 
 
 def evaluation(label="x", **values):
@@ -193,27 +225,54 @@ class TestSeeds:
         mean = mean_of_seeds("row", [evaluation(JSD=1.0, MMD=2.0), evaluation(JSD=1.0)])
         assert mean.row("MMD") is None
 
-    @pytest.mark.parametrize(
-        ("ours", "theirs", "better", "alike"),
-        [
-            ((1.0, 1.0), (2.0, 2.0), "yes", "no"),
-            ((2.0, 2.0), (1.0, 1.0), "no", "no"),
-            ((1.0, 2.0), (2.0, 1.0), "unclear", "yes"),
-            ((1.0, 1.0), (1.1, 1.1), "unclear", "yes"),  # within sqrt(0.1^2 + 0.1^2)
-        ],
-    )
-    def test_an_order_holds_where_every_seed_shows_it(self, ours, theirs, better, alike):
-        rows = tuple(Row(key, key, {}, {}) for key in "ab")
+    def test_a_row_with_fewer_seeds_keeps_what_must_be_known_of_each(self):
+        one, other = evaluation(JSD=1.0), evaluation(JSD=2.0)
+        few = replace(other.rows[0], note="few scenes")
+        bad = {**other.about, "extra": {"bad_samples": ["7"]}}
+        mean = mean_of_seeds("row", [one, replace(other, rows=(few,), about=bad)])
+        assert mean.row("JSD").note == "few scenes"
+        assert mean.bad_samples == ["7"]
+
+
+class TestOrders:
+    def holds(self, ours, theirs, published=({}, {})):
+        rows = tuple(Row(key, key, found, {}) for key, found in zip("ab", published, strict=True))
         table = Table("t", "", rows, (("a", "b"),), (("a", "b"),))
         results = {
             key: {seed: evaluation(JSD=value) for seed, value in enumerate(values)}
             for key, values in (("a", ours), ("b", theirs))
         }
-        found = order_results(table, results, ["JSD"])
-        assert [(order.claim, order.holds) for order in found] == [
-            ("better", better),
-            ("alike", alike),
-        ]
+        return {order.claim: order for order in order_results(table, results, ["JSD"])}
+
+    @pytest.mark.parametrize(
+        ("ours", "theirs", "better", "alike"),
+        [
+            ((1.0,), (2.0,), "yes", "no"),
+            ((2.0,), (1.0,), "no", "no"),
+            ((1.0,), (1.1,), "unclear", "unclear"),  # half widths of 0.1 each
+            ((20.0,), (20.1,), "unclear", "yes"),
+            ((1.0, 1.01), (2.0, 2.0), "yes", "no"),
+            ((1.0, 1.9), (2.0, 2.0), "unclear", "unclear"),  # both better, by very unlike amounts
+            ((1.0, 2.0), (2.0, 1.0), "unclear", "unclear"),
+            ((3.0, 5.0), (3.01, 5.01), "unclear", "yes"),  # in pairs: seeds differ more than rows
+        ],
+    )
+    def test_an_order_is_told_by_the_interval_of_the_difference(self, ours, theirs, better, alike):
+        found = self.holds(ours, theirs)
+        assert (found["better"].holds, found["alike"].holds) == (better, alike)
+
+    def test_intervals(self):
+        single = self.holds((1.0,), (2.0,))["better"]
+        assert single.change == -0.5
+        assert single.interval == pytest.approx((-0.5 - 0.02**0.5 / 2, -0.5 + 0.02**0.5 / 2))
+        expected = ttest_1samp((-0.5, -0.6, -0.4), 0).confidence_interval()
+        several = self.holds((1.0, 0.8, 1.2), (2.0, 2.0, 2.0))["better"]
+        assert several.interval == pytest.approx((expected.low, expected.high))
+
+    def test_what_the_paper_printed_goes_before_its_claim(self):
+        reverse = ({"JSD": 3.0}, {"JSD": 2.0})
+        assert self.holds((1.0,), (2.0,), reverse)["worse"].holds == "no"
+        assert self.holds((2.0,), (1.0,), reverse)["worse"].holds == "yes"
 
 
 @pytest.fixture
@@ -317,7 +376,7 @@ def wandb_records(path):
             yield record
 
 
-@pytest.mark.slow  # 20 s; its parts are tested below and in test_ablate_stages.py
+@pytest.mark.slow  # 20 s; its parts are tested below, with processes that take no time
 def test_two_rows_from_nothing_to_the_tables(table, scale_file, tmp_path, started, capsys):
     out = tmp_path / "out"
     words = ["ablate", str(table), "--scale", str(scale_file), "--out", str(out)]
@@ -379,23 +438,115 @@ def test_two_rows_from_nothing_to_the_tables(table, scale_file, tmp_path, starte
 
 
 def without_training(words):
-    """Leaves the numbers of a test where they belong."""
+    """Leaves behind what others need."""
+    run_dir = Path(words[words.index("--run_dir") + 1]) if "--run_dir" in words else None
+    if words[0] == "fit":
+        (run_dir / "checkpoints").mkdir(exist_ok=True)
+        (run_dir / "checkpoints" / "last.ckpt").touch()
     if words[0] == "test":
-        folder = Path(words[words.index("--run_dir") + 1])
-        evaluation(JSD=1.0).save(folder / "evaluation" / "evaluation.json")
+        evaluation(JSD=1.0).save(run_dir / "evaluation" / "evaluation.json")
+    if words[0] == "reference":
+        Path(words[words.index("--out") + 1]).touch()
+
+
+@pytest.fixture
+def command(table, scale_file, tmp_path, started, monkeypatch):
+    """Words of an ablation whose processes take no time."""
+    monkeypatch.setattr(InThisProcess, "run", staticmethod(without_training))
+    out = tmp_path / "out"
+    words = ["ablate", str(table), "--scale", str(scale_file), "--out", str(out)]
+    return [*words, "--wandb", "off"]
+
+
+def kinds_of(started):
+    found = [words[0] for words in started]
+    started.clear()
+    return found
+
+
+def test_what_starts_from_a_stage_is_trained_anew_with_it(command, tmp_path, started):
+    main(command)
+    assert sorted(kinds_of(started)) == ["features", *3 * ["fit"], "reference", *2 * ["test"]]
+    main(command)
+    assert kinds_of(started) == []
+    stages = tmp_path / "out" / "stages"
+    old = sorted(stages.glob("flow_matching-*/checkpoints/last.ckpt"))
+    for path in old:
+        path.write_text("of the VAE before")
+    (vae,) = stages.glob("vae_alignment-*")
+    shutil.rmtree(vae)
+    main(command)
+    assert sorted(kinds_of(started)) == [*3 * ["fit"], *2 * ["test"]]
+    assert [path.read_text() for path in old] == ["", ""]
+
+
+def test_an_interrupted_training_goes_on(command, tmp_path, started, monkeypatch):
+    def stopped(words):
+        without_training(words)
+        if words[0] == "fit":
+            raise RuntimeError("stopped")
+
+    monkeypatch.setattr(InThisProcess, "run", staticmethod(stopped))
+    with pytest.raises(SystemExit):
+        main(command)
+    (checkpoint,) = (tmp_path / "out").glob("stages/vae_alignment-*/checkpoints/last.ckpt")
+    checkpoint.write_text("half way")
+    monkeypatch.setattr(InThisProcess, "run", staticmethod(lambda words: None))
+    with pytest.raises(SystemExit):
+        main(command)
+    assert checkpoint.read_text() == "half way"
+
+
+def test_a_test_without_numbers_is_a_failure_and_old_ones_are_gone(
+    command, tmp_path, started, monkeypatch, capsys
+):
+    """As `r3dpa test` ends where scenes are too few to compare."""
+    main(command)
+    assert (tmp_path / "out" / "table_x.md").is_file()
+    scale = Path(command[command.index("--scale") + 1])
+    scale.write_text(scale.read_text().replace("num_scenes: 4", "num_scenes: 5"))
+    monkeypatch.setattr(InThisProcess, "run", staticmethod(lambda words: None))
+    for _ in range(2):
+        started.clear()
+        capsys.readouterr()
+        with pytest.raises(SystemExit):
+            main(command)
+        assert kinds_of(started) == 2 * ["test"]
+        printed = capsys.readouterr().out
+        assert "left no evaluation.json" in printed
+        assert "no row has a result" in printed
+        assert printed.endswith("tables: none\n")
+    assert not list((tmp_path / "out").glob("table_x.*"))
+
+
+def test_wandb_shows_the_newest_numbers_of_each_row(command, tmp_path, started, monkeypatch):
+    def summaries():
+        return sorted(
+            json.loads(item.value_json)
+            for path in (tmp_path / "out").glob("wandb/offline-run-*/*.wandb")
+            for record in wandb_records(path)
+            for item in record.summary.update
+            if item.key == "JSD" or list(item.nested_key) == ["JSD"]
+        )
+
+    command = command[:-2]
+    main(command)
+    assert summaries() == [1.0, 1.0]
+    (one, _) = sorted((tmp_path / "out").glob("stages/flow_matching-*/evaluation/evaluation.json"))
+    evaluation(JSD=2.0).save(one)
+    main(command)
+    assert summaries() == [1.0, 2.0]
 
 
 def test_a_row_that_fails_leaves_the_other(
-    table, scale_file, tmp_path, started, monkeypatch, capsys
+    table, scale_file, command, tmp_path, started, monkeypatch, capsys
 ):
     out = tmp_path / "out"
     scale = read_scale(scale_file)
     broken = make_plan(table, scale, (0,)).tables[0].rows[1].tested(0).name
-    monkeypatch.setattr(InThisProcess, "run", staticmethod(without_training))
     monkeypatch.setattr(InThisProcess, "broken", f"fit --config {out}/stages/{broken}")
-    words = ["ablate", str(table), "--scale", str(scale_file), "--out", str(out), "--wandb", "off"]
     with pytest.raises(SystemExit) as ended:
-        main(words)
+        main(command)
     assert ended.value.code == 1
     printed = capsys.readouterr().out
     assert f"! {broken} ended with status 3" in printed
@@ -406,19 +557,20 @@ def test_a_row_that_fails_leaves_the_other(
     assert [bool(row["values"]) for row in stored["rows"]] == [True, False]
     monkeypatch.setattr(InThisProcess, "broken", "")
     started.clear()
-    main(words)
-    assert [words[0] for words in started] == ["fit", "test"]
+    main(command)
+    assert kinds_of(started) == ["fit", "test"]
 
 
 def test_processes_are_real(monkeypatch, tmp_path):
     """What is started is this package; a failure shows the end of what it wrote."""
-    job = runner._Job("check", ["check", str(tmp_path / "none")], tmp_path / "check", (), "")
+    words = ["check", str(tmp_path / "none")]
+    job = runner._Job("check", words, tmp_path / "check", (), (), "")
     with (
         runner._processes() as start,
         pytest.raises(RuntimeError, match=r"status 1; .*(\n.*)*none"),
     ):
-        start(job, runner.RunSettings(tmp_path))
-    assert not job.done.exists()
+        start(job, {}, runner.RunSettings(tmp_path))
+    assert job.state().ending is None
 
 
 def test_a_stopped_ablation_stops_what_it_started(tmp_path):
@@ -432,11 +584,11 @@ def test_a_stopped_ablation_stops_what_it_started(tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "Popen", Sleeping)
-        job = runner._Job("sleep", [], tmp_path / "sleep", (), "")
+        job = runner._Job("sleep", [], tmp_path / "sleep", (), (), "")
 
         def interrupted():
             with runner.ThreadPoolExecutor(1) as pool, runner._processes() as start:
-                pool.submit(start, job, runner.RunSettings(tmp_path))
+                pool.submit(start, job, {}, runner.RunSettings(tmp_path))
                 while not sleeping:
                     time.sleep(0.01)
                 raise KeyboardInterrupt

@@ -3,13 +3,12 @@
 from r3dpa.ablation.budget import Budget, budget_of
 from r3dpa.ablation.plan import Plan, Row, Scale, Stage, Table, make_plan, read_scale
 from r3dpa.ablation.report import OrderResult, write_table
-from r3dpa.ablation.runner import Outcome, RunSettings, run_plan
+from r3dpa.ablation.runner import RunSettings, run_plan
 from r3dpa.ablation.wandb_rows import log_rows
 
 __all__ = [
     "Budget",
     "OrderResult",
-    "Outcome",
     "Plan",
     "Row",
     "RunSettings",

@@ -39,12 +39,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from r3dpa.ablation.configs import merged, merged_files, read_config, with_value
+from r3dpa.metrics.results import published_scales
 
 __all__ = ["PRIOR", "Plan", "Row", "Scale", "Stage", "Table", "make_plan", "read_scale"]
 
@@ -52,6 +55,7 @@ __all__ = ["PRIOR", "Plan", "Row", "Scale", "Stage", "Table", "make_plan", "read
 PRIOR = "rgb_pretraining"
 
 _DIGITS = 10
+_WEIGHTS = (".pt", ".pth", ".ckpt", ".safetensors")
 _OPTIONS = ("start", "scans", "seeded")
 _SEED_KEYS = ("seed_everything", "model.init_args.seed", "data.init_args.seed", "scorer.seed")
 
@@ -69,6 +73,7 @@ class Scale:
         overrides: What all stages on scans change.
         experiments: Keys ``configs``, ``set``, ``start``, ``scans``, ``seeded`` by experiment.
         num_scans: Scans that the budget counts with.
+        num_images: Images of stage 0 that it counts with.
     """
 
     name: str
@@ -79,6 +84,7 @@ class Scale:
     overrides: dict[str, Any]
     experiments: dict[str, dict[str, Any]]
     num_scans: int
+    num_images: int
 
     @property
     def scorer(self) -> dict[str, Any]:
@@ -94,7 +100,8 @@ class Stage:
         experiment: What the scale calls it.
         config: Of ``r3dpa fit``, but for folders, devices and loggers.
         starts: Stage, or file of weights, whose checkpoint a configuration key gets.
-        name: Experiment and hash of all that training depends on; name of its folder.
+        name: Experiment and hash of its configuration, of the files that it names and of the stages
+            before it; name of its folder.
     """
 
     experiment: str
@@ -156,6 +163,12 @@ class Plan:
         return self.scale.experiments[stage.experiment].get("scans", True)
 
     @property
+    def missing_weights(self) -> list[Path]:
+        """Files of weights that stages and their tests need, and that are not there."""
+        named = {path for stage in self.stages for path in _weights_in(stage.config)}
+        return sorted(path for path in named if not path.is_file())
+
+    @property
     def tested(self) -> list[Stage]:
         """Stages that are tested, each once."""
         rows = (row for table in self.tables for row in table.rows)
@@ -176,6 +189,7 @@ def read_scale(path: Path) -> Scale:
         read_config(path),
         path,
         ("about", "common", "data", "set", "experiments", "num_scans"),
+        ("num_images",),
     )
     experiments = {
         name: _keys(given, f"{path}: experiments.{name}", ("configs",), ("set", *_OPTIONS))
@@ -190,6 +204,7 @@ def read_scale(path: Path) -> Scale:
         found["set"],
         experiments,
         found["num_scans"],
+        found.get("num_images", 0),
     )
 
 
@@ -205,10 +220,13 @@ def make_plan(
         rgb_weights: RGB-pretrained SiT, instead of pretraining one.
 
     Raises:
-        ValueError: If there is no table, a file is not as it must be, or a seed occurs twice.
+        ValueError: If there is no table, a file is not as it must be, or a seed is negative or
+            occurs twice.
     """
-    if not seeds or len(set(seeds)) < len(seeds):
-        raise ValueError(f"--seeds must be different numbers, at least one, got {list(seeds)}")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise ValueError(
+            f"--seeds must be different numbers from 0 on, at least one, got {list(seeds)}"
+        )
     if rgb_weights is not None and not rgb_weights.is_file():
         raise ValueError(f"--rgb_weights {rgb_weights}: there is no such file")
     single = (folder / "table.yaml").is_file()
@@ -235,11 +253,21 @@ def _table(
                 raise ValueError(f"{path}: {name}: {list(pair)} is no pair of {sorted(known)}")
     if not rows:
         raise ValueError(f"{folder}: has a table.yaml but no row; add a YAML file for each")
+    for label, times in Counter(row.label for row in rows).items():
+        if times > 1:
+            raise ValueError(f"{folder}: {times} rows have the label {label!r}; tell them apart")
     return Table(folder.name, about["caption"], rows, orders["better"], orders["alike"])
 
 
 def _row(path: Path, scale: Scale, seeds: Sequence[int], prior: tuple[Path, str] | None) -> Row:
     row = _keys(read_config(path), path, ("label", "stages"), ("published",))
+    metrics = published_scales()
+    for name in row.get("published", {}):
+        if name not in metrics:
+            raise ValueError(
+                f"{path}: published: {name!r} is no metric of the paper; give some of "
+                f"{', '.join(metrics)}"
+            )
     stages = {seed: _stages(row["stages"], path, scale, seed, prior) for seed in seeds}
     return Row(path.stem, row["label"], row.get("published", {}), stages)
 
@@ -298,9 +326,19 @@ def _stage(
         for key, start in starts.items()
     }
     trained = {key: value for key, value in config.items() if key != "scorer"}
-    text = json.dumps([trained, identity], sort_keys=True)
+    files = [_content(path) for path in _weights_in(trained) if path.is_file()]
+    text = json.dumps([trained, identity, *files], sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
     return [*chain, Stage(experiment, config, starts, f"{experiment}-{digest}")]
+
+
+def _weights_in(config: Any) -> list[Path]:
+    """Files of weights that a configuration names."""
+    if isinstance(config, Mapping | list):
+        values = config.values() if isinstance(config, Mapping) else config
+        return [path for value in values for path in _weights_in(value)]
+    named = isinstance(config, str) and Path(config).suffix in _WEIGHTS
+    return [Path(config)] if named else []
 
 
 def _content_of(path: Path, prior: tuple[Path, str] | None) -> str:
@@ -330,6 +368,13 @@ def _files(folder: Path, names: Iterable[Any]) -> dict[str, Any]:
 
 
 def _content(path: Path) -> str:
+    found = path.stat()
+    return _digest(path, found.st_size, found.st_mtime_ns)
+
+
+@cache
+def _digest(path: Path, _size: int, _mtime_ns: int) -> str:
+    """Of a file, read once unless it is replaced."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Literal
@@ -15,16 +14,17 @@ from scipy.stats import t as student
 
 from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Stage, Table
-from r3dpa.ablation.runner import evaluation_of
+from r3dpa.ablation.runner import commit_of, evaluation_of
 from r3dpa.atomic import atomic_path
 from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import About, Evaluation, MetricResult
+from r3dpa.metrics.results import About, Evaluation, MetricResult, published_scales
 from r3dpa.metrics.scene_features import SPACES
 
 __all__ = ["OrderResult", "mean_of_seeds", "order_results", "write_table"]
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _LEVEL = 0.95
+_ALIKE = 0.05
 _POINTS = 100  # at most, of a curve in the JSON file
 
 Results = Mapping[str, Mapping[int, Evaluation]]
@@ -36,34 +36,40 @@ class OrderResult:
     """What became of one order of the paper, in one metric.
 
     Args:
-        first: Row that the paper has as better, or as alike.
-        second: The other row.
-        claim: What the paper says.
+        first: Row that the claim is about.
+        second: The row that it is compared with.
+        claim: What the paper found: in this metric where it printed both, else in general.
         metric: Name of the metric.
-        verdicts: For each seed that both rows have: is ``first`` ``better``, ``worse``, or can it
-            not be told (``tie``)?
-        change: Mean over the seeds of the relative difference of ``first`` to ``second``.
+        change: Relative difference of ``first`` to ``second``, the mean over the seeds.
+        interval: Ends of its 95 % interval: Student's of the differences seed by seed, or with a
+            single seed that of the scenes, without the noise of training.
+        direction: Which values are better.
     """
 
     first: str
     second: str
-    claim: Literal["better", "alike"]
+    claim: Literal["better", "worse", "alike"]
     metric: str
-    verdicts: tuple[Literal["better", "tie", "worse"], ...]
     change: float
+    interval: tuple[float, float]
+    direction: Literal["lower", "higher"] = "lower"
 
     @property
     def holds(self) -> Literal["yes", "no", "unclear"]:
-        """Whether all seeds agree with the claim, or all disagree.
+        """Whether the interval lies where the claim has it, or wholly elsewhere.
 
-        *Alike* is what is not better, or worse, in all seeds.
+        *Alike* are rows that differ by no more than 5 %, some times as much as those that the paper
+        calls so.
         """
-        same = len(set(self.verdicts)) == 1 and self.verdicts[0] != "tie"
+        low, high = self.interval
         if self.claim == "alike":
-            return "no" if same else "yes"
-        if not same:
+            if max(-low, high) <= _ALIKE:
+                return "yes"
+            return "no" if low > _ALIKE or high < -_ALIKE else "unclear"
+        if low <= 0 <= high:
             return "unclear"
-        return "yes" if self.verdicts[0] == "better" else "no"
+        better = (high < 0) == (self.direction == "lower")
+        return "yes" if better == (self.claim == "better") else "no"
 
 
 def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -86,51 +92,83 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         if len(values) < len(evaluations):
             rows.append(replace(row, value=None, interval=None, note="not in every seed"))
             continue
-        mean, num = fmean(values), len(values)
-        half = student.ppf((1 + _LEVEL) / 2, num - 1) * stdev(values) / math.sqrt(num)
-        rows.append(replace(row, value=mean, interval=(mean - half, mean + half), note=""))
-    seeds = {"seeds": len(evaluations), "of each seed": [e.about["source"] for e in evaluations]}
-    about: About = {**first.about, "seed": None, "extra": {**first.about["extra"], **seeds}}
+        mean, half = fmean(values), _students(values)
+        notes = dict.fromkeys(other.note for other in found if other.note)
+        rows.append(
+            replace(row, value=mean, interval=(mean - half, mean + half), note="; ".join(notes))
+        )
+    extra = {
+        **first.about["extra"],
+        "bad_samples": [name for e in evaluations for name in e.bad_samples],
+        "seeds": len(evaluations),
+        "of each seed": [e.about["source"] for e in evaluations],
+    }
+    about: About = {**first.about, "seed": None, "extra": extra}
     return Evaluation(label, tuple(rows), about)
 
 
 def order_results(table: Table, results: Results, metrics: Sequence[str]) -> list[OrderResult]:
     """What became of the orders of the paper, as far as there are results."""
+    rows = {row.key: row for row in table.rows}
+    claims = [("better", pair) for pair in table.better] + [("alike", pair) for pair in table.alike]
     found = []
-    claims: tuple[tuple[Literal["better", "alike"], tuple[tuple[str, str], ...]], ...]
-    claims = (("better", table.better), ("alike", table.alike))
-    for claim, pairs in claims:
-        for first, second in pairs:
-            ours, theirs = results.get(first, {}), results.get(second, {})
-            for metric in metrics:
-                both = [
-                    (a, b)
-                    for seed in sorted(ours.keys() & theirs.keys())
-                    if (a := ours[seed].row(metric)) and (b := theirs[seed].row(metric))
-                ]
-                if both:
-                    changes = [_change(a, b) for a, b in both]
-                    verdicts = tuple(_verdict(a, b) for a, b in both)
-                    found.append(
-                        OrderResult(first, second, claim, metric, verdicts, fmean(changes))
+    for claim, (first, second) in claims:
+        ours, theirs = results.get(first, {}), results.get(second, {})
+        for metric in metrics:
+            both = [
+                (a, b)
+                for seed in sorted(ours.keys() & theirs.keys())
+                if (a := ours[seed].row(metric)) and (b := theirs[seed].row(metric))
+            ]
+            both = [(a, b) for a, b in both if a.value is not None and b.value]
+            if both:
+                direction = both[0][0].direction
+                printed = [rows[key].published.get(metric) for key in (first, second)]
+                found.append(
+                    OrderResult(
+                        first,
+                        second,
+                        _claim(claim, printed, direction),
+                        metric,
+                        *_difference(both),
+                        direction,
                     )
+                )
     return found
 
 
-def _verdict(ours: MetricResult, theirs: MetricResult) -> Literal["better", "tie", "worse"]:
-    """Told by the intervals of the scenes; the floor is the same for both and says nothing here."""
-    ours, theirs = replace(ours, floor=None), replace(theirs, floor=None)
-    if ours.ties_with(theirs):
-        return "tie"
-    assert ours.value is not None
-    assert theirs.value is not None
-    return "better" if (ours.value < theirs.value) == (ours.direction == "lower") else "worse"
+def _claim(
+    general: str, printed: Sequence[float | None], direction: str
+) -> Literal["better", "worse", "alike"]:
+    """The claim in a metric: what was printed of it may be the reverse of the general claim."""
+    if general == "alike":
+        return "alike"
+    first, second = printed
+    if first is None or second is None or first == second:
+        return "better"
+    return "better" if (first < second) == (direction == "lower") else "worse"
 
 
-def _change(ours: MetricResult, theirs: MetricResult) -> float:
-    assert ours.value is not None
-    assert theirs.value is not None
-    return (ours.value - theirs.value) / abs(theirs.value) if theirs.value else 0.0
+def _difference(
+    both: Sequence[tuple[MetricResult, MetricResult]],
+) -> tuple[float, tuple[float, float]]:
+    """Mean relative difference, and the ends of its interval."""
+    changes = []
+    for a, b in both:
+        assert a.value is not None
+        assert b.value is not None
+        changes.append((a.value - b.value) / abs(b.value))
+        half = math.hypot(a.half_width, b.half_width) / abs(b.value)
+    if len(changes) > 1:
+        half = _students(changes)
+    mean = fmean(changes)
+    return mean, (mean - half, mean + half)
+
+
+def _students(values: Sequence[float]) -> float:
+    """Half the width of Student's interval of a mean."""
+    num = len(values)
+    return float(student.ppf((1 + _LEVEL) / 2, num - 1)) * stdev(values) / math.sqrt(num)
 
 
 def write_table(
@@ -159,9 +197,9 @@ def write_table(
             if f"test of {stage.name}" not in failed and path.is_file():
                 results[row.key][seed] = Evaluation.load(path)
     own = [
-        mean_of_seeds(row.label, list(results[row.key].values()))
+        mean_of_seeds(_counted(row.label, found, plan), list(found.values()))
         for row in table.rows
-        if results[row.key]
+        if (found := results[row.key])
     ]
     lost = [
         f"{row.label}, seed {seed}: no result"
@@ -170,6 +208,8 @@ def write_table(
         if seed not in results[row.key]
     ]
     if not own:
+        for suffix in ("md", "tex", "csv", "json"):  # of another run, they would look like its own
+            (out / f"{table.name}.{suffix}").unlink(missing_ok=True)
         return f"{table.name}: {table.caption}\n\nno row has a result", results
     distances = [
         replace(e, rows=tuple(row for row in e.rows if row.name in _DISTANCES)) for e in own
@@ -182,8 +222,16 @@ def write_table(
         f"{', '.join(map(str, plan.seeds))}."
     )
     if len(plan.seeds) > 1:
-        head += " Intervals are Student's, of the mean over the seeds."
+        head += (
+            " Intervals are Student's, of the mean over the seeds, which share scans and prior; "
+            "those of orders are of the differences seed by seed."
+        )
+    else:
+        head += " Intervals are those of the scenes: another training differs by more."
+    commits = _commits(out, table, results)
     told = [*_told(table, orders), *lost]
+    if len(commits) > 1:
+        told.append(f"trained or tested by different commits: {', '.join(commits)}")
     with atomic_path(out / f"{table.name}.md") as temporary:
         listed = "\n".join(f"- {line}" for line in told)
         text = f"# {table.name}\n\n{head}\n\n{shown.markdown()}\n{listed}\n"
@@ -191,27 +239,42 @@ def write_table(
     with atomic_path(out / f"{table.name}.tex") as temporary:
         temporary.write_text(f"% {' '.join(head.split())}\n{shown.latex()}", encoding="utf-8")
     EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
-    _save_json(plan, table, out, results, orders, failed)
+    _save_json(plan, table, out, results, orders, failed, commits)
     return "\n".join([f"{table.name}: {head}", "", str(shown), *told]), results
+
+
+def _counted(label: str, found: Mapping[int, Evaluation], plan: Plan) -> str:
+    """Label of a row, with the number of its seeds where some are missing."""
+    num, total = len(found), len(plan.seeds)
+    return label if num == total else f"{label} ({num} of {total} seeds)"
+
+
+def _commits(out: Path, table: Table, results: Results) -> list[str]:
+    """Commits of the code that trained and tested the rows, shortened."""
+    found: dict[str, None] = {}
+    for row in table.rows:
+        for seed, evaluation in results[row.key].items():
+            trained = [commit_of(out, stage) for stage in row.stages[seed]]
+            for commit in (*trained, evaluation.about["commit"]):
+                found[commit[:10] if commit else "unknown"] = None
+    return list(found)
 
 
 def _told(table: Table, orders: Sequence[OrderResult]) -> list[str]:
     """Each order of the paper in a line."""
     labels = {row.key: row.label for row in table.rows}
-    lines: dict[tuple[str, str, str], list[str]] = {}
+    lines: dict[tuple[str, str, bool], list[str]] = {}
     for order in orders:
-        counts = ", ".join(
-            f"{verdict} {order.verdicts.count(verdict)}"
-            for verdict in ("better", "tie", "worse")
-            if verdict in order.verdicts
+        low, high = (100 * end for end in order.interval)
+        reverse = " (worse there)" if order.claim == "worse" else ""
+        lines.setdefault((order.first, order.second, order.claim == "alike"), []).append(
+            f"{order.metric}{reverse} {order.holds}, {100 * order.change:+.0f} % "
+            f"[{low:+.0f}, {high:+.0f}]"
         )
-        lines.setdefault((order.first, order.second, order.claim), []).append(
-            f"{order.metric} {order.holds} ({100 * order.change:+.0f} %; seeds: {counts})"
-        )
-    words = {"better": "better than", "alike": "like"}
     return [
-        f"Paper: {labels[first]} {words[claim]} {labels[second]}. Here: {'; '.join(found)}"
-        for (first, second, claim), found in lines.items()
+        f"Paper: {labels[first]} {'like' if alike else 'better than'} {labels[second]}. "
+        f"Here: {'; '.join(found)}"
+        for (first, second, alike), found in lines.items()
     ]
 
 
@@ -222,12 +285,14 @@ def _save_json(
     results: Results,
     orders: Sequence[OrderResult],
     failed: Mapping[str, str],
+    commits: Sequence[str],
 ) -> None:
     stored = {
         "table": table.name,
         "caption": table.caption,
         "scale": plan.scale.name,
         "about": plan.scale.about,
+        "commits": list(commits),
         "rows": [
             {
                 "key": row.key,
@@ -241,6 +306,10 @@ def _save_json(
                     str(seed): {r.name: r.value for r in e.rows}
                     for seed, e in results[row.key].items()
                 },
+                "intervals": {
+                    str(seed): {r.name: r.interval for r in e.rows}
+                    for seed, e in results[row.key].items()
+                },
             }
             for row in table.rows
         ],
@@ -250,8 +319,8 @@ def _save_json(
                 "second": order.second,
                 "claim": order.claim,
                 "metric": order.metric,
-                "verdicts": list(order.verdicts),
                 "change": order.change,
+                "interval": order.interval,
                 "holds": order.holds,
             }
             for order in orders
@@ -285,8 +354,7 @@ def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
 
 def _published(table: Table) -> list[Evaluation]:
     """The rows as the paper printed them; KITTI-360, other networks and other data than here."""
-    content = files("r3dpa.metrics").joinpath("published.json").read_text(encoding="utf-8")
-    scales = json.loads(content)["scales"]
+    scales = published_scales()
     found = []
     for row in table.rows:
         values = tuple(

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from subprocess import Popen, TimeoutExpired
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
 from r3dpa.ablation.configs import merged, with_value
 from r3dpa.ablation.plan import Plan, Stage
 from r3dpa.atomic import atomic_path
+from r3dpa.checkpoints import source_commit
 from r3dpa.metrics.scene_features import FREE_SPACES
 
-__all__ = ["Outcome", "RunSettings", "evaluation_of", "run_plan", "stage_folder"]
+__all__ = ["RunSettings", "commit_of", "evaluation_of", "run_plan", "stage_folder"]
 
 _TAIL = 12  # lines of a failed process that are shown
 _STOP_SECONDS = 60.0  # that a stopped training gets to save its checkpoint
@@ -54,11 +57,21 @@ class RunSettings:
             )
 
 
-class Outcome(NamedTuple):
-    """What became of the processes: why each failed one failed, and seconds of the others."""
+@dataclass(frozen=True)
+class _State:
+    """What is known of a job that was started.
 
-    failed: dict[str, str]
-    seconds: dict[str, float]
+    Args:
+        content: Settings that it ran with.
+        used: The endings of the jobs whose results it used, by name.
+        commit: Of the code.
+        ending: Another one each time that it ends well; None before.
+    """
+
+    content: str
+    used: dict[str, str]
+    commit: str | None
+    ending: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,36 +81,44 @@ class _Job:
     Args:
         name: For the user.
         words: Of the command line.
-        place: Its output goes to ``<place>.log``; ``<place>.done`` says that it has ended well.
+        place: Its output goes to ``<place>.log``, its state to ``<place>.state``.
         needs: Names of other jobs.
-        content: All that the result depends on: another one of before does not count as done.
+        uses: Those of them whose results change its own.
+        content: Settings that its result depends on.
+        makes: File that it must leave behind; one of before is removed.
+        goes_on: Whether it goes on from what its last start left in the folder of ``place``.
     """
 
     name: str
     words: list[str]
     place: Path
     needs: tuple[str, ...]
+    uses: tuple[str, ...]
     content: str
+    makes: Path | None = None
+    goes_on: bool = False
 
     @property
     def log(self) -> Path:
         return self.place.with_suffix(".log")
 
-    @property
-    def done(self) -> Path:
-        return self.place.with_suffix(".done")
+    def state(self) -> _State | None:
+        """What its last start left."""
+        return _read_state(self.place.with_suffix(".state"))
 
-    def seconds(self) -> float | None:
-        """What it took, None where it is still to be run."""
-        if not self.done.is_file():
-            return None
-        try:
-            found = json.loads(self.done.read_text(encoding="utf-8"))
-            return float(found["seconds"]) if found["content"] == self.content else None
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{self.done}: is damaged ({error}); remove it to run {self.name} again"
-            ) from error
+    def save(self, state: _State) -> None:
+        """Written whole or not at all."""
+        with atomic_path(self.place.with_suffix(".state")) as temporary:
+            temporary.write_text(json.dumps(asdict(state)), encoding="utf-8")
+
+
+def _read_state(path: Path) -> _State | None:
+    if not path.is_file():
+        return None
+    try:
+        return _State(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: is damaged ({error}); remove it to run its job again") from error
 
 
 def stage_folder(out: Path, stage: Stage) -> Path:
@@ -110,10 +131,18 @@ def evaluation_of(out: Path, stage: Stage) -> Path:
     return stage_folder(out, stage) / "evaluation" / "evaluation.json"
 
 
-def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> Outcome:
+def commit_of(out: Path, stage: Stage) -> str | None:
+    """Commit of the code that trained a stage; None where it is not known."""
+    state = _read_state(stage_folder(out, stage) / "fit.state")
+    return None if state is None else state.commit
+
+
+def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> dict[str, str]:
     """Trains and tests what is not done yet; the same call goes on after an interrupt.
 
-    A failed stage takes with it only what starts from it.
+    Done is what ended well with the same settings and the same results of stages before it. The
+    commit of the code is kept, but another one does not count: remove a stage's folder to have it
+    trained anew. A failed stage takes with it only what starts from it.
 
     Args:
         plan: What to run.
@@ -121,7 +150,7 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> O
         say: Gets a line for each process that starts or ends.
 
     Returns:
-        Failures by name of the process.
+        Why processes failed, by name.
 
     Raises:
         ValueError: If a stage's batch cannot be shared by the devices.
@@ -129,12 +158,12 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> O
     jobs = _jobs(plan, settings)
     for job in jobs:
         job.place.parent.mkdir(parents=True, exist_ok=True)
-    seconds = {job.name: took for job in jobs if (took := job.seconds()) is not None}
-    left = {job.name: job for job in jobs if job.name not in seconds}
-    if len(left) < len(jobs):
-        say(f"{len(jobs) - len(left)} of {len(jobs)} are done already")
+    endings = _endings(jobs)
+    left = {job.name: job for job in jobs if job.name not in endings}
+    if endings:
+        say(f"{len(endings)} of {len(jobs)} are done already")
     failed: dict[str, str] = {}
-    running: dict[Future[float], _Job] = {}
+    running: dict[Future[None], tuple[_Job, float]] = {}
     with ThreadPoolExecutor(settings.jobs) as pool, _processes() as start:
         while left or running:
             for job in _lost(left, failed):
@@ -143,24 +172,42 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> O
                 say(f"  - {job.name}: {failed[job.name]}")
                 del left[job.name]
             for job in list(left.values()):
-                if len(running) < settings.jobs and seconds.keys() >= set(job.needs):
-                    running[pool.submit(start, job, settings)] = left.pop(job.name)
+                if len(running) < settings.jobs and endings.keys() >= set(job.needs):
+                    used = {name: endings[name] for name in job.uses}
+                    future = pool.submit(start, job, used, settings)
+                    running[future] = left.pop(job.name), time.monotonic()
                     say(f"  > {job.name}")
             if not running:
                 continue
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job = running.pop(future)
+                job, began = running.pop(future)
                 error = future.exception()
                 if error is None:
-                    seconds[job.name] = future.result()
-                    num_done = f"{len(seconds)} of {len(jobs)}"
-                    say(f"  = {job.name}: {seconds[job.name]:.0f} s ({num_done})")
+                    endings |= _endings([job], endings)
+                    took, num_done = time.monotonic() - began, f"{len(endings)} of {len(jobs)}"
+                    say(f"  = {job.name}: {took:.0f} s ({num_done})")
                 elif isinstance(error, RuntimeError):
                     failed[job.name] = str(error)
                     say(f"  ! {job.name} {error}")
                 else:
                     raise error
-    return Outcome(failed, seconds)
+    return failed
+
+
+def _endings(jobs: Iterable[_Job], known: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Endings of those jobs that need not be run again; ``known`` are those of jobs before them."""
+    found = dict(known or {})
+    for job in jobs:
+        state = job.state()
+        used = {name: found.get(name) for name in job.uses}
+        if (
+            state is not None
+            and state.ending is not None
+            and (state.content, state.used) == (job.content, used)
+            and (job.makes is None or job.makes.is_file())
+        ):
+            found[job.name] = state.ending
+    return found
 
 
 def _lost(left: Mapping[str, _Job], failed: Mapping[str, str]) -> list[_Job]:
@@ -183,20 +230,28 @@ def _jobs(plan: Plan, settings: RunSettings) -> list[_Job]:
             "features",
             ["features", "--data", str(data), *made],
             out / "features",
-            (),
-            f"{scans} {grids}",
+            needs=(),
+            uses=(),
+            content=f"{scans} {grids}",
         ),
-        _Job("reference", words, out / "reference", ("features",), f"{scans} {spaces}"),
+        _Job(
+            "reference",
+            words,
+            out / "reference",
+            needs=("features",),
+            uses=(),
+            content=f"{scans} {spaces}",
+            makes=reference,
+        ),
     ]
     for stage in plan.stages:
         folder = stage_folder(out, stage)
         config = folder / "stage.yaml"
         _write(config, _settled(stage, settings))
         words = ["fit", "--config", str(config), "--run_dir", str(folder), "--ckpt_path", "last"]
-        needs = tuple(before.name for before in stage.before)
-        if plan.on_scans(stage):
-            needs = (*needs, "features")
-        jobs.append(_Job(stage.name, words, folder / "fit", needs, stage.name))
+        uses = tuple(before.name for before in stage.before)
+        needs = (*uses, "features") if plan.on_scans(stage) else uses
+        jobs.append(_Job(stage.name, words, folder / "fit", needs, uses, stage.name, goes_on=True))
     for stage in plan.tested:
         folder = stage_folder(out, stage)
         words = ["test", "--config", str(folder / "stage.yaml"), "--run_dir", str(folder)]
@@ -204,7 +259,9 @@ def _jobs(plan: Plan, settings: RunSettings) -> list[_Job]:
         words += ["--trainer.logger", "false", "--trainer.devices", "1"]
         content = json.dumps([scans, stage.config.get("scorer")], sort_keys=True)
         needs = (stage.name, "reference")
-        jobs.append(_Job(f"test of {stage.name}", words, folder / "test", needs, content))
+        numbers = evaluation_of(out, stage)
+        name = f"test of {stage.name}"
+        jobs.append(_Job(name, words, folder / "test", needs, needs, content, numbers))
     return jobs
 
 
@@ -238,6 +295,7 @@ def _settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
     if settings.online:
         init_args = {"project": "r3dpa", "save_dir": "runs", "name": stage.name}
         init_args |= {"job_type": "stage", "group": f"stages of {settings.out.name}"}
+        init_args |= {"id": f"{settings.out.name}-{stage.name}", "resume": "allow"}
         loggers.append({"class_path": "WandbLogger", "init_args": init_args})
     for logger in loggers:
         logger["class_path"] = f"lightning.pytorch.loggers.{logger['class_path']}"
@@ -263,15 +321,22 @@ def _write(path: Path, config: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def _processes() -> Iterator[Callable[[_Job, RunSettings], float]]:
+def _processes() -> Iterator[Callable[[_Job, dict[str, str], RunSettings], None]]:
     """A function that runs jobs; when the block is left early, those that still run are stopped."""
     alive: set[Popen[bytes]] = set()
     stopped = False
 
-    def start(job: _Job, settings: RunSettings) -> float:
+    def start(job: _Job, used: dict[str, str], settings: RunSettings) -> None:
         if stopped:
             raise RuntimeError("was not started any more")
-        began = time.monotonic()
+        before, state = job.state(), _State(job.content, used, source_commit())
+        if job.goes_on and before is not None and before.used != used:  # it would be of others
+            for path in job.place.parent.iterdir():
+                if path.is_dir():
+                    shutil.rmtree(path)
+        if job.makes is not None:
+            job.makes.unlink(missing_ok=True)
+        job.save(state)
         cores = max(1, (os.cpu_count() or 1) // settings.jobs)
         environment = {"OMP_NUM_THREADS": str(cores)} | os.environ
         words = [sys.executable, "-m", "r3dpa", *job.words]
@@ -280,15 +345,13 @@ def _processes() -> Iterator[Callable[[_Job, RunSettings], float]]:
             alive.add(process)
             status = process.wait()
             alive.discard(process)
+        lines = job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        tail = "\n".join(f"      {line}" for line in lines[-_TAIL:])
         if status:
-            lines = job.log.read_text(encoding="utf-8", errors="replace").splitlines()
-            tail = "\n".join(f"      {line}" for line in lines[-_TAIL:])
             raise RuntimeError(f"ended with status {status}; {job.log} ends with\n{tail}")
-        seconds = time.monotonic() - began
-        with atomic_path(job.done) as temporary:
-            text = json.dumps({"seconds": seconds, "content": job.content})
-            temporary.write_text(text, encoding="utf-8")
-        return seconds
+        if job.makes is not None and not job.makes.is_file():
+            raise RuntimeError(f"left no {job.makes.name}; {job.log} ends with\n{tail}")
+        job.save(replace(state, ending=uuid.uuid4().hex))
 
     try:
         yield start

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any, Literal
 
 from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.report import Results
+from r3dpa.atomic import atomic_path
 
 __all__ = ["log_rows"]
 
 
 def log_rows(
     plan: Plan, table: Table, results: Results, out: Path, mode: Literal["offline", "online"]
-) -> int:
+) -> None:
     """Writes a run for each row and seed: group, configuration, curves, metrics as its summary.
 
-    A run that is there already is not written again. Offline ones lie in ``<out>/wandb``;
-    ``wandb sync`` uploads them.
+    A run that is there already is not written again, and takes the place of an offline one of the
+    same row and seed with other numbers. Offline ones lie in ``<out>/wandb``; ``wandb sync``
+    uploads them.
 
     Args:
         plan: The plan that was run.
@@ -28,24 +31,24 @@ def log_rows(
         results: Of the rows.
         out: Folder of the ablation.
         mode: Whether to write to disk or to send.
-
-    Returns:
-        Runs that were written.
     """
-    written = 0
     for row in table.rows:
         for seed, evaluation in results[row.key].items():
             metrics = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
             summary: dict[str, Any] = {k: v for k, v in metrics.items() if v is not None}
-            stages = row.stages[seed]
-            told = [table.name, row.key, seed, [stage.name for stage in stages], summary]
-            run_id = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
-            note = out / "wandb" / f"{run_id}.{mode}"
-            if not note.is_file():
-                _log_row(plan, table, row, seed, summary, out, run_id, mode)
-                note.write_text(f"{table.name}, {row.key}, seed {seed}\n", encoding="utf-8")
-                written += 1
-    return written
+            stages = [stage.name for stage in row.stages[seed]]
+            told = json.dumps([table.name, row.key, seed, stages, plan.scale.scorer])
+            run_id = hashlib.sha256(told.encode()).hexdigest()[:12]
+            note = out / "wandb" / f"{table.name}-{row.key}-{seed}.{mode}.json"
+            text = json.dumps({"id": run_id, "summary": summary})
+            if note.is_file():
+                if (before := note.read_text(encoding="utf-8")) == text:
+                    continue
+                for stale in note.parent.glob(f"offline-run-*-{json.loads(before)['id']}"):
+                    shutil.rmtree(stale)
+            _log_row(plan, table, row, seed, summary, out, run_id, mode)
+            with atomic_path(note) as temporary:
+                temporary.write_text(text, encoding="utf-8")
 
 
 def _log_row(
@@ -69,6 +72,13 @@ def _log_row(
         "seed": seed,
         "stages": {stage.experiment: stage.config for stage in stages},
         "runs": [stage.name for stage in stages],
+        "starts": {
+            stage.name: {
+                key: start.name if isinstance(start, Stage) else str(start)
+                for key, start in stage.starts.items()
+            }
+            for stage in stages
+        },
     }
     with wandb.init(
         project="r3dpa",
@@ -76,6 +86,7 @@ def _log_row(
         job_type="row",
         name=f"{row.label}, seed {seed}",
         id=run_id,
+        resume="allow" if mode == "online" else None,
         dir=out,
         mode=mode,
         config=config,

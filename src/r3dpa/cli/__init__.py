@@ -122,7 +122,7 @@ def ablate_tables(
             file of that kind.
         seeds: Numbers separated by commas; every row is trained and tested for each.
         out: Folder for everything; ``runs/ablation/<scale>`` where not given.
-        jobs: Trainings and tests at a time; cores are shared out, a GPU is used by all.
+        jobs: Trainings and tests at a time; cores are shared out, all of them use the first GPU.
         devices: GPUs of each training, which share its batch.
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
         wandb: A run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
@@ -131,6 +131,8 @@ def ablate_tables(
     """
     from r3dpa.cli.ablate_tables import ablate_tables as run
 
+    if not all(word.isdecimal() for word in _words(seeds)):
+        raise ValueError(f"--seeds {seeds}: give whole numbers separated by commas, such as 0,1,2")
     numbers = [int(word) for word in _words(seeds)]
     try:
         complete = run(tables, scale, numbers, out, jobs, devices, rgb_weights, wandb, budget_only)

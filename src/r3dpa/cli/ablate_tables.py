@@ -42,24 +42,32 @@ def ablate_tables(
     _say(str(budget_of(plan)))
     if budget_only:
         return True
+    if plan.missing_weights:
+        listed = ", ".join(map(str, plan.missing_weights))
+        raise ValueError(f"scale {found.name} needs files that are not there: {listed}")
     with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
-        outcome = run_plan(plan, settings, _say)
+        failed = run_plan(plan, settings, _say)
+        results = {}
         for table in plan.tables:
-            text, results = write_table(plan, table, folder, outcome.failed)
+            text, results[table.name] = write_table(plan, table, folder, failed)
             _say(f"\n{text}")
-            if wandb != "off":
-                log_rows(plan, table, results, folder, wandb)
-    for name, reason in outcome.failed.items():
+        if wandb != "off":
+            for table in plan.tables:
+                log_rows(plan, table, results[table.name], folder, wandb)
+    for name, reason in failed.items():
         _say(f"failed: {name}: {reason}")
-    _say(f"tables: {', '.join(str(folder / f'{table.name}.md') for table in plan.tables)}")
-    return not outcome.failed
+    files = [folder / f"{table.name}.md" for table in plan.tables]
+    _say(f"tables: {', '.join(str(file) for file in files if file.is_file()) or 'none'}")
+    return not failed
 
 
 def _scale_file(tables: Path, scale: str) -> Path:
     """The YAML file of a scale: itself, or by its name in the folder of the tables."""
+    if not tables.is_dir():
+        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
     if Path(scale).suffix in (".yaml", ".yml"):
         return Path(scale)
-    near = [folder / "scale" for folder in (tables, tables.parent)]
+    near = [folder / "scale" for folder in (tables, tables.resolve().parent)]
     place = next((folder for folder in near if folder.is_dir()), near[-1])
     return place / f"{scale}.yaml"
 

@@ -279,8 +279,21 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
     """
     if split not in get_args(Split):
         raise ValueError(f"split is {split!r}; the paper has {', '.join(get_args(Split))}")
-    table = json.loads(files(__package__).joinpath("published.json").read_text(encoding="utf-8"))
+    table = _published_table()
     return tuple(_published(method, table, split) for method in table["methods"])
+
+
+def published_scales() -> dict[str, int]:
+    """Power of ten of the printed column of each metric of the paper."""
+    scales: dict[str, int] = _published_table()["scales"]
+    return scales
+
+
+@cache
+def _published_table() -> dict[str, Any]:
+    text = files(__package__).joinpath("published.json").read_text(encoding="utf-8")
+    table: dict[str, Any] = json.loads(text)
+    return table
 
 
 def _published(method: Mapping[str, Any], table: Mapping[str, Any], split: Split) -> Evaluation:
