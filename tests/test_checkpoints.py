@@ -26,6 +26,7 @@ from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProje
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
+from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
 
 SIT_ARGS = {
@@ -624,6 +625,17 @@ class TestTransfer:
         with pytest.raises(ValueError, match=message):
             transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
         assert all(torch.equal(value, before[key]) for key, value in sit.state_dict().items())
+
+    def test_only_a_sit_has_rgb_weights(self):
+        args = {"in_channels": 4, "input_size": (4, 8), "channels": 32, "feature_dim": 8}
+        unet = UNet(**args)
+        networks = {
+            "sit": NetworkState.of(unet, args),
+            "latent_norm": NetworkState.of(LatentNorm(4), {"channels": 4}),
+        }
+        source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
+        with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* of a SiT"):
+            transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
 
     def test_a_fresh_projector_may_look_at_another_block(self):
         source, sit = self.source(alignment_depth=1), SiT(**SIT_ARGS)

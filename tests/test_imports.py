@@ -31,7 +31,7 @@ ALLOWED = {
     "snapshots": {"checkpoints", "modules", "nn"},
     "callbacks": {"geometry", "data", "generation", "modules", "nn", "viz"}
     | {"checkpoints", "metrics", "scoring"},
-    "ablation": {"imports", "metrics", "modules", "viz"},
+    "ablation": {"imports", "metrics", "modules", "checkpoints", "viz"},
     "bench": CORE
     | {"imports", "simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
     | {"editing"},

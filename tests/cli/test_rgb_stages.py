@@ -12,6 +12,8 @@ from PIL import Image
 
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
+from r3dpa.modules import ImageVAETraining, LossWeights, RGBPretraining
+from r3dpa.nn import ImageVAE, SiT
 from r3dpa.nn.backbones import DINOv2
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -123,17 +125,47 @@ def test_images_of_a_folder_are_aligned_with_a_teacher(image_vae, tmp_path):
         "data.init_args.mirrored": "true",
         **{key: value for key, value in LEAVES.items() if "source" not in key},
     }
-    start = {
-        "model.init_args.init_from": image_vae,
-        "model.init_args.teacher.init_args.weights": tmp_path / "dino.pth",
-    }
+    start = {"model.init_args.init_from": image_vae}
     configs = ("trainer", "data/images", "experiment/rgb_pretraining")
-    path = fit(tmp_path / "run", configs, folder, VAE, TINY, teacher, steps(2), start)
+    settings = (folder, VAE, TINY, teacher, steps(2), start)
+    with pytest.raises(ValueError, match=r"random weights: give .*teacher\.init_args\.weights"):
+        fit(tmp_path / "run", configs, *settings)
+    weights = {"model.init_args.teacher.init_args.weights": tmp_path / "dino.pth"}
+    path = fit(tmp_path / "run", configs, *settings, weights)
     content = torch.load(path, weights_only=True)
     assert not any("teacher" in key or "cls_token" in key for key in content["state_dict"])
     moments = content["optimizer_states"][0]["state"]
     (group,) = content["optimizer_states"][0]["param_groups"]
     assert len(moments) == len(group["params"])  # the projector too has gradients
+
+
+def test_a_teacher_is_moved_to_the_images():
+    """Also where no fit starts, as in `r3dpa test`."""
+    sit = SiT(
+        input_size=(8, 8), hidden_size=16, depth=1, num_heads=2, alignment_depth=1, feature_dim=16
+    )
+    vae = ImageVAE(sit.in_channels, channels=(8, 16), norm_groups=4)
+    teacher = DINOv2(dim=16, depth=1, num_heads=2, grid_size=2)
+    module = RGBPretraining(vae, sit, teacher, weights=LossWeights(sit_alignment=0.5))
+    features = module._features({"image": torch.empty(1, 3, 16, 16, device="meta")})
+    assert features.device.type == "meta"
+
+
+@pytest.mark.filterwarnings("ignore:step . was skipped")
+def test_broken_steps_do_not_lead_to_replay_which_knows_no_images(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        ImageVAETraining, "vae_losses", lambda *args: {"kl": args[-1].mean() * torch.nan}
+    )
+    with pytest.raises(RuntimeError, match=r"steps in a row.* named in .*bad_batches") as stop:
+        fit(
+            tmp_path,
+            (*DEMO, "experiment/image_vae"),
+            LEAVES,
+            VAE,
+            steps(4),
+            {"model.init_args.guards.max_skipped_steps": 2},
+        )
+    assert "replay" not in str(stop.value)
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,13 @@ def test_a_replaced_scan_has_a_row_of_its_own(tmp_path, projection, settings):
         opened(tmp_path, projection, old).read(old[0][0], 1)
 
 
+def test_shards_are_mapped_without_taking_memory(tmp_path, projection, settings):
+    """A map that may be written counts as memory as a whole: large shards could not be opened."""
+    fill(tmp_path, settings(), (0, 2))
+    mapping, _ = opened(tmp_path, projection, samples(0, 2))._reader.find(("drive/0000000000", 160))
+    assert memoryview(mapping).readonly
+
+
 # --- killed writers and damaged files
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import tarfile
+import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,6 +80,73 @@ def test_damaged_files_are_named(folder, shards):
         ImageFolder(str(shards)).entries()
 
 
+def test_a_damaged_chunk_of_a_png_names_the_file(tmp_path):
+    """Of a name that is none: a SyntaxError of Pillow."""
+    pixels = np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8)
+    first, second, third = encoded(pixels).split(b"IDAT")
+    (tmp_path / "0.png").write_bytes(first + b"IDAT" + second + bytes(4) + third)
+    source = ImageFolder(str(tmp_path))
+    with pytest.raises(ImageError, match=r"0\.png: is no image .*broken PNG"):
+        source.read(source.entries()[0], 8)
+
+
+def cut_before_a_header(data):
+    return data[: data.index(b"n01/2")]
+
+
+def cut_within_a_header(data):
+    return data[: data.index(b"n01/2") + 100]
+
+
+def damage_a_header(data):
+    return data.replace(b"n01/2", b"n02/2")
+
+
+@pytest.mark.parametrize("damage", [cut_before_a_header, cut_within_a_header, damage_a_header])
+def test_a_shard_that_ends_too_soon_is_refused(damage, shards):
+    """tarfile takes what it cannot read behind the first member for the end."""
+    path = shards / "000.tar"
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ImageError, match=r"000\.tar is .*damaged"):
+        TarImages(str(shards)).entries()
+
+
+def test_16_bits_of_grey_keep_their_shades(tmp_path):
+    values = np.array([[0, 255, 256, 32768], [40000, 65279, 65280, 65535]] * 2, np.uint16)
+    Image.fromarray(values).save(tmp_path / "grey.png")
+    source = ImageFolder(str(tmp_path))
+    (entry,) = source.entries()
+    assert np.array_equal(source.read(entry, 4), (values // 256)[..., None].repeat(3, axis=2))
+
+
+def test_links_are_followed_and_what_is_hidden_is_left_out(folder, tmp_path):
+    root = tmp_path / "linked"
+    root.mkdir()
+    (root / "n02").symlink_to(folder / "n01")
+    (root / "n03").mkdir()
+    (root / "n03" / "up").symlink_to(root)
+    for hidden in (".cache/0.png", "n03/._0.png"):
+        (root / hidden).parent.mkdir(exist_ok=True)
+        (root / hidden).write_bytes(b"no image")
+    names = [entry.name for entry in ImageFolder(str(root)).entries()]
+    assert names == [f"n02/{index}.png" for index in range(4)]
+
+
+@pytest.mark.parametrize("name", ["0.png", "n01"])
+def test_a_link_to_nothing_is_named(name, folder):
+    (folder / "n02").mkdir()
+    (folder / "n02" / name).symlink_to(folder / "gone")
+    with pytest.raises(ImageError, match=rf"n02/{name}.* mend or remove it"):
+        ImageFolder(str(folder)).entries()
+
+
+def test_hidden_shards_and_members_are_left_out(shards, pictures):
+    (shards / "._000.tar").write_bytes(b"what macOS writes beside files")
+    with tarfile.open(shards / "000.tar", "a") as file:
+        file.addfile(tarfile.TarInfo("n01/._0.png"))
+    assert len(TarImages(str(shards)).entries()) == len(pictures)
+
+
 def test_names_that_leave_the_folder_are_refused(tmp_path):
     with tarfile.open(tmp_path / "a.tar", "w") as file:
         file.addfile(tarfile.TarInfo("../../evil.png"), io.BytesIO())
@@ -109,6 +179,36 @@ def test_splits_mirrors_and_range(folder):
     pixels = module.source.read(module.train_set.entries[0], 8)
     expected = torch.from_numpy(pixels.copy()).permute(2, 0, 1) / 127.5 - 1
     torch.testing.assert_close(plain["image"], expected)
+
+
+@pytest.mark.parametrize("per_node", [False, True])
+def test_which_processes_share_a_disk(folder, per_node):
+    source = ImageFolder(str(folder))
+    assert ImageDataModule(source).prepare_data_per_node is False
+    assert ImageDataModule(source, prepare_data_per_node=per_node).prepare_data_per_node is per_node
+
+
+def test_fewer_images_than_processes_are_refused(folder):
+    module = ImageDataModule(ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4)
+    module.setup("fit")
+    module.trainer = SimpleNamespace(world_size=2, global_rank=0, limit_train_batches=1.0)
+    with pytest.raises(ValueError, match="1 held-out images are fewer than the 2 processes"):
+        module.val_dataloader()
+    with pytest.raises(
+        ValueError, match=r"3 training images do not fill .* 2 images .*more images"
+    ):
+        module.train_dataloader()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_replaced_image_of_the_same_size_is_another_one(packed, folder, shards):
+    source = TarImages(str(shards)) if packed else ImageFolder(str(folder))
+    before = source.entries()[0]
+    os.utime(before.path, ns=(0, before.path.stat().st_mtime_ns + 1))
+    after = source.entries()[0]
+    assert (after.name, after.num_bytes) == (before.name, before.num_bytes)
+    assert after.cache_key != before.cache_key
+    assert after.mirror().cache_key[1:] == after.cache_key[1:]
 
 
 def test_dead_leaves_depend_on_seed_and_number_alone():
@@ -162,8 +262,12 @@ def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
     with cache.writer(0) as add:
         add(entries, moments)  # those known are left as they are
     posteriors = CachedTensors(cache, entries)
-    for entry, expected in zip(entries, moments, strict=True):
-        assert torch.equal(posteriors.read(entry), expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # such as that of torch on memory that it must not write
+        for entry, expected in zip(entries, moments, strict=True):
+            assert torch.equal(posteriors.read(entry), expected)
+    posteriors.read(entries[0]).zero_()  # a copy
+    assert torch.equal(posteriors.read(entries[0]), moments[0])
     mean, variance = latent_statistics(posteriors)
     means, logvars = moments.chunk(2, dim=1)
     torch.testing.assert_close(mean, means.mean(dim=(0, 2, 3)))

@@ -112,11 +112,11 @@ def test_place_in_other_data_or_within_a_batch_is_refused():
     iterator = iter(loader)
     next(iterator)
     state = loader.state_dict()
-    with pytest.raises(ValueError, match=r"over 40 scans .* this run has 41 scans"):
+    with pytest.raises(ValueError, match=r"over 40 samples .* this run has 41 samples"):
         training_loader(Numbers(41), 4).load_state_dict(state)
     with pytest.raises(ValueError, match="order of seed 0"):
         training_loader(Numbers(40), 4, seed=1).load_state_dict(state)
-    with pytest.raises(ValueError, match=r"after 4 scans .* batch of 8"):
+    with pytest.raises(ValueError, match=r"after 4 samples .* batch of 8"):
         training_loader(Numbers(40), 8).load_state_dict(state)
     for _ in iterator:
         pass

@@ -70,6 +70,17 @@ class TestCachedLatents:
         (journal,) = tmp_path.glob("latents/posterior_*/shard_*.jsonl")
         assert len(journal.read_text().splitlines()) == 2
 
+    def test_they_are_not_rounded_in_mixed_precision(self, smoke_args, vae_checkpoint, tmp_path):
+        """Bit for bit those of float32, in a folder of the same name."""
+        more = ["--trainer.fast_dev_run=1", "--model.init_args.init_from", str(vae_checkpoint)]
+        more += ["--model.init_args.cache_latents=true", "--trainer.precision"]
+        rows = []
+        for name in ("32-true", "bf16-mixed"):
+            main(smoke_args("flow_matching", tmp_path / name, *more, name))
+            (path,) = (tmp_path / name).glob("latents/posterior_*/shard_00000.rows")
+            rows.append((path.parent.name, path.read_bytes()))
+        assert rows[0] == rows[1]
+
     def test_mirrored_scans_are_refused_at_once(self, smoke_args, vae_checkpoint, tmp_path):
         more = ["--trainer.logger=false", "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--data.init_args.augmentation.flip=true"]

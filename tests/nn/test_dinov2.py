@@ -57,6 +57,8 @@ def test_weights_are_loaded_strictly(network, tmp_path):
     image = torch.rand(1, 3, 28, 28)
     twin = DINOv2(str(path), **SMALL).eval()
     assert torch.equal(twin(image, (2, 2)), network(image, (2, 2)))
+    assert twin.trained
+    assert not network.trained
     state = dict(network.state_dict(), register_tokens=torch.zeros(1, 4, 16))
     torch.save(state, path)
     with pytest.raises(ValueError, match=r"dinov2\.pth holds no DINOv2 of width 16 and 2 blocks"):

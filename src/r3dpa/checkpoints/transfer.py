@@ -92,9 +92,15 @@ def transfer_rgb(
         The fate of every group of weights; fresh ones keep the values they have in ``sit``.
 
     Raises:
-        ValueError: If anything beside those groups does not fit; nothing is changed then.
+        ValueError: If the checkpoint holds no SiT, or anything beside those groups does not fit;
+            nothing is changed then.
     """
     rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
+    if not issubclass(rgb.kind, SiT):
+        raise ValueError(
+            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights are those of a SiT: "
+            "give a checkpoint of stage rgb_pretraining, or an official one"
+        )
     theirs = _grouped({**rgb.state_dict, **_prefixed(statistics.state_dict)})
     ours = _grouped({**sit.state_dict(), **_prefixed(latent_norm.state_dict())})
     patch = rgb.arguments["patch_size"]

@@ -8,7 +8,6 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning.pytorch import LightningDataModule
-from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
 from torch.utils.data import DataLoader
@@ -18,7 +17,7 @@ from r3dpa.data.datasets import LatentDataset, LidarDataset
 from r3dpa.data.feature_grids import Extractor, default_features_dir, write_feature_grids
 from r3dpa.data.feature_store import FeatureGrids, stored_feature_dim, stored_source
 from r3dpa.data.grid_settings import GridSettings
-from r3dpa.data.loaders import training_loader
+from r3dpa.data.loaders import ordered_sampler, training_loader
 from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.data.tensor_cache import CachedTensors
@@ -346,17 +345,10 @@ class LidarDataModule(LightningDataModule):
         )
 
     def _ordered_loader(self, dataset: LidarDataset | LatentDataset) -> DataLoader[Any]:
-        num_replicas, rank = self._place()
-        if len(dataset) < num_replicas:
-            raise ValueError(
-                f"{len(dataset)} scans are fewer than the {num_replicas} processes, each of which "
-                "needs one: use more scans or fewer devices."
-            )
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            # Lightning's default pads the last batch with scans that then count twice.
-            sampler=UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False),
+            sampler=ordered_sampler(dataset, *self._place()),
             num_workers=self.num_workers,
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.num_workers > 0,

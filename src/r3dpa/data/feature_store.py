@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from r3dpa.data.feature_grids import Extractor
 
 _LARGEST_CODE = 127
-_TORCH = {"<f2": torch.float16, "<f4": torch.float32, "|i1": torch.int8}
 _GRIDS = Rows("feature grids", "features_dir", f"grids again with {REMEDY}", FeatureGridError)
 
 
@@ -166,10 +165,8 @@ class FeatureGrids:
             assert self._row.fields is not None
             dtype, offset = self._row.fields[name][:2]
             kind, shape = dtype.subdtype or (dtype, ())
-            values = torch.frombuffer(
-                mapping, dtype=_TORCH[kind.str], count=math.prod(shape), offset=start + offset
-            )
-            return values.reshape(shape).float()
+            values = np.frombuffer(mapping, kind, math.prod(shape), start + offset)
+            return torch.from_numpy(values.reshape(shape).copy()).float()
 
         if "values" in (self._row.names or ()):
             return field("values")

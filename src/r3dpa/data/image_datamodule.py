@@ -6,11 +6,10 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
-from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader
 
 from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
-from r3dpa.data.loaders import training_loader
+from r3dpa.data.loaders import ordered_sampler, training_loader
 from r3dpa.data.tensor_cache import CachedTensors
 
 
@@ -26,6 +25,8 @@ class ImageDataModule(LightningDataModule):
         val_every: Every this many images, one is held out.
         mirrored: Also train on the mirror image of each image. Off, as in REPA-E, which caches
             latents of centre crops as they are.
+        prepare_data_per_node: Whether the processes of each node encode the images for themselves,
+            as node-local disks need; by default all share the work, on a disk that the nodes share.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -40,8 +41,10 @@ class ImageDataModule(LightningDataModule):
         seed: int = 0,
         val_every: int = 100,
         mirrored: bool = False,
+        prepare_data_per_node: bool = False,
     ) -> None:
         super().__init__()
+        self.prepare_data_per_node = prepare_data_per_node
         for name, value, least in (
             ("image_size", image_size, 1),
             ("batch_size", batch_size, 1),
@@ -99,6 +102,7 @@ class ImageDataModule(LightningDataModule):
             rank=0 if trainer is None else trainer.global_rank,
             limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
             pin_memory=torch.cuda.is_available(),
+            kind="images",
         )
 
     def val_dataloader(self) -> DataLoader[Any]:
@@ -108,7 +112,7 @@ class ImageDataModule(LightningDataModule):
         return DataLoader(
             dataset,
             self.batch_size,
-            sampler=UnrepeatedDistributedSampler(dataset, replicas, rank, shuffle=False),
+            sampler=ordered_sampler(dataset, replicas, rank, "held-out images"),
             num_workers=self.num_workers,
             pin_memory=torch.cuda.is_available(),
             generator=torch.Generator(),  # the default would draw from the global random state

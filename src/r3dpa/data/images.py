@@ -6,18 +6,19 @@ Letters: H x W image size, S side of a square image.
 from __future__ import annotations
 
 import io
+import os
 import tarfile
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -38,6 +39,8 @@ __all__ = [
 ]
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+# A SyntaxError is what Pillow makes of a damaged PNG.
+_DECODING_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 _MIRRORED = ".mirrored"  # end of the name of an entry that is seen from the other side
 
 
@@ -79,6 +82,7 @@ class ImageEntry:
         num_bytes: Size of the encoded image; 0 if it is computed.
         offset: Where in ``path`` it starts.
         mirrored: Whether left and right are exchanged.
+        mtime_ns: When ``path`` was changed last; 0 if the image is computed.
     """
 
     name: str
@@ -86,16 +90,16 @@ class ImageEntry:
     num_bytes: int
     offset: int = 0
     mirrored: bool = False
+    mtime_ns: int = 0
 
     @property
-    def cache_key(self) -> tuple[str, int]:
-        """Name and size."""
-        return self.name, self.num_bytes
+    def cache_key(self) -> tuple[str, int, int]:
+        """Name, size and time of change, which tell images of one name apart."""
+        return self.name, self.num_bytes, self.mtime_ns
 
     def mirror(self) -> ImageEntry:
         """The same image, seen from the other side."""
-        values = self.name + _MIRRORED, self.path, self.num_bytes, self.offset
-        return ImageEntry(*values, mirrored=not self.mirrored)
+        return replace(self, name=self.name + _MIRRORED, mirrored=not self.mirrored)
 
 
 class ImageSource(ABC):
@@ -125,6 +129,8 @@ class ImageSource(ABC):
 class ImageFolder(ImageSource):
     """Images below a folder, at any depth: ImageNet's ``<split>/<class>/<image>.JPEG`` or others.
 
+    Folders may be links; what is hidden (``.name``) is left out.
+
     Args:
         root: The folder.
     """
@@ -133,15 +139,11 @@ class ImageFolder(ImageSource):
         self.root = root
 
     def entries(self) -> list[ImageEntry]:
-        """All images below the folder but hidden ones, by their path relative to it."""
+        """All images below the folder, by their path relative to it."""
         root = Path(self.root)
         if not root.is_dir():
             raise ImageError(f"no folder {root}: give one that holds images.")
-        found = [
-            ImageEntry(str(path.relative_to(root)), path, path.stat().st_size)
-            for path in root.rglob("*")
-            if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
-        ]
+        found = [_entry(path, str(path.relative_to(root))) for path in _files(root, _SUFFIXES)]
         if not found:
             raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}).")
         return sorted(found, key=lambda entry: entry.name)
@@ -162,7 +164,8 @@ class TarImages(ImageSource):
     shuffling needs no unpacking.
 
     Args:
-        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file.
+        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file. What is
+            hidden (``.name``) is left out, also in the shards.
     """
 
     def __init__(self, root: str) -> None:
@@ -171,7 +174,7 @@ class TarImages(ImageSource):
     def entries(self) -> list[ImageEntry]:
         """All images of all shards, as ``<shard>/<member>``."""
         root = Path(self.root)
-        shards = [root] if root.is_file() else sorted(root.rglob("*.tar"))
+        shards = [root] if root.is_file() else sorted(_files(root, (".tar",)))
         base = root.parent if root.is_file() else root
         found = [
             entry
@@ -198,17 +201,57 @@ class TarImages(ImageSource):
         return _decoded(data, name, size)
 
 
-def _members(shard: Path, prefix: str) -> list[ImageEntry]:
-    found = []
+def _files(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
+    """Files below a folder by the end of their name, also through links, but nothing hidden."""
+    for folder, names, files in os.walk(root, followlinks=True):
+        here = Path(folder).resolve()
+        # A link to a folder above leads to the same files again, without end.
+        names[:] = [
+            name
+            for name in names
+            if not _hidden(name) and not here.is_relative_to(Path(folder, name).resolve())
+        ]
+        for path in (Path(folder, name) for name in files if not _hidden(name)):
+            if path.suffix.lower() in suffixes:
+                yield path
+            elif path.is_symlink() and not path.exists():  # such as a folder of images
+                raise ImageError(f"{path} is a link to nothing: mend or remove it.")
+
+
+def _hidden(name: str) -> bool:
+    return any(part.startswith(".") and part != ".." for part in PurePath(name).parts)
+
+
+def _entry(path: Path, name: str) -> ImageEntry:
     try:
-        with tarfile.open(shard, "r:") as file:  # not compressed, or nothing could be found fast
+        about = path.stat()
+    except OSError as error:
+        reason = error.strerror or error
+        raise ImageError(f"{path}: cannot be read ({reason}); mend or remove it.") from error
+    return ImageEntry(name, path, about.st_size, mtime_ns=about.st_mtime_ns)
+
+
+def _members(shard: Path, prefix: str) -> list[ImageEntry]:
+    whole, found = _entry(shard, prefix), []
+    try:
+        # Not compressed, or nothing could be found fast.
+        with shard.open("rb") as data, tarfile.open(fileobj=data, mode="r:") as file:
             for member in file:
-                if not member.isfile() or Path(member.name).suffix.lower() not in _SUFFIXES:
+                suffix = PurePath(member.name).suffix.lower()
+                if not member.isfile() or suffix not in _SUFFIXES or _hidden(member.name):
                     continue
                 name = f"{prefix}/{member.name.removeprefix('./')}"
                 if reason := refuse_name(name):
                     raise ImageError(f"{shard}: name of member {reason}")
-                found.append(ImageEntry(name, shard, member.size, member.offset_data))
+                found.append(
+                    replace(whole, name=name, num_bytes=member.size, offset=member.offset_data)
+                )
+            data.seek(file.offset)
+            # Where a header is damaged or cut off, tarfile stops as if the shard ended there.
+            if data.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+                raise ImageError(
+                    f"{shard} is damaged or cut short at byte {file.offset}: pack or copy it again."
+                )
     except (tarfile.TarError, OSError) as error:
         raise ImageError(f"{shard} is no uncompressed tar file, or damaged ({error}).") from error
     return found
@@ -216,9 +259,12 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
 
 def _decoded(data: bytes, name: str, size: int) -> NDArray[np.uint8]:
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data)) as file:
+            image: Image.Image = file
+            if image.mode.startswith("I"):  # 16 bits of grey, which convert() would clip at 255
+                image = Image.fromarray((np.asarray(image) // 256).astype(np.uint8))
             return center_crop(image.convert("RGB"), size)
-    except (OSError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except _DECODING_ERRORS as error:
         raise ImageError(f"{name}: is no image that can be read ({error}); remove it.") from error
 
 

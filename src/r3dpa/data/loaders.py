@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 
@@ -114,20 +115,20 @@ class ResumableLoader(DataLoader[Any]):
             ValueError: If the place lies within an epoch over other data, or of another order, or
                 within one batch of this loader.
         """
-        samples, num_scans = state_dict["samples"], len(cast(Sized, self.dataset))
+        samples, num_samples = state_dict["samples"], len(cast(Sized, self.dataset))
         seed = cast(EpochSampler, self.sampler).seed
-        if samples and (state_dict["dataset_size"], state_dict["seed"]) != (num_scans, seed):
+        if samples and (state_dict["dataset_size"], state_dict["seed"]) != (num_samples, seed):
             raise ValueError(
-                f"The checkpoint was saved within an epoch over {state_dict['dataset_size']} scans "
-                f"in the order of seed {state_dict['seed']}, but this run has {num_scans} scans "
-                f"and seed {seed}: resume with the same data and seed, or start a new run from "
-                "the weights."
+                f"The checkpoint was saved within an epoch over {state_dict['dataset_size']} "
+                f"samples in the order of seed {state_dict['seed']}, but this run has "
+                f"{num_samples} samples and seed {seed}: resume with the same data and seed, or "
+                "start a new run from the weights."
             )
         if samples % self._samples_per_batch:
             raise ValueError(
-                f"The checkpoint was saved after {samples} scans of an epoch, which is no multiple "
-                f"of this run's batch of {self._samples_per_batch} scans (batch_size x processes): "
-                "resume with the same total batch."
+                f"The checkpoint was saved after {samples} samples of an epoch, which is no "
+                f"multiple of this run's batch of {self._samples_per_batch} samples (batch_size x "
+                "processes): resume with the same total batch."
             )
         self._resume_at = (state_dict["epoch"], samples // self._samples_per_batch)
 
@@ -144,6 +145,7 @@ def training_loader(
     pin_memory: bool = False,
     with_epoch: bool = False,
     collate_fn: Callable[[list[Any]], Any] | None = None,
+    kind: str = "scans",
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches.
 
@@ -160,15 +162,16 @@ def training_loader(
         with_epoch: Ask the data set for ``(epoch, index)``, where samples change from epoch to
             epoch.
         collate_fn: Makes a batch of samples; that of ``DataLoader`` where None.
+        kind: What the samples are, for the message.
 
     Raises:
         ValueError: If the data set is smaller than one batch over all processes.
     """
-    num_scans = len(cast(Sized, dataset))
-    if num_scans < batch_size * num_replicas:
+    num_samples = len(cast(Sized, dataset))
+    if num_samples < batch_size * num_replicas:
         raise ValueError(
-            f"{num_scans} training scans do not fill one batch of {batch_size} scans for each of "
-            f"{num_replicas} processes: use a smaller batch_size or more scans."
+            f"{num_samples} training {kind} do not fill one batch of {batch_size} {kind} for each "
+            f"of {num_replicas} processes: use a smaller batch_size or more {kind}."
         )
     loader = ResumableLoader(
         dataset,
@@ -184,3 +187,26 @@ def training_loader(
     batches = limit_batches if isinstance(limit_batches, int) else limit_batches * len(loader)
     loader.batches_per_epoch = min(int(batches), len(loader))
     return loader
+
+
+def ordered_sampler(
+    dataset: Dataset[Any], num_replicas: int, rank: int, kind: str = "scans"
+) -> UnrepeatedDistributedSampler:
+    """All samples in order, none twice; Lightning's default pads the last batch with some again.
+
+    Args:
+        dataset: Its length is used.
+        num_replicas: Number of processes.
+        rank: This process.
+        kind: What the samples are, for the message.
+
+    Raises:
+        ValueError: If there are fewer samples than processes.
+    """
+    num_samples = len(cast(Sized, dataset))
+    if num_samples < num_replicas:
+        raise ValueError(
+            f"{num_samples} {kind} are fewer than the {num_replicas} processes, each of which "
+            f"needs one: use more {kind} or fewer devices."
+        )
+    return UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False)

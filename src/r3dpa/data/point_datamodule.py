@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 from lightning.pytorch import LightningDataModule
-from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.loaders import training_loader
+from r3dpa.data.loaders import ordered_sampler, training_loader
 from r3dpa.data.points import list_collate
 from r3dpa.data.scans import Scan, read_scan
 from r3dpa.geometry import LidarSensor
@@ -124,7 +123,7 @@ class PointDataModule(LightningDataModule):
         return DataLoader(
             self.val_set,
             self.batch_size,
-            sampler=UnrepeatedDistributedSampler(self.val_set, replicas, rank, shuffle=False),
+            sampler=ordered_sampler(self.val_set, replicas, rank),
             num_workers=self.num_workers,
             collate_fn=list_collate,
             generator=torch.Generator(),  # the default would draw from the global random state

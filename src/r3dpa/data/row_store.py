@@ -221,7 +221,7 @@ class RowReader:
         self._maps: dict[int, mmap.mmap] = {}
 
     def find(self, key: RowKey) -> tuple[mmap.mmap, int] | None:
-        """Memory of a shard, and where in it the row of a key starts; None if there is no row."""
+        """Memory of a shard, read-only, and where in it the row starts; None if there is none."""
         place = self.places.get(key)
         if place is None:
             return None
@@ -240,8 +240,8 @@ class RowReader:
         if shard not in self._maps:
             try:
                 with _rows_path(self._folder, shard).open("rb") as file:
-                    # A private copy that nobody writes: torch takes no memory that is read-only.
-                    self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+                    # Read-only: a private copy would count as memory, 42 GB for a large shard.
+                    self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             except (FileNotFoundError, ValueError) as error:  # gone, or empty
                 raise self._lost(shard, "is gone or empty") from error
         return self._maps[shard]

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -99,10 +100,8 @@ class CachedTensors(Generic[Item]):
             )
         mapping, start = found
         shape = self.cache.shape
-        values = torch.frombuffer(
-            mapping, dtype=torch.float32, count=math.prod(shape), offset=start
-        )
-        return values.reshape(shape).clone()
+        values = np.frombuffer(mapping, "<f4", count=math.prod(shape), offset=start)
+        return torch.from_numpy(values.reshape(shape).copy())
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ class TensorCache(Generic[Item]):
                         raise TensorCacheError(
                             f"{items[place].path}: what is kept of {items[place].name} as "
                             f"{self.name} is not finite; look at the file (`r3dpa check` for "
-                            "scans), and leave it out or, if it is sound, train in fp32"
+                            "scans), and leave it out"
                         )
                 rows = tensors[new].float().cpu().contiguous().numpy().astype("<f4", copy=False)
                 writer.add([keys[place] for place in new], rows.tobytes())

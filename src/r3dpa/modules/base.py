@@ -71,6 +71,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             names.
     """
 
+    replayed = True
     default_init: tuple[str, ...] = ()
     trains_velocity: bool = True
     data_class: type[L.LightningDataModule] = LidarDataModule  # that it works with, see StageCLI

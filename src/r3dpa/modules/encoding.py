@@ -35,9 +35,12 @@ def encoded_once(
 ) -> CachedTensors[Item]:
     """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
 
+    They are kept for the whole training, and thus computed in float32 whatever the precision of the
+    steps.
+
     Args:
         module: In training, on its device.
-        vae: Frozen autoencoder; its weights and the precision are part of the settings.
+        vae: Frozen autoencoder; its weights are part of the settings.
         root: Folder of caches.
         settings: What else the moments depend on, as JSON values.
         shape: ``(2C, h, w)``.
@@ -51,11 +54,7 @@ def encoded_once(
     """
     trainer = module.trainer
     datamodule = cast(Any, trainer).datamodule
-    about = {
-        **settings,
-        "vae": weights_sha256(vae.state_dict()),
-        "precision": str(trainer.precision),
-    }
+    about = {**settings, "vae": weights_sha256(vae.state_dict())}
     cache: TensorCache[Item] = TensorCache(root, "posterior", about, shape)
     own = missing = cache.missing(items)
     trainer.strategy.barrier("cached latents: all have looked")
@@ -77,8 +76,7 @@ def encoded_once(
         )
         with cache.writer(trainer.global_rank) as add:
             for batch in loader:
-                with trainer.precision_plugin.forward_context():
-                    posterior = vae.encode(batch[image].to(module.device))
+                posterior = vae.encode(batch[image].to(module.device))
                 moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
                 add([own[index] for index in batch["index"].tolist()], moments)
     trainer.strategy.barrier("cached latents: all are written")

@@ -33,6 +33,7 @@ class GuardedOptimisation(StepLosses):
     """
 
     stage: str
+    replayed = False  # whether `r3dpa replay` knows the stage
     ema: EMA | None
     optimizer_config: OptimizerConfig
 
@@ -161,17 +162,21 @@ class GuardedOptimisation(StepLosses):
                 kept = f"not kept: {error}"
             warnings.warn(
                 f"step {self.global_step} was skipped: losses {_listed(losses[index])}; gradient "
-                f"norms {_listed(found)}; scans {', '.join(names) or 'without names'} (batch "
+                f"norms {_listed(found)}; samples {', '.join(names) or 'without names'} (batch "
                 f"{number}, process {self.global_rank}), {kept}",
                 stacklevel=2,
             )
         if guard.in_a_row >= guard.config.max_skipped_steps:
+            look = f"Look at the samples that are named in {folder}"
+            if self.replayed:
+                look = (
+                    f"For a file of {folder}, `r3dpa replay FILE {run_dir}/checkpoints/last.ckpt` "
+                    "tells in which layer it starts; look at the scans with `r3dpa check`"
+                )
             raise RuntimeError(
                 f"{guard.in_a_row} steps in a row had a non-finite loss or gradient, the last one "
-                f"at step {self.global_step} (gradient norms: {_listed(found)}). For a file of "
-                f"{folder}, `r3dpa replay FILE {run_dir}/checkpoints/last.ckpt` tells in "
-                "which layer it starts; look at the scans with `r3dpa check`; if they are sound, "
-                "lower the learning rate, or train in bf16 or fp32 instead of fp16"
+                f"at step {self.global_step} (gradient norms: {_listed(found)}). {look}; if they "
+                "are sound, lower the learning rate, or train in bf16 or fp32 instead of fp16"
             )
 
     def _refuse_collapse(self, guard: StepGuard) -> None:

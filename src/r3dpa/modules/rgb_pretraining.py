@@ -29,9 +29,11 @@ class ImageTeacher(Protocol):
 
     Attributes:
         dim: Width F of the features.
+        trained: Whether it has other than random weights.
     """
 
     dim: int
+    trained: bool
 
     def __call__(self, image: Tensor, grid_size: tuple[int, int]) -> Tensor:
         """Features ``(B, N, F)`` of the cells of a grid, row-major.
@@ -67,7 +69,7 @@ class RGBPretraining(ImageStage):
         time_sampling: Density of the training times.
         ema_decay: Decay of the averaged SiT.
         ema_buffers: ``copy`` the latent statistics, or ``decay`` them as the official code does.
-        latents_dir: Folder of the encoded images, which runs may share: 65 kB each at 4 x 32 x 32;
+        latents_dir: Folder of the encoded images, which runs may share: 33 kB each at 4 x 32 x 32;
             ``<run_dir>/latents`` where None.
         seed: Key of the training draws.
         guards: When a step is dropped, and when training stops; None trains without.
@@ -124,9 +126,16 @@ class RGBPretraining(ImageStage):
         """Checks data against networks.
 
         Raises:
-            ValueError: As :class:`ImageStage`, or if the latents have another size than the SiT's.
+            ValueError: As :class:`ImageStage`, if the latents have another size than the SiT's, or
+                if the teacher of a fit has random weights.
         """
         super().setup(stage)
+        if stage == "fit" and not all(cast(ImageTeacher, one).trained for one in self._teacher):
+            raise ValueError(
+                "the teacher has random weights: give model.init_args.teacher.init_args.weights "
+                "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "
+                "(model.init_args.teacher null, model.init_args.weights.sit_alignment 0)"
+            )
         if self.latent_size != tuple(self.sit.input_size):
             raise ValueError(
                 f"images of {self.datamodule.image_size} pixels give {self.latent_size} latents, "
@@ -147,8 +156,6 @@ class RGBPretraining(ImageStage):
                     "diffusion_pytorch_model.safetensors of Stable Diffusion's VAE"
                 )
             load_into({"vae": self.vae}, read_checkpoint(self.init_from), stage=self.stage)
-        for teacher in self._teacher:
-            teacher.to(self.device)
         posteriors = self._encoded()
         self.datamodule.use_posteriors(posteriors, with_images=bool(self._teacher))
         if not self.resumed:
@@ -193,7 +200,9 @@ class RGBPretraining(ImageStage):
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:
         for teacher in self._teacher:
-            return teacher(batch["image"], self.sit.grid_size)
+            image = batch["image"]
+            # Trainers do not move what is in a tuple; to move what is there costs next to nothing.
+            return teacher.to(image.device)(image, self.sit.grid_size)
         return None
 
     def evaluate(self, batch: ImageBatch, batch_idx: int) -> dict[str, Tensor]:

@@ -37,11 +37,14 @@ class DINOv2(nn.Module):
     2024); resizing and input size as in REPA (Yu et al. 2025) and REPA-E.
 
     Args:
-        weights: Released file; random weights where None, which no one should be aligned with.
+        weights: Released file; random weights where None, with which no fit starts.
         dim: Token width D, a multiple of ``num_heads``.
         depth: Number of blocks.
         num_heads: Attention heads.
         grid_size: Side of the token grid of the position table.
+
+    Attributes:
+        trained: Whether the weights are those of a file.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -69,6 +72,7 @@ class DINOv2(nn.Module):
         self.norm = nn.LayerNorm(dim, _EPS)
         self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_STD)[:, None, None], persistent=False)
+        self.trained = weights is not None
         if weights is not None:
             self._load(Path(weights))
 
