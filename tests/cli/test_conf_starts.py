@@ -119,8 +119,8 @@ def test_experiments_with_tiny_networks(stage, launch, start, smoke_root, tmp_pa
 
 
 @pytest.mark.parametrize("data", SCANS)
-def test_scans(data, start, smoke_root):
-    """With the VAE alignment at smoke size: 16 x 64 range images."""
+def test_scans(data, start, smoke_root, vae_checkpoint):
+    """With the VAE alignment at smoke size, whose checkpoint comes with simulated scans."""
     key = "scans" if "folder" in data else "root"
     settings = {
         f"data.init_args.{key}": smoke_root,

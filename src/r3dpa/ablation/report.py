@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Literal
+from typing import Any, Literal
 
 from scipy.stats import t as student
 
@@ -172,7 +172,7 @@ def _students(values: Sequence[float]) -> float:
 
 
 def write_table(
-    plan: Plan, table: Table, out: Path, failed: Mapping[str, str]
+    plan: Plan, table: Table, out: Path, failed: Mapping[str, str], provenance: Mapping[str, Any]
 ) -> tuple[str, Results]:
     """Writes ``<out>/<table>.md``, ``.tex``, ``.csv`` and ``.json`` of what is there.
 
@@ -184,6 +184,7 @@ def write_table(
         table: One of its tables.
         out: Folder of the ablation.
         failed: Why processes failed, by name.
+        provenance: Command, machine and versions, for the JSON.
 
     Returns:
         The table for the terminal, and the evaluations by row and seed.
@@ -239,7 +240,8 @@ def write_table(
     with atomic_path(out / f"{table.name}.tex") as temporary:
         temporary.write_text(f"% {' '.join(head.split())}\n{shown.latex()}", encoding="utf-8")
     EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
-    _save_json(plan, table, out, results, orders, failed, commits)
+    about = {**provenance, "commits": commits}
+    _save_json(plan, table, out, results, orders, failed, about)
     return "\n".join([f"{table.name}: {head}", "", str(shown), *told]), results
 
 
@@ -285,14 +287,14 @@ def _save_json(
     results: Results,
     orders: Sequence[OrderResult],
     failed: Mapping[str, str],
-    commits: Sequence[str],
+    about: Mapping[str, Any],
 ) -> None:
     stored = {
         "table": table.name,
         "caption": table.caption,
         "scale": plan.scale.name,
         "about": plan.scale.about,
-        "commits": list(commits),
+        **about,
         "rows": [
             {
                 "key": row.key,

@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from r3dpa.ablation import RunSettings, budget_of, log_rows, make_plan, read_scale, run_plan
 from r3dpa.ablation.report import write_table
 from r3dpa.atomic import only_writer
+from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.cli.files import check_folder, print_text
 
 __all__ = ["ablate_tables"]
@@ -48,8 +51,9 @@ def ablate_tables(
     with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
         failed = run_plan(plan, settings, _say)
         results = {}
+        about = {"command": command(), "machine": machine(), "versions": versions(torch)}
         for table in plan.tables:
-            text, results[table.name] = write_table(plan, table, folder, failed)
+            text, results[table.name] = write_table(plan, table, folder, failed, about)
             _say(f"\n{text}")
         if wandb != "off":
             for table in plan.tables:
