@@ -5,6 +5,8 @@ Networks and images have their own sizes in the slow tests, but for the depth of
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -66,14 +68,18 @@ def test_no_file_is_left_out():
     assert not STARTED & set(ELSEWHERE)
 
 
+def words_of(configs, settings, run_dir):
+    words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
+    words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
+    return ["fit", *words, f"--run_dir={run_dir}"]
+
+
 @pytest.fixture
 def start(tmp_path, caplog):
     """``start(configs, settings)`` runs ``r3dpa fit`` for one batch."""
 
     def start(configs, settings):
-        words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
-        words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
-        main(["fit", *words, f"--run_dir={tmp_path / 'run'}"])
+        main(words_of(configs, settings, tmp_path / "run"))
         assert "`Trainer.fit` stopped: `max_steps=1` reached" in caplog.text
         weights = [
             p for p in (tmp_path / "run").rglob("*") if p.suffix in (".ckpt", ".safetensors")
@@ -109,13 +115,22 @@ def start_flow(folder, vae, size):
 
 
 @pytest.mark.parametrize("stage", EXPERIMENTS)
-@pytest.mark.parametrize("launch", [(), ("launch/nodes",)], ids=["alone", "nodes"])
-def test_experiments_with_tiny_networks(stage, launch, start, smoke_root, tmp_path):
-    settings = SIMULATED | {"data.init_args.root": smoke_root, "trainer.num_nodes": 1}
+def test_experiments_with_tiny_networks(stage, start, smoke_root, tmp_path):
+    settings = SIMULATED | {"data.init_args.root": smoke_root}
     if stage == "flow_matching":
         vae = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["vae"]
         settings |= start_flow(tmp_path, vae["init_args"], (16, 64))
-    start(("trainer", *launch, f"experiment/{stage}", "smoke"), settings)
+    start(("trainer", f"experiment/{stage}", "smoke"), settings)
+
+
+def test_nodes(smoke_root, tmp_path):
+    """A process of its own: the group that it founds would stay for all tests after it."""
+    settings = SIMULATED | {"data.init_args.root": smoke_root, "trainer.num_nodes": 1}
+    configs = ("trainer", "launch/nodes", "experiment/vae_alignment", "smoke")
+    words = [sys.executable, "-m", "r3dpa", *words_of(configs, settings, tmp_path)]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert told.returncode == 0, told.stderr
+    assert "distributed_backend=gloo" in told.stderr
 
 
 @pytest.mark.parametrize("data", SCANS)
