@@ -56,7 +56,11 @@ def module(kind=FlowMatching, **more):
 
 def trainer(folder, step=0, max_steps=64, rank=0):
     return SimpleNamespace(
-        default_root_dir=folder, global_step=step, max_steps=max_steps, is_global_zero=rank == 0
+        default_root_dir=folder,
+        global_step=step,
+        max_steps=max_steps,
+        is_global_zero=rank == 0,
+        fast_dev_run=False,
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+import wandb
 import yaml
 from scipy.stats import ttest_1samp
 
@@ -349,7 +350,8 @@ class InThisProcess:
 def started(monkeypatch):
     monkeypatch.setattr(InThisProcess, "started", [])
     monkeypatch.setattr(runner, "Popen", InThisProcess)
-    return InThisProcess.started
+    yield InThisProcess.started
+    wandb.teardown()  # else it keeps its settings of now for all tests after this one
 
 
 def wandb_records(path):
