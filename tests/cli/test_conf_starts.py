@@ -123,6 +123,7 @@ def test_experiments_with_tiny_networks(stage, start, smoke_root, tmp_path):
     start(("trainer", f"experiment/{stage}", "smoke"), settings)
 
 
+@pytest.mark.slow
 def test_nodes(smoke_root, tmp_path):
     """A process of its own: the group that it founds would stay for all tests after it."""
     settings = SIMULATED | {"data.init_args.root": smoke_root, "trainer.num_nodes": 1}
@@ -148,6 +149,7 @@ def test_scans(data, start, smoke_root, vae_checkpoint):
     start(("trainer", "experiment/vae_alignment", "smoke", f"data/{data}"), settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [*EXPERIMENTS, "joint_unet"])
 def test_demo_sizes(stage, start, smoke_root, tmp_path):
     settings = SIMULATED | {
