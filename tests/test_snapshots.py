@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from tiny_networks import VAE_ARGS
 
 from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint, weights_sha256
 from r3dpa.cli import main
@@ -32,13 +33,6 @@ SIT_ARGS = {
     "alignment_depth": 1,
     "feature_dim": 4,
     "projector_dim": 4,
-}
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": [1, 1, 1],
-    "strides": [[2, 2], [2, 2]],
-    "num_res_blocks": 1,
 }
 
 
