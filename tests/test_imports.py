@@ -10,10 +10,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "r3dpa"
 CORE = {"geometry", "flow", "losses", "nn"}
 ALLOWED = {
-    "atomic": set(),
+    "io": set(),
     "unpickling": set(),
-    "devices": set(),
-    "names": set(),
     "imports": set(),
     "geometry": set(),
     "flow": set(),
@@ -54,7 +52,7 @@ def violations(source: str, area: str) -> set[str]:
         else:
             continue
         found |= {name.split(".")[1] for name in names if name.startswith("r3dpa.")}
-    return found - ALLOWED[area] - {area, "atomic", "unpickling", "devices", "names", "__version__"}
+    return found - ALLOWED[area] - {area, "io", "unpickling", "__version__"}
 
 
 @pytest.mark.parametrize(

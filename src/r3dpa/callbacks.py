@@ -25,12 +25,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
-from r3dpa.checkpoints import source_commit
 from r3dpa.data import Scan, write_bin
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import points_of
+from r3dpa.io import atomic_path, source_commit
 from r3dpa.metrics.evaluation import TooFewScenesError, check_counts
 from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics

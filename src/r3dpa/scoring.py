@@ -13,9 +13,8 @@ import torch
 from tqdm import tqdm
 
 from r3dpa import viz
-from r3dpa.atomic import only_writer
 from r3dpa.data.scans import Scan, read_scan
-from r3dpa.devices import usable_device
+from r3dpa.io import only_writer, usable_device
 from r3dpa.metrics.evaluation import Comparison, evaluate
 from r3dpa.metrics.official_statistics import (
     OfficialSplit,

@@ -11,41 +11,12 @@ import io
 import os
 import pickle
 import struct
-import tokenize
-import zipfile
 from collections.abc import Callable, Mapping
 from typing import IO, Any, ClassVar
 
 import numpy as np
 
-__all__ = ["UNPICKLING_ERRORS", "ArraysOnly", "array_header", "first_line"]
-
-#: Of ``torch.load``, restricted unpicklers and NumPy's heads, on bytes cut off, exchanged, or not
-#: accepted. Where more is caught than files are known to raise, the cause stays in the message.
-UNPICKLING_ERRORS = (
-    pickle.UnpicklingError,
-    struct.error,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    ImportError,
-    LookupError,
-    MemoryError,
-    OSError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    ZeroDivisionError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-)
-
-
-def first_line(error: BaseException) -> str:
-    """Start of an error's message, or its kind where it has none."""
-    return str(error).partition("\n")[0] or type(error).__name__
+__all__ = ["ArraysOnly", "array_header"]
 
 
 def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:

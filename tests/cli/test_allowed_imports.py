@@ -87,7 +87,7 @@ def test_classes_in_lists_and_in_arguments_of_any_type(refused, hostile):
     "name",
     [
         "os.system",
-        "r3dpa.atomic.os.system",  # where it is defined counts
+        "r3dpa.io.os.system",  # where it is defined counts
         "r3dpa.checkpoints.files.subprocess.run",
         "builtins.eval",
         "torch.hub.load",

@@ -15,13 +15,14 @@ import pytest
 import torch
 from PIL import Image
 
-from r3dpa.checkpoints import read_checkpoint, source_commit, weights_sha256
+from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.cli import main
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.flow import RestartPlan, ode_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
+from r3dpa.io import source_commit
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from r3dpa.atomic import atomic_path
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     ScanError,
@@ -20,6 +19,7 @@ from r3dpa.data.scans import (
     write_ply,
 )
 from r3dpa.geometry import LidarSensor
+from r3dpa.io import atomic_path
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
 

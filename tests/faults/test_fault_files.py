@@ -12,7 +12,6 @@ from fault_commands import fit_words, last
 from safetensors.torch import save_file
 from torch import nn
 
-from r3dpa.atomic import atomic_path, only_writer
 from r3dpa.cli import main
 from r3dpa.data.datasets import LidarDataset
 from r3dpa.data.feature_grids import write_feature_grids
@@ -22,6 +21,7 @@ from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import ScanError, find_scans, read_npz, write_npz
 from r3dpa.data.tensor_cache import CachedTensors, TensorCacheError
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection
+from r3dpa.io import atomic_path, only_writer
 
 PROJECTION = SphericalProjection(LidarSensor(beams=8, columns=32))
 

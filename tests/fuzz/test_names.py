@@ -16,9 +16,9 @@ from r3dpa.data import read_samples
 from r3dpa.data.row_store import Rows
 from r3dpa.data.scans import read_npz
 from r3dpa.geometry import LidarSensor
+from r3dpa.io import refuse_name
 from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.names import refuse_name
 from r3dpa.simulation import expected_scans
 from r3dpa.unpickling import ArraysOnly
 

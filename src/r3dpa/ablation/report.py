@@ -15,7 +15,7 @@ from scipy.stats import t as student
 from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Stage, Table
 from r3dpa.ablation.runner import commit_of, evaluation_of
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import About, Evaluation, MetricResult, published_scales
 from r3dpa.metrics.scene_features import SPACES

@@ -20,8 +20,7 @@ import yaml
 
 from r3dpa.ablation.configs import merged, with_value
 from r3dpa.ablation.plan import Plan, Stage
-from r3dpa.atomic import atomic_path
-from r3dpa.checkpoints import source_commit
+from r3dpa.io import atomic_path, source_commit
 from r3dpa.metrics.scene_features import FREE_SPACES
 
 __all__ = ["RunSettings", "commit_of", "evaluation_of", "run_plan", "stage_folder"]

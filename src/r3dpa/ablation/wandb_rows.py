@@ -11,7 +11,7 @@ from typing import Any, Literal
 from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.report import Results
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 
 __all__ = ["log_rows"]
 

@@ -16,9 +16,9 @@ import torch
 from r3dpa.bench import control_edits, control_guidance
 from r3dpa.bench.control_report import Finding, write_control
 from r3dpa.bench.control_scans import Bench, ControlSettings, Part, ScanDesk
-from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.data.objects import ObjectLibrary
 from r3dpa.generation import SceneGenerator
+from r3dpa.io import command, machine, versions
 from r3dpa.nn.backbones import feature_source
 
 __all__ = ["ControlSettings", "Part", "control"]

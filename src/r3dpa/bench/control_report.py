@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import one_line
 from r3dpa.geometry import Projection
+from r3dpa.io import atomic_path, one_line
 from r3dpa.metrics.bootstrap import Interval, bootstrap_interval
 
 __all__ = ["Finding", "Value", "difference_of", "mean_of", "share_of", "sheet_of", "write_control"]

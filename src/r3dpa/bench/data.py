@@ -16,8 +16,6 @@ import lightning as L
 import torch
 from torch.utils.data import DataLoader
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare, seconds
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import CachedTensors, FeatureGrids, TensorCache, read_scan
@@ -25,6 +23,7 @@ from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarDataset
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import LidarSensor, range_image
+from r3dpa.io import atomic_path, one_line, provenance
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
 

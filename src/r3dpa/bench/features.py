@@ -22,14 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
 from r3dpa.bench.point_network import NetworkCost, network_cost
-from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare, seconds
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import FeatureGrids, FeatureGridWriter, GridSettings, read_scan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, pool_cells
+from r3dpa.io import atomic_path, one_line, provenance
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
 

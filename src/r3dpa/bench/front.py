@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.atomic import atomic_path
 from r3dpa.flow.solvers import ODE_SOLVERS
+from r3dpa.io import atomic_path
 
 __all__ = [
     "Row",

@@ -21,15 +21,14 @@ from scipy.spatial.distance import jensenshannon
 from torch import Tensor
 from torch.nn import functional as F
 
-from r3dpa.atomic import atomic_path
 from r3dpa.bench.features import comparison_table, simulated_scan
 from r3dpa.bench.metric_networks import NETWORKS, MetricNetworkCost, metric_network_cost
 from r3dpa.bench.point_network import now
-from r3dpa.bench.provenance import one_line, provenance
 from r3dpa.bench.timing import Comparison, compare
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import read_scan
 from r3dpa.geometry import LidarSensor
+from r3dpa.io import atomic_path, one_line, provenance
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
     MatchingTiming,

@@ -16,7 +16,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from r3dpa.atomic import atomic_path
 from r3dpa.bench.official_imports import COMMIT, OfficialCode, Overlay, load_official
 from r3dpa.bench.official_networks import (
     at_times,
@@ -36,7 +35,6 @@ from r3dpa.bench.official_runs import (
     write_official_scenes,
 )
 from r3dpa.bench.official_step import train_ours
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.bench.timing import Comparison, compare
 from r3dpa.checkpoints import Checkpoint, save_checkpoint, to_official
 from r3dpa.checkpoints.networks import format_table
@@ -44,6 +42,7 @@ from r3dpa.data.scans import read_scan
 from r3dpa.flow import Interpolant, euler, euler_maruyama, ode_times, sde_times
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import ScanGeometry, range_image
+from r3dpa.io import atomic_path, command, machine, one_line, versions
 from r3dpa.nn import VAE, SiT
 
 __all__ = ["PARTS", "OfficialSettings", "official"]

@@ -24,12 +24,12 @@ from r3dpa.bench.front import (
 )
 from r3dpa.bench.hardware import Peak, control_kernel, peak_of
 from r3dpa.bench.problems import Make, MixtureProblem, ModelProblem, Problem, Setting, Solved
-from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.bench.sampling_report import EVALUATIONS, Found, write_report
 from r3dpa.bench.timing import Controlled, Series, measure
 from r3dpa.flow.mixture import toy_mixture
 from r3dpa.flow.solvers import steps_for
 from r3dpa.generation import SamplerConfig, Solver
+from r3dpa.io import command, machine, versions
 
 __all__ = ["Effort", "run_problem", "sampling", "settings_of"]
 

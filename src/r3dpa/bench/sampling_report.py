@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
 from r3dpa.bench.error_budget import Reference
 from r3dpa.bench.front import Row, duration, quality_levels, save_quality_levels, sentences
 from r3dpa.bench.hardware import Peak
-from r3dpa.bench.provenance import one_line
 from r3dpa.bench.timing import Controlled
 from r3dpa.checkpoints.networks import format_table
+from r3dpa.io import atomic_path, one_line
 from r3dpa.viz.pareto import (
     ParetoPlot,
     ParetoPoint,

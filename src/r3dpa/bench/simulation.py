@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.checkpoints.networks import format_table
+from r3dpa.io import atomic_path, command, machine, one_line, versions
 from r3dpa.simulation import (
     EFFECTS,
     TRAIN_DRIVES,

@@ -11,15 +11,14 @@ from typing import Any
 
 import torch
 
-from r3dpa.atomic import atomic_path
 from r3dpa.bench.hardware import control_kernel, peak_of
 from r3dpa.bench.official_networks import random_networks
 from r3dpa.bench.problems import Make, ModelProblem, Setting
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.bench.timing import measure
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry
+from r3dpa.io import atomic_path, command, machine, one_line, versions
 from r3dpa.nn import VAE, LatentNorm, SiT
 
 __all__ = ["random_generators", "speed"]

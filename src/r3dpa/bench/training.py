@@ -24,16 +24,14 @@ import yaml
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.bench.timing import Comparison
 from r3dpa.bench.training_profile import PartCost, StepProfile
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor
 from r3dpa.imports import ConfigParser
+from r3dpa.io import atomic_path, command, machine, one_line, usable_device, versions
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
 from r3dpa.nn.backbones import GeometricFeatures

@@ -17,14 +17,11 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.bench.timing import Comparison, compare, seconds
 from r3dpa.checkpoints import NetworkState, read_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data import find_scans, read_scan
 from r3dpa.data.scans import evenly
-from r3dpa.devices import usable_device
 from r3dpa.geometry import (
     LidarSensor,
     RangeCodec,
@@ -32,6 +29,7 @@ from r3dpa.geometry import (
     SphericalProjection,
     range_image,
 )
+from r3dpa.io import atomic_path, command, machine, one_line, usable_device, versions
 from r3dpa.nn import VAE
 from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
 

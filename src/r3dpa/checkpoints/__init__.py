@@ -1,7 +1,7 @@
 """Checkpoints: our files, Lightning's and the official ones, with strict loading."""
 
 from r3dpa.checkpoints.convert import ConversionReport, convert
-from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint, source_commit
+from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint
 from r3dpa.checkpoints.fingerprint import weights_sha256
 from r3dpa.checkpoints.leaks import leaks_labels, refuse_leak
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
@@ -22,7 +22,6 @@ __all__ = [
     "read_checkpoint",
     "refuse_leak",
     "save_checkpoint",
-    "source_commit",
     "to_official",
     "transfer_rgb",
     "weights_sha256",

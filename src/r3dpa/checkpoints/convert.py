@@ -10,7 +10,6 @@ from typing import Any, Literal
 import torch
 import yaml
 
-from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.files import (
     official_neighbour,
     read_checkpoint,
@@ -20,6 +19,7 @@ from r3dpa.checkpoints.files import (
 from r3dpa.checkpoints.networks import Checkpoint, NetworkState, format_table
 from r3dpa.checkpoints.official import statistics_of, to_official
 from r3dpa.checkpoints.transfer import TransferReport, transfer_rgb
+from r3dpa.io import atomic_path
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 

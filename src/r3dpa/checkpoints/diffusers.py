@@ -10,8 +10,8 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 
 from r3dpa.checkpoints.networks import Checkpoint, NetworkState
+from r3dpa.io import UNPICKLING_ERRORS, first_line
 from r3dpa.nn.image_vae import ImageVAE
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 __all__ = ["from_diffusers", "is_diffusers"]
 

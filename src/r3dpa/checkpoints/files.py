@@ -9,7 +9,6 @@ import json
 import pickle
 import re
 import reprlib
-import subprocess
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,18 +21,16 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.atomic import atomic_path
 from r3dpa.checkpoints.diffusers import from_diffusers, is_diffusers
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
 from r3dpa.checkpoints.official import from_official, is_official
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit
 
 __all__ = [
     "official_neighbour",
     "read_checkpoint",
     "refuse_existing",
     "save_checkpoint",
-    "source_commit",
 ]
 
 _FORMAT = "r3dpa-checkpoint-1"
@@ -61,18 +58,6 @@ _LIGHTNING = {
 
 
 @functools.cache
-def source_commit() -> str | None:
-    """Commit of the r3dpa checkout that runs; None if it was installed without one."""
-    package = Path(__file__).resolve().parents[1]
-    try:
-        command = ["git", "-C", str(package), "rev-parse", "--show-toplevel", "HEAD"]
-        answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    top, commit = answer.splitlines()
-    return commit if Path(top, "src", "r3dpa").resolve() == package else None
-
-
 def read_checkpoint(
     path: str | Path,
     *,

@@ -11,9 +11,8 @@ import torch
 
 from r3dpa.ablation import RunSettings, budget_of, log_rows, make_plan, read_scale, run_plan
 from r3dpa.ablation.report import write_table
-from r3dpa.atomic import only_writer
-from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.cli.files import check_folder, print_text
+from r3dpa.io import command, machine, only_writer, versions
 
 __all__ = ["ablate_tables"]
 

@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.bench.simulation import DRIVES, WEATHERS
 from r3dpa.cli.ablation_report import NOTHING, Ablation, EffectAblation
 from r3dpa.cli.realism import pooled
 from r3dpa.data.scans import find_scans
+from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics import scan_statistics
 from r3dpa.simulation import (
     EFFECTS,

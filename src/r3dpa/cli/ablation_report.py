@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from statistics import median, quantiles
 from typing import Any, NamedTuple
 
-from r3dpa.bench.provenance import one_line
+from r3dpa.io import one_line
 from r3dpa.metrics import MEASURES, Measure, ScanStatistics, known
 
 #: Row in which nothing is switched off: how far two timings of one scan are apart.

@@ -246,9 +246,9 @@ def bench_control(
     from r3dpa.bench.control import ControlSettings, control
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.scenes import generator_from
-    from r3dpa.devices import usable_device
     from r3dpa.editing import EditSettings
     from r3dpa.generation import SamplerConfig
+    from r3dpa.io import usable_device
 
     check_folder(out)
     device = usable_device(device)
@@ -288,7 +288,7 @@ def bench_speed(
         out: JSON file for the same figures.
     """
     from r3dpa.bench.speed import random_generators, speed
-    from r3dpa.devices import usable_device
+    from r3dpa.io import usable_device
 
     check_file(out)
     device = usable_device(device)

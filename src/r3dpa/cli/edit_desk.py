@@ -18,8 +18,7 @@ from torch import Tensor
 
 import r3dpa
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
-from r3dpa.checkpoints import read_checkpoint, source_commit
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.edits import EditJob
 from r3dpa.cli.scenes import draw_scene, generator_from, written
 from r3dpa.data import (
@@ -35,11 +34,11 @@ from r3dpa.data import (
 )
 from r3dpa.data.objects import object_library
 from r3dpa.data.scene_writer import SceneWriter
-from r3dpa.devices import usable_device
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import LidarSensor, in_range, range_image
 from r3dpa.geometry.gaps import check_view
+from r3dpa.io import atomic_path, source_commit, usable_device
 from r3dpa.nn.backbones import feature_source
 
 __all__ = ["EditDesk", "Guidance", "Parts", "ScanView", "without_features"]

@@ -11,13 +11,14 @@ from typing import Any, Literal
 from jsonargparse import Namespace
 from tqdm import tqdm
 
-from r3dpa.checkpoints import refuse_leak, source_commit
+from r3dpa.checkpoints import refuse_leak
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
 from r3dpa.data.sample_files import SampleError
 from r3dpa.data.samples import Samples, read_samples
 from r3dpa.data.scans import Scan, evenly
 from r3dpa.geometry import LidarSensor
 from r3dpa.imports import ConfigParser
+from r3dpa.io import source_commit
 from r3dpa.metrics.official_statistics import OfficialSplit
 from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics

@@ -12,8 +12,8 @@ from tqdm import tqdm
 from r3dpa.data import Scan, find_scans
 from r3dpa.data.objects import ObjectLibrary, object_library
 from r3dpa.data.scans import evenly
-from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.io import usable_device
 from r3dpa.nn.backbones import feature_source
 
 __all__ = ["objects"]

@@ -14,12 +14,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, one_line, versions
 from r3dpa.data import PointDataset, Scan, kitti360_scans
 from r3dpa.data.scans import evenly
-from r3dpa.devices import usable_device
 from r3dpa.geometry import LidarSensor
+from r3dpa.io import atomic_path, command, machine, one_line, usable_device, versions
 from r3dpa.metrics import SourceProbe, known, probe_source
 from r3dpa.metrics.probe import Labelled
 from r3dpa.nn.backbones import WaffleIronS, feature_source

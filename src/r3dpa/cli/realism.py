@@ -9,8 +9,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
 from r3dpa.data.scans import Scan, ScanError, find_scans, read_scan
+from r3dpa.io import atomic_path
 from r3dpa.metrics import RealismTable, ScanStatistics, realism_table, scan_statistics
 
 

@@ -22,14 +22,13 @@ from r3dpa.checkpoints import (
     Checkpoint,
     leaks_labels,
     read_checkpoint,
-    source_commit,
     weights_sha256,
 )
 from r3dpa.data.scene_writer import SceneWriter
-from r3dpa.devices import usable_device
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
+from r3dpa.io import source_commit, usable_device
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
-from r3dpa.bench.provenance import command, machine, versions
 from r3dpa.data.scans import Scan, evenly, find_scans, read_scan
+from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics.corruption import Corruption, Step, corruptions, steps
 from r3dpa.metrics.distances import Resampling, histogram_rows, matching_rows
 from r3dpa.metrics.evaluation import gather

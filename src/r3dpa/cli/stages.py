@@ -12,10 +12,10 @@ from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.utilities import rank_zero_only
 
-from r3dpa.atomic import atomic_path, delete_unfinished, only_writer
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint, refuse_leak
 from r3dpa.imports import ConfigParser
+from r3dpa.io import atomic_path, delete_unfinished, only_writer
 from r3dpa.modules import GenerativeModule
 
 __all__ = ["StageCLI", "run"]

@@ -8,10 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from r3dpa.checkpoints import read_checkpoint, source_commit
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.cli.scenes import generator_from, sit_sha256
-from r3dpa.devices import usable_device
 from r3dpa.flow import ode_times
 from r3dpa.flow.tuned import TunedSolver
 from r3dpa.flow.tuning import (
@@ -23,6 +22,7 @@ from r3dpa.flow.tuning import (
     solver_error,
 )
 from r3dpa.generation import SamplerConfig
+from r3dpa.io import source_commit, usable_device
 
 __all__ = ["tune"]
 

@@ -10,9 +10,9 @@ from zipfile import BadZipFile
 from numpy.typing import NDArray
 
 from r3dpa import viz
-from r3dpa.atomic import atomic_path
 from r3dpa.data.scans import evenly, find_scans, read_beside, read_npz, read_ply, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection
+from r3dpa.io import atomic_path
 from r3dpa.simulation import Origin, Semantic
 
 __all__ = ["view"]

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from r3dpa.atomic import atomic_path
 from r3dpa.geometry import Projection, projection_to_dict
+from r3dpa.io import atomic_path
 
 if TYPE_CHECKING:
     from r3dpa.data.feature_grids import Extractor

@@ -22,7 +22,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r3dpa.names import refuse_name
+from r3dpa.io import refuse_name
 
 if TYPE_CHECKING:
     from r3dpa.data.tensor_cache import CachedTensors

@@ -17,12 +17,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
 from r3dpa.data.feature_grids import Extractor
 from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan, read_scan
 from r3dpa.geometry import Projection, in_range, projection_to_dict
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 
 __all__ = ["ObjectClass", "ObjectLibrary", "object_library"]
 

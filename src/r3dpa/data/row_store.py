@@ -26,7 +26,7 @@ from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
-from r3dpa.names import refuse_name
+from r3dpa.io import refuse_name
 
 _log = logging.getLogger(__name__)
 

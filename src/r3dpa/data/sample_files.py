@@ -26,7 +26,8 @@ from r3dpa.data.scans import (
     read_ply,
     read_scan,
 )
-from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly
+from r3dpa.io import UNPICKLING_ERRORS
+from r3dpa.unpickling import ArraysOnly
 
 SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth", "joblib"]
 SUFFIXES: dict[SampleFormat, tuple[str, ...]] = {

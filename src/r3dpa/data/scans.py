@@ -19,11 +19,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from r3dpa.atomic import atomic_path
 from r3dpa.geometry import LidarSensor, in_range
-from r3dpa.names import refuse_name
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, refuse_name
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
-from r3dpa.unpickling import UNPICKLING_ERRORS, array_header
+from r3dpa.unpickling import array_header
 
 Split = Literal["train", "val"]
 T = TypeVar("T")

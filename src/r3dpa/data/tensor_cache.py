@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
 from r3dpa.data.row_store import RowKey, RowReader, Rows, RowWriter
+from r3dpa.io import atomic_path
 
 __all__ = ["Cacheable", "CachedTensors", "TensorCache", "TensorCacheError"]
 

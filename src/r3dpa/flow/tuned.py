@@ -12,8 +12,8 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
 from r3dpa.flow.solvers import OdeSolver, Velocity, ab2, ab3, euler
+from r3dpa.io import atomic_path
 
 __all__ = ["TunedSolver", "multistep"]
 

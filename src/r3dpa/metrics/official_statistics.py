@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r3dpa.io import UNPICKLING_ERRORS
 from r3dpa.metrics.distances import Resampling, cell_rows, distance_row
 from r3dpa.metrics.evaluation import PYTHON_OPTION, about_generated, check_counts, gather
 from r3dpa.metrics.feature_distances import FeatureSample, frechet_row
@@ -27,7 +28,7 @@ from r3dpa.metrics.protocol import PUBLISHED
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.unpickling import UNPICKLING_ERRORS, ArraysOnly, array_header
+from r3dpa.unpickling import ArraysOnly, array_header
 
 __all__ = ["OfficialSplit", "OfficialStatistics", "evaluate_official", "is_official"]
 

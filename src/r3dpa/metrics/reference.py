@@ -14,14 +14,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, refuse_name
 from r3dpa.metrics.functional import Moments
 from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import SceneFeatures
 from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
-from r3dpa.names import refuse_name
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 2

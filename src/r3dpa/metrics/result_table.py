@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 from r3dpa.metrics.results import Evaluation, MetricResult, printed
 
 _COMPARABLE = ("protocol", "reference", "backbones")

@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self, TypedDict, get_args
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 from r3dpa.modules.settings import LossWeights, PathName
 from r3dpa.modules.step_losses import PathDraws
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa import __version__
-from r3dpa.checkpoints import source_commit
+from r3dpa.io import source_commit
 from r3dpa.modules.bad_batches import BadBatch, tensors_of
 from r3dpa.modules.guards import StepGuard, Verdict
 from r3dpa.modules.settings import OptimizerConfig

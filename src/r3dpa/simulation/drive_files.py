@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 from r3dpa.simulation.scan import SimulatedScan
 from r3dpa.simulation.scene import Pose, Scene, Weather
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import atomic_path
 
 Array = Tensor | NDArray[np.generic]
 Pixels = NDArray[np.uint8]

@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from r3dpa.io import UNPICKLING_ERRORS, first_line
 from r3dpa.nn.attention import SelfAttention
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 __all__ = ["DINOv2"]
 

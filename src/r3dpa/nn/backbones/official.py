@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from r3dpa.unpickling import UNPICKLING_ERRORS
+from r3dpa.io import UNPICKLING_ERRORS
 
 _MODEL = "the model.ckpt of the released weights"
 

@@ -13,12 +13,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from r3dpa.atomic import atomic_path
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 from r3dpa.nn.backbones.kernel import random_basis
 from r3dpa.nn.backbones.tokens import TokenFeatures, sha256
 from r3dpa.nn.backbones.voxels import PointCloudBatch, ScanGrid
 from r3dpa.nn.backbones.waffleiron import WaffleIron
-from r3dpa.unpickling import UNPICKLING_ERRORS, first_line
 
 _SHIPPED = Path(str(files("r3dpa.nn.backbones"))) / "waffleiron_s.safetensors"
 NORM_EPS = nn.BatchNorm1d(1).eps
