@@ -180,7 +180,6 @@ class TestErrorsOnTheTerminal:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["simulate", "--ablate", "--out", "file/below"], "file is a file; give another --out"),
         (["view", "scans", "--out", "file"], "file is a file; give another --out"),
         (["realism", "--scans", "scans", "--reference", "scans", "--out", "scans"], "is a folder"),
         (["bench", "simulation", "--out", "scans"], "scans is a folder; give --out the name"),

@@ -38,11 +38,10 @@ def simulate(
     effects: dict[str, str | bool] | None = None,
     weather: Weather | None = None,
 ) -> None:
-    """Write simulated scans in the KITTI-360 layout, or with --ablate what each effect buys.
+    """Write simulated scans in the KITTI-360 layout.
 
     The same command completes what was interrupted. Prints what each effect did and cost, which
-    stays in ``report.json``; ``sim/*.json`` tells it for each scan. ``r3dpa simulate --ablate``
-    writes no data set and has options of its own: :func:`ablate`.
+    stays in ``report.json``; ``sim/*.json`` tells it for each scan.
 
     Args:
         out: Root of the data set to write.
@@ -67,35 +66,6 @@ def simulate(
         sys.stderr.write(f"r3dpa simulate: stopped; the same command goes on in {out}\n")
         sys.exit(130)  # as a shell reports an interrupt
     print_text(report)
-
-
-def ablate(
-    out: Path,
-    scans: int = 24,
-    seed: int = 0,
-    sensor: str = "hdl64e",
-    weather: Weather | None = None,
-    reference: Path | None = None,
-) -> None:
-    """Switch off one effect at a time: what each buys in realism, and what it costs.
-
-    Prints the table, which stays in ``ablation.md``; ``ablation.csv`` and ``ablation.json`` hold
-    every measure and time. Takes about ten seconds a scan.
-
-    Args:
-        out: Folder for the three files.
-        scans: Number of scenes over all drives; half are dry, the others wet, in rain, fog or
-            snow, under a low sun, or with two returns a shot.
-        seed: Seed of streets and instrument.
-        sensor: As for ``r3dpa simulate``.
-        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``.
-        reference: Folder of real scans: does each effect bring the scans nearer to them?
-    """
-    from r3dpa.cli.ablation import ablate as run
-    from r3dpa.simulation import load_sensor
-
-    check_folder(out)
-    print_text(run(out, load_sensor(sensor), scans, seed, weather, reference))
 
 
 def ablate_tables(
@@ -647,9 +617,6 @@ def _run(args: list[str]) -> None:
         from r3dpa.cli.features import features
 
         features(args[1:])
-    elif args[0] == "simulate" and "--ablate" in args:
-        words = [word for word in args[1:] if word != "--ablate"]
-        _run_function(ablate, words, "r3dpa simulate --ablate")
     elif args[0] == "bench":
         from r3dpa.cli.benches import BENCHES
 
