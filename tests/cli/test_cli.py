@@ -38,11 +38,10 @@ COMMANDS = {
         "report",
         "bench",
         "ablate",
-        "probe",
         "tune-solver",
         "replay",
     ),
-    *("reference", "evaluate", "selfcheck"),
+    *("reference", "evaluate"),
     *("inpaint", "mix", "complete", "vary", "interpolate", "objects"),
 }
 CONF = Path(__file__).resolve().parents[2] / "conf"

@@ -159,38 +159,6 @@ def realism(scans: Path, reference: Path, out: Path | None = None) -> None:
     print_text(compare(scans, reference, out))
 
 
-def probe(
-    data: Path,
-    sources: str = "geometric,waffleiron-s,random",
-    ckpt: Path | None = None,
-    train_scans: int = 40,
-    val_scans: int = 20,
-    device: str = "auto",
-    out: Path | None = None,
-) -> None:
-    """Tell what 3D features know of the classes of simulated scans, and what they cost.
-
-    Prints, for each source of features, the scores of a linear classifier of its point features,
-    fitted on the training drives and tested on all points of the validation drives; the share of
-    empty cells and the cosine between neighbouring ones; and the time per scan.
-
-    Args:
-        data: Root of a data set of ``r3dpa simulate``.
-        sources: Names, separated by commas: ``geometric``, ``waffleiron-s``, ``scalr``, ``oracle``
-            (made from the labels: an upper bound) and ``random`` (the network of ``waffleiron-s``
-            without training).
-        ckpt: Checkpoint of ``scalr``, or of ``waffleiron-s`` where that is not among the sources.
-        train_scans: Scans to fit the classifier on.
-        val_scans: Scans to test it on.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        out: JSON file for the same figures.
-    """
-    from r3dpa.cli.probe import probe as compare
-
-    check_file(out)
-    print_text(compare(data, _words(sources), ckpt, train_scans, val_scans, device, out))
-
-
 def sample(
     ckpt: Path,
     out: Path,
@@ -417,37 +385,6 @@ def evaluate(
     print_text(compare(samples, reference, names, ckpt, protocol, *options))
 
 
-def selfcheck(
-    data: Path,
-    against: Path | None = None,
-    spaces: str = "fwid,fgeo",
-    ckpt: dict[str, Path] | None = None,
-    protocol: Literal["default", "published"] = "default",
-    limit: int | None = None,
-    device: str = "auto",
-    out: Path | None = None,
-) -> None:
-    """Tell whether every metric worsens when real scans are made worse step by step.
-
-    One half of the scans is compared with the other half: as it is, with noise on its ranges, with
-    points dropped, and turned; of other drives where there are several.
-
-    Args:
-        data: Folder of real scans, in the KITTI-360 layout or any other.
-        against: Folder of simulated scans, to be compared with the same half.
-        spaces: Feature spaces, separated by commas, as for ``r3dpa reference``.
-        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
-        protocol: ``default`` or ``published``, as for ``r3dpa reference``.
-        limit: Use this many real scans at most, spread evenly.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        out: JSON file for all numbers.
-    """
-    from r3dpa.cli.selfcheck import selfcheck as check_metrics
-
-    check_file(out)
-    print_text(check_metrics(data, against, _words(spaces), ckpt, protocol, limit, device, out))
-
-
 def convert(
     source: Path,
     out: Path,
@@ -558,8 +495,8 @@ def tune_solver(
 _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
-        *(simulate, check, view, realism, probe),
-        *(sample, tune_solver, reference, evaluate, selfcheck, convert, replay, report),
+        *(simulate, check, view, realism),
+        *(sample, tune_solver, reference, evaluate, convert, replay, report),
     )
 } | {"ablate": ablate_tables}
 

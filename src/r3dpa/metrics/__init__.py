@@ -34,14 +34,6 @@ from r3dpa.metrics.measures import (
     known,
     wasserstein_1,
 )
-from r3dpa.metrics.probe import (
-    ProbeScores,
-    SourceProbe,
-    empty_share,
-    linear_probe,
-    neighbour_cosine,
-    probe_source,
-)
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED, Protocol
 from r3dpa.metrics.realism import RealismRow, RealismTable, realism_table
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -69,19 +61,16 @@ __all__ = [
     "Moments",
     "PolynomialMMD",
     "PrecisionRecall",
-    "ProbeScores",
     "Protocol",
     "RealismRow",
     "RealismTable",
     "ReferenceStatistics",
     "ScanStatistics",
     "SceneFeatures",
-    "SourceProbe",
     "bootstrap_interval",
     "chamfer_squared",
     "curve_rmse",
     "curves",
-    "empty_share",
     "evaluate",
     "fd_infinity",
     "frechet_distance",
@@ -89,12 +78,9 @@ __all__ = [
     "histogram_distance",
     "jensen_shannon",
     "known",
-    "linear_probe",
     "minimum_matching",
-    "neighbour_cosine",
     "polynomial_mmd",
     "precision_recall",
-    "probe_source",
     "published_evaluations",
     "realism_table",
     "scan_statistics",
