@@ -21,8 +21,7 @@ FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.ya
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
 	test-faults test-torture test-nodes fuzz notebooks demo clean bench bench-training \
-	bench-sampling bench-control bench-vae bench-data bench-simulation bench-features bench-metrics \
-	bench-gpu ablations
+	bench-sampling bench-gpu ablations
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
@@ -48,7 +47,7 @@ types: $(READY) ## mypy alone
 	$(BIN)/mypy
 
 test: $(READY) ## default tests, a few minutes on two cores
-	$(BIN)/pytest -m "not slow and not gpu and not weights"
+	$(BIN)/pytest -m "not slow and not gpu and not weights and not bench"
 
 test-all: $(READY) ## every test that this machine can run
 	$(BIN)/pytest
@@ -85,7 +84,8 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 	$(BIN)/r3dpa test --config $(OUT)/joint/config.yaml \
 		--ckpt_path $(OUT)/joint/checkpoints/last.ckpt
 
-bench: bench-training bench-sampling bench-vae bench-data bench-simulation bench-features bench-metrics ## all of the following
+bench: $(READY) ## micro-benchmarks of simulation, data, features, metrics, VAE, sampling, guidance
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/bench -m bench
 
 bench-training: $(READY) ## one full-size training step of each stage: time and peak memory
 	$(BIN)/r3dpa bench training
@@ -93,38 +93,15 @@ bench-training: $(READY) ## one full-size training step of each stage: time and 
 bench-sampling: $(READY) ## what accuracy costs in time, for an exact velocity: minutes
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench sampling --quick --out runs/bench_sampling
 
-# A checkpoint, the simulated scans that it learned from, and a library of `r3dpa objects`.
-LIBRARY ?= runs/objects.safetensors
-bench-control: $(READY) ## guidance and edits of a trained model: CKPT=..., LIBRARY=...; an hour on a CPU
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench control --ckpt $(CKPT) --data $(OUT)/data \
-		--library $(LIBRARY) --out runs/bench_control
-
 ablations: $(READY) ## tables II, III and IV at the demo's size: less than an hour on two cores
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa ablate conf/ablation --scale demo --jobs 2
 
-bench-vae: $(READY) ## reconstruction against decode time of the VAE layouts
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench vae
-
-bench-data: $(READY) ## scans per second from simulation to batches
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench data
-
-bench-simulation: $(READY) ## what a simulated scan costs on one core, by part and effect
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench simulation
-
-bench-features: $(READY) ## what feature grids cost: building, reading, one pass of a network
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench features
-
-bench-metrics: $(READY) ## what metrics cost: networks, histograms, matching, sparse convolution
-	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench metrics
-
 # A checkpoint that fits, for the picture of a trained model: make bench-gpu CKPT=...
 CKPT ?=
-bench-gpu: $(READY) ## on a GPU: speed of full-size networks, training steps, VAEs; half an hour
+bench-gpu: $(READY) ## on a GPU: training steps at full size, and sampling from CKPT
 	mkdir -p runs/bench_gpu
-	$(BIN)/r3dpa bench speed --device cuda --out runs/bench_gpu/speed.json
 	$(BIN)/r3dpa bench training --device cuda --precision bf16-mixed --batch_size 32 --steps 10 \
 		--out runs/bench_gpu/training.json
-	$(BIN)/r3dpa bench vae --device cuda --batch_size 16 --rounds 10 --out runs/bench_gpu/vae.json
 	$(if $(CKPT),$(BIN)/r3dpa bench sampling --device cuda --ckpt $(CKPT) --out runs/bench_gpu/sampling)
 
 clean: ## remove caches and runs, keep .venv

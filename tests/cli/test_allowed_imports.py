@@ -93,7 +93,7 @@ def test_classes_in_lists_and_in_arguments_of_any_type(refused, hostile):
         "torch.hub.load",
         "torch.load",
         "r3dpa.cli.main",
-        "r3dpa.bench.official_imports.official_modules",
+        "r3dpa.bench.hardware.peak_of",
         # With weights_only=False it unpickles whatever the file holds.
         "r3dpa.modules.VAEAlignment.load_from_checkpoint",
     ],

@@ -181,7 +181,7 @@ class TestErrorsOnTheTerminal:
     [
         (["view", "scans", "--out", "file"], "file is a file; give another --out"),
         (["realism", "--scans", "scans", "--reference", "scans", "--out", "scans"], "is a folder"),
-        (["bench", "simulation", "--out", "scans"], "scans is a folder; give --out the name"),
+        (["bench", "training", "--out", "scans"], "scans is a folder; give --out the name"),
         (["bench", "training", "--out", "file/costs.json"], "file is a file; give another --out"),
     ],
 )

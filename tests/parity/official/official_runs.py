@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from official_imports import OfficialCode, OneProcess, Overlay
 from torch import Tensor, nn
 
-from r3dpa.bench.official_imports import OfficialCode, OneProcess, Overlay
 from r3dpa.checkpoints import Checkpoint, to_official
 
 __all__ = [

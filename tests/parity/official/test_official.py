@@ -7,14 +7,12 @@ import sys
 import time
 from pathlib import Path
 
+import official_imports
 import pytest
 import torch
 import torch.nn.functional as F
-
-from r3dpa.bench import official_imports
-from r3dpa.bench.official import OfficialSettings, official
-from r3dpa.bench.official_imports import Attention, Mlp, Overlay, PatchEmbed, load_official
-from r3dpa.bench.official_networks import (
+from official_imports import Attention, Mlp, Overlay, PatchEmbed, load_official
+from official_networks import (
     at_times,
     equal_error,
     noise_of,
@@ -24,13 +22,15 @@ from r3dpa.bench.official_networks import (
     trained_networks,
     vaes,
 )
-from r3dpa.bench.official_runs import (
+from official_runs import (
     replaced,
     save_for_official,
     train_official,
     write_official_scenes,
 )
-from r3dpa.bench.official_step import train_ours
+from official_speed import OfficialSettings, official
+from official_step import train_ours
+
 from r3dpa.checkpoints import save_checkpoint, to_official
 from r3dpa.flow import euler, ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator
@@ -267,8 +267,8 @@ def test_training_script_moves_the_weights_as_our_step_does(code, tmp_path):
 
 
 def test_other_result_is_an_error_and_no_ratio(code, repo, monkeypatch):
-    monkeypatch.setattr("r3dpa.bench.official.at_times", lambda sit, times: lambda x, time: -x)
-    monkeypatch.setattr("r3dpa.bench.official._SMALL_SIT", SIT)
+    monkeypatch.setattr("official_speed.at_times", lambda sit, times: lambda x, time: -x)
+    monkeypatch.setattr("official_speed._SMALL_SIT", SIT)
     settings = OfficialSettings(parts=("sampler",), quick=True)
     with pytest.raises(RuntimeError, match="sampler: r3dpa differs from the official result"):
         official(repo, sample=lambda *args: None, settings=settings)

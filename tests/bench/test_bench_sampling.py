@@ -30,7 +30,6 @@ from r3dpa.bench.hardware import flop_of, peak_of
 from r3dpa.bench.problems import MixtureProblem, ModelProblem, Setting
 from r3dpa.bench.sampling import Effort, run_problem, sampling, settings_of
 from r3dpa.bench.timing import Spent, measure
-from r3dpa.cli import main
 from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.solvers import evaluations
 from r3dpa.generation import SamplerConfig, SceneGenerator
@@ -420,15 +419,3 @@ class TestFiles:
     def test_counts_below_one_are_refused(self, tmp_path):
         with pytest.raises(ValueError, match=r"at least 2, rounds.*got 1"):
             sampling(tmp_path, scenes=1)
-
-
-def test_speed_of_random_networks(tmp_path, capsys):
-    """Work is counted, times are positive, and the table tells what the file tells."""
-    main(["bench", "speed", "--quick", "--device", "cpu", "--rounds", "1", "--out",
-          str(tmp_path / "speed.json")])  # fmt: skip
-    found = json.loads((tmp_path / "speed.json").read_text())
-    printed = capsys.readouterr().out
-    assert [row["case"] in printed for row in found["rows"]] == [True, True]
-    for row in found["rows"]:
-        assert row["limit_seconds"] > 0
-        assert row["tera_flop"] / row["seconds"] == pytest.approx(row["tera_flop_per_second"])

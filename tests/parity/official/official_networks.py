@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from official_imports import OfficialCode
+from official_runs import official_sit, official_vae
 from torch import Tensor
 
-from r3dpa.bench.official_imports import OfficialCode
-from r3dpa.bench.official_runs import official_sit, official_vae
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, to_official
 from r3dpa.flow import Velocity, heun, ode_solver, ode_times
 from r3dpa.generation import SamplerConfig, Solver, scene_random

@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
-
-from r3dpa.bench.official_imports import COMMIT, OfficialCode, Overlay, load_official
-from r3dpa.bench.official_networks import (
+from official_imports import COMMIT, OfficialCode, Overlay, load_official
+from official_networks import (
     at_times,
     equal_error,
     noise_of,
@@ -27,14 +25,16 @@ from r3dpa.bench.official_networks import (
     trained_networks,
     vaes,
 )
-from r3dpa.bench.official_runs import (
+from official_runs import (
     PATCHES,
     replaced,
     save_for_official,
     train_official,
     write_official_scenes,
 )
-from r3dpa.bench.official_step import train_ours
+from official_step import train_ours
+from torch import Tensor, nn
+
 from r3dpa.bench.timing import Comparison, compare
 from r3dpa.checkpoints import Checkpoint, save_checkpoint, to_official
 from r3dpa.checkpoints.networks import format_table

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import lightning as L
+from official_runs import Trained
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from r3dpa.bench.official_runs import Trained
 from r3dpa.checkpoints import Checkpoint, to_official
 from r3dpa.checkpoints.networks import NetworkState
 from r3dpa.modules import JointAlignment
