@@ -129,9 +129,9 @@ class TestOurFiles:
         )
 
     def test_feature_source_of_new_and_earlier_files(self, checkpoint, tmp_path):
-        known = replace(checkpoint, feature_source="oracle")
+        known = replace(checkpoint, feature_source="geometric")
         path = save_checkpoint(known, tmp_path / "a.safetensors")
-        assert read_checkpoint(path).feature_source == "oracle"
+        assert read_checkpoint(path).feature_source == "geometric"
         description = path.with_suffix(".yaml")
         about = yaml.safe_load(description.read_text())
         del about["feature_source"]

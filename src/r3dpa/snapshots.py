@@ -124,7 +124,7 @@ class WeakModel:
             guides, see :func:`r3dpa.flow.autoguidance.renormalised`.
         shift: ``(C,)`` float32.
         step: Optimiser steps that it was trained for, if known.
-        feature_source: What its weights learned from; a leak of labels is one of the guided model.
+        feature_source: Feature source of its training, if known.
     """
 
     path: Path

@@ -139,20 +139,18 @@ def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
 def test_what_made_the_samples_is_told(reference_file, samples, tmp_path):
     metadata = {
         "r3dpa": "1.0",
-        "feature_source": "oracle",
+        "feature_source": "geometric",
         "sampler": {"solver": "heun", "steps": 7},
         "seed": 3,
         "weights": "ema",
     }
     (samples.parent / "metadata.json").write_text(json.dumps(metadata))
     words = ["--samples", samples, "--reference", reference_file, "--allow_few"]
-    with pytest.raises(ValueError, match=r"samples: made with features of 'oracle'.*allow_oracle"):
-        evaluate(*words)
-    evaluate(*words, "--allow_oracle", "--out", tmp_path / "out", "--label", "ours")
+    evaluate(*words, "--out", tmp_path / "out", "--label", "ours")
     stored = Evaluation.load(tmp_path / "out" / "evaluation.json")
     about = stored.about
     assert (stored.label, about["solver"], about["steps"], about["seed"]) == ("ours", "heun", 7, 3)
-    assert (about["feature_source"], about["extra"]["weights"]) == ("oracle", "ema")
+    assert (about["feature_source"], about["extra"]["weights"]) == ("geometric", "ema")
     (samples.parent / "metadata.json").write_text("{")
     with pytest.raises(ValueError, match=r"metadata\.json: is damaged"):
         evaluate(*words)

@@ -8,7 +8,6 @@ import torch
 from r3dpa.nn.backbones import (
     SOURCES,
     GeometricFeatures,
-    OracleFeatures,
     ScaLR,
     WaffleIron,
     feature_source,
@@ -26,11 +25,10 @@ def scalr_file(tmp_path):
 
 
 def test_each_name_gives_its_extractor(scalr_file):
-    assert SOURCES == ("scalr", "waffleiron-s", "geometric", "oracle")
+    assert SOURCES == ("scalr", "waffleiron-s", "geometric")
     for name, ckpt, kind in (
         ("scalr", scalr_file, ScaLR),
         ("geometric", None, GeometricFeatures),
-        ("oracle", None, OracleFeatures),
     ):
         source = feature_source(name, ckpt, dim=4)
         assert type(source) is kind
@@ -50,15 +48,14 @@ def test_waffleiron_s_takes_weights_or_has_its_own(monkeypatch):
 
 def test_refused_names_and_checkpoints(scalr_file):
     with pytest.raises(
-        ValueError, match="no feature source 'dino'; there are scalr, waffleiron-s, geometric, ora"
+        ValueError, match="no feature source 'dino'; there are scalr, waffleiron-s, geometric"
     ):
         feature_source("dino")
     with pytest.raises(ValueError, match=r"scalr needs ckpt.*one of waffleiron-s, geometric"):
         feature_source("scalr")
     with pytest.raises(ValueError, match=r"ckpt_last.pth has features of width 4, but dim is 768"):
         feature_source("scalr", scalr_file)
-    for name in ("geometric", "oracle"):
-        with pytest.raises(ValueError, match=rf"{name} has no weights: leave ckpt \(a.pth\) out"):
-            feature_source(name, "a.pth")
+    with pytest.raises(ValueError, match=r"geometric has no weights: leave ckpt \(a.pth\) out"):
+        feature_source("geometric", "a.pth")
     with pytest.raises(ValueError, match="dim must be even and at least 2, got 5"):
-        feature_source("oracle", dim=5)
+        feature_source("geometric", dim=5)

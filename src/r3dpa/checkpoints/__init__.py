@@ -3,7 +3,6 @@
 from r3dpa.checkpoints.convert import ConversionReport, convert
 from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint
 from r3dpa.checkpoints.fingerprint import weights_sha256
-from r3dpa.checkpoints.leaks import leaks_labels, refuse_leak
 from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
 from r3dpa.checkpoints.official import from_official, to_official
 from r3dpa.checkpoints.transfer import TransferReport, TransferRow, transfer_rgb
@@ -17,10 +16,8 @@ __all__ = [
     "TransferRow",
     "convert",
     "from_official",
-    "leaks_labels",
     "load_into",
     "read_checkpoint",
-    "refuse_leak",
     "save_checkpoint",
     "to_official",
     "transfer_rgb",

@@ -187,8 +187,8 @@ class Checkpoint:
         step: Optimiser steps taken, None if the file does not tell.
         geometry: Plain values of the ``ScanGeometry`` it was trained for, None if unknown.
         augmentation: Plain values of the ``Augmentation`` of its training, None if unknown.
-        feature_source: Name of the feature source that its weights learned from, of several one
-            that leaks labels; None if unknown or none.
+        feature_source: Name of the feature source of its last training stage; None if unknown or
+            none.
         interpolant: Path between latents and noise that its SiT was trained on.
         version: Version of r3dpa that wrote it, None for official files.
         commit: Commit of r3dpa that wrote it, if known.

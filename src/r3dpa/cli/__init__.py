@@ -349,7 +349,6 @@ def evaluate(
     protocol: Literal["default", "published"] | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,
-    allow_oracle: bool = False,
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
@@ -370,7 +369,6 @@ def evaluate(
         protocol: Refuse a reference of another protocol than this.
         skip_bad: Leave out samples that cannot be used, and say which.
         allow_few: Accept fewer samples than features: only to try it.
-        allow_oracle: Evaluate also what was made with features that read the labels.
         label: Name of the generator in tables; that of ``samples`` where not given.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
@@ -381,7 +379,7 @@ def evaluate(
     if out is not None:
         check_folder(out)
     names = None if spaces is None else _words(spaces)
-    options = (skip_bad, allow_few, allow_oracle, label, device, out, split)
+    options = (skip_bad, allow_few, label, device, out, split)
     print_text(compare(samples, reference, names, ckpt, protocol, *options))
 
 

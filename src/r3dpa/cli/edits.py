@@ -248,7 +248,7 @@ def objects(
         out: File to write, ``.safetensors``.
         like: Checkpoint of a model that the objects are for: source, dim, sensor and grid_size are
             its own.
-        source: Feature source: ``geometric``, ``waffleiron-s``, ``scalr`` or ``oracle``.
+        source: Feature source: ``geometric``, ``waffleiron-s`` or ``scalr``.
         features_ckpt: Weights of the feature source, where it has none of its own.
         classes: Names, separated by commas; all that the scans show where not given.
         limit: Use this many scans at most, evenly spread.

@@ -11,7 +11,6 @@ from typing import Any, Literal
 from jsonargparse import Namespace
 from tqdm import tqdm
 
-from r3dpa.checkpoints import refuse_leak
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
 from r3dpa.data.sample_files import SampleError
 from r3dpa.data.samples import Samples, read_samples
@@ -92,7 +91,6 @@ def evaluate(
     protocol: str | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,
-    allow_oracle: bool = False,
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
@@ -109,7 +107,6 @@ def evaluate(
         protocol: Must be that of the reference; not compared where None.
         skip_bad: Leave out samples that cannot be used, and list them.
         allow_few: Accept fewer samples than features.
-        allow_oracle: Accept samples of a model that learned from labels.
         label: Of the generator; the name of ``samples`` where None.
         device: Where the networks compute.
         out: Folder for tables and figures; without figures for the official file.
@@ -122,7 +119,6 @@ def evaluate(
         ValueError: If an argument is not as above, or samples or reference cannot be used.
     """
     made_with = _made_with(samples)
-    refuse_leak(made_with.get("feature_source"), str(samples), allow=allow_oracle)
     statistics = load_reference(reference, split)
     found = reference_spaces(statistics, spaces, ckpt, protocol, device)
     setting = statistics.protocol

@@ -20,7 +20,6 @@ import r3dpa
 from r3dpa import viz
 from r3dpa.checkpoints import (
     Checkpoint,
-    leaks_labels,
     read_checkpoint,
     weights_sha256,
 )
@@ -198,11 +197,9 @@ def sample(
         raise ValueError(f"seed and pictures must be at least 0, got {seed} and {pictures}")
     device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
-    guidance, about_guide, feature_source = None, None, checkpoint.feature_source
+    guidance, about_guide = None, None
     if guide is not None:
         guidance, about_guide = _autoguidance(checkpoint, guide, weights, device)
-        if leaks_labels(about_guide["feature_source"]):
-            feature_source = about_guide["feature_source"]  # a leak is one of the scenes, too
     generator = generator_from(
         checkpoint,
         sampler,
@@ -222,7 +219,7 @@ def sample(
         "checkpoint_written": written(ckpt),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
-        "feature_source": feature_source,
+        "feature_source": checkpoint.feature_source,
         "weights": weights,
         "num": num,
         "seed": seed,

@@ -8,12 +8,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
-from lightning import Callback, LightningDataModule, LightningModule, Trainer
+from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.utilities import rank_zero_only
 
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
-from r3dpa.checkpoints import read_checkpoint, refuse_leak
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.imports import ConfigParser
 from r3dpa.io import atomic_path, delete_unfinished, only_writer
 from r3dpa.modules import GenerativeModule
@@ -45,16 +45,6 @@ class _SaveFitConfig(SaveConfigCallback):
             temporary.write_text(text, encoding="utf-8")
 
 
-class _RefuseLeaks(Callback):
-    """Refuses to evaluate weights that learned from labels, whatever file they came from."""
-
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if isinstance(pl_module, GenerativeModule):
-            refuse_leak(pl_module.feature_source, f"the model of {trainer.ckpt_path}")
-
-    on_test_start = on_validation_start
-
-
 class StageCLI(LightningCLI):
     """Wires a stage, a data module and a trainer from YAML files.
 
@@ -78,23 +68,6 @@ class StageCLI(LightningCLI):
         parser.link_arguments(
             "run_dir", "checkpoint.dirpath", compute_fn=lambda run_dir: f"{run_dir}/checkpoints"
         )
-
-    def _prepare_subcommand_parser(
-        self, klass: type, subcommand: str, **kwargs: Any
-    ) -> LightningArgumentParser:
-        """Adds ``allow_oracle`` to the commands that report metrics."""
-        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        if subcommand in ("validate", "test"):
-            parser.add_argument(
-                "--allow_oracle",
-                "--allow-oracle",
-                type=bool,
-                nargs="?",
-                const=True,
-                default=False,
-                help="evaluate also what was made with features that read the labels",
-            )
-        return parser
 
     def _parse_ckpt_path(self) -> None:
         """Checks that the file can be read; the model stays the one of the configuration.
@@ -147,16 +120,7 @@ class StageCLI(LightningCLI):
         if self._ckpt_path is None:
             raise ValueError(f"{self.subcommand} needs trained weights: give --ckpt_path")
 
-    def before_validate(self) -> None:
-        """Refuses to evaluate random weights, and what was made with features that leak labels."""
-        self.before_predict()
-        if not self.config[self.subcommand].allow_oracle:
-            refuse_leak(
-                getattr(self.datamodule, "feature_source", None), "the feature grids of the data"
-            )
-            cast(Any, self.trainer).callbacks.append(_RefuseLeaks())
-
-    before_test = before_validate
+    before_validate = before_test = before_predict
 
     @property
     def _ckpt_path(self) -> str | None:

@@ -9,10 +9,9 @@ from typing import Any, Literal, cast
 
 import lightning as L
 import torch
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_info
 
 from r3dpa.checkpoints import (
-    leaks_labels,
     load_into,
     read_checkpoint,
     transfer_rgb,
@@ -127,8 +126,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.geometry: ScanGeometry | None = None
         self.augmentation: Augmentation | None = None
         self.loaded_step = 0
-        self._data_source: str | None = None
-        self._learned_from: list[str | None] = []  # sources of the weights that were loaded
+        self.feature_source: str | None = None
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
 
@@ -161,7 +159,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.geometry, self.augmentation = datamodule.geometry, datamodule.augmentation
         self._check_sizes(self.geometry)
         if stage != "predict":
-            self._data_source = datamodule.feature_source
+            self.feature_source = datamodule.feature_source
         if self.needs_features() and stage != "predict":
             self._check_features(self.geometry, datamodule)
 
@@ -171,19 +169,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             self.load_previous_stage()
         if self._previous_geometry is not None:
             self._check_geometry(self._previous_geometry, str(self.init_from))
-        if leaks_labels(self.feature_source):
-            rank_zero_warn(
-                f"Features of {self.feature_source!r} read the labels: the numbers of this run and "
-                "of all that starts from it must not be compared with others."
-            )
-
-    @property
-    def feature_source(self) -> str | None:
-        """Feature source of the data, but what loaded weights learned from if that leaks labels.
-
-        A later stage does not undo the leak.
-        """
-        return next(filter(leaks_labels, self._learned_from), self._data_source)
 
     def load_previous_stage(self) -> None:
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
@@ -200,7 +185,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
                     "leave rgb_weights out"
                 )
             rgb = read_checkpoint(self.rgb_weights)
-            self._learned_from.append(rgb.feature_source)
             report = transfer_rgb(
                 rgb,
                 self.sit,
@@ -213,7 +197,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             networks = {name: self.get_submodule(name) for name in self.init_networks}
             load_into(networks, before, stage=self.stage)
             self._previous_geometry = before.geometry
-            self._learned_from.append(before.feature_source)
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
         self._has_weights = True
@@ -293,7 +276,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.loaded_step = checkpoint.get("global_step", 0)
         self._has_weights = True
         super().on_load_checkpoint(checkpoint)
-        self._learned_from.append(checkpoint["r3dpa"].get("feature_source"))
         stored = checkpoint["r3dpa"]["geometry"]
         if self.geometry is None:
             self.geometry = ScanGeometry.from_dict(stored)

@@ -5,7 +5,6 @@ from r3dpa.nn.backbones.geometric import GeometricFeatures
 from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.masking import MaskedScan, Masking
 from r3dpa.nn.backbones.minkowski import MinkowskiNet
-from r3dpa.nn.backbones.oracle import OracleFeatures
 from r3dpa.nn.backbones.pretrained import WaffleIronS
 from r3dpa.nn.backbones.rangevit import RangeViT
 from r3dpa.nn.backbones.scalr import ScaLR
@@ -30,7 +29,6 @@ __all__ = [
     "MaskedScan",
     "Masking",
     "MinkowskiNet",
-    "OracleFeatures",
     "PointCloudBatch",
     "PreparedScan",
     "RangeViT",

@@ -7,11 +7,10 @@ from pathlib import Path
 from torch import nn
 
 from r3dpa.nn.backbones.geometric import GeometricFeatures
-from r3dpa.nn.backbones.oracle import OracleFeatures
 from r3dpa.nn.backbones.scalr import ScaLR
 
 #: Names that :func:`feature_source` knows.
-SOURCES = ("scalr", "waffleiron-s", "geometric", "oracle")
+SOURCES = ("scalr", "waffleiron-s", "geometric")
 
 
 def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) -> nn.Module:
@@ -20,7 +19,7 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
     Args:
         name: ``"scalr"``: distilled from images, needs the released checkpoint;
             ``"waffleiron-s"``: trained on simulated scans without labels; ``"geometric"``: local
-            shape, without training; ``"oracle"``: the simulator's labels, which leak.
+            shape, without training.
         ckpt: Weights of ``"scalr"`` or ``"waffleiron-s"``; the latter has its own where None.
         dim: Width D of the features; of ``"scalr"`` that of its checkpoint.
 
@@ -47,4 +46,4 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         return WaffleIronS(None if ckpt is None else Path(ckpt), dim=dim)
     if ckpt is not None:
         raise ValueError(f"feature source {name} has no weights: leave ckpt ({ckpt}) out.")
-    return GeometricFeatures(dim) if name == "geometric" else OracleFeatures(dim)
+    return GeometricFeatures(dim)
