@@ -1,4 +1,4 @@
-"""What a scan lacks of a field of view: refused, or interpolated.
+"""Missing parts of a range image: checked against the field of view, or interpolated.
 
 Letters: H beams, W columns, P points.
 """
@@ -33,9 +33,9 @@ def check_view(
     """Refuse a scan that does not fill the field of view that a model was trained on.
 
     Args:
-        points: ``(P, 3)`` metres, those of the scan.
-        range_m: ``(H, W)`` their range image.
-        projection: That of the model.
+        points: ``(P, 3)`` metres.
+        range_m: ``(H, W)``, range image of the points.
+        projection: Projection of the model.
         missing: ``(H, W)`` bool, pixels that need not be filled.
 
     Raises:
@@ -80,17 +80,14 @@ def check_view(
 
 
 def filled(range_m: Tensor, missing: Tensor, how: Gaps = "inverse") -> Tensor:
-    """Range image whose gaps are interpolated: between beams, and between columns where none is.
+    """Range image ``(H, W)`` with interpolated gaps: between beams, else between columns.
 
     Args:
         range_m: ``(H, W)`` metres, -1 without a return.
-        missing: ``(H, W)`` bool.
+        missing: ``(H, W)`` bool; all other pixels stay as they are.
         how: Between two returns ``inverse`` is linear in 1 / range, which is exact on planes up to
-            the curvature of the angles; ``linear`` is so in range. Where one neighbour has no
-            return, and with ``nearest``, the nearest one, the upper or left one of two.
-
-    Returns:
-        ``(H, W)``; pixels that are not missing are unchanged.
+            the curvature of the angles; ``linear`` is linear in range. Where one neighbour has no
+            return, and with ``nearest``, the nearest one, the upper or left one at a tie.
     """
     between, found = _neighbours(range_m.T, ~missing.T)
     range_m = torch.where(missing & found.T, between.mean(how).T, range_m)
@@ -102,18 +99,18 @@ def filled(range_m: Tensor, missing: Tensor, how: Gaps = "inverse") -> Tensor:
 
 
 def refined(made_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
-    """A generated range image with its ranges as known beams have them.
+    """Generated ranges corrected by the known beams around them.
 
     Between two known beams on one surface the range is interpolated, between two without a return
-    there is none; elsewhere near a known beam it is moved by the error there.
+    there is none; elsewhere near a known beam the error at that beam is subtracted.
 
     Args:
-        made_m: ``(H, W)`` metres, not above 0 without a return.
-        range_m: ``(H, W)`` of the scan.
-        missing: ``(H, W)`` bool, pixels that the scan does not know.
+        made_m: ``(H, W)`` metres, generated; not above 0 without a return.
+        range_m: ``(H, W)`` metres, the scan.
+        missing: ``(H, W)`` bool, pixels that the scan lacks.
 
     Returns:
-        ``(H, W)``, -1 without a return; as ``made_m`` far from known beams.
+        ``(H, W)``, -1 without a return; ``made_m`` far from known beams.
     """
     made = made_m > 0
     between, found = _neighbours(range_m.T, ~missing.T)
@@ -124,22 +121,16 @@ def refined(made_m: Tensor, range_m: Tensor, missing: Tensor) -> Tensor:
     error = torch.where(usable, range_m - made_m, 0.0)
     errors, _ = _neighbours(error.T, usable.T)
     moved = made_m + errors.first.lerp(errors.second, errors.share).T
-    # A correction that would carry a return behind the sensor tells nothing of it.
+    # A correction must not carry a return behind the sensor.
     moved = torch.where(_near(usable.T).T & (moved > 0), moved, made_m)
     ranges = torch.where(smooth.T, between.mean("inverse").T, moved)
     return torch.where(made, ranges, EMPTY_RANGE_M)
 
 
 def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = None) -> float:
-    """Mean absolute difference of range images over pixels with a return in both, metres.
+    """Mean absolute difference, metres, over the pixels with a return in both range images.
 
-    Args:
-        first_m: ``(..., H, W)`` metres, -1 without a return.
-        second_m: Likewise.
-        pixels: ``(H, W)`` bool, those that count; all where None.
-
-    Returns:
-        NaN where there are none.
+    ``pixels`` ``(H, W)`` bool restricts the mean; NaN if no pixel counts.
     """
     both = (first_m > 0) & (second_m > 0)
     if pixels is not None:
@@ -148,7 +139,7 @@ def range_error_m(first_m: Tensor, second_m: Tensor, pixels: Tensor | None = Non
 
 
 class _Neighbours(NamedTuple):
-    """Nearest known values on both sides of a pixel, and where it lies between them, in [0, 1]."""
+    """Nearest known values on both sides of a pixel and its position between them, in [0, 1]."""
 
     first: Tensor
     second: Tensor
@@ -166,7 +157,7 @@ class _Neighbours(NamedTuple):
 
 
 def _neighbours(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:
-    """Neighbours along the last axis, one twice at an end; and where there is any."""
+    """Known neighbours along the last axis (at an end the same one twice), and where any exists."""
     length = values.shape[-1]
     place = torch.arange(length).expand(values.shape)
     before = torch.where(known, place, -1).cummax(dim=-1).values
@@ -179,7 +170,7 @@ def _neighbours(values: Tensor, known: Tensor) -> tuple[_Neighbours, Tensor]:
 
 
 def _near(known: Tensor) -> Tensor:
-    """Within some steps of known ones along the last axis."""
+    """Pixels within ``_NEAR_ROWS`` of a known one along the last axis."""
     near = known.clone()
     for step in range(1, _NEAR_ROWS + 1):
         near[..., step:] |= known[..., :-step]

@@ -29,9 +29,7 @@ from r3dpa.geometry.rays import (
 from r3dpa.geometry.rings import RingProjection
 from r3dpa.geometry.sensor import LidarSensor
 
-# Points of a cell that are added in their own precision; such sums are then added in float64. More
-# points a bag are no faster.
-_BAG = 32
+_BAG = 32  # points of a cell that are added in float32; more are no faster
 
 
 @dataclass(frozen=True)
@@ -83,14 +81,7 @@ class SphericalProjection(PixelRays):
         return row.clamp(0, sensor.beams - 1), column
 
     def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
-        """Inclination of each row and azimuth of each column.
-
-        Args:
-            corner: Take the upper left corner of the pixel, not its centre.
-
-        Returns:
-            ``(H,)`` and ``(W,)`` radians, float64.
-        """
+        """Inclination ``(H,)`` and azimuth ``(W,)`` of the pixel centres or corners, radians."""
         sensor = self.sensor
         pitch = (sensor.inclination_max_rad - sensor.inclination_min_rad) / sensor.beams
         rows = torch.arange(sensor.beams, dtype=torch.float64) + pixel_offset(corner)
@@ -105,18 +96,7 @@ Projection = SphericalProjection | RingProjection
 
 
 def in_range(points: Tensor, sensor: LidarSensor) -> Tensor:
-    """Whether each point is finite and strictly inside the range limits.
-
-    Args:
-        points: ``(..., 3)`` metres.
-        sensor: Its range limits, both exclusive.
-
-    Returns:
-        ``(...)`` bool.
-
-    Raises:
-        ValueError: If the last axis of ``points`` is not of size 3.
-    """
+    """Whether each point of ``(..., 3)`` is finite and strictly inside the range limits, bool."""
     check_points(points)
     return _inside_limits(range_of(points), sensor)
 
@@ -126,9 +106,8 @@ def range_image(
 ) -> tuple[Tensor, Tensor | None]:
     """Range image of the nearest return in each pixel.
 
-    Points outside the range limits and points that are not finite are dropped; rows of NaN can
-    therefore pad scans to one length. Of points at equal distance the first one wins, so the
-    result is the same on every run and device.
+    Points outside the range limits or not finite are dropped, so NaN rows can pad scans to one
+    length. Of points at equal distance the first one wins: the result is deterministic.
 
     Args:
         points: ``(P, 3)`` or ``(B, P, 3)`` metres.
@@ -141,7 +120,7 @@ def range_image(
         or None.
 
     Raises:
-        ValueError: If the shapes of ``points`` and ``values`` are not those above.
+        ValueError: If the shapes are not those above.
     """
     check_points(points)
     if points.ndim not in (2, 3):
@@ -205,18 +184,11 @@ def unproject(range_m: Tensor, projection: Projection, corner: bool = False) -> 
 
 
 def points_of(range_m: Tensor, projection: Projection, corner: bool = False) -> Tensor:
-    """Points of the pixels that hold a return, row after row.
+    """Points ``(P, 3)`` of the pixels ``(H, W)`` that hold a return, row after row.
 
     Within a row the order is that of the image, or for rings that of a scan, whose azimuth grows
-    from 0: what is written can be read again with the same projection.
-
-    Args:
-        range_m: ``(H, W)`` metres, not positive without a return.
-        projection: Which ray a pixel stands for.
-        corner: Use the corner of the pixel as the official code does, not its centre.
-
-    Returns:
-        ``(P, 3)`` metres, in the dtype of ``range_m``.
+    from 0, so that a written file can be read with the same projection. Otherwise as
+    :func:`unproject`.
 
     Raises:
         ValueError: If the image is batched or not of the size of the sensor.
@@ -240,10 +212,8 @@ def pool_cells(
     """Mean of point values over the cells of a coarse grid laid over the range image.
 
     A cell is a block of pixels, so that an image and a grid of one projection never disagree.
-
-    Sums of up to 32 points are formed in float32, and these added in float64: a mean is off by at
-    most 33 * 2^-24 of the mean absolute value in its cell, however many points that has. The result
-    does not depend on threads. The values are read from memory once.
+    Sums of up to 32 points are formed in float32 and added in float64: a mean is off by at most
+    33 * 2^-24 of the mean absolute value in its cell. The result does not depend on threads.
 
     Args:
         points: ``(P, 3)`` metres.

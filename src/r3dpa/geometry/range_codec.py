@@ -47,7 +47,6 @@ class RangeCodec:
     legacy_inverse: bool = False
 
     def __post_init__(self) -> None:
-        """Check the encoding and its scale."""
         if self.encoding not in _DEFAULT_SCALES:
             raise ValueError(f"range encoding must be 'linear' or 'log2', got {self.encoding!r}")
         if self.scale is None:  # so that a codec equals the same one written out
@@ -69,14 +68,7 @@ class RangeCodec:
         return 2 * fraction - 1 + _THRESHOLD_MARGIN
 
     def encode(self, range_m: Tensor) -> Tensor:
-        """Image of a range in metres.
-
-        Args:
-            range_m: Any shape, metres; ``EMPTY_RANGE_M`` (or any negative) without a return.
-
-        Returns:
-            Same shape, float32 in [-1, 1]; the lowest value of the encoding without a return.
-        """
+        """Image in [-1, 1], float32, of ranges in metres; any negative range means no return."""
         # Clamped first: log2 of a range below -1 m is NaN, which would survive the last clamp.
         # float64: float32 logarithms alone would move a range of 50 m by 2e-5 m.
         metres = range_m.double().clamp(min=0)
@@ -85,25 +77,11 @@ class RangeCodec:
         return (2 * metres / self._divisor - 1).clamp(-1, 1).float()
 
     def valid_mask(self, image: Tensor) -> Tensor:
-        """Pixels of an encoded image that hold a return.
-
-        Args:
-            image: Any shape, encoded range.
-
-        Returns:
-            Same shape, bool.
-        """
+        """Pixels of an encoded image that hold a return, bool."""
         return image > self.threshold
 
     def to_range(self, image: Tensor) -> Tensor:
-        """Inverse of the formula for every pixel, with or without a return.
-
-        Args:
-            image: Any shape, encoded range; decoder outputs outside [-1, 1] are allowed.
-
-        Returns:
-            Same shape, float32 metres, negative below an image value of -1.
-        """
+        """Inverse of the formula for every pixel, float32 metres; negative below an image of -1."""
         metres = (image.double() + 1) / 2 * self._divisor
         if self.encoding == "log2":
             offset = 0.0 if self.legacy_inverse else _LOG_OFFSET_M
@@ -111,15 +89,14 @@ class RangeCodec:
         return metres.float()
 
     def decode(self, image: Tensor, sensor: LidarSensor) -> Tensor:
-        """Range of an encoded image, with pixels that hold no return marked.
+        """Ranges of an encoded image, float32 metres.
 
         Args:
             image: Any shape, encoded range; decoder outputs outside [-1, 1] are allowed.
-            sensor: Its range limits, exclusive, decide what is a return.
+            sensor: Gives the range limits, which are exclusive.
 
         Returns:
-            Same shape, float32 metres; ``EMPTY_RANGE_M`` where the pixel is empty, outside the
-            range limits, or NaN.
+            ``EMPTY_RANGE_M`` where the pixel is empty, outside the range limits, or NaN.
         """
         range_m = self.to_range(image)
         inside = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)

@@ -26,17 +26,10 @@ class PixelRays(ABC):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ) -> Tensor:
-        """Unit vector along the ray of each pixel.
+        """Unit vectors ``(H, W, 3)`` along the rays of the pixels.
 
-        Args:
-            corner: Take the corner of :meth:`ray_angles`, not the centre of the pixel. The
-                official code does, which turns points by half a pixel (0.22 degrees up, 0.18
-                sideways).
-            dtype: Of the result.
-            device: Of the result.
-
-        Returns:
-            ``(H, W, 3)``, a fresh tensor.
+        With ``corner`` they pass the upper left corner of the pixel, not its centre, as in the
+        official code: half a pixel (0.22 degrees up, 0.18 sideways).
         """
         return kept_directions(self, corner, dtype, torch.device(device)).clone()
 

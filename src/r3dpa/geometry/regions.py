@@ -1,9 +1,9 @@
-"""Which pixels of a range image, and which tokens, an edit takes: True is generated anew.
+"""Masks of pixels and tokens for editing: True is generated anew.
 
-Angles are given as users draw them, in degrees: azimuth 0 looks forward and grows to the left
-(counter-clockwise seen from above), so that 180 and -180 look backwards, where the range image has
-its seam; inclination grows upwards from the horizon. A pixel stands for its ray, which passes its
-centre. A mask that selects no pixel, or all of them, is refused with the reason.
+Angles are in degrees: azimuth 0 looks forward and grows to the left (counter-clockwise seen from
+above), so that 180 and -180 look backwards, where the range image has its seam; inclination grows
+upwards from the horizon. A pixel stands for the ray through its centre. A mask that selects no
+pixel, or all of them, raises a ValueError that says why.
 Letters: H beams, W columns, h x w cells, N = h * w tokens, S sources.
 """
 
@@ -45,21 +45,11 @@ def angle_box(
     inclination_min_deg: float,
     inclination_max_deg: float,
 ) -> Tensor:
-    """Pixels between two azimuths and two inclinations.
+    """Pixels ``(H, W)`` bool between two azimuths in -360..360 and two inclinations.
 
-    Azimuths count from the first border to the left until the second, so that ``170, -170`` are the
-    20 degrees across the seam behind the sensor and ``-10, 10`` the 20 degrees ahead. Of each pair,
-    the first border belongs to the box and the second does not.
-
-    Args:
-        projection: That of the range image.
-        azimuth_from_deg: Right border, within -360..360.
-        azimuth_to_deg: Left border, likewise.
-        inclination_min_deg: Lower border.
-        inclination_max_deg: Upper border.
-
-    Returns:
-        ``(H, W)`` bool.
+    Azimuths run leftwards from the first to the second: ``170, -170`` are the 20 degrees across
+    the seam behind the sensor, ``-10, 10`` the 20 degrees ahead. The first border of each pair
+    belongs to the box, the second does not.
 
     Raises:
         ValueError: If a pair of borders is empty, the box lies outside the field of view or
@@ -80,14 +70,7 @@ def angle_box(
 
 
 def sector(projection: Projection, azimuth_from_deg: float, azimuth_to_deg: float) -> Tensor:
-    """All pixels between two azimuths, which count as in :func:`angle_box`.
-
-    Returns:
-        ``(H, W)`` bool.
-
-    Raises:
-        ValueError: If the sector is empty, lies between two columns, or is a full turn.
-    """
+    """All pixels ``(H, W)`` bool between two azimuths, as in :func:`angle_box`."""
     what = f"sector of azimuth {azimuth_from_deg:g}..{azimuth_to_deg:g} degrees"
     columns = _between(projection, azimuth_from_deg, azimuth_to_deg, what)
     return check_mask(columns.repeat(projection.sensor.beams, 1), what)
@@ -99,16 +82,14 @@ def box3d(
     size_m: Sequence[float],
     yaw_deg: float = 0.0,
 ) -> Tensor:
-    """Pixels whose ray meets a box within the range limits of the sensor.
-
-    Whatever stands before the box is selected with it: to see the box it must go.
+    """Pixels whose ray meets a box within the range limits, and thus what occludes it, too.
 
     Slab test per ray ``t * d`` from the sensor, with the box's centre c and half size s in the
     axes of the box: the ray is inside for ``max_i min(t_i) <= t <= min_i max(t_i)``, where
     ``t_i = (c_i -+ s_i) / d_i``.
 
     Args:
-        projection: That of the range image; its rays may be those of laser rings.
+        projection: Rays of the range image.
         centre_m: x forward, y left, z up of the middle of the box, in the sensor frame.
         size_m: Length (along x before the turn), width and height.
         yaw_deg: Turn about the vertical axis, counter-clockwise seen from above.
@@ -117,8 +98,8 @@ def box3d(
         ``(H, W)`` bool.
 
     Raises:
-        ValueError: If a value is no size or place, the box holds the sensor, or no ray meets it:
-            out of range, outside the field of view, or between rays. The numbers are given.
+        ValueError: If a value is not finite or a size not positive, the box contains the sensor,
+            or no ray meets it (out of range, outside the field of view, or between rays).
     """
     sensor = projection.sensor
     what = (
@@ -163,15 +144,10 @@ def box3d(
 
 
 def dropped_beams(projection: Projection, kept: int | Sequence[int]) -> Tensor:
-    """Pixels of the beams that a scan with fewer beams lacks.
+    """Pixels ``(H, W)`` bool of the beams that a scan with fewer beams lacks.
 
-    Args:
-        projection: That of the range image.
-        kept: How many beams remain, evenly spread from the first row on, as 32 or 16 of 64; or
-            their rows.
-
-    Returns:
-        ``(H, W)`` bool, True in the rows that are missing.
+    ``kept`` is the number of beams that remain, evenly spread from the first row on, such as 32 of
+    64, or their rows.
 
     Raises:
         ValueError: If the number does not divide H, a row does not exist, or none or all remain.
@@ -189,20 +165,13 @@ def dropped_beams(projection: Projection, kept: int | Sequence[int]) -> Tensor:
 
 
 def sensor_pair(projection: Projection, other: Projection) -> Tensor:
-    """Pixels that another sensor at the same place does not fill.
+    """Pixels ``(H, W)`` bool that another sensor at the same place does not fill.
 
-    Each ray of the other sensor that lies in our field of view fills the pixel whose ray is
-    nearest, the upper and left one of two.
-
-    Args:
-        projection: That of the range image.
-        other: Of the sensor with fewer beams or columns, or another field of view.
-
-    Returns:
-        ``(H, W)`` bool, True where the other sensor sees nothing.
+    Each ray of the other sensor in the field of view of ``projection`` fills the pixel whose ray
+    is nearest, the upper and left one at a tie.
 
     Raises:
-        ValueError: If it sees no pixel, or all.
+        ValueError: If it fills no pixel, or all.
     """
     sensor = projection.sensor
     beams = _inclinations_deg(other)
@@ -222,15 +191,7 @@ def sensor_pair(projection: Projection, other: Projection) -> Tensor:
 
 
 def check_mask(mask: Tensor, what: str) -> Tensor:
-    """The mask, if it selects something and leaves something.
-
-    Args:
-        mask: Bool, of pixels, tokens or latents.
-        what: Names it in the error.
-
-    Raises:
-        ValueError: If nothing or everything is selected.
-    """
+    """The mask itself; a ValueError that starts with ``what`` if it selects nothing or all."""
     if not mask.any():
         raise ValueError(f"{what}: selects nothing, so that nothing would change; make it larger")
     if mask.all():
@@ -247,12 +208,12 @@ def token_mask(
     rule: Literal["any", "all"] = "any",
     dilation: int = 0,
 ) -> Tensor:
-    """Tokens that a mask of pixels takes.
+    """Tokens that a mask of pixels selects.
 
     Args:
         pixel_mask: ``(H, W)`` bool.
         grid_size: Rows and columns (h, w) of the tokens, dividing H and W.
-        rule: Take a token with ``any`` pixel of its cell selected, or only with ``all``.
+        rule: Select a token if ``any`` pixel of its cell is selected, or only if ``all`` are.
         dilation: Steps of :func:`dilated` on the tokens afterwards.
 
     Returns:
@@ -276,15 +237,12 @@ def token_mask(
 
 
 def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Mask of tokens as one of latents or pixels, each token a patch.
+    """Token values ``(..., N)`` of a grid ``(h, w)`` repeated over the patches of an image.
 
     Args:
         tokens: ``(..., N)``, bool or weights.
         grid_size: Rows and columns (h, w) of the tokens.
-        size: Rows and columns of the latents, or of the range image; multiples of h and w.
-
-    Returns:
-        ``(..., rows, columns)``.
+        size: Rows and columns of the result; multiples of h and w.
 
     Raises:
         ValueError: If the sizes do not fit each other.
@@ -295,28 +253,12 @@ def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, 
             f"{tokens.shape[-1]} tokens in a grid of {rows} x {columns} do not fill {height} x "
             f"{width} with equal patches"
         )
-    return repeat(
-        tokens,
-        "... (h w) -> ... (h p) (w q)",
-        h=rows,
-        p=height // rows,
-        q=width // columns,
-    )
+    p, q = height // rows, width // columns
+    return repeat(tokens, "... (h w) -> ... (h p) (w q)", h=rows, p=p, q=q)
 
 
 def dilated(mask: Tensor, steps: int) -> Tensor:
-    """Mask grown by its neighbours, the diagonal ones too; the first column is beside the last.
-
-    Args:
-        mask: ``(..., rows, columns)`` bool, of pixels, latents or tokens.
-        steps: How often, at least 0.
-
-    Returns:
-        ``(..., rows, columns)`` bool.
-
-    Raises:
-        ValueError: If ``steps`` is negative.
-    """
+    """Mask ``(..., rows, columns)`` dilated ``steps`` times by its 8 neighbours; columns wrap."""
     if steps < 0:
         raise ValueError(f"dilation must be 0 or greater, got {steps}")
     for _ in range(steps):
@@ -330,18 +272,17 @@ def dilated(mask: Tensor, steps: int) -> Tensor:
 def sector_weights(
     layout: Sequence[tuple[float, int]], grid_size: tuple[int, int], blend_deg: float = 0.0
 ) -> Tensor:
-    """Share that each source has in each token, where scenes are mixed by azimuth.
+    """Weight of each source in each token when scenes are mixed by azimuth.
 
-    A sector reaches from its azimuth to the left until the next one. Its weight at an azimuth is
-    the part of the surrounding ``blend_deg`` that lies in it: linear ramps centred on the seams,
-    which sum to 1 for any layout, the seam behind the sensor among them::
+    A sector reaches from its azimuth leftwards to the next one. Its weight at an azimuth is the
+    part of the surrounding ``blend_deg`` that lies in it: linear ramps centred on the seams::
 
         weight_i(a) = |[a - blend / 2, a + blend / 2] in sector i| / blend
 
     Args:
         layout: Azimuth in degrees and number of the source of each sector, in any order; a source
             may have several. The left half of 0 and the right half of 1: ``[(0, 0), (180, 1)]``.
-        grid_size: Rows and columns (h, w) of the tokens, which stand for the middle of their cell.
+        grid_size: Rows and columns (h, w) of the tokens; a token counts at its cell's centre.
         blend_deg: Width of the seams, in [0, 360].
 
     Returns:
@@ -377,7 +318,7 @@ def sector_weights(
 
 
 def _covered(place: Tensor, width: float) -> Tensor:
-    """Length of a sector ``[0, width]`` that repeats every turn, from 0 to a place; degrees."""
+    """Length of a sector ``[0, width]``, repeated every turn, between 0 and a place; degrees."""
     return (place / _TURN_DEG).floor() * width + (place % _TURN_DEG).clamp(max=width)
 
 
@@ -398,7 +339,7 @@ def _between(projection: Projection, from_deg: float, to_deg: float, what: str) 
 
 
 def _missed(projection: Projection, what: str, lowest_deg: float, highest_deg: float) -> str:
-    """Why no ray meets what lies between two inclinations and within range."""
+    """Message: no ray meets what lies between two inclinations."""
     inclination = _inclinations_deg(projection)
     bottom, top = inclination.min().item(), inclination.max().item()
     if lowest_deg > top or highest_deg < bottom:
@@ -415,11 +356,8 @@ def _missed(projection: Projection, what: str, lowest_deg: float, highest_deg: f
 
 
 def _view(projection: Projection) -> str:
-    sensor = projection.sensor
-    return (
-        f"{sensor.columns} columns, {sensor.inclination_min_deg:g}..{sensor.inclination_max_deg:g} "
-        "degrees"
-    )
+    s = projection.sensor
+    return f"{s.columns} columns, {s.inclination_min_deg:g}..{s.inclination_max_deg:g} degrees"
 
 
 def _inclinations_deg(projection: Projection) -> Tensor:
@@ -431,7 +369,7 @@ def _azimuths_deg(projection: Projection) -> Tensor:
 
 
 def _nearest(apart_deg: Tensor) -> Tensor:
-    """Column of the smallest angle of each row; the first where rounding alone tells two apart."""
+    """Index of the smallest angle in each row; the first of those equal up to rounding."""
     return apart_deg.abs().round(decimals=_DECIMALS).argmin(dim=1)
 
 

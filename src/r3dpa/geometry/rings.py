@@ -54,7 +54,7 @@ class RingProjection(PixelRays):
     ring_inclinations_deg: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Check the inclinations; a list, as YAML gives it, would not be hashable."""
+        # A list, as YAML gives it, would not be hashable.
         object.__setattr__(self, "ring_inclinations_deg", tuple(self.ring_inclinations_deg))
         if len(self.ring_inclinations_deg) != self.sensor.beams:
             raise ValueError(
@@ -70,15 +70,11 @@ class RingProjection(PixelRays):
     def fit(cls, scans: Iterable[Tensor], sensor: LidarSensor) -> Self:
         """Projection whose ring inclinations are the medians measured in real scans.
 
-        Scans in which another number of rings than H is seen (a laser without any return) do
-        not tell which laser is which, and are left out.
+        Scans that show another number of rings than H (a laser without any return) are left out.
 
         Args:
             scans: Each ``(P, 3)`` metres, points in the order of the file.
             sensor: Image size, range limits and field of view.
-
-        Returns:
-            The fitted projection.
 
         Raises:
             ValueError: If a scan is not stored as above, or none shows H rings.
@@ -104,15 +100,15 @@ class RingProjection(PixelRays):
         return cls(sensor, tuple(medians.rad2deg().tolist()))
 
     def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Row and column of the range-image pixel that each point of whole scans falls into.
+        """Row and column of the pixel that each point of whole scans falls into.
 
         Where fewer than H rings are found they are matched in order to the known inclinations;
         fewer than H returns go to the nearest inclinations one by one.
 
         Args:
             points: ``(P, 3)`` or ``(B, P, 3)`` metres, each scan whole and in the order of the
-                file. Points that are not finite (padding) or not beyond the shortest range take
-                no part in the search for rings and get pixel (0, 0).
+                file. Points that are not finite (padding) or not beyond the shortest range get
+                pixel (0, 0).
 
         Returns:
             ``(row, column)``, each ``(P,)`` or ``(B, P)`` int64, in ``[0, H)`` and ``[0, W)``.
@@ -141,14 +137,7 @@ class RingProjection(PixelRays):
         return row, column
 
     def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
-        """Inclination of each row and azimuth of each column.
-
-        Args:
-            corner: Take the left border of the column, not its centre. A ring has no corner.
-
-        Returns:
-            ``(H,)`` and ``(W,)`` radians, float64.
-        """
+        """Inclination ``(H,)`` and azimuth ``(W,)``, radians; ``corner``: left column borders."""
         return self._inclinations(), column_azimuths(self.sensor.columns, corner)
 
     def column_order(self) -> Tensor:
@@ -178,15 +167,9 @@ class RingProjection(PixelRays):
 
 
 def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) -> tuple[Tensor, int]:
-    """Ring of each return from the turns of the azimuth, and the number of rings.
+    """Ring ``(P,)`` of each return from the wraps of the azimuth, and the number of rings.
 
-    Args:
-        inclination: ``(P,)`` radians, returns in the order of the file.
-        azimuth: ``(P,)`` radians.
-        sensor: Number of beams and field of view, to recognise scans in another order.
-
-    Returns:
-        ``(P,)`` int64 from 0, and the number of rings.
+    ``inclination`` and ``azimuth`` are ``(P,)`` radians in the order of the file.
 
     Raises:
         ValueError: If the returns are not stored ring after ring.
@@ -219,12 +202,8 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
 def match_in_order(measured: Tensor, known: Tensor) -> Tensor:
     """Beam of each measured ring: the order-keeping choice with the least sum of differences.
 
-    Args:
-        measured: ``(R,)`` mean inclinations of the rings found, radians, R <= H.
-        known: ``(H,)`` inclinations of the beams, radians.
-
-    Returns:
-        ``(R,)`` int64, strictly increasing.
+    ``measured`` is ``(R,)`` and ``known`` ``(H,)``, radians, R <= H; the result is ``(R,)`` int64,
+    strictly increasing.
     """
     costs = (measured.unsqueeze(1) - known.unsqueeze(0)).abs()
     total, choices = costs[0], []
@@ -239,22 +218,13 @@ def match_in_order(measured: Tensor, known: Tensor) -> Tensor:
 
 
 def mean_per_ring(values: Tensor, ring: Tensor, num_rings: int) -> Tensor:
-    """Mean of values per ring.
-
-    Args:
-        values: ``(P,)``, one per return.
-        ring: ``(P,)`` int64 in ``[0, R)``, no ring without a return.
-        num_rings: R.
-
-    Returns:
-        ``(R,)`` in the unit of ``values``.
-    """
+    """Mean ``(R,)`` of values ``(P,)`` per ring; every ring in ``[0, R)`` has a return."""
     sums = values.new_zeros(num_rings).index_add(0, ring, values)
     return sums / torch.bincount(ring, minlength=num_rings)
 
 
 def _is_return(points: Tensor, sensor: LidarSensor) -> Tensor:
-    """Points that may show a ring: files hold dummies at the origin, and padding is NaN."""
+    """Points other than NaN padding and the dummies at the origin that files hold."""
     check_points(points)
     distance = range_of(points)
     return distance.isfinite() & (distance > sensor.range_min_m)

@@ -1,4 +1,4 @@
-"""Everything that turns a scan into network inputs, as one value that checkpoints can hold."""
+"""Projection, range encoding and grid size as one value that checkpoints store."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ class ScanGeometry:
     grid_size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        """Check that the parts fit together."""
         sensor = self.projection.sensor
         sensor.cell_size(self.grid_size)
         farthest_m = self.codec.to_range(torch.ones(())).item()

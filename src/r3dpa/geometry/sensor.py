@@ -32,7 +32,6 @@ class LidarSensor:
     range_max_m: float = 56.0
 
     def __post_init__(self) -> None:
-        """Check counts and limits."""
         if self.beams < 1 or self.columns < 1:
             raise ValueError(
                 "a sensor needs at least one beam and one column, "
@@ -51,10 +50,7 @@ class LidarSensor:
             )
 
     def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns of the range image in one cell of a grid that is laid over it.
-
-        Args:
-            grid_size: Rows and columns of the grid.
+        """Rows and columns of pixels in one cell of a grid ``(rows, columns)``.
 
         Raises:
             ValueError: If the grid does not divide the range image.
