@@ -13,8 +13,7 @@ import pytest
 import torch
 from tiny_networks import tiny_networks
 
-from r3dpa.flow import ODE_SOLVERS, RestartPlan, euler_maruyama, ode_times, sde_times
-from r3dpa.flow.tuned import TunedSolver
+from r3dpa.flow import ODE_SOLVERS, euler_maruyama, ode_times, sde_times
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
 from r3dpa.nn import LatentNorm
@@ -99,7 +98,6 @@ def test_global_random_state_is_neither_read_nor_moved():
     [
         *[("euler", 5, 5), ("heun", 5, 9), ("heun", 1, 1), ("midpoint", 5, 10), ("ab2", 5, 5)],
         *[("ab3", 5, 5), ("dpmpp_2m", 5, 5), ("unipc", 5, 5), ("euler_maruyama", 5, 5)],
-        ("restart", 5, 6 + 2 * 4),  # one more step is cut in two, and two ways of four steps
     ],
 )
 def test_network_evaluations(solver, steps, evaluations):
@@ -167,16 +165,6 @@ def test_another_sampler_gets_another_table():
     assert torch.equal(scenes.generate([0]).latents, before.latents)
     scenes.sampler = sampler
     assert torch.equal(scenes.generate([0]).latents, fresh.latents)
-
-
-def test_a_tuned_solver_replaces_solver_and_steps(tmp_path):
-    """Tuned to nothing but AB2, it draws the scenes of AB2."""
-    path = tmp_path / "tuned.json"
-    TunedSolver.from_adams(ode_times(6, shift=2.0), order=2).save(path)
-    found = generator(SamplerConfig(tuned=str(path))).generate([0, 1])
-    expected = generator(SamplerConfig("ab2", 6, shift=2.0)).generate([0, 1])
-    assert found.nfe == expected.nfe == 6
-    torch.testing.assert_close(found.latents, expected.latents, atol=1e-5, rtol=0)
 
 
 def test_a_table_is_computed_once():
@@ -310,7 +298,7 @@ def test_unfitted_statistics_are_refused():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solver": "rk45"}, r"euler, heun, .*, euler_maruyama, restart, got 'rk45'"),
+        ({"solver": "rk45"}, r"euler, heun, .*, euler_maruyama, got 'rk45'"),
         ({"steps": 0}, r"steps >= 1, .* got 0, 1.0 and 1.0"),
         ({"shift": 0.0}, r"shift > 0 .* got 256, 0.0 and 1.0"),
         ({"eta": -1.0}, r"eta >= 0, got 256, 1.0 and -1.0"),
@@ -320,8 +308,6 @@ def test_unfitted_statistics_are_refused():
         ({"shift": 2.0}, r"solver euler_maruyama does not read shift, which is for euler, heun"),
         ({"solver": "dopri5", "shift": 2.0}, r"solver dopri5 does not read shift"),
         ({"solver": "dopri5", "steps": 9}, r"solver dopri5 does not read steps"),
-        ({"solver": "heun", "restart": RestartPlan(rounds=3)}, r"heun does not read restart"),
-        ({"tuned": "a.json", "eta": 0.5}, r"tuned solver a\.json does not read eta"),
     ],
 )
 def test_samplers_that_cannot_be_are_refused(options, message):
@@ -384,12 +370,10 @@ def test_a_diverged_network_gives_nan_and_no_empty_scene():
     assert scenes.generate([0]).range_m.isnan().all()
 
 
-def test_preparing_says_what_the_first_scene_would(tmp_path, monkeypatch):
+def test_preparing_says_what_the_first_scene_would(monkeypatch):
     """And computes what that would wait for."""
     with pytest.raises(ValueError, match=r"must lie in \(0, 1\), got 2"):
         generator(SamplerConfig(sde_last_time=2.0)).prepare()
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
-        generator(SamplerConfig(tuned=str(tmp_path / "none.json"))).prepare()
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "torchdiffeq", None)
         with pytest.raises(ImportError, match="pip install"):

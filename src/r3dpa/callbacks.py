@@ -489,8 +489,8 @@ class SceneScorer(L.Callback):
         nfe = total / self.num_scenes  # whole but for a solver that chooses its steps
         nfe = int(nfe) if nfe.is_integer() else nfe
         return {
-            "solver": self.sampler.solver if self.sampler.tuned is None else "tuned",
-            "steps": self.sampler.steps if self.sampler.tuned is None else nfe,
+            "solver": self.sampler.solver,
+            "steps": self.sampler.steps,
             "seed": self.seed,
             "precision": self.precision,
             "feature_source": module.feature_source,

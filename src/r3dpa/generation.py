@@ -16,10 +16,9 @@ from torch import Tensor
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sde import RestartPlan, euler_maruyama, restart
+from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
-from r3dpa.flow.tuned import TunedSolver
 from r3dpa.geometry import ScanGeometry
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
@@ -43,19 +42,17 @@ Solver = Literal[
     "unipc",
     "dopri5",
     "euler_maruyama",
-    "restart",
 ]
 Quality = Literal["draft", "good", "best"]
 
 _SDE: tuple[Solver, ...] = ("euler_maruyama",)
-#: Settings that only some solvers read. A tuned solver reads none of them.
+#: Settings that only some solvers read.
 _READ_BY: dict[str, tuple[Solver, ...]] = {
     "eta": _SDE,
     "sde_last": _SDE,
     "sde_last_time": _SDE,
     "shift": tuple(s for s in get_args(Solver) if s not in ("euler_maruyama", "dopri5")),
     "steps": tuple(s for s in get_args(Solver) if s != "dopri5"),
-    "restart": ("restart",),
 }
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 
@@ -65,15 +62,13 @@ class SamplerConfig:
     """How noise becomes latents.
 
     Args:
-        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``restart`` goes back
-            towards noise at times; ``dopri5`` chooses its steps itself.
+        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``dopri5`` chooses its steps
+            itself.
         steps: Solver steps; not of ``dopri5``.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
         shift: Finer steps near noise (above 1) or data (below 1); not of the SDE and ``dopri5``.
         eta: Strength of the noise of the SDE; 1 as published, 0 for none.
-        tuned: File of a :class:`r3dpa.flow.tuned.TunedSolver`, which replaces solver and steps.
-        restart: Where ``restart`` goes back, how often, and how it solves.
 
     Raises:
         ValueError: If the solver is unknown, a number out of its range, or a setting other than its
@@ -86,8 +81,6 @@ class SamplerConfig:
     sde_last: Literal["denoise", "mean"] = "denoise"
     shift: float = 1.0
     eta: float = 1.0
-    tuned: str | None = None
-    restart: RestartPlan = field(default_factory=RestartPlan)
 
     def __post_init__(self) -> None:
         """Check name and numbers."""
@@ -101,12 +94,8 @@ class SamplerConfig:
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
         for name, solvers in _READ_BY.items():
-            usual = RestartPlan() if name == "restart" else getattr(type(self), name)
-            if getattr(self, name) == usual:
-                continue
-            if self.tuned is not None and name != "steps":
-                raise ValueError(f"the tuned solver {self.tuned} does not read {name}; drop one")
-            if self.tuned is None and self.solver not in solvers:
+            changed = getattr(self, name) != getattr(type(self), name)
+            if changed and self.solver not in solvers:
                 raise ValueError(
                     f"solver {self.solver} does not read {name}, which is for "
                     f"{', '.join(solvers)}; drop one"
@@ -247,7 +236,6 @@ class SceneGenerator:
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
         self._scheduled: SamplerConfig | None = None
-        self._tuned: TunedSolver | None = None
 
     @property
     def device(self) -> torch.device:
@@ -266,8 +254,7 @@ class SceneGenerator:
         """Does now what the first scene would wait for, and says now what cannot be.
 
         Raises:
-            ValueError: If the numbers of the solver do not fit together, or a tuned one is damaged.
-            FileNotFoundError: If there is no file of the tuned solver.
+            ValueError: If the numbers of the solver do not fit together.
             ImportError: If a package that the solver needs is missing.
         """
         self._schedule()
@@ -329,10 +316,8 @@ class SceneGenerator:
         """
         if self._scheduled == self.sampler:
             return
-        tuned = self.sampler.tuned
-        self._tuned = None if tuned is None else TunedSolver.load(tuned)
         networks = [network for network in (self._strong, self._weak) if network is not None]
-        adaptive = self.sampler.solver == "dopri5" and self.sampler.tuned is None
+        adaptive = self.sampler.solver == "dopri5"
         if adaptive:  # its package may be missing
             dopri5(lambda x, _: torch.zeros_like(x), torch.zeros(1), ode_times(1))
         for network in networks:
@@ -347,9 +332,6 @@ class SceneGenerator:
 
     def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
         sampler, velocity = self.sampler, self._velocity()
-        if sampler.tuned is not None:
-            assert self._tuned is not None
-            return self._tuned.solve(velocity, noise)
         if sampler.solver == "euler_maruyama":
             return euler_maruyama(
                 velocity,
@@ -361,9 +343,6 @@ class SceneGenerator:
                 eta=sampler.eta,
             )
         times = ode_times(sampler.steps, shift=sampler.shift)
-        if sampler.solver == "restart":
-            plan = sampler.restart
-            return restart(velocity, noise, times, draws, plan=plan, interpolant=self.interpolant)
         if sampler.solver == "dopri5":
             return dopri5(velocity, noise, times)
         return ode_solver(sampler.solver, self.interpolant)(velocity, noise, times)

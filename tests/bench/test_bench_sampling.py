@@ -172,7 +172,7 @@ class TestQuality:
     ROWS = (
         *(row("euler 4", 1.0, 0.5), row("ab2 4", 1.1, 0.19), row("ab2 8", 2.0, 0.06)),
         *(row("ab2 16", 4.0, 0.019), row("ab2 32", 8.0, 0.004), row("euler 32", 7.9, 0.01)),
-        row("restart 25", 0.5, None, discretisation=None),
+        row("euler_maruyama 25", 0.5, None, discretisation=None),
         row("ab2 8", 0.1, 0.001, batch=1),
         row("ab2 8", 0.2, 0.011, precision="bf16", precision_error=0.01),
         row("euler 8", 0.1, 0.001, name="euler autoguided"),
@@ -221,7 +221,7 @@ class TestQuality:
 
     def test_nothing_to_choose_from(self):
         with pytest.raises(ValueError, match="no deterministic row"):
-            quality_levels([row("restart 25", 0.5, None)])
+            quality_levels([row("euler_maruyama 25", 0.5, None)])
 
 
 class TestErrorBudget:
@@ -251,7 +251,7 @@ class TestErrorBudget:
         torch.testing.assert_close(found, 3 + 0.5 * noise, atol=1e-5, rtol=0)
 
     def test_counted_evaluations_are_those_known_beforehand(self, make):
-        ways = settings_of(TINY, "cpu", (), False, ())
+        ways = settings_of(TINY, "cpu", False, ())
         for problem in (MixtureProblem(MIXTURE, 2), ModelProblem(make, 2)):
             found = run_problem(problem, ways, TINY)
             for way, line in zip(ways, found.rows, strict=True):

@@ -15,11 +15,9 @@ import pytest
 import torch
 from PIL import Image
 
-from r3dpa.checkpoints import read_checkpoint, weights_sha256
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.data.scans import read_npz, read_ply, read_scan
-from r3dpa.flow import RestartPlan, ode_times
-from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import source_commit
@@ -38,7 +36,6 @@ COMMANDS = {
         "report",
         "bench",
         "ablate",
-        "tune-solver",
         "replay",
     ),
     *("reference", "evaluate"),
@@ -426,8 +423,6 @@ class TestSample:
             "sde_last": "denoise",
             "shift": 1.0,
             "eta": 1.0,
-            "tuned": None,
-            "restart": asdict(RestartPlan()),
         }
         assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
         assert metadata["seconds_per_scene"] > metadata["device_seconds_per_scene"] > 0
@@ -443,7 +438,7 @@ class TestSample:
         ("solver", "evaluations"),
         [
             *[("euler", 3), ("midpoint", 6), ("ab2", 3), ("ab3", 3), ("dpmpp_2m", 3)],
-            *[("unipc", 3), ("euler_maruyama", 3), ("restart", 4 + 2 * 4)],
+            *[("unipc", 3), ("euler_maruyama", 3)],
         ],
     )
     def test_every_solver_can_be_chosen(
@@ -487,7 +482,6 @@ class TestSample:
             (["--guidance_scale", 2], "--guidance_scale says nothing without --autoguidance"),
             (["--guidance_interval", "[0, 1]"], "--guidance_interval .* without --autoguidance"),
             (["--allow_other_latents", "true"], "--allow_other_latents .* --autoguidance"),
-            (["--allow_other_model", "true"], "--allow_other_model says nothing without --tuned"),
             (["--sde_last_time", 2], r"must lie in \(0, 1\), got 2"),
             (["--seed", -1], "seed and pictures must be at least 0, got -1 and 64"),
             (["--pictures", -1], "seed and pictures must be at least 0, got 0 and -1"),
@@ -503,27 +497,6 @@ class TestSample:
             sample(joint_checkpoint, tmp_path, *words, "--overwrite", "true")
         assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
         assert len(list(tmp_path.iterdir())) == 2
-
-    def test_a_tuned_solver_is_for_the_weights_it_was_tuned_for(self, joint_checkpoint, tmp_path):
-        """Whatever file they are in; for others only where allowed, and nothing is touched."""
-        tuned, out = tmp_path / "tuned.json", tmp_path / "out"
-        read = read_checkpoint(joint_checkpoint)
-        sha256 = weights_sha256(read.network("ema").state_dict)
-        card = {"sit_sha256": sha256, "weights": "ema", "stage": "joint", "step": 3}
-        adams = TunedSolver.from_adams(ode_times(2), 2)
-        TunedSolver(adams.times, adams.coefficients, card).save(tuned)
-        exported = tmp_path / "joint.safetensors"
-        main(["convert", str(joint_checkpoint), str(exported)])
-        words = ["sample", "--ckpt", exported, "--out", out, "--num", 1, "--tuned", tuned]
-        words = list(map(str, [*words, "--pictures", 0]))
-        main(words)
-        kept = (out / "range_m.npy").read_bytes()
-        with pytest.raises(ValueError, match=r"tuned\.json was tuned for the ema .*, not .* last"):
-            main([*words, "--weights", "last", "--overwrite", "true"])
-        assert (out / "range_m.npy").read_bytes() == kept
-        allowed = ["--weights", "last", "--overwrite", "true", "--allow_other_model", "true"]
-        main([*words, *allowed])
-        assert json.loads((out / "metadata.json").read_text())["nfe"] == 2
 
     def test_metadata_holds_paths_as_they_are_given(self, joint_checkpoint, tmp_path, monkeypatch):
         monkeypatch.chdir(joint_checkpoint.parent)

@@ -6,7 +6,7 @@ from einops import rearrange
 
 from r3dpa.bench.hardware import flop_of
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
-from r3dpa.flow.sde import RestartPlan, euler_maruyama, restart
+from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, euler, heun, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 from r3dpa.nn.sit import SiT
@@ -389,13 +389,10 @@ def solve(solver, velocity, x):
 
     if solver == "euler_maruyama":
         return euler_maruyama(velocity, x, sde_times(5), draws())
-    if solver == "restart":
-        plan = RestartPlan(0.3, 0.6, 1, 2)
-        return restart(velocity, x, ode_times(5), draws(), plan=plan)
     return ode_solver(solver)(velocity, x, ode_times(5))
 
 
-SAMPLERS = [*ODE_SOLVERS, "euler_maruyama", "restart"]
+SAMPLERS = [*ODE_SOLVERS, "euler_maruyama"]
 
 
 @pytest.mark.parametrize("solver", SAMPLERS)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sde import RestartPlan, euler_maruyama, restart
-from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, euler
+from r3dpa.flow.sde import euler_maruyama
+from r3dpa.flow.solvers import CountingVelocity, euler
 from r3dpa.flow.times import ode_times, sde_times
 
 
@@ -167,7 +167,6 @@ def test_state_keeps_its_dtype_with_noise(dtype):
         euler_maruyama(velocity, x, sde_times(3), generator, last=last)
         for last in ("denoise", "mean")
     ]
-    results.append(restart(velocity, x, ode_times(20), generator))
     assert all(result.dtype == dtype for result in results)
     wide = torch.float64 if dtype == torch.float64 else torch.float32
     assert set(seen) == {(dtype, wide, (2,))}
@@ -228,83 +227,3 @@ def test_sde_converges_strongly_with_coupled_noise():
     # Diffusion that depends on time only: strong order 1.
     assert errors[0] / errors[1] == pytest.approx(2, rel=0.25)
     assert errors[1] / errors[2] == pytest.approx(2, rel=0.25)
-
-
-def test_restart_jumps_by_hand():
-    # v = 0: the state only jumps. From 0.5 to 0.75 linear: a = 1/2, b^2 = 9/16 - 1/16.
-    plan = RestartPlan(lower=0.5, upper=0.75, rounds=2, round_steps=1, solver="euler")
-    draws = torch.tensor([3.0, -1.0]).double()[:, None, None]
-    start, times = torch.ones(1, 1).double(), ode_times(4)
-    result = restart(still, start, times, draws, plan=plan)
-    spread = math.sqrt(0.5)
-    assert result.item() == pytest.approx((0.5 + 3 * spread) / 2 - spread)
-    # Up to pure noise nothing of the state is kept.
-    whole = RestartPlan(lower=0.5, upper=1.0, rounds=1, round_steps=1, solver="euler")
-    assert restart(still, start, times, draws, plan=whole).item() == pytest.approx(3)
-
-
-@pytest.mark.parametrize("path", ["linear", "cosine"])
-def test_restart_keeps_the_marginal(path):
-    interpolant = Interpolant(path)
-
-    def velocity(x, time):
-        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
-        return (alpha * d_alpha * 0.25 + sigma * d_sigma) / (alpha**2 * 0.25 + sigma**2) * x
-
-    plan = RestartPlan(lower=0.2, upper=0.8, rounds=4, round_steps=40, solver="ab3")
-    noise, generator = standard_noise(20_000, 1), torch.Generator().manual_seed(2)
-    data = restart(velocity, noise, ode_times(60), generator, plan=plan, interpolant=interpolant)
-    assert data.std().item() == pytest.approx(0.5, rel=0.015)  # three standard errors
-    assert abs((data * noise).mean().item()) < 0.1  # the noise of the start is mostly forgotten
-
-
-def test_restart_forgets_errors_made_before():
-    """A push away at t > 1/2 only is contracted by going back to noise."""
-    exact = gaussian_velocity(0.5)
-
-    def pushed(x, time):
-        return exact(x, time) - 1.0 * (time > 0.5)[:, None]
-
-    noise, times = standard_noise(4000, 1), ode_times(40)
-    plan = RestartPlan(lower=0.1, upper=0.45, rounds=6, round_steps=10)
-    without = euler(pushed, noise, times).mean().abs()
-    again = restart(pushed, noise, times, torch.Generator().manual_seed(1), plan=plan).mean().abs()
-    assert again < without / 4
-
-
-@pytest.mark.parametrize("solver", ODE_SOLVERS)
-@pytest.mark.parametrize("lower", [0.06, 0.25])
-def test_restart_evaluations_are_known_beforehand(solver, lower):
-    plan = RestartPlan(lower=lower, upper=0.5, rounds=3, round_steps=2, solver=solver)
-    counted, times = CountingVelocity(growth), ode_times(8)
-    restart(counted, torch.ones(2, 3), times, torch.Generator(), plan=plan)
-    assert counted.nfe == plan.evaluations(times)
-
-
-def test_restart_cuts_the_grid():
-    down, on = RestartPlan(lower=0.25, upper=0.5).parts(ode_times(4))
-    assert down.tolist() == [1, 0.75, 0.5, 0.25]
-    assert on.tolist() == [0.25, 0]
-    down, on = RestartPlan(lower=0.2, upper=0.5).parts(ode_times(2))
-    assert (down.tolist(), on.tolist()) == ([1, 0.5, 0.2], [0.2, 0])
-
-
-@pytest.mark.parametrize(
-    ("run", "message"),
-    [
-        (lambda: RestartPlan(lower=0.5, upper=0.5), r"got 0\.5 and 0\.5"),
-        (lambda: RestartPlan(lower=0.0), r"got 0\.0 and"),
-        (lambda: RestartPlan(rounds=0), "one round, got 0"),
-        (lambda: RestartPlan(round_steps=0), "at least one step, got 0"),
-        (lambda: RestartPlan(solver="dopri5"), "ab3, dpmpp_2m, unipc, got 'dopri5'"),
-        (lambda: RestartPlan().parts(ode_times(2, 0.0, 1.0)), r"decrease through 0\.06"),
-        (lambda: RestartPlan().parts(ode_times(2, 1.0, 0.1)), r"decrease through 0\.06"),
-        (
-            lambda: restart(growth, torch.ones(2, 3), ode_times(4), torch.zeros(1, 2, 3)),
-            r"2 draws of shape \(2, 3\) are needed, got 1 draws",
-        ),
-    ],
-)
-def test_restart_that_cannot_run_is_refused(run, message):
-    with pytest.raises(ValueError, match=message):
-        run()

@@ -21,10 +21,9 @@ from r3dpa.bench.hardware import flop_of, peak_memory, synchronise
 from r3dpa.bench.timing import Spent
 from r3dpa.data import write_bin
 from r3dpa.flow.mixture import GaussianMixture
-from r3dpa.flow.sde import euler_maruyama, restart
+from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, heun
 from r3dpa.flow.times import ode_times, sde_times
-from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import points_of
 
@@ -56,15 +55,13 @@ class Setting:
     @property
     def name(self) -> str:
         """Solver with its settings, without the number of steps."""
-        solver = "tuned" if self.sampler.tuned is not None else self.sampler.solver
-        name = plain_name(solver, self.sampler.shift)
+        name = plain_name(self.sampler.solver, self.sampler.shift)
         return " ".join(filter(None, [name, self.tag, "autoguided" if self.autoguided else ""]))
 
     @property
     def deterministic(self) -> bool:
         """Whether noise alone decides the result, so that it can be compared scene by scene."""
-        solver = self.sampler.solver
-        return self.sampler.tuned is not None or solver in ODE_SOLVERS or solver == "dopri5"
+        return self.sampler.solver != "euler_maruyama"
 
     @property
     def plain(self) -> Setting:
@@ -151,15 +148,11 @@ class MixtureProblem:
         noise: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        if sampler.tuned is not None:
-            return TunedSolver.load(sampler.tuned).solve(velocity, noise)
         if sampler.solver == "euler_maruyama":
             times = sde_times(sampler.steps, sampler.sde_last_time)
             last, eta = sampler.sde_last, sampler.eta
             return euler_maruyama(velocity, noise, times, generator, last=last, eta=eta)
         times = ode_times(sampler.steps, shift=sampler.shift)
-        if sampler.solver == "restart":
-            return restart(velocity, noise, times, generator)
         return ODE_SOLVERS[sampler.solver](velocity, noise, times)
 
     def converged(self, steps: int, num: int) -> Solved:

@@ -38,7 +38,6 @@ _SOLVERS: tuple[tuple[Solver, float], ...] = (
     *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.75), ("ab2", 2.0)),
     *(("ab3", 1.0), ("ab3", 1.5), ("ab3", 2.5), ("dpmpp_2m", 1.75), ("unipc", 1.0)),
 )
-_RESTARTS = (16, 32, 64)  # steps, of those that the evaluations have room for
 _PRECISION_STEPS = 32
 _BATCH = {"cuda": 64, "cpu": 4}
 _LEAST_SHARE = 0.01
@@ -75,7 +74,6 @@ def sampling(
     rounds: int | None = None,
     nfe: Sequence[int] | None = None,
     reference_steps: int | None = None,
-    tuned: Sequence[Path] = (),
     autoguided: bool = False,
     about: Mapping[str, Any] | None = None,
     published: Mapping[str, float] | None = None,
@@ -100,7 +98,6 @@ def sampling(
         nfe: Evaluations of the model's rows; 2 to 256, or 4 to 32 with ``quick``.
         reference_steps: Heun steps of the model's converged solution, an even number; 1000, or 200
             with ``quick``.
-        tuned: Files of tuned solvers, each a row.
         autoguided: Whether ``make`` can guide: one more solver in the picture.
         about: What a reader must know of the model, such as its name, stage and step.
         published: Values of other work by the name of the distance.
@@ -125,8 +122,8 @@ def sampling(
     found = {}
     mixture = toy_mixture()
     effort = _effort("mixture", quick)
-    # A mixture has no network: what was tuned for one or changes its speed does not apply.
-    ways = settings_of(effort, "cpu", (), False, ())
+    # A mixture has no network: what changes its speed does not apply.
+    ways = settings_of(effort, "cpu", False, ())
     distances = SlicedDistance(mixture, effort.samples)
     found["mixture"] = run_problem(MixtureProblem(mixture, effort.batch), ways, effort, distances)
     if make is not None:
@@ -141,7 +138,7 @@ def sampling(
         if data is not None:
             real = SceneDistances(data, problem.sensor, effort.samples, str(device))
         kinds = (False,) if quick else (False, True)  # compiling takes minutes
-        ways = settings_of(effort, device.type, tuned, autoguided, kinds)
+        ways = settings_of(effort, device.type, autoguided, kinds)
         found["model"] = run_problem(problem, ways, effort, real)
     facts = _facts(about, make is not None)
     return write_report(out, found, facts, dict(published or {}))
@@ -168,7 +165,6 @@ def _effort(
 def settings_of(
     effort: Effort,
     device: str,
-    tuned: Sequence[Path],
     autoguided: bool,
     compiled: Sequence[bool],
 ) -> list[Setting]:
@@ -180,7 +176,6 @@ def settings_of(
     Args:
         effort: Gives NFE and batch.
         device: ``cuda`` or ``cpu``.
-        tuned: Files of tuned solvers.
         autoguided: Whether guided rows are wanted.
         compiled: Whether to compile that, or each; none where only the solver matters.
     """
@@ -196,12 +191,6 @@ def settings_of(
         for last in ("mean", "denoise"):
             sampler = SamplerConfig("euler_maruyama", nfe, sde_last=last)
             ways.append(replace(usual, sampler=sampler, tag=last))
-    for steps in _RESTARTS:
-        if 2 * steps <= max(effort.evaluations):
-            ways.append(replace(usual, sampler=SamplerConfig("restart", steps)))
-    for path in tuned:
-        sampler = SamplerConfig("euler", 1, tuned=str(path))
-        ways.append(replace(usual, sampler=sampler, tag=path.stem))
     usual = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
     if autoguided:
         for steps in (8, _PRECISION_STEPS):
@@ -319,7 +308,7 @@ def _row(
     return Row(
         label,
         way.name,
-        "tuned" if way.sampler.tuned is not None else way.sampler.solver,
+        way.sampler.solver,
         way.sampler.steps,
         way.sampler.shift,
         error.nfe,

@@ -175,13 +175,10 @@ def sample(
         "unipc",
         "dopri5",
         "euler_maruyama",
-        "restart",
     ]
     | None = None,
     steps: int | None = None,
     shift: float | None = None,
-    tuned: Path | None = None,
-    allow_other_model: bool = False,
     eta: float | None = None,
     sde_last: Literal["denoise", "mean"] | None = None,
     sde_last_time: float | None = None,
@@ -214,8 +211,6 @@ def sample(
         solver: ODE solver; or ``euler_maruyama`` for the SDE, where none is given.
         steps: Solver steps; 256 where not given.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; 1 where not given.
-        tuned: File of a tuned solver, which replaces all other options of the solver.
-        allow_other_model: Accept a solver that was tuned for other weights than these.
         eta: Strength of the noise of the SDE; 1, as published, where not given.
         sde_last: Last SDE step: ``denoise``, where not given, or ``mean`` as in the official
             sampler.
@@ -247,13 +242,10 @@ def sample(
         "eta": eta,
         "sde_last": sde_last,
         "sde_last_time": sde_last_time,
-        "tuned": None if tuned is None else str(tuned),
     }
     given: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
-    if tuned is not None and len(given) > 1:
-        raise ValueError(f"--tuned replaces --{next(iter(given))}; drop one")
     if quality is not None:
         sampler = SamplerConfig.of_quality(quality)
         print_text(SamplerConfig.quality_line(quality))
@@ -263,7 +255,6 @@ def sample(
         "guidance_scale": (guidance_scale is not None, "autoguidance", autoguidance),
         "guidance_interval": (guidance_interval is not None, "autoguidance", autoguidance),
         "allow_other_latents": (allow_other_latents, "autoguidance", autoguidance),
-        "allow_other_model": (allow_other_model, "tuned", tuned),
     }
     for name, (is_given, other, value) in needs.items():
         if is_given and value is None:
@@ -289,7 +280,6 @@ def sample(
             formats=_words(formats),
             pictures=pictures,
             overwrite=overwrite,
-            allow_other_model=allow_other_model,
         )
     except KeyboardInterrupt:
         again = "the same command, without --overwrite," if overwrite else "the same command"
@@ -437,64 +427,11 @@ def report(run: Path) -> None:
     print_text(draw(run))
 
 
-def tune_solver(
-    ckpt: Path,
-    out: Path,
-    steps: int = 10,
-    num: int = 64,
-    val: int = 64,
-    reference_steps: int = 200,
-    iterations: int = 200,
-    velocities: int = 2,
-    batch_size: int = 16,
-    seed: int = 0,
-    weights: Literal["ema", "last"] = "ema",
-    device: str = "auto",
-) -> None:
-    """Fit a solver of few steps to a checkpoint: times and weights of past velocities.
-
-    Prints it beside Euler, AB2 and learned times; ``r3dpa sample --tuned FILE`` uses it.
-
-    Args:
-        ckpt: Checkpoint of stage joint or flow_matching.
-        out: JSON file of the solver.
-        steps: Steps, which are its network evaluations.
-        num: Noises to fit it to.
-        val: Noises to choose by, and as many again that only test it.
-        reference_steps: Heun steps of the converged solutions.
-        iterations: Of the search.
-        velocities: Past velocities that a step combines, at least 2.
-        batch_size: Noises solved together.
-        seed: Of the noises.
-        weights: Averaged (``ema``) or last weights of the SiT.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-    """
-    from r3dpa.cli.tune import tune
-
-    check_file(out)
-    print_text(
-        tune(
-            ckpt,
-            out,
-            steps,
-            num,
-            val,
-            reference_steps,
-            iterations,
-            velocities,
-            batch_size,
-            seed,
-            weights,
-            device,
-        )
-    )
-
-
 _COMMANDS: dict[str, Callable[..., None]] = {
     command.__name__.replace("_", "-"): command
     for command in (
         *(simulate, check, view, realism),
-        *(sample, tune_solver, reference, evaluate, convert, replay, report),
+        *(sample, reference, evaluate, convert, replay, report),
     )
 } | {"ablate": ablate_tables}
 

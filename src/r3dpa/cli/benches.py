@@ -51,7 +51,6 @@ def bench_sampling(
     rounds: int | None = None,
     nfe: list[int] | None = None,
     reference_steps: int | None = None,
-    tuned: list[Path] | None = None,
     autoguidance: Path | None = None,
     guidance_scale: float = 2.0,
     allow_other_latents: bool = False,
@@ -70,7 +69,6 @@ def bench_sampling(
         rounds: Of the timing; 20, or 3 with ``--quick``.
         nfe: Network evaluations a scene; 2 to 256, or 4 to 32 with ``--quick``.
         reference_steps: Heun steps of the converged solution; 1000, or 200 with ``--quick``.
-        tuned: Files of ``r3dpa tune-solver``, each one more way.
         autoguidance: Snapshot of a weaker model: one more way is guided away from it.
         guidance_scale: Strength of autoguidance.
         allow_other_latents: Accept a snapshot whose latents are only about the same.
@@ -87,8 +85,8 @@ def bench_sampling(
         if autoguidance is not None:
             guide = WeakGuide(autoguidance, guidance_scale, (0.0, 1.0), allow_other_latents)
         make, about = generators_of(ckpt, guide, device)
-    elif autoguidance is not None or tuned:
-        raise ValueError("--autoguidance and --tuned belong to a model; give its --ckpt")
+    elif autoguidance is not None:
+        raise ValueError("--autoguidance belongs to a model; give its --ckpt")
     print_text(
         sampling(
             out,
@@ -100,7 +98,6 @@ def bench_sampling(
             rounds=rounds,
             nfe=nfe,
             reference_steps=reference_steps,
-            tuned=tuned or (),
             autoguided=autoguidance is not None,
             about=about,
         )

@@ -198,8 +198,8 @@ def _made_with(samples: Path) -> dict[str, Any]:
     sampler = found.get("sampler") or {}
     kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
     return {
-        "solver": "tuned" if sampler.get("tuned") else sampler.get("solver"),
-        "steps": found.get("nfe") if sampler.get("tuned") else sampler.get("steps"),
+        "solver": sampler.get("solver"),
+        "steps": sampler.get("steps"),
         **{key: found.get(key) for key in kept},
         "sampler": sampler,
         "made_by_commit": found.get("commit"),

@@ -21,10 +21,8 @@ from r3dpa import viz
 from r3dpa.checkpoints import (
     Checkpoint,
     read_checkpoint,
-    weights_sha256,
 )
 from r3dpa.data.scene_writer import SceneWriter
-from r3dpa.flow.tuned import TunedSolver
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import source_commit, usable_device
@@ -40,7 +38,6 @@ __all__ = [
     "generators_of",
     "report",
     "sample",
-    "sit_sha256",
     "written",
 ]
 
@@ -177,7 +174,6 @@ def sample(
     formats: Sequence[str] = ("bin",),
     pictures: int = 64,
     overwrite: bool = False,
-    allow_other_model: bool = False,
 ) -> dict[str, Any]:
     """Writes scenes, pictures and metadata below ``out``; see ``r3dpa sample --help``.
 
@@ -188,7 +184,7 @@ def sample(
 
     Raises:
         ValueError: If ``out`` holds scenes already, or unfinished ones of another request, the
-            checkpoint cannot be sampled from, or the solver was tuned for another one.
+            checkpoint cannot be sampled from.
         OSError: If a file cannot be written.
     """
     if num < 1 or batch_size < 1:
@@ -212,8 +208,6 @@ def sample(
         compile=compile,
     )
     generator.prepare()
-    if sampler.tuned is not None and not allow_other_model:
-        _refuse_other_model(Path(sampler.tuned), checkpoint, weights)
     request = {
         "checkpoint": str(ckpt),
         "checkpoint_written": written(ckpt),
@@ -224,7 +218,6 @@ def sample(
         "num": num,
         "seed": seed,
         "sampler": asdict(sampler),
-        "tuned_written": None if sampler.tuned is None else written(Path(sampler.tuned)),
         "autoguidance": about_guide,
         "interpolant": checkpoint.interpolant,
         "precision": precision,
@@ -315,26 +308,6 @@ class _DeviceClock:
             return [stop - start for start, stop in pairs]
         torch.cuda.synchronize()
         return [start.elapsed_time(stop) / 1000 for start, stop in pairs]
-
-
-def sit_sha256(checkpoint: Checkpoint, weights: Literal["ema", "last"]) -> str:
-    """What tells the SiT that is sampled from others, whatever file it is in."""
-    return weights_sha256(checkpoint.network("ema" if weights == "ema" else "sit").state_dict)
-
-
-def _refuse_other_model(
-    tuned: Path, checkpoint: Checkpoint, weights: Literal["ema", "last"]
-) -> None:
-    """Refuses a solver whose card names other weights; one without such a card fits any."""
-    card = TunedSolver.load(tuned).card
-    expected = card.get("sit_sha256")
-    if expected is not None and expected != sit_sha256(checkpoint, weights):
-        raise ValueError(
-            f"{tuned} was tuned for the {card.get('weights')} weights of stage "
-            f"{card.get('stage')}, step {card.get('step')}, not for the {weights} weights of "
-            f"{checkpoint.path}, step {checkpoint.step}; run `r3dpa tune-solver` for these, or "
-            "give --allow_other_model true"
-        )
 
 
 def written(path: Path) -> str:

@@ -19,7 +19,7 @@ from r3dpa.flow.guidance import (
 )
 from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
 from r3dpa.flow.mixture import GaussianMixture, toy_mixture
-from r3dpa.flow.sde import DriftChange, RestartPlan, euler_maruyama, restart
+from r3dpa.flow.sde import DriftChange, euler_maruyama
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
     AfterStep,
@@ -54,7 +54,6 @@ __all__ = [
     "Interpolant",
     "OdeSolver",
     "PathCoefficients",
-    "RestartPlan",
     "Trajectory",
     "Velocity",
     "ab2",
@@ -75,7 +74,6 @@ __all__ = [
     "pnp_flow_feature",
     "renoised",
     "renormalised",
-    "restart",
     "sample_time",
     "sde_times",
     "spherical_mean",

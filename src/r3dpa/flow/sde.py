@@ -1,23 +1,22 @@
-"""Samplers that add noise on the way from t = 1 (noise) to t = 0 (data): SDE and Restart.
+"""SDE sampler from t = 1 (noise) to t = 0 (data).
 
-They follow the conventions of :mod:`r3dpa.flow.solvers`. Letters: B batch, ``...`` further axes.
+Follows the conventions of :mod:`r3dpa.flow.solvers`. Letters: B batch, ``...`` further axes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import AfterStep, Velocity, evaluations, ode_solver, unchanged
-from r3dpa.flow.times import batch_time, ode_times, step_pairs
+from r3dpa.flow.solvers import AfterStep, Velocity, unchanged
+from r3dpa.flow.times import batch_time, step_pairs
 
-__all__ = ["DriftChange", "RestartPlan", "euler_maruyama", "restart"]
+__all__ = ["DriftChange", "euler_maruyama"]
 
 DriftChange = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -101,132 +100,6 @@ def euler_maruyama(
     else:
         x = x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
     return after_step(x, then, len(steps) + 1)
-
-
-@dataclass(frozen=True)
-class RestartPlan:
-    """Where Restart goes back to noise, how often, and how it solves.
-
-    Args:
-        lower: Time to jump from, in (0, 1).
-        upper: Time to jump to, above ``lower``, at most 1.
-        rounds: Number of jumps K.
-        round_steps: Equidistant steps of every way back from ``upper`` to ``lower``.
-        solver: A key of :data:`r3dpa.flow.solvers.ODE_SOLVERS`.
-
-    Raises:
-        ValueError: If the times are out of order, a count is below 1 or the solver is unknown.
-    """
-
-    lower: float = 0.06
-    upper: float = 0.23
-    rounds: int = 2
-    round_steps: int = 4
-    solver: str = "ab2"
-
-    def __post_init__(self) -> None:
-        """Check times, counts and the name."""
-        if not 0 < self.lower < self.upper <= 1:
-            raise ValueError(
-                f"Restart needs 0 < lower < upper <= 1, got {self.lower} and {self.upper}"
-            )
-        if self.rounds < 1:
-            raise ValueError(f"Restart needs at least one round, got {self.rounds}")
-        evaluations(self.solver, self.round_steps)
-
-    def evaluations(self, times: Tensor) -> int:
-        """Network evaluations per sample of :func:`restart` on that main grid.
-
-        Args:
-            times: ``(T,)`` times of the main way.
-
-        Returns:
-            The NFE.
-
-        Raises:
-            ValueError: If the times do not decrease through ``lower``.
-        """
-        down, on = self.parts(times)
-        main = evaluations(self.solver, len(down) - 1) + evaluations(self.solver, len(on) - 1)
-        return main + self.rounds * evaluations(self.solver, self.round_steps)
-
-    def parts(self, times: Tensor) -> tuple[Tensor, Tensor]:
-        """The main way cut at ``lower``, which becomes a time of both parts.
-
-        Args:
-            times: ``(T,)`` times of the main way.
-
-        Returns:
-            Times from the first one to ``lower`` and from there to the last one; together T
-            steps, or T - 1 if ``lower`` is one of the times.
-
-        Raises:
-            ValueError: If the times do not decrease through ``lower``.
-        """
-        step_pairs(times)
-        if not times[0] > self.lower > times[-1]:
-            raise ValueError(
-                f"the times of Restart must decrease through {self.lower}, got {times.tolist()}"
-            )
-        cut = times.new_tensor([self.lower])
-        return torch.cat([times[times > cut], cut]), torch.cat([cut, times[times < cut]])
-
-
-_DEFAULT_PLAN = RestartPlan()
-
-
-@torch.no_grad()
-def restart(
-    velocity: Velocity,
-    x: Tensor,
-    times: Tensor,
-    noise: torch.Generator | Iterable[Tensor],
-    *,
-    plan: RestartPlan = _DEFAULT_PLAN,
-    interpolant: Interpolant = _LINEAR,
-) -> Tensor:
-    """Solve the ODE, but on the way go back to noise a few times and solve again.
-
-    The jump from ``lower`` to ``upper`` adds just the noise that keeps the marginals: a sample
-    ``alpha_l data + sigma_l noise`` becomes one of the later time by::
-
-        x_u = a x_l + b draw        a = alpha_u / alpha_l        b^2 = sigma_u^2 - a^2 sigma_l^2
-
-    so that the errors made so far shrink, as those of an SDE do, while the steps between stay
-    those of an ODE solver.
-
-    Source: Restart (Xu et al. 2023), alg. 1; the jump re-derived for paths that scale the data.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        x: ``(B, ...)`` Gaussian noise, the state at t = 1.
-        times: ``(T,)`` decreasing times of the main way, which is cut at ``plan.lower``.
-        noise: One Gaussian draw ``(B, ...)`` per round, or where to draw them from.
-        plan: The interval, the rounds and the solver.
-        interpolant: Path of the velocity.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
-    Raises:
-        ValueError: If ``times`` do not decrease through ``plan.lower`` or the draws do not suffice
-            or have another shape.
-    """
-    down, on = plan.parts(times)
-    again = ode_times(plan.round_steps, start=plan.upper, stop=plan.lower)
-    ends = interpolant.coefficients(torch.tensor([plan.lower, plan.upper], dtype=torch.float64))
-    (alpha_lower, alpha_upper), (sigma_lower, sigma_upper) = (
-        ends.alpha.tolist(),
-        ends.sigma.tolist(),
-    )
-    kept = alpha_upper / alpha_lower
-    spread = math.sqrt(sigma_upper**2 - (kept * sigma_lower) ** 2)
-    solver = ode_solver(plan.solver, interpolant)
-    draws = _draws(noise, x, plan.rounds)
-    x = solver(velocity, x, down)
-    for _ in range(plan.rounds):
-        x = solver(velocity, kept * x + spread * next(draws), again)
-    return solver(velocity, x, on)
 
 
 def _draws(
