@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.nn import VAE, ImageVAE, LatentNorm
+from r3dpa.nn import VAE, ImageVAE, LatentNorm, SiT
 from r3dpa.nn.backbones import DINOv2
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -36,7 +36,7 @@ ELSEWHERE = {  # and the test that starts them
 EXPERIMENTS = ("vae_alignment", "joint", "flow_matching")
 SCANS = ("demo", "demo_folder", "folder", "kitti360", "simulated")
 VAES = sorted(path.stem for path in CONF.glob("net/vae_h*.yaml"))
-SITS = sorted(path.stem for path in CONF.glob("net/sit_[sblx]*[1248].yaml"))
+SITS = ("sit_b2",)
 UNETS = ("unet_lidm", "unet_small")
 STARTED = {
     *("smoke", "trainer", "trainer_demo", "launch/nodes", "data/images", "data/points"),
@@ -208,6 +208,22 @@ def test_vaes_at_their_own_size(name, start, smoke_root):
         "model.init_args.sit.init_args.num_heads": 2,
     }
     start(("trainer", "data/simulated", "experiment/vae_alignment"), settings)
+
+
+# Widths, depths and heads of DiT and SiT; millions of parameters as those papers print them, which
+# count neither the projector nor the fixed position embedding.
+@pytest.mark.parametrize(
+    ("width", "depth", "heads", "millions"),
+    [(384, 12, 6, 33), (768, 12, 12, 130), (1024, 24, 16, 458), (1152, 28, 16, 675)],
+)
+@pytest.mark.parametrize("patch", [2, 4, 8])
+def test_a_size_is_two_overrides(width, depth, heads, millions, patch):
+    sizes = {"hidden_size": width, "depth": depth, "num_heads": heads, "patch_size": patch}
+    with torch.device("meta"):
+        sit = SiT(**{**net("sit_b2"), **sizes})
+    head = sum(p.numel() for p in sit.projector.parameters())
+    count = sum(p.numel() for p in sit.parameters()) - head
+    assert count / 1e6 == pytest.approx(millions, rel=0.02)
 
 
 @pytest.mark.slow

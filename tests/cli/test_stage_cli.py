@@ -32,8 +32,7 @@ class PickyModel(BoringModel):
 def words(model, data, run_dir):
     fixed = ["--trainer.accelerator=cpu", "--trainer.logger=false", "--trainer.max_steps=2"]
     fixed += ["--trainer.enable_progress_bar=false", "--trainer.limit_val_batches=2"]
-    own = ["--allow-imports", f"{__name__},{BORING}"]
-    return [*own, "--model", model, "--data", data, "--run_dir", str(run_dir), *fixed]
+    return ["--model", model, "--data", data, "--run_dir", str(run_dir), *fixed]
 
 
 @pytest.fixture
@@ -64,7 +63,6 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
 
 def test_a_stage_of_range_images_needs_their_data_module(smoke_args, tmp_path):
     arguments = smoke_args("vae_alignment", tmp_path, "--data", f"{BORING}.BoringDataModule")
-    arguments += ["--allow-imports", BORING]
     with pytest.raises(
         ValueError,
         match=r"data\.class_path: VAEAlignment needs a r3dpa\.data\.datamodules\.LidarDataModule "

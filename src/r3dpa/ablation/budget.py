@@ -12,12 +12,12 @@ from typing import Any
 import lightning as L
 import torch
 import yaml
+from lightning.pytorch.cli import LightningArgumentParser
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from r3dpa.ablation.configs import with_value
 from r3dpa.ablation.plan import Plan, Stage
-from r3dpa.imports import ConfigParser
 from r3dpa.modules import FlowMatching, GenerativeModule, RGBPretraining
 from r3dpa.modules.step_losses import PathDraws
 
@@ -127,7 +127,7 @@ def _on_meta(config: Mapping[str, Any]) -> L.LightningModule:
     """The module of a configuration, its weights without memory, and no file read."""
     if config["model"]["init_args"].get("teacher"):
         config = with_value(config, "model.init_args.teacher.init_args.weights", None)
-    parser = ConfigParser(exit_on_error=False)
+    parser = LightningArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(L.LightningModule, "model")
     parsed = parser.parse_string(yaml.safe_dump({"model": config["model"]}))
     with torch.device("meta"):

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import lightning as L
 import torch
 import yaml
+from lightning.pytorch.cli import LightningArgumentParser
 from torch import Tensor
 from tqdm import tqdm
 
@@ -30,7 +31,6 @@ from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
-from r3dpa.imports import ConfigParser
 from r3dpa.io import atomic_path, command, machine, one_line, usable_device, versions
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
@@ -315,7 +315,7 @@ def _build(experiments: list[Path], fresh_vae: Path) -> GenerativeModule:
     Stage flow_matching refuses to start without the VAE of another stage. Random weights cost the
     same, so all stages are given such a file.
     """
-    parser = ConfigParser(exit_on_error=False)
+    parser = LightningArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(GenerativeModule, "model")
     parser.add_argument("--trainer", type=dict)  # the length of a whole run: not used
     parser.add_argument("--config", action="config")

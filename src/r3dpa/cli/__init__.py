@@ -474,7 +474,16 @@ def _run_function(
         raise
 
 
+def _refuse_imports() -> None:
+    """Keeps YAML files from naming functions that run commands or code, such as os.system."""
+    from jsonargparse import set_parsing_settings
+
+    set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
+
+
 def _run(args: list[str]) -> None:
+    if args and not args[0].startswith("-"):
+        _refuse_imports()
     if not args or args[0] in ("-h", "--help"):
         print_text(_help())
     elif args[0] == "--version":

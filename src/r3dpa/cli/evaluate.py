@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jsonargparse import Namespace
+from lightning.pytorch.cli import LightningArgumentParser
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
@@ -16,7 +17,6 @@ from r3dpa.data.sample_files import SampleError
 from r3dpa.data.samples import Samples, read_samples
 from r3dpa.data.scans import Scan, evenly
 from r3dpa.geometry import LidarSensor
-from r3dpa.imports import ConfigParser
 from r3dpa.io import source_commit
 from r3dpa.metrics.official_statistics import OfficialSplit
 from r3dpa.metrics.protocol import PROTOCOLS
@@ -164,7 +164,7 @@ def _scans(data: Path, split: SplitName, limit: int | None) -> tuple[list[Scan],
         in_layout = (data / "data_3d_raw").is_dir()
         module = KITTI360DataModule(str(data)) if in_layout else LidarDataModule(str(data))
     elif data.suffix in (".yaml", ".yml"):
-        parser = ConfigParser()
+        parser = LightningArgumentParser()
         parser.add_argument("--config", action="config")
         parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
         config: Namespace = parser.parse_args(["--config", str(data)])

@@ -13,12 +13,12 @@ from typing import Any, Literal, cast
 
 from jsonargparse import Namespace
 from lightning import Trainer
+from lightning.pytorch.cli import LightningArgumentParser
 
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import Extractor, GridPlan, features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
-from r3dpa.imports import ConfigParser
 from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
 from r3dpa.nn.backbones.sources import SOURCES, feature_source
 
@@ -174,15 +174,14 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
     return found
 
 
-def _parser() -> ConfigParser:
-    parser = ConfigParser(
+def _parser() -> LightningArgumentParser:
+    parser = LightningArgumentParser(
         prog="r3dpa features",
         description="Write the feature grids of all scans of --data: a folder of scans, in the "
         "KITTI-360 layout or any other, or a data YAML. What is made is kept, and the same command "
         "completes what was interrupted. Of several devices and nodes, each makes its share.",
     )
     parser.add_argument("--config", action="config", help="YAML, the same as after --data")
-    parser.add_allow_imports()
     parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
     parser.add_argument(
         "--extractor",

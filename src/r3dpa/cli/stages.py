@@ -14,7 +14,6 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.imports import ConfigParser
 from r3dpa.io import atomic_path, delete_unfinished, only_writer
 from r3dpa.modules import GenerativeModule
 
@@ -60,7 +59,6 @@ class StageCLI(LightningCLI):
         parser.add_argument(
             "--run_dir", type=str, default="runs/default", help="folder that the run writes to"
         )
-        cast(ConfigParser, parser).add_allow_imports()
         parser.add_lightning_class_args(RunCheckpoint, "checkpoint")
         parser.add_lightning_class_args(SceneScorer, "scorer")
         parser.set_defaults({"checkpoint.save_last": True, "checkpoint.filename": "{step:07d}"})
@@ -171,7 +169,6 @@ def run(args: list[str]) -> None:
         save_config_callback=_SaveFitConfig,
         save_config_kwargs={"overwrite": True},
         auto_configure_optimizers=False,
-        parser_class=ConfigParser,
         # Lightning warns where both the process's own command line and a list are given.
         args=None if args == sys.argv[1:] else args,
     )
