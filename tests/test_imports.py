@@ -12,7 +12,6 @@ CORE = {"geometry", "flow", "losses", "nn"}
 ALLOWED = {
     "io": set(),
     "unpickling": set(),
-    "imports": set(),
     "geometry": set(),
     "flow": set(),
     "losses": set(),
@@ -30,14 +29,14 @@ ALLOWED = {
     "callbacks": CORE
     | {"data", "checkpoints", "generation", "modules", "metrics", "viz"}
     | {"scoring", "simulation"},
-    "ablation": {"imports", "metrics", "modules", "checkpoints", "viz"},
+    "ablation": {"metrics", "modules", "checkpoints", "viz"},
     "bench": CORE
-    | {"imports", "simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
+    | {"simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
     | {"editing"},
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "scoring", "snapshots", "imports", "ablation", "editing"},
+    | {"metrics", "scoring", "snapshots", "ablation", "editing"},
 }
 ANYWHERE = {"io", "unpickling", "__version__"}
 
