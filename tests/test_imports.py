@@ -25,7 +25,6 @@ ALLOWED = {
     "editing": {"geometry", "nn", "flow", "generation", "checkpoints"},
     "modules": CORE | {"data", "checkpoints", "generation", "editing"},
     "scoring": {"data", "metrics", "viz"},
-    "snapshots": {"checkpoints", "modules", "nn"},
     "callbacks": CORE
     | {"data", "checkpoints", "generation", "modules", "metrics", "viz"}
     | {"scoring", "simulation"},
@@ -36,7 +35,7 @@ ALLOWED = {
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "scoring", "snapshots", "ablation", "editing"},
+    | {"metrics", "scoring", "ablation", "editing"},
 }
 ANYWHERE = {"io", "unpickling", "__version__"}
 

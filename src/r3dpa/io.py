@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import os
 import pickle
 import platform
@@ -220,6 +221,7 @@ def usable_device(name: str) -> str:
     return name
 
 
+@functools.cache
 def source_commit() -> str | None:
     """Commit of the r3dpa checkout that runs; None if it was installed without one."""
     package = Path(__file__).resolve().parent

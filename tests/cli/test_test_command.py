@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from r3dpa import callbacks
-from r3dpa.callbacks import SceneScorer
+from r3dpa.callbacks import SceneScorer, scene_scoring
 from r3dpa.cli import main
 from r3dpa.generation import SceneGenerator
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
@@ -35,7 +34,7 @@ NO_FEATURES += ["--data.init_args.extractor=null"]
 def coarse_protocols(monkeypatch):
     """Cells of half a metre: a hundredth of the work."""
     coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
-    monkeypatch.setattr(callbacks, "PROTOCOLS", coarse)
+    monkeypatch.setattr(scene_scoring, "PROTOCOLS", coarse)
 
 
 @pytest.fixture(scope="module")

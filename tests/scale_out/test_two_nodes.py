@@ -17,7 +17,7 @@ import torch
 import yaml
 from cluster import PYTHON, Node, child_of, finish, two_nodes
 
-from r3dpa import callbacks
+from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
 from r3dpa.data import FeatureGrids, find_scans
 from r3dpa.geometry import LidarSensor, SphericalProjection
@@ -221,7 +221,7 @@ def test_scores_are_those_of_one_process(nodes, fit, one, tmp_path, monkeypatch)
     """Scenes and comparison are the same to the last bit; metres of error are means over a
     batch, of which two processes have others (5e-4 seen)."""
     coarse = {"default": replace(DEFAULT, voxel_m=0.5)}  # a hundredth of the work
-    monkeypatch.setattr(callbacks, "PROTOCOLS", coarse)
+    monkeypatch.setattr(scene_scoring, "PROTOCOLS", coarse)
     more = ["--ckpt_path", str(one / "checkpoints" / "last.ckpt"), "--scorer.spaces", "[fgeo]"]
     main(["test", *fit(tmp_path / "coarse", 2, *more)[1:]])
     reference = tmp_path / "coarse" / "evaluation" / "reference.safetensors"

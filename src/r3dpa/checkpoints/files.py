@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import hashlib
 import json
 import pickle
@@ -57,7 +56,6 @@ _LIGHTNING = {
 }
 
 
-@functools.cache
 def read_checkpoint(
     path: str | Path,
     *,

@@ -113,7 +113,7 @@ def _autoguidance(
     checkpoint: Checkpoint, guide: WeakGuide, weights: Literal["ema", "last"], device: str
 ) -> tuple[Autoguidance, dict[str, Any]]:
     """The weak model, and what the metadata tell of it."""
-    from r3dpa.snapshots import read_snapshot  # brings lightning, which takes seconds
+    from r3dpa.checkpoints.snapshots import read_snapshot
 
     weak = read_snapshot(guide.path, checkpoint, weights, guide.allow)
     about = {

@@ -1,29 +1,22 @@
-"""Early averages of the SiT: kept while training, read back as weak models for autoguidance."""
+"""Early averages of the SiT read back as weak models for autoguidance."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal
 
-import lightning as L
 import torch
-from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
-from r3dpa.checkpoints import (
-    Checkpoint,
-    NetworkState,
-    read_checkpoint,
-    save_checkpoint,
-    weights_sha256,
-)
-from r3dpa.modules import GenerativeModule
+from r3dpa.checkpoints.files import read_checkpoint
+from r3dpa.checkpoints.fingerprint import weights_sha256
+from r3dpa.checkpoints.networks import Checkpoint
 from r3dpa.nn import LatentNorm, VelocityNetwork
 
-__all__ = ["NORM_TOLERANCE", "EMASnapshots", "WeakModel", "read_snapshot"]
+__all__ = ["NORM_TOLERANCE", "WeakModel", "read_snapshot", "vae_fingerprint"]
 
 NORM_TOLERANCE = 0.05
 """Largest difference between channels in how the latent scales of two models differ.
@@ -32,85 +25,6 @@ On the latents of a frozen VAE at demo size, two running statistics 100 to 900 s
 up to 0.031 at batch 4 and 0.014 at batch 32. For Gaussian latents a difference d moves what the
 weak model expects by at most 0.77 d standard deviations.
 """
-
-_NORM_ARGS = ("channels", "eps", "momentum", "legacy_inverse", "replace_non_finite")
-
-
-class EMASnapshots(L.Callback):
-    """Keeps the averaged SiT at a few early steps, as weak models for autoguidance.
-
-    Each step makes ``<run_dir>/<folder>/step_<step>.safetensors`` with its ``.yaml``: average,
-    latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
-    file that exists is never replaced, so a resumed run adds those that are missing and still
-    ahead. A stage without average, or without a SiT, keeps none and says so.
-
-    Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
-
-    Args:
-        fractions: Steps as parts of ``trainer.max_steps``, each in (0, 1].
-        steps: Optimiser steps, at least 1; where given, ``fractions`` do not count.
-        folder: Below the folder of the run.
-
-    Raises:
-        ValueError: If a number is out of its range.
-    """
-
-    def __init__(
-        self,
-        fractions: Sequence[float] = (1 / 32, 1 / 16, 1 / 8),
-        steps: Sequence[int] | None = None,
-        folder: str = "snapshots",
-    ) -> None:
-        if not all(0 < fraction <= 1 for fraction in fractions):
-            raise ValueError(f"snapshot fractions must be in (0, 1], got {list(fractions)}")
-        if steps is not None and not all(step >= 1 for step in steps):
-            raise ValueError(f"snapshot steps must be at least 1, got {list(steps)}")
-        self.fractions = tuple(fractions)
-        self.steps = None if steps is None else frozenset(steps)
-        self.folder = folder
-        self._due: frozenset[int] = frozenset()
-
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Works out the steps, and refuses early what could not be written.
-
-        Raises:
-            ValueError: If the number of steps is not known, or the module not its configuration.
-        """
-        self._due = frozenset()
-        if not isinstance(pl_module, GenerativeModule) or pl_module.ema is None:
-            stage = getattr(pl_module, "stage", type(pl_module).__name__)
-            rank_zero_info(f"stage {stage} averages no SiT: no snapshots are kept")
-            return
-        _sit_config(pl_module)
-        if cast(Any, trainer).fast_dev_run:
-            return
-        if self.steps is not None:
-            self._due = self.steps
-        elif trainer.max_steps > 0:
-            self._due = frozenset(max(1, round(f * trainer.max_steps)) for f in self.fractions)
-        else:
-            raise ValueError(
-                f"EMASnapshots needs to know the length of the training, but trainer.max_steps is "
-                f"{trainer.max_steps}: set it, or give the callback steps"
-            )
-
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
-        """Writes the snapshot of this step if one is due and not there yet."""
-        if trainer.global_step not in self._due or not trainer.is_global_zero:
-            return
-        assert isinstance(pl_module, GenerativeModule)
-        step = trainer.global_step
-        path = Path(trainer.default_root_dir) / self.folder / f"step_{step:07d}.safetensors"
-        if not path.exists():  # with accumulated gradients, several batches end at one step
-            # A description without weights may be left of a run that was killed: overwrite.
-            save_checkpoint(_checkpoint(pl_module, path, step), path, overwrite=True)
 
 
 @dataclass(frozen=True)
@@ -151,7 +65,7 @@ def read_snapshot(
     what moved in mean and scale.
 
     Args:
-        path: File of :class:`EMASnapshots`, or another checkpoint.
+        path: File of :class:`r3dpa.callbacks.EMASnapshots`, or another checkpoint.
         strong: Checkpoint of the model to be guided.
         weights: Whose latent statistics it uses, those of the average or of the last step.
         allow: Warn of latents that differ instead of refusing them.
@@ -206,45 +120,15 @@ def read_snapshot(
     return WeakModel(Path(path), sit, scale, shift, checkpoint.step, checkpoint.feature_source)
 
 
-def _checkpoint(module: GenerativeModule, path: Path, step: int) -> Checkpoint:
-    assert module.ema is not None
-    about: dict[str, Any] = {"state_dict": {}}
-    module.on_save_checkpoint(about)
-    config, sit, norm = _sit_config(module), module.ema.sit, module.ema.latent_norm
-    networks = {
-        "ema": NetworkState(config["class_path"], config.get("init_args") or {}, sit.state_dict()),
-        "ema_latent_norm": NetworkState.of(
-            norm, {name: getattr(norm, name) for name in _NORM_ARGS}
-        ),
-    }
-    return Checkpoint(
-        path=path,
-        networks=networks,
-        step=step,
-        left_out={"vae": _note(module.vae.state_dict())},
-        **about["r3dpa"],
-    )
-
-
-def _sit_config(module: GenerativeModule) -> Mapping[str, Any]:
-    """Class and arguments of the SiT, as ``r3dpa fit`` records them."""
-    config = module.hparams["sit"]
-    if not isinstance(config, Mapping):
-        raise ValueError(
-            "EMASnapshots writes class and arguments of the SiT, which a module built by hand does "
-            "not know; train with `r3dpa fit`, or leave the callback out"
-        )
-    return config
-
-
 def _vae_note(checkpoint: Checkpoint) -> str | None:
-    """What tells the VAE of a checkpoint from others; None if nothing does, which is no VAE's."""
+    """Fingerprint of the VAE of a checkpoint, None if it has none."""
     if "vae" in checkpoint.networks:
-        return _note(checkpoint.network("vae").state_dict)
+        return vae_fingerprint(checkpoint.network("vae").state_dict)
     return checkpoint.left_out.get("vae")
 
 
-def _note(vae: Mapping[str, Tensor]) -> str:
+def vae_fingerprint(vae: Mapping[str, Tensor]) -> str:
+    """Description of a VAE that a snapshot leaves out: the hash of its weights."""
     return f"not kept in a snapshot; SHA-256 of its weights: {weights_sha256(vae)}"
 
 

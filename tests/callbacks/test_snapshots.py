@@ -13,13 +13,14 @@ import torch
 import yaml
 from tiny_networks import VAE_ARGS
 
+from r3dpa.callbacks import EMASnapshots
 from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint, weights_sha256
+from r3dpa.checkpoints.snapshots import read_snapshot
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import FlowMatching, VAEAlignment
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
-from r3dpa.snapshots import EMASnapshots, read_snapshot
 
 GEOMETRY = ScanGeometry(
     SphericalProjection(LidarSensor(beams=16, columns=64)), RangeCodec(), (2, 8)
@@ -190,7 +191,7 @@ def test_numbers_out_of_range_are_refused(arguments, given):
 
 def test_a_run_of_the_command_line_keeps_and_extends_them(smoke_args, vae_checkpoint, tmp_path):
     config = tmp_path / "snapshots.yaml"
-    callback = {"class_path": "r3dpa.snapshots.EMASnapshots", "init_args": {"steps": [1, 2, 3]}}
+    callback = {"class_path": "r3dpa.callbacks.EMASnapshots", "init_args": {"steps": [1, 2, 3]}}
     config.write_text(yaml.safe_dump({"trainer": {"callbacks": [callback], "logger": False}}))
     words = smoke_args("flow_matching", tmp_path / "run", "--config", str(config))
     words += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.limit_val_batches=0"]

@@ -1,0 +1,182 @@
+"""Checkpoints of a run: written whole, on time, at the end and when a signal asks to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any, cast
+
+import lightning as L
+import torch
+from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities import rank_zero_info
+
+from r3dpa.io import atomic_path
+from r3dpa.modules.guards import StepGuard
+
+__all__ = ["AtomicCheckpointIO", "RunCheckpoint"]
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes checkpoints beside their place, then renames them: no moment has half a file there.
+
+    Lightning's own writes to the system's folder for temporary files. Where that is on another disk
+    than the run, its last move is a copy over the checkpoint before, which a kill or a full disk
+    leaves cut short.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
+    ) -> None:
+        """Writes a checkpoint.
+
+        Args:
+            checkpoint: What to write.
+            path: Its file.
+            storage_options: Refused, as by Lightning's own.
+
+        Raises:
+            OSError: If it cannot be written; names the file and the reason. A checkpoint that was
+                there before stays.
+        """
+        if storage_options is not None:
+            raise TypeError(f"{type(self).__name__} knows no storage_options")
+        # A file object: what torch opens itself fails without telling why.
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            torch.save(checkpoint, file)
+            file.flush()
+            os.fsync(file.fileno())  # else a loss of power could leave an empty file of this name
+
+
+class RunCheckpoint(ModelCheckpoint):
+    """ModelCheckpoint whose ``last.ckpt`` holds the last step, whatever the saving interval.
+
+    Lightning's own saves at the end of training only if it has never saved before.
+
+    A SIGTERM, as job systems send it before they end a job, and Ctrl-C (SIGINT) are obeyed after
+    the next optimiser step, or by a single process after the next batch of a validation:
+    ``last.ckpt`` is saved and the process ends with status 143 or 130. It is enough that one of
+    several gets the signal. A second Ctrl-C ends a single process at once, without saving.
+
+    Several processes that go on from different checkpoints, as copies on the disks of their own
+    may be, are refused.
+    """
+
+    _signal = 0  # that asked to stop
+    _step = 0  # optimiser steps when a batch ended last
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Has checkpoints written whole, unless a strategy or plugin writes them its own way."""
+        super().setup(trainer, pl_module, stage)
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Takes the signals over from Lightning, which ends training without saving.
+
+        Raises:
+            ValueError: If the processes are at different steps.
+        """
+        super().on_train_start(trainer, pl_module)
+        first = trainer.strategy.broadcast(trainer.global_step)
+        if trainer.global_step != first:
+            raise ValueError(
+                f"process {trainer.global_rank} goes on from step {trainer.global_step} of "
+                f"{trainer.ckpt_path}, the first one from step {first}: give all processes the "
+                "same checkpoint, on a disk that all see, by its full name"
+            )
+        self._step = trainer.global_step
+        self._signal = signal.SIGTERM if trainer.received_sigterm else 0
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):  # Lightning restores those before
+
+                def stop(asked: int, _: object) -> None:
+                    if self._signal == asked == signal.SIGINT and trainer.world_size == 1:
+                        raise KeyboardInterrupt  # of several, torchrun sends each another one
+                    self._signal = asked
+
+                signal.signal(number, stop)
+
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Has the guard of the step tell the other processes who asked to stop: no talk more."""
+        guard = getattr(pl_module, "guard", None)
+        if isinstance(guard, StepGuard):
+            guard.stop = self._signal
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Saves where it is time to; then stops where that was asked for."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if trainer.global_step != self._step:  # else gradients are still to be accumulated
+            self._step = trainer.global_step
+            self._stop_if_asked(trainer)
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Stops where that was asked for: a validation may take longer than a job system waits.
+
+        Several processes wait for the next step: they may have unequal numbers of batches here.
+        """
+        if trainer.state.fn == "fit" and not trainer.sanity_checking and trainer.world_size == 1:
+            self._stop_if_asked(trainer)
+
+    def _asked(self, trainer: L.Trainer) -> int:
+        """Signal that asked any process to stop, 0 for none; the same answer in all of them."""
+        guard = getattr(trainer.lightning_module, "guard", None)
+        if trainer.world_size == 1:
+            return self._signal
+        if isinstance(guard, StepGuard):
+            return guard.stop
+        asked = torch.tensor(self._signal, device=trainer.strategy.root_device)
+        return int(trainer.strategy.reduce(asked, reduce_op="max"))
+
+    def _stop_if_asked(self, trainer: L.Trainer) -> None:
+        number = self._asked(trainer)
+        if not number:
+            return
+        if not self._should_skip_saving_checkpoint(trainer):
+            self.save_last = True  # else the steps since the last saving would be lost
+            self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
+        rank_zero_info(
+            f"stopped by {signal.Signals(number).name} after step {trainer.global_step}: the same "
+            f"command goes on with --ckpt_path {self.last_model_path}"
+        )
+        raise SystemExit(128 + number)  # as a shell reports it
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Saves unless the last step is saved already, or this is a ``fast_dev_run``."""
+        if cast(Any, trainer).fast_dev_run:
+            return  # Lightning would save here, though nowhere else
+        if self._last_global_step_saved != trainer.global_step:
+            self._last_checkpoint_saved = ""
+        super().on_train_end(trainer, pl_module)
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Saves where all steps were trained before, but ``last.ckpt`` is older: of a killed run.
+
+        Lightning ends such a training without calling ``on_train_end``.
+        """
+        super().on_fit_end(trainer, pl_module)
+        resumed = Path(trainer.ckpt_path or "")
+        if resumed.name != f"{self.CHECKPOINT_NAME_LAST}.ckpt" and not (
+            self._should_skip_saving_checkpoint(trainer)
+        ):
+            self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))

@@ -1,0 +1,128 @@
+"""Reconstructions as files, and pictures of a validation or test run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import WandbLogger
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from r3dpa import viz
+from r3dpa.data import write_bin
+from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import points_of
+from r3dpa.modules import GenerativeModule
+from r3dpa.nn import EMA
+
+__all__ = ["PictureLogger", "ReconstructionWriter"]
+
+
+class ReconstructionWriter(L.Callback):
+    """Writes what ``r3dpa predict`` reconstructs, as ``<run_dir>/reconstructions/<scan>.bin``."""
+
+    def on_predict_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Writes the points of each reconstructed range image, intensity 0."""
+        if not isinstance(pl_module, GenerativeModule):
+            raise TypeError(f"needs a GenerativeModule, got {type(pl_module).__name__}")
+        folder = Path(trainer.default_root_dir) / "reconstructions"
+        for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
+            points = points_of(range_m, pl_module.scan_geometry.projection)
+            write_bin(folder / f"{name}.bin", points)
+
+
+class PictureLogger(L.Callback):
+    """Draws a held-out reconstruction and a few samples after each validation or test run.
+
+    Pictures go to ``<run_dir>/pictures`` and, where a WandbLogger is attached, to wandb.
+
+    Args:
+        num_scenes: Scenes to sample; 0 samples none.
+        steps: Euler steps of those samples.
+        seed: Seed of those samples.
+    """
+
+    def __init__(self, num_scenes: int = 4, steps: int = 32, seed: int = 0) -> None:
+        self.num_scenes = num_scenes
+        self.sampler = SamplerConfig(solver="euler", steps=steps)
+        self.seed = seed
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draws after a validation run, but not after the sanity check."""
+        if not trainer.sanity_checking:
+            self._draw(trainer, pl_module, "val")
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draws after a test run."""
+        self._draw(trainer, pl_module, "test")
+
+    def _draw(self, trainer: L.Trainer, module: L.LightningModule, split: str) -> None:
+        if not trainer.is_global_zero:
+            return
+        if not isinstance(module, GenerativeModule):
+            raise TypeError(f"PictureLogger draws GenerativeModules, got {type(module).__name__}")
+        datamodule = getattr(trainer, "datamodule", None)
+        if not isinstance(datamodule, LidarDataModule):
+            raise TypeError(
+                f"PictureLogger needs a LidarDataModule, got {type(datamodule).__name__}"
+            )
+        pictures = {}
+        if datamodule.val_set:
+            image = datamodule.val_set[len(datamodule.val_set) // 2]["range_image"]
+            pictures["reconstruction"] = self._reconstruction(module, image)
+        if self.num_scenes and module.ema is not None:
+            pictures["samples"] = self._samples(module, module.ema)
+        folder = Path(trainer.default_root_dir) / "pictures"
+        step = trainer.global_step or module.loaded_step
+        for name, figure in pictures.items():
+            path = viz.save(figure, folder / f"{split}_{name}_{step:07d}.png")
+            for logger in trainer.loggers:
+                if isinstance(logger, WandbLogger):
+                    logger.log_image(f"{split}/{name}", [str(path)])
+
+    @torch.inference_mode()
+    def _reconstruction(self, module: GenerativeModule, image: Tensor) -> Figure:
+        image = image[None].to(module.device)
+        geometry = module.scan_geometry
+        sensor = geometry.projection.sensor
+        range_m = geometry.codec.decode(image[0, 0], sensor)
+        found_m = geometry.codec.decode(module.reconstruct(image)[0, 0].float(), sensor)
+        both = (range_m > 0) & (found_m > 0)
+        error_m = (range_m - found_m).abs()[both].mean().item()
+        agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
+        return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
+
+    def _samples(self, module: GenerativeModule, average: EMA) -> Figure:
+        generator = averaged_generator(module, average, self.sampler)
+        scenes = generator.generate(range(self.num_scenes), self.seed)
+        return viz.scenes_sheet(list(scenes.range_m.cpu()), generator.geometry.projection)
+
+
+def averaged_generator(
+    module: GenerativeModule,
+    average: EMA,
+    sampler: SamplerConfig,
+    precision: Literal["fp32", "bf16"] = "fp32",
+) -> SceneGenerator:
+    """Samples from the averaged weights of a module."""
+    return SceneGenerator(
+        module.vae,
+        average.sit,
+        average.latent_norm,
+        module.scan_geometry,
+        sampler,
+        module.interpolant.path,
+        precision,
+    )

@@ -1,0 +1,278 @@
+"""Scenes sampled after a test run and compared with real scans."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from lightning.pytorch.utilities import rank_zero_info
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from tqdm import tqdm
+
+from r3dpa.callbacks.pictures import averaged_generator
+from r3dpa.data import Scan
+from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.generation import SamplerConfig
+from r3dpa.geometry import points_of
+from r3dpa.io import atomic_path, source_commit
+from r3dpa.metrics.evaluation import TooFewScenesError, check_counts
+from r3dpa.metrics.protocol import PROTOCOLS
+from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
+from r3dpa.modules import GenerativeModule
+from r3dpa.scoring import (
+    AnyReference,
+    cached_reference,
+    compare,
+    feature_spaces,
+    load_reference,
+    reference_spaces,
+    report,
+    save_reports,
+)
+
+__all__ = ["SceneScorer"]
+
+_SAMPLER = SamplerConfig()
+_OPTION = "--scorer.{} true"  # how the SceneScorer of `r3dpa test` is told to allow something
+
+
+class SceneScorer(L.Callback):
+    """Samples scenes after a test run and tells how near they are to real scans.
+
+    The processes share the sampling; the first one compares. Scenes are sampled in the same
+    batches whatever the number of processes, so that the numbers do not depend on it. It prints
+    the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and writes them with
+    tables and figures to ``<run_dir>/evaluation``, which all processes must see.
+
+    A stage that trains no velocity has nothing to sample, and says so.
+
+    Args:
+        num_scenes: Scenes to sample, more than there are features; 0 samples none.
+        batch_size: Scenes sampled together.
+        sampler: Solver and steps.
+        precision: Of the networks that sample.
+        seed: Of the scenes, see :class:`SceneGenerator`.
+        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``. Without it,
+            all scans of the data module are the reference, training and held-out; their statistics
+            are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
+        split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
+        spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
+        ckpt: Official weights by space.
+        protocol: ``default`` or ``published``; where None, that of the reference file, or
+            ``default`` without one.
+        allow_few: Accept fewer scenes than features: only to try it.
+        skip_bad: Leave out scenes that cannot be used, such as those without any return; the tables
+            tell how many and the numbers' file which. Else the first one ends the test.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        num_scenes: int = 256,
+        batch_size: int = 8,
+        sampler: SamplerConfig = _SAMPLER,
+        precision: Literal["fp32", "bf16"] = "fp32",
+        seed: int = 0,
+        reference: str | None = None,
+        split: Literal["val", "all"] | None = None,
+        spaces: list[str] | None = None,
+        ckpt: dict[str, str] | None = None,
+        protocol: Literal["default", "published"] | None = None,
+        allow_few: bool = False,
+        skip_bad: bool = True,
+    ) -> None:
+        for name, value, least in (
+            ("num_scenes", num_scenes, 0),
+            ("batch_size", batch_size, 1),
+            ("seed", seed, 0),
+        ):
+            if value < least:
+                raise ValueError(f"scorer.{name} must be at least {least}, got {value}")
+        self.num_scenes = num_scenes
+        self.batch_size = batch_size
+        self.sampler = sampler
+        self.precision = precision
+        self.seed = seed
+        self.reference = reference
+        self.split = split
+        self.spaces = spaces
+        self.ckpt = ckpt or {}
+        self.protocol = protocol
+        self.allow_few = allow_few
+        self.skip_bad = skip_bad
+        self._job: tuple[AnyReference, list[SceneFeatures], list[Scan]] | None = None
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Checks all that can be checked before scenes are sampled."""
+        self._job = None
+        if not isinstance(pl_module, GenerativeModule) or not self.num_scenes:
+            return
+        if pl_module.ema is None:
+            rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
+            return
+        datamodule = getattr(trainer, "datamodule", None)
+        if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
+            raise TypeError(f"SceneScorer needs a LidarDataModule, got {type(datamodule).__name__}")
+        device = str(pl_module.device)
+        counts, statistics = {"generated scenes": self.num_scenes}, self._loaded()
+        scans: list[Scan] = []
+        if statistics is not None:
+            spaces = reference_spaces(statistics, self.spaces, self.ckpt, self.protocol, device)
+        else:
+            scans = datamodule.all_set.scans
+            setting = PROTOCOLS[self.protocol or "default"].with_sensor(datamodule.sensor)
+            names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
+            spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)
+            about = {
+                "data": str(datamodule.scans),
+                "split": "all",
+                "scans_sha256": _stamp(scans),  # names may stay
+                "commit": source_commit(),
+            }
+            scan_names = [scan.name for scan in scans]
+            statistics = ReferenceStatistics.prepare(spaces, setting, scan_names, about)
+        if isinstance(statistics, ReferenceStatistics):
+            counts["real scans"] = len(statistics.names)
+        check_counts(counts, spaces, self.allow_few, _OPTION)
+        self._job = (statistics, spaces, scans)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Samples and compares."""
+        if self._job is None or not isinstance(pl_module, GenerativeModule):
+            return
+        statistics, spaces, scans = self._job
+        self._job = None
+        folder = Path(trainer.default_root_dir) / "evaluation"
+        self._sample(trainer, pl_module, folder)
+        trainer.strategy.barrier("SceneScorer")
+        if not trainer.is_global_zero:
+            return
+        made_with = self._made_with(trainer, pl_module, folder)
+        if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
+            path = folder / "reference.safetensors"
+            statistics = cached_reference(statistics, scans, spaces, path)
+        try:
+            evaluation, comparison = compare(
+                self._sampled(pl_module, folder, statistics),
+                statistics,
+                spaces,
+                label=folder.absolute().parent.name,
+                source=str(trainer.ckpt_path),
+                made_with=made_with,
+                commit=source_commit(),
+                allow_few=True,  # checked before; what falls out later is told
+                skip_bad=self.skip_bad,
+                option=_OPTION,
+            )
+        except TooFewScenesError as error:  # the losses of the test are still to be printed
+            trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
+            return
+        shutil.rmtree(_parts(folder))
+        save_reports(evaluation, comparison, statistics, folder)
+        trainer.print(report(evaluation, statistics))
+        _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
+
+    def _loaded(self) -> AnyReference | None:
+        """The reference file, None without one."""
+        if self.reference is None:
+            return None
+        try:
+            return load_reference(Path(self.reference), self.split)
+        except ValueError as error:
+            raise ValueError(f"scorer.reference: {error}") from error
+
+    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> None:
+        """Writes the batches of this process."""
+        assert module.ema is not None
+        generator = averaged_generator(module, module.ema, self.sampler, self.precision)
+        starts = range(0, self.num_scenes, self.batch_size)
+        quiet = None if trainer.is_global_zero else True
+        for first in tqdm(
+            starts[trainer.global_rank :: trainer.world_size],
+            "sampling",
+            unit="batch",
+            disable=quiet,
+        ):
+            indices = range(first, min(first + self.batch_size, self.num_scenes))
+            scenes = generator.generate(indices, self.seed)
+            part = {"range_m": scenes.range_m.cpu().contiguous(), "nfe": torch.tensor(scenes.nfe)}
+            with atomic_path(_part(folder, first)) as temporary:
+                save_file(part, temporary)
+
+    def _made_with(
+        self, trainer: L.Trainer, module: GenerativeModule, folder: Path
+    ) -> dict[str, Any]:
+        """What made the scenes; ``nfe`` is the mean over all of them, whoever drew them."""
+        total = 0
+        for first in range(0, self.num_scenes, self.batch_size):
+            with safe_open(_part(folder, first), framework="pt") as file:
+                num = file.get_slice("range_m").get_shape()[0]
+                total += num * int(file.get_tensor("nfe"))
+        nfe = total / self.num_scenes  # whole but for a solver that chooses its steps
+        nfe = int(nfe) if nfe.is_integer() else nfe
+        return {
+            "solver": self.sampler.solver,
+            "steps": self.sampler.steps,
+            "seed": self.seed,
+            "precision": self.precision,
+            "feature_source": module.feature_source,
+            "checkpoint": str(trainer.ckpt_path),
+            "stage": module.stage,
+            "step": trainer.global_step or module.loaded_step,
+            "weights": "ema",
+            "nfe": nfe,
+            "sampler": asdict(self.sampler),
+        }
+
+    def _sampled(
+        self, module: GenerativeModule, folder: Path, statistics: AnyReference
+    ) -> Iterator[EvaluationScene]:
+        """Scenes of all processes, in order; as points where the reference has other pixels."""
+        projection = module.scan_geometry.projection
+        for first in range(0, self.num_scenes, self.batch_size):
+            images = load_file(_part(folder, first))["range_m"]
+            for index, range_m in enumerate(images, first):
+                name = f"{index:06d}"
+                if projection == statistics.protocol.projection:
+                    yield EvaluationScene(name, None, range_m)
+                else:
+                    yield EvaluationScene(name, points_of(range_m, projection))
+
+
+def _stamp(scans: Sequence[Scan]) -> str:
+    """Hash of names, sizes and times of change: scans replaced by others of their names differ."""
+    stats = [(scan.name, scan.path.stat()) for scan in scans]
+    told = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    return hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def _parts(folder: Path) -> Path:
+    return folder / "sampled"
+
+
+def _part(folder: Path, first: int) -> Path:
+    """File of the batch that starts with this scene."""
+    return _parts(folder) / f"{first:06d}.safetensors"
+
+
+def _log(trainer: L.Trainer, evaluation: Evaluation, step: int) -> None:
+    values = {
+        f"test/{row.name.replace(' ', '_')}": row.value
+        for row in evaluation.rows
+        if row.value is not None
+    }
+    for logger in trainer.loggers:
+        logger.log_metrics(values, step)
+        logger.save()
