@@ -6,16 +6,27 @@ drawn at random here: scenes then differ from each other, and hold pixels with a
 
 from __future__ import annotations
 
+import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from tiny_networks import tiny_networks
+from tiny_networks import SIT_ARGS, VAE_ARGS, tiny_networks
 
+import r3dpa
+from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.flow import ODE_SOLVERS, euler_maruyama, ode_times, sde_times
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
+from r3dpa.geometry import (
+    LidarSensor,
+    RangeCodec,
+    ScanGeometry,
+    SphericalProjection,
+    points_of,
+    range_image,
+)
 from r3dpa.nn import LatentNorm
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
@@ -384,3 +395,79 @@ def test_preparing_says_what_the_first_scene_would(monkeypatch):
     scenes.prepare()
     scenes.generate([0])
     assert len(asked) == 1
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """File whose last weights and statistics differ from the averaged ones."""
+    vae, last, norm = tiny_networks()
+    _, average, average_norm = tiny_networks(spread=0.2)
+    average_norm.running_mean.add_(0.1)
+    networks = {
+        "vae": NetworkState.of(vae, VAE_ARGS),
+        "sit": NetworkState.of(last, SIT_ARGS),
+        "latent_norm": NetworkState.of(norm, {"channels": 4}),
+        "ema": NetworkState.of(average, SIT_ARGS),
+        "ema_latent_norm": NetworkState.of(average_norm, {"channels": 4}),
+    }
+    content = Checkpoint(
+        "tiny", "joint", networks, geometry=GEOMETRY.to_dict(), interpolant="cosine"
+    )
+    path = tmp_path_factory.mktemp("checkpoint") / "joint.safetensors"
+    return save_checkpoint(content, path)
+
+
+@pytest.mark.parametrize("weights", ["ema", "last"])
+def test_a_checkpoint_is_sampled_with_the_weights_asked_for(checkpoint, weights):
+    """Averaged weights with their own statistics by default, on the path of the training."""
+    options = {} if weights == "ema" else {"weights": "last"}
+    found = r3dpa.SceneGenerator.from_checkpoint(checkpoint, ODE, **options).generate(2, seed=1)
+    _, sit, norm = tiny_networks(spread=0.2 if weights == "ema" else 0.1)
+    if weights == "ema":
+        norm.running_mean.add_(0.1)
+    expected = SceneGenerator(tiny_networks()[0], sit, norm, GEOMETRY, ODE, "cosine")
+    expected = expected.generate(range(2), seed=1)
+    assert torch.equal(found.latents, expected.latents)
+    assert torch.equal(found.range_m, expected.range_m)
+    assert torch.equal(found.points(1), points_of(expected.range_m[1], GEOMETRY.projection))
+    assert len(found) == 2
+
+
+def test_a_checkpoint_is_sampled_in_good_quality_by_default(checkpoint):
+    scenes = SceneGenerator.from_checkpoint(str(checkpoint))
+    assert scenes.sampler == SamplerConfig.of_quality("good")
+    assert scenes.interpolant.path == "cosine"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stage": "vae_alignment"}, "trains no velocity; sample from .* joint or flow_matching"),
+        ({"geometry": None}, "does not record which sensor"),
+        ({"networks": {}}, "has no vae"),
+    ],
+)
+def test_checkpoints_that_cannot_be_sampled_are_refused(checkpoint, change, message):
+    with pytest.raises(ValueError, match=message):
+        SceneGenerator.from_checkpoint(replace(read_checkpoint(checkpoint), **change))
+
+
+def test_vae_of_a_checkpoint_encodes_and_decodes_a_scan(checkpoint):
+    """From points to the posterior mean, and back to points on the rays of the pixels."""
+    vae = r3dpa.SceneVAE.from_checkpoint(checkpoint)
+    points = 10 * torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1, 1, 0.1])
+    )
+    latents = vae.encode(torch.cat([points, torch.ones(500, 1)], dim=1).numpy())
+    image = GEOMETRY.codec.encode(range_image(points, GEOMETRY.projection)[0])
+    assert torch.equal(latents, vae.vae.encode(image[None, None]).mean)
+    scene = vae.decode(latents)
+    assert scene.range_m.shape == (1, 16, 64)
+    assert len(scene.points(0)) == (scene.range_m > 0).sum()
+
+
+def test_importing_the_package_imports_no_torch():
+    code = "import sys, r3dpa; assert 'torch' not in sys.modules; r3dpa.__version__"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="has no attribute 'SceneMaker'"):
+        r3dpa.SceneMaker  # noqa: B018

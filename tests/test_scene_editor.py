@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_networks import tiny_networks
+from tiny_networks import tiny_checkpoint, tiny_networks
 
 from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
 from r3dpa.geometry.regions import angle_box, dropped_beams, sector_weights, token_mask
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
@@ -214,3 +214,12 @@ def test_starts_outside_are_refused(editor, scan, start):
 def test_noise_is_that_of_the_generator(editor):
     drawn = next(editor._draws([4], 7))
     assert drawn[0].equal(torch.randn(4, 4, 16, generator=scene_random(7, 4)))
+
+
+def test_a_checkpoint_is_edited_with_its_averaged_weights(tmp_path, scan):
+    path = tiny_checkpoint(tmp_path / "tiny.safetensors", GEOMETRY, spread=0.05)
+    found = SceneEditor.from_checkpoint(path, SETTINGS).vary(scan, 2)
+    networks = tiny_networks(spread=0.05)
+    expected = SceneEditor(SceneGenerator(*networks, GEOMETRY), SETTINGS).vary(scan, range(2))
+    assert torch.equal(found.latents, expected.latents)
+    assert torch.equal(found.points(1), points_of(expected.range_m[1], GEOMETRY.projection))

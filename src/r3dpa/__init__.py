@@ -1,3 +1,24 @@
 """LiDAR scene generation with 3D representation alignment (R3DPA)."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from r3dpa.editing import SceneEditor
+    from r3dpa.generation import SceneGenerator, SceneVAE
+
 __version__ = "0.1.0"
+__all__ = ["SceneEditor", "SceneGenerator", "SceneVAE", "__version__"]
+
+_MODULES = {
+    "SceneEditor": "r3dpa.editing",
+    "SceneGenerator": "r3dpa.generation",
+    "SceneVAE": "r3dpa.generation",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public class on first use: torch takes seconds."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'r3dpa' has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

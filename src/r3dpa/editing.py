@@ -8,16 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
 
+from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.editing import Trajectory, invert, kept, renoised, spherical_mean
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
 from r3dpa.flow.times import batch_time, ode_times
-from r3dpa.generation import SceneGenerator, scene_random
+from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices, scene_random
 from r3dpa.geometry.gaps import filled, range_error_m, refined
 from r3dpa.geometry.regions import check_mask, mask_of_tokens, token_mask
 
@@ -79,24 +81,19 @@ class EditSettings:
         return ode_times(self.steps, start, shift=self.shift)
 
 
-class EditResult(NamedTuple):
-    """What an edit made, on the CPU.
+@dataclass(frozen=True, eq=False)
+class EditResult(SceneBatch):
+    """Edited scenes, on the CPU; ``nfe`` includes the evaluations of an inversion.
 
     Attributes:
-        range_m: ``(B, H, W)`` metres, -1 without a return.
-        latents: ``(B, C, h, w)`` normalised, before they were decoded.
-        nfe: Network evaluations per scene, those of its inversion included.
-        vae_error_m: Mean absolute range error of the scans behind encoder and decoder alone; None
+        vae_error_m: Mean absolute range error of the scans after encoder and decoder alone; None
             where no scan is encoded.
-        round_trip_m: Mean absolute range error of what comes back from noise without an edit,
-            against the same; at most this is added to ``vae_error_m``. None without inversion.
-        cosine: ``(B,)`` mean cosine between projected features of the latents and what guided
-            them; None without features.
+        round_trip_m: Mean absolute range error of inversion and back without an edit, relative to
+            the same; at most this is added to ``vae_error_m``. None without inversion.
+        cosine: ``(B,)`` mean cosine between projected features of the latents and the features
+            that guided them; None without features.
     """
 
-    range_m: Tensor
-    latents: Tensor
-    nfe: int
     vae_error_m: float | None = None
     round_trip_m: float | None = None
     cosine: Tensor | None = None
@@ -134,6 +131,27 @@ class SceneEditor:
         for network in (generator.sit, generator.vae):
             network.requires_grad_(False)
 
+    @classmethod
+    def from_checkpoint(
+        cls,
+        checkpoint: str | Path | Checkpoint,
+        settings: EditSettings = EditSettings(),
+        *,
+        weights: Literal["ema", "last"] = "ema",
+        device: str = "auto",
+        batch_size: int = 8,
+    ) -> Self:
+        """Rebuilds the networks of a checkpoint, as :meth:`SceneGenerator.from_checkpoint`.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it cannot be sampled from, or ``batch_size`` is below 1.
+        """
+        generator = SceneGenerator.from_checkpoint(
+            checkpoint, SamplerConfig(), weights=weights, device=device
+        )
+        return cls(generator, settings, batch_size)
+
     @torch.no_grad()
     def encode(self, range_m: Tensor) -> Tensor:
         """Normalised latents ``(B, C, h, w)`` of range images ``(B, H, W)``, means of the VAE."""
@@ -145,7 +163,7 @@ class SceneEditor:
         self,
         range_m: Tensor,
         pixel_mask: Tensor,
-        indices: Sequence[int],
+        indices: int | Sequence[int],
         seed: int = 0,
         *,
         feature: Tensor | None = None,
@@ -162,7 +180,7 @@ class SceneEditor:
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
             pixel_mask: ``(H, W)`` bool, True where the scan is to change.
-            indices: Numbers of the results.
+            indices: Numbers of the results, or how many.
             seed: Number of their collection.
             feature: ``(F,)`` feature of the object; no guidance where None.
             start: Time that the way back starts from, in (0, 1]; below 1 some of what was there
@@ -201,14 +219,14 @@ class SceneEditor:
         decoded = self._decoded(made)
         pasted = torch.where(pixel_mask, decoded, range_m)
         errors = self._errors(range_m[None], latents, trajectory)
-        return EditResult(pasted, made.cpu(), 2 * self._nfe, *errors, cosine)
+        return self._result(pasted, made, 2 * self._nfe, *errors, cosine)
 
     @torch.no_grad()
     def mix(
         self,
         features: Sequence[Tensor],
         token_weights: Tensor,
-        indices: Sequence[int],
+        indices: int | Sequence[int],
         seed: int = 0,
     ) -> EditResult:
         """Draw scenes from noise that follow the stitched features of several scans.
@@ -218,7 +236,7 @@ class SceneEditor:
         Args:
             features: S feature grids ``(N, F)``; zero in cells without points.
             token_weights: ``(S, N)``, see :func:`r3dpa.geometry.regions.sector_weights`.
-            indices: Numbers of the results.
+            indices: Numbers of the results, or how many.
             seed: Number of their collection.
 
         Returns:
@@ -236,14 +254,14 @@ class SceneEditor:
             return made, _cosine(guidance, made)
 
         made, cosine = self._each(indices, seed, solve)
-        return EditResult(self._decoded(made), made.cpu(), self._nfe, cosine=cosine)
+        return self._result(self._decoded(made), made, self._nfe, cosine=cosine)
 
     @torch.no_grad()
     def complete(
         self,
         range_m: Tensor,
         missing: Tensor,
-        indices: Sequence[int],
+        indices: int | Sequence[int],
         seed: int = 0,
         *,
         start: float = 0.3,
@@ -266,7 +284,7 @@ class SceneEditor:
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
             missing: ``(H, W)`` bool; what the scan holds there is not used.
-            indices: Numbers of the results.
+            indices: Numbers of the results, or how many.
             seed: Number of their collection.
             start: First time, in (0, 1]; 1 forgets the interpolation, which small gaps do not need.
 
@@ -295,18 +313,20 @@ class SceneEditor:
             return self._fitted(x, image, known)
 
         parts = []
-        for index in indices:  # one by one: fitting enlarges the rounding of another batch size
+        for index in scene_indices(
+            indices
+        ):  # one by one: fitting enlarges the rounding of another batch size
             draws = self._draws([index], seed)
             parts.append(solve(next(draws), draws))
         made = torch.cat(parts)
         completed = torch.stack([refined(one, range_m, missing) for one in self._decoded(made)])
         errors = self._errors(range_m[None], self.encode(range_m[None]), None)
         pasted = torch.where(missing, completed, range_m)
-        return EditResult(pasted, made.cpu(), len(times) - 1, errors[0])
+        return self._result(pasted, made, len(times) - 1, errors[0])
 
     @torch.no_grad()
     def vary(
-        self, range_m: Tensor, indices: Sequence[int], seed: int = 0, *, start: float = 0.5
+        self, range_m: Tensor, indices: int | Sequence[int], seed: int = 0, *, start: float = 0.5
     ) -> EditResult:
         """Other scenes like a scan: part of the way to noise, and back.
 
@@ -314,7 +334,7 @@ class SceneEditor:
 
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
-            indices: Numbers of the results.
+            indices: Numbers of the results, or how many.
             seed: Number of their collection.
             start: Time of the noise, in (0, 1]; the more the less like the scan.
 
@@ -333,7 +353,7 @@ class SceneEditor:
 
         made, _ = self._each(indices, seed, solve)
         error = self._errors(range_m[None], latents, None)[0]
-        return EditResult(self._decoded(made), made.cpu(), self._nfe, error)
+        return self._result(self._decoded(made), made, self._nfe, error)
 
     @torch.no_grad()
     def interpolate(self, first_m: Tensor, second_m: Tensor, frames: int) -> EditResult:
@@ -365,7 +385,21 @@ class SceneEditor:
             ]
         )
         errors = self._errors(scans, latents, trajectory)
-        return EditResult(self._decoded(made), made.cpu(), 2 * self._nfe, *errors)
+        return self._result(self._decoded(made), made, 2 * self._nfe, *errors)
+
+    def _result(
+        self,
+        range_m: Tensor,
+        latents: Tensor,
+        nfe: int,
+        vae_error_m: float | None = None,
+        round_trip_m: float | None = None,
+        cosine: Tensor | None = None,
+    ) -> EditResult:
+        projection = self.generator.geometry.projection
+        return EditResult(
+            range_m, latents.cpu(), nfe, projection, vae_error_m, round_trip_m, cosine
+        )
 
     @property
     def _nfe(self) -> int:
@@ -406,12 +440,14 @@ class SceneEditor:
 
     def _each(
         self,
-        indices: Sequence[int],
+        indices: int | Sequence[int],
         seed: int,
         solve: Callable[[Tensor], tuple[Tensor, Tensor | None]],
     ) -> tuple[Tensor, Tensor | None]:
         """Latents of scenes, made of their noise in batches, and their cosines."""
-        parts = [solve(next(self._draws(part, seed))) for part in self._parts(indices)]
+        parts = [
+            solve(next(self._draws(part, seed))) for part in self._parts(scene_indices(indices))
+        ]
         cosines = [cosine.cpu() for _, cosine in parts if cosine is not None]
         return torch.cat([made for made, _ in parts]), torch.cat(cosines) if cosines else None
 

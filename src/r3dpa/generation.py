@@ -7,19 +7,22 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any, Literal, NamedTuple, Self, get_args
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
+from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
 __all__ = [
@@ -28,7 +31,9 @@ __all__ = [
     "SamplerConfig",
     "SceneBatch",
     "SceneGenerator",
+    "SceneVAE",
     "Solver",
+    "scene_indices",
     "scene_random",
 ]
 
@@ -126,17 +131,30 @@ def _qualities() -> dict[str, Any]:
     return json.loads((files("r3dpa") / "quality.json").read_text(encoding="utf-8"))
 
 
-class SceneBatch(NamedTuple):
-    """Generated scenes.
+@dataclass(frozen=True, eq=False)
+class SceneBatch:
+    """Generated scenes, on the device of the networks.
 
-    ``range_m`` is ``(B, H, W)`` float32 metres with -1 where there is no return, NaN for a scene
-    that the networks gave anything not finite for; ``latents`` the normalised ``(B, C, h, w)``
-    latents, ``nfe`` the network evaluations per scene.
+    Attributes:
+        range_m: ``(B, H, W)`` float32 metres; -1 without a return, NaN for a whole scene if the
+            networks returned anything non-finite for it.
+        latents: ``(B, C, h, w)`` normalised latents.
+        nfe: Network evaluations per scene.
+        projection: Maps pixels to points.
     """
 
     range_m: Tensor
     latents: Tensor
     nfe: int
+    projection: Projection
+
+    def __len__(self) -> int:
+        """Number of scenes B."""
+        return len(self.range_m)
+
+    def points(self, index: int) -> Tensor:
+        """Points ``(P, 3)`` of one scene in metres, x forward, y left, z up, on the CPU."""
+        return points_of(self.range_m[index].cpu(), self.projection)
 
 
 @dataclass(frozen=True)
@@ -237,6 +255,75 @@ class SceneGenerator:
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
         self._scheduled: SamplerConfig | None = None
 
+    @classmethod
+    def from_checkpoint(
+        cls,
+        checkpoint: str | Path | Checkpoint,
+        sampler: SamplerConfig | Quality = "good",
+        *,
+        weights: Literal["ema", "last"] = "ema",
+        device: str = "auto",
+        precision: Literal["fp32", "bf16"] = "fp32",
+        autoguidance: Autoguidance | None = None,
+        batch_size: int | None = None,
+        decode_batch_size: int | None = None,
+        compile: bool = False,
+    ) -> Self:
+        """Rebuilds the networks of a checkpoint, on the path and geometry they were trained with.
+
+        Args:
+            checkpoint: File of stage joint or flow_matching in any layout, or its content.
+            sampler: Solver and steps, or a quality that selects them.
+            weights: Averaged or last weights of the SiT.
+            device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+            precision: As for the constructor, like all other arguments.
+            autoguidance: Weak model, on the same device.
+            batch_size: See the constructor.
+            decode_batch_size: See the constructor.
+            compile: See the constructor.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it cannot be read, or a network, the latent statistics or the scan
+                geometry is missing.
+
+        Example:
+            >>> scenes = SceneGenerator.from_checkpoint("last.ckpt").generate(4)  # doctest: +SKIP
+            >>> scenes.range_m.shape, scenes.points(0).shape  # doctest: +SKIP
+            (torch.Size([4, 64, 1024]), torch.Size([58012, 3]))
+        """
+        checkpoint = _opened(checkpoint)
+        if checkpoint.stage == "vae_alignment":
+            raise ValueError(
+                f"{checkpoint.path} is of stage vae_alignment, which trains no velocity; sample "
+                "from a checkpoint of stage joint or flow_matching"
+            )
+        geometry = _geometry_of(checkpoint)
+        names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
+        device = usable_device(device)
+        vae, sit, norm = (checkpoint.network(name).build().to(device) for name in ("vae", *names))
+        if not (
+            isinstance(vae, VAE)
+            and isinstance(sit, VelocityNetwork)
+            and isinstance(norm, LatentNorm)
+        ):
+            raise ValueError(
+                f"{checkpoint.path} holds other classes than VAE, velocity network and LatentNorm"
+            )
+        return cls(
+            vae,
+            sit,
+            norm,
+            geometry,
+            SamplerConfig.of_quality(sampler) if isinstance(sampler, str) else sampler,
+            checkpoint.interpolant,
+            precision,
+            autoguidance=autoguidance,
+            batch_size=batch_size,
+            decode_batch_size=decode_batch_size,
+            compile=compile,
+        )
+
     @property
     def device(self) -> torch.device:
         """Where the networks are."""
@@ -260,13 +347,13 @@ class SceneGenerator:
         self._schedule()
 
     @torch.inference_mode()
-    def generate(self, indices: Sequence[int], seed: int = 0) -> SceneBatch:
+    def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
         """Draws one scene per index.
 
         Nothing waits for a GPU here: its results are ready when they are copied.
 
         Args:
-            indices: Numbers of the scenes.
+            indices: Numbers of the scenes, or how many: 4 for ``range(4)``.
             seed: Number of the collection.
 
         Returns:
@@ -275,6 +362,7 @@ class SceneGenerator:
         Raises:
             ValueError: If there are more than ``batch_size`` of them.
         """
+        indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
             raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
@@ -293,7 +381,8 @@ class SceneGenerator:
         noise = draws()
         latents = self._solve(next(noise), noise)[: len(indices)]
         range_m = self.decode(latents)
-        return SceneBatch(range_m, latents, sum(network.calls for network in networks))
+        nfe = sum(network.calls for network in networks)
+        return SceneBatch(range_m, latents, nfe, self.geometry.projection)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -357,6 +446,72 @@ class SceneGenerator:
         return autoguided(self._strong, weak, guidance.scale, guidance.interval)
 
 
+class SceneVAE:
+    """Scans to raw latents and back, with the VAE and the geometry of a checkpoint of any stage.
+
+    Args:
+        vae: Encoder and decoder.
+        geometry: Projection and range encoding of its training data.
+
+    Example:
+        >>> vae = SceneVAE.from_checkpoint("last.ckpt")  # doctest: +SKIP
+        >>> latents = vae.encode(read_scan("scan.bin"))  # doctest: +SKIP
+        >>> points = vae.decode(latents).points(0)  # doctest: +SKIP
+    """
+
+    def __init__(self, vae: VAE, geometry: ScanGeometry) -> None:
+        self.vae, self.geometry = vae.eval(), geometry
+
+    @classmethod
+    def from_checkpoint(cls, checkpoint: str | Path | Checkpoint, device: str = "auto") -> Self:
+        """Rebuilds the VAE of a checkpoint.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it cannot be read, or holds no range-image VAE or no scan geometry.
+        """
+        checkpoint = _opened(checkpoint)
+        vae = checkpoint.network("vae").build().to(usable_device(device))
+        if not isinstance(vae, VAE):
+            raise ValueError(
+                f"{checkpoint.path} holds a {type(vae).__name__} for a range-image VAE"
+            )
+        return cls(vae, _geometry_of(checkpoint))
+
+    @torch.no_grad()
+    def encode(self, points: Tensor | np.ndarray) -> Tensor:
+        """Posterior means ``(1, C, h, w)`` of one scan ``(P, 3)`` or ``(P, 4)`` in metres."""
+        xyz = torch.as_tensor(points)[:, :3].float()
+        return self.encode_images(range_image(xyz, self.geometry.projection)[0][None])
+
+    @torch.no_grad()
+    def encode_images(self, range_m: Tensor) -> Tensor:
+        """Posterior means ``(B, C, h, w)`` of range images ``(B, H, W)``, -1 without a return."""
+        image = self.geometry.codec.encode(range_m.to(next(self.vae.parameters()).device))
+        return self.vae.encode(image[:, None]).mean
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> SceneBatch:
+        """Scenes of raw latents ``(B, C, h, w)``."""
+        projection = self.geometry.projection
+        image = self.vae.decode(latents)[:, 0].float()
+        range_m = self.geometry.codec.decode(image, projection.sensor)
+        return SceneBatch(range_m, latents, 0, projection)
+
+
+def _opened(checkpoint: str | Path | Checkpoint) -> Checkpoint:
+    return checkpoint if isinstance(checkpoint, Checkpoint) else read_checkpoint(checkpoint)
+
+
+def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
+    if checkpoint.geometry is None:
+        raise ValueError(
+            f"{checkpoint.path} does not record which sensor it was trained for; convert it from "
+            "its official file with `r3dpa convert --encoding linear` (or log2)"
+        )
+    return ScanGeometry.from_dict(dict(checkpoint.geometry))
+
+
 class _ScheduledNetwork:
     """A network as the velocity function of a solver whose times are known.
 
@@ -403,6 +558,11 @@ class _ScheduledNetwork:
 def _filled(values: Tensor, size: int) -> Tensor:
     """``(B, C, h, w)`` with zeros up to ``size`` samples."""
     return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
+
+
+def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
+    """Numbers of scenes; a number stands for that many from 0 on."""
+    return range(indices) if isinstance(indices, int) else indices
 
 
 def scene_random(seed: int, index: int) -> torch.Generator:

@@ -12,8 +12,7 @@ from torch import nn
 
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
-from r3dpa.cli.scenes import generator_from
-from r3dpa.generation import SamplerConfig, Solver
+from r3dpa.generation import SamplerConfig, SceneGenerator, Solver
 from r3dpa.modules import LossWeights
 from r3dpa.nn import VAE, PatchDiscriminator, UNet
 
@@ -134,7 +133,9 @@ def test_every_solver_samples_from_it(solver, joint_checkpoint):
         pytest.importorskip("torchdiffeq")
     checkpoint = read_checkpoint(joint_checkpoint)
     batches = {
-        precision: generator_from(checkpoint, config, precision=precision).generate([0, 1])
+        precision: SceneGenerator.from_checkpoint(checkpoint, config, precision=precision).generate(
+            [0, 1]
+        )
         for precision in ("fp32", "bf16")
     }
     wide, half = batches["fp32"].latents, batches["bf16"].latents
@@ -145,7 +146,7 @@ def test_every_solver_samples_from_it(solver, joint_checkpoint):
 
 
 def test_a_scene_does_not_depend_on_its_batch(joint_checkpoint):
-    scenes = generator_from(read_checkpoint(joint_checkpoint), SamplerConfig("heun", steps=3))
+    scenes = SceneGenerator.from_checkpoint(joint_checkpoint, SamplerConfig("heun", steps=3))
     both, alone = scenes.generate([0, 1], seed=3), scenes.generate([1], seed=3)
     torch.testing.assert_close(alone.latents[0], both.latents[1], atol=1e-5, rtol=0)
 

@@ -20,7 +20,7 @@ import r3dpa
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.edits import EditJob
-from r3dpa.cli.scenes import draw_scene, generator_from, written
+from r3dpa.cli.scenes import draw_scene, written
 from r3dpa.data import (
     Extractor,
     PointSample,
@@ -35,7 +35,6 @@ from r3dpa.data import (
 from r3dpa.data.objects import object_library
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
-from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import LidarSensor, in_range, range_image
 from r3dpa.geometry.gaps import check_view
 from r3dpa.io import atomic_path, source_commit, usable_device
@@ -100,10 +99,14 @@ class EditDesk:
         self.settings = EditSettings(job.solver, job.steps, job.shift, **given)
         self.device = usable_device(job.device)
         self.checkpoint = read_checkpoint(job.ckpt)
-        generator = generator_from(
-            self.checkpoint, SamplerConfig(), job.weights, device=self.device
+        self.editor = SceneEditor.from_checkpoint(
+            self.checkpoint,
+            self.settings,
+            weights=job.weights,
+            device=self.device,
+            batch_size=job.batch_size,
         )
-        self.editor = SceneEditor(generator, self.settings, job.batch_size)
+        generator = self.editor.generator
         self.geometry = generator.geometry
         self.projection = generator.geometry.projection
         self.sensor = self.projection.sensor

@@ -14,11 +14,10 @@ from torch import Tensor
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.edit_desk import EditDesk, Guidance, Parts, without_features
 from r3dpa.cli.edits import EditJob
-from r3dpa.cli.scenes import generator_from
 from r3dpa.data.mask_files import read_mask
 from r3dpa.data.objects import ObjectLibrary
 from r3dpa.editing import EditResult
-from r3dpa.generation import SamplerConfig
+from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.geometry.gaps import filled, range_error_m
 from r3dpa.geometry.regions import (
@@ -319,7 +318,7 @@ def library_settings(ckpt: Path) -> tuple[str, int, LidarSensor, tuple[int, int]
         ValueError: If it cannot be sampled from, or was trained without features.
     """
     checkpoint = read_checkpoint(ckpt)
-    generator = generator_from(checkpoint, SamplerConfig())
+    generator = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device="cpu")
     if checkpoint.feature_source is None:
         raise ValueError(without_features(ckpt))
     sit, sensor = generator.sit, generator.geometry.projection.sensor

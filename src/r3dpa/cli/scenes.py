@@ -26,7 +26,6 @@ from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import source_commit, usable_device
-from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
 
 if TYPE_CHECKING:
     from r3dpa.bench.problems import Setting
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 __all__ = [
     "WeakGuide",
     "draw_scene",
-    "generator_from",
     "generators_of",
     "report",
     "sample",
@@ -52,61 +50,6 @@ class WeakGuide:
     scale: float
     interval: tuple[float, float]
     allow: bool
-
-
-def generator_from(
-    checkpoint: Checkpoint,
-    sampler: SamplerConfig,
-    weights: Literal["ema", "last"] = "ema",
-    precision: Literal["fp32", "bf16"] = "fp32",
-    device: str = "cpu",
-    autoguidance: Autoguidance | None = None,
-    **fast_path: Any,
-) -> SceneGenerator:
-    """Rebuilds the networks of a checkpoint for sampling, on the path they were trained on.
-
-    Args:
-        checkpoint: Of stage joint or flow_matching.
-        sampler: Solver and steps.
-        weights: Averaged or last weights of the SiT.
-        precision: Of the networks.
-        device: Where they compute.
-        autoguidance: Weak model, on the same device.
-        **fast_path: ``batch_size``, ``decode_batch_size`` and ``compile`` of the generator.
-
-    Raises:
-        ValueError: If a network, the latent statistics or the scan geometry is missing.
-    """
-    if checkpoint.stage == "vae_alignment":
-        raise ValueError(
-            f"{checkpoint.path} is of stage vae_alignment, which trains no velocity; sample from "
-            "a checkpoint of stage joint or flow_matching"
-        )
-    if checkpoint.geometry is None:
-        raise ValueError(
-            f"{checkpoint.path} does not say which sensor it was trained for; convert it with "
-            "`r3dpa convert`, which records it"
-        )
-    names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
-    vae, sit, norm = (checkpoint.network(name).build().to(device) for name in ("vae", *names))
-    if not (
-        isinstance(vae, VAE) and isinstance(sit, VelocityNetwork) and isinstance(norm, LatentNorm)
-    ):
-        raise ValueError(
-            f"{checkpoint.path} holds other classes than VAE, velocity network and LatentNorm"
-        )
-    geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
-    return SceneGenerator(
-        vae,
-        sit,
-        norm,
-        geometry,
-        sampler,
-        checkpoint.interpolant,
-        precision,
-        autoguidance=autoguidance,
-        **fast_path,
-    )
 
 
 def _autoguidance(
@@ -137,7 +80,7 @@ def generators_of(
     """
     device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
-    plain = generator_from(checkpoint, SamplerConfig(), device=device)
+    plain = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device=device)
     guidance = None if guide is None else _autoguidance(checkpoint, guide, "ema", device)[0]
 
     def make(setting: Setting) -> SceneGenerator:
@@ -196,13 +139,13 @@ def sample(
     guidance, about_guide = None, None
     if guide is not None:
         guidance, about_guide = _autoguidance(checkpoint, guide, weights, device)
-    generator = generator_from(
+    generator = SceneGenerator.from_checkpoint(
         checkpoint,
         sampler,
-        weights,
-        precision,
-        device,
-        guidance,
+        weights=weights,
+        device=device,
+        precision=precision,
+        autoguidance=guidance,
         batch_size=batch_size if compile else None,
         decode_batch_size=decode_batch_size,
         compile=compile,
