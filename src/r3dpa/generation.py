@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.flow.autoguidance import autoguided, renormalised
+from r3dpa.flow.guidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
@@ -159,7 +159,7 @@ class SceneBatch:
 
 @dataclass(frozen=True)
 class Autoguidance:
-    """Guidance away from a weaker model, see :func:`r3dpa.flow.autoguidance.autoguided`.
+    """Guidance away from a weaker model, see :func:`r3dpa.flow.autoguided`.
 
     Args:
         weak: Its SiT, on the device of the other networks.

@@ -27,10 +27,10 @@ from r3dpa.bench.front import (
     steps_along,
 )
 from r3dpa.bench.hardware import flop_of, peak_of
+from r3dpa.bench.mixture import GaussianMixture, toy_mixture
 from r3dpa.bench.problems import MixtureProblem, ModelProblem, Setting
 from r3dpa.bench.sampling import Effort, run_problem, sampling, settings_of
 from r3dpa.bench.timing import Spent, measure
-from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.solvers import evaluations
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection

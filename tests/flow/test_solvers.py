@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 import torch
 
+from r3dpa.bench.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
     CountingVelocity,

@@ -7,11 +7,11 @@ import weakref
 import pytest
 import torch
 
+from r3dpa.bench.mixture import GaussianMixture
 from r3dpa.flow import (
     ODE_SOLVERS,
     FeatureGuidance,
     FeatureTarget,
-    GaussianMixture,
     aligned_velocity,
     euler,
     euler_maruyama,

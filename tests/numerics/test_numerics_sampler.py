@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from r3dpa.bench.mixture import GaussianMixture
 from r3dpa.flow import (
     ODE_SOLVERS,
-    GaussianMixture,
     Interpolant,
     ab2,
     euler,

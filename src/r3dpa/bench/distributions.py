@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from r3dpa.bench.mixture import GaussianMixture
 from r3dpa.bench.problems import Solved
 from r3dpa.data.scans import find_scans, read_scan
-from r3dpa.flow.mixture import GaussianMixture
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.bootstrap import Interval, bootstrap_interval
 from r3dpa.metrics.distances import Resampling, histogram_rows

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from r3dpa.bench.front import plain_name
 from r3dpa.bench.hardware import flop_of, peak_memory, synchronise
+from r3dpa.bench.mixture import GaussianMixture
 from r3dpa.bench.timing import Spent
 from r3dpa.data import write_bin
-from r3dpa.flow.mixture import GaussianMixture
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, heun
 from r3dpa.flow.times import ode_times, sde_times

@@ -23,10 +23,10 @@ from r3dpa.bench.front import (
     steps_along,
 )
 from r3dpa.bench.hardware import Peak, control_kernel, peak_of
+from r3dpa.bench.mixture import toy_mixture
 from r3dpa.bench.problems import Make, MixtureProblem, ModelProblem, Problem, Setting, Solved
 from r3dpa.bench.sampling_report import EVALUATIONS, Found, write_report
 from r3dpa.bench.timing import Controlled, Series, measure
-from r3dpa.flow.mixture import toy_mixture
 from r3dpa.flow.solvers import steps_for
 from r3dpa.generation import SamplerConfig, Solver
 from r3dpa.io import command, machine, versions

@@ -35,7 +35,7 @@ class WeakModel:
         path: Its file.
         sit: Averaged network, in evaluation mode on the CPU.
         scale: Its normalised latents are ``scale * latents + shift`` of those of the model that it
-            guides, see :func:`r3dpa.flow.autoguidance.renormalised`.
+            guides, see :func:`r3dpa.flow.renormalised`.
         shift: ``(C,)`` float32.
         step: Optimiser steps that it was trained for, if known.
         feature_source: Feature source of its training, if known.

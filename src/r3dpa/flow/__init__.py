@@ -1,6 +1,5 @@
 """Flow matching without networks: paths, solvers, guidance and editing over velocity functions."""
 
-from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.editing import (
     Trajectory,
     invert,
@@ -16,9 +15,10 @@ from r3dpa.flow.guidance import (
     FeatureTarget,
     GuidanceRecord,
     aligned_velocity,
+    autoguided,
+    renormalised,
 )
 from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
-from r3dpa.flow.mixture import GaussianMixture, toy_mixture
 from r3dpa.flow.sde import DriftChange, euler_maruyama
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
@@ -49,7 +49,6 @@ __all__ = [
     "DriftChange",
     "FeatureGuidance",
     "FeatureTarget",
-    "GaussianMixture",
     "GuidanceRecord",
     "Interpolant",
     "OdeSolver",
@@ -78,6 +77,5 @@ __all__ = [
     "sde_times",
     "spherical_mean",
     "steps_for",
-    "toy_mixture",
     "unipc",
 ]

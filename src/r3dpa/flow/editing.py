@@ -1,6 +1,6 @@
-"""Editing of given latents: inversion to noise, inpainting with what is around it kept.
+"""Editing of given latents: inversion to noise, inpainting that keeps the surroundings.
 
-What is kept is put back after every step of a solver::
+The kept latents are put back after every step of a solver::
 
     trajectory = invert(sit.velocity, latents, ode_times(50), "midpoint")
     start = renoised(trajectory, edit_mask, noise)
@@ -28,13 +28,7 @@ _LINEAR = Interpolant("linear")
 
 
 class Trajectory(NamedTuple):
-    """Given latents on their way from noise to data.
-
-    Attributes:
-        times: ``(T,)`` decreasing times.
-        states: ``(T, B, ...)`` latents at these times; the first are the noise, the last the
-            given latents themselves.
-    """
+    """Latents ``(T, B, ...)`` at decreasing times ``(T,)``: noise first, the given latents last."""
 
     times: Tensor
     states: Tensor
@@ -48,7 +42,7 @@ def invert(
     *,
     interpolant: Interpolant = _LINEAR,
 ) -> Trajectory:
-    """Carry data along the probability flow towards noise, on a sampling grid run backwards.
+    """Carry data along the probability flow towards noise, on a sampling grid in reverse.
 
     Sampling from the first state by the same solver on the same grid gives the data back up to the
     solver's error, which Euler steps make first order and midpoint steps second order small.
@@ -79,11 +73,11 @@ def invert(
         )
     states = [latents]
 
-    def note(x: Tensor, time: float, index: int) -> Tensor:
+    def record(x: Tensor, time: float, index: int) -> Tensor:
         states.append(x)
         return x
 
-    ode_solver(solver, interpolant, note)(velocity, latents, times.flip(0))
+    ode_solver(solver, interpolant, record)(velocity, latents, times.flip(0))
     return Trajectory(times, torch.stack(states[::-1]))
 
 
@@ -93,10 +87,10 @@ def renoised(
     noise: Tensor,
     interpolant: Interpolant = _LINEAR,
 ) -> Tensor:
-    """Start of an edit: fresh noise where it is to happen, the inverted latents elsewhere.
+    """Start of an edit: fresh noise inside the mask, the inverted latents elsewhere.
 
-    Where the trajectory starts at a time t below 1, as much of the data is left as a noisy latent
-    of that time has: ``alpha(t) data + sigma(t) noise``.
+    Where the trajectory starts at a time t below 1, the edit starts from the noisy latents of that
+    time, ``alpha(t) data + sigma(t) noise``.
 
     Args:
         trajectory: From data to the time that the edit starts from.
@@ -123,18 +117,15 @@ def renoised(
 def kept(trajectory: Trajectory, edit_mask: Tensor) -> AfterStep:
     """Hook of a solver that puts the given latents back outside the mask after every step.
 
-    At every time of the grid they are where the inversion was; at the last time they are the given
-    latents bit by bit. Stages between two times (midpoint, Heun) see a state that is a step
-    further on outside. Multistep solvers keep the velocities that they have seen: those outside
-    belong to the states put back, so their history is that of the trajectory, and what they amend
-    afterwards of an earlier step is put back too.
+    Outside, the state equals the trajectory at every time of the grid; at the last time it is the
+    given latents bit by bit. Stages between two times (midpoint, Heun) see a state that is a step
+    further on outside. The velocities that multistep solvers keep belong to the states put back, so
+    outside their history is that of the trajectory, and corrections of an earlier step are
+    overwritten too.
 
     Args:
         trajectory: Of the latents to keep, on the grid of the solver.
         edit_mask: Bool, True where latents are generated anew; broadcasts to ``(B, ...)``.
-
-    Returns:
-        An ``after_step``, see :mod:`r3dpa.flow.solvers`.
 
     Raises:
         ValueError: If the mask is not bool or does not fit or, when called, the solver is at
@@ -168,7 +159,7 @@ def spherical_mean(first: Tensor, second: Tensor, share: float) -> Tensor:
         share: In [0, 1].
 
     Returns:
-        ``(B, ...)``; the straight mean for noises of one or of opposite direction.
+        ``(B, ...)``; the straight mean of parallel or opposite noises.
 
     Raises:
         ValueError: If the shapes differ or the share is outside [0, 1].

@@ -1,6 +1,7 @@
-"""Feature guidance: a velocity function that pulls tokens towards given 3D features.
+"""Guidance: velocity functions pulled towards 3D features, or away from a weaker model.
 
-Letters: B batch, N tokens, F feature width, S sources, ``...`` axes of the latents.
+Letters: B batch, C latent channels, N tokens, F feature width, S sources, ``...`` further axes of
+the latents.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from typing import NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
+from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import DriftChange
 from r3dpa.flow.solvers import Velocity
+from r3dpa.flow.times import per_sample
 
 __all__ = [
     "AlignedEvaluation",
@@ -23,13 +26,138 @@ __all__ = [
     "FeatureTarget",
     "GuidanceRecord",
     "aligned_velocity",
+    "autoguided",
+    "renormalised",
 ]
 
 _COSINE_EPS = 1e-6
+_LINEAR = Interpolant("linear")
+
+
+def autoguided(
+    velocity: Velocity,
+    weak: Velocity,
+    scale: float,
+    interval: tuple[float, float] = (0.0, 1.0),
+) -> Velocity:
+    """Velocity extrapolated from that of a weak model through that of the model itself.
+
+    Both models err in the same direction, the weak one further: the difference points to the data.
+    It needs no classes. Formula: ``weak + scale (velocity - weak)`` at times inside the interval,
+    ``velocity`` outside, where ``weak`` is not evaluated.
+
+    Source: Karras et al., "Guiding a diffusion model with a bad version of itself" (2024), eq. 3;
+    interval: Kynkäänniemi et al. 2024.
+
+    Args:
+        velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` of the model.
+        weak: The same of a weaker one, in the same normalised latents: see :func:`renormalised`.
+        scale: Strength, at least 1; at 1 the result is ``velocity`` itself.
+        interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
+            waits for a GPU.
+
+    Returns:
+        Guided velocity, in at least float32 where it is guided.
+
+    Raises:
+        ValueError: If ``scale`` or ``interval`` is out of range or, when called, the two velocities
+            have different shapes.
+
+    Example:
+        >>> guided = autoguided(lambda x, time: 2 * x, lambda x, time: x, scale=3.0)
+        >>> guided(torch.ones(1, 2), torch.tensor([0.5]))
+        tensor([[4., 4.]])
+    """
+    first, last = interval
+    if not (math.isfinite(scale) and scale >= 1):
+        raise ValueError(
+            f"the scale of autoguidance must be a number of 1 or more, got {scale}; 1 is no "
+            "guidance, and less would move towards the weak model"
+        )
+    _check_interval(interval, "autoguidance")
+    if scale == 1:
+        return velocity
+    everywhere = first == 0 and last == 1
+
+    def guided(x: Tensor, time: Tensor) -> Tensor:
+        strong = velocity(x, time)
+        inside = per_sample((time >= first) & (time <= last), strong)
+        if not (everywhere or inside.any()):
+            return strong
+        weaker = weak(x, time)
+        if weaker.shape != strong.shape:
+            raise ValueError(
+                f"the weak model answers {tuple(weaker.shape)}, the model {tuple(strong.shape)}; "
+                "both must be of the same latents"
+            )
+        dtype = torch.promote_types(strong.dtype, torch.float32)  # a small difference, magnified
+        pushed = torch.lerp(weaker.to(dtype), strong.to(dtype), scale)
+        return pushed if everywhere else torch.where(inside, pushed, strong.to(dtype))
+
+    return guided
+
+
+def renormalised(
+    weak: Velocity, scale: float, shift: Tensor, interpolant: Interpolant = _LINEAR
+) -> Velocity:
+    """Velocity of a model whose latents are ``scale * latents + shift``, for these latents.
+
+    Exact. A noisy latent is ``x = alpha z + sigma e``; the model knows ``z' = scale z + shift``
+    and, since the noise of its path has unit variance too, another ratio of data and noise. At the
+    time t' of its path with ``sigma' / alpha' = scale sigma / alpha`` its noisy latent is::
+
+        x' = alpha' z' + sigma' e = (alpha' / alpha) scale x + alpha' shift
+
+    with the same noise ``e``, so what it expects of ``z'`` and ``e`` given ``x'`` holds given
+    ``x``, and ``v = d_alpha (z' - shift) / scale + d_sigma e``. Nothing is divided by t or 1 - t.
+
+    One number ``scale`` serves all channels: with one for each, ``e`` would have to differ in
+    strength between channels, which the model never saw.
+
+    Args:
+        weak: ``(x' (B, C, ...), time' (B,)) -> (B, C, ...)`` in its own latents.
+        scale: Positive number.
+        shift: ``(C,)`` on the device of the latents.
+        interpolant: Path of both models.
+
+    Returns:
+        ``weak`` itself at scale 1 and shift 0.
+
+    Raises:
+        ValueError: If ``scale`` is not positive and finite, or ``shift`` has not one axis.
+    """
+    if not (math.isfinite(scale) and scale > 0) or shift.dim() != 1:
+        raise ValueError(
+            "scale must be positive and finite and shift have shape (C,), got "
+            f"{scale} and {tuple(shift.shape)}"
+        )
+    if scale == 1 and not shift.any():
+        return weak
+
+    def velocity(x: Tensor, time: Tensor) -> Tensor:
+        here = interpolant.coefficients(per_sample(time, x))
+        scaled = scale * here.sigma
+        if interpolant.path == "linear":
+            length = here.alpha + scaled
+            there_time = scaled / length
+        else:
+            length = torch.hypot(here.alpha, scaled)
+            there_time = torch.atan2(scaled, here.alpha) * (2 / math.pi)
+        there = interpolant.coefficients(there_time)
+        offset = shift.to(there_time.dtype).reshape(-1, *[1] * (x.dim() - 2))
+        there_x = scale / length * x + there.alpha * offset
+        slope = weak(there_x.to(x.dtype), there_time.flatten())
+        # x' and its slope are two mixtures of data and noise: solved for both.
+        determinant = there.alpha * there.d_sigma - there.sigma * there.d_alpha
+        data = (there.d_sigma * there_x - there.sigma * slope) / determinant
+        noise = (there.alpha * slope - there.d_alpha * there_x) / determinant
+        return here.d_alpha * (data - offset) / scale + here.d_sigma * noise
+
+    return velocity
 
 
 class AlignedEvaluation(Protocol):
-    """A network evaluation that has come as far as the features, and may be finished."""
+    """A network evaluation that has reached the projected features and can be finished."""
 
     @property
     def features(self) -> Tensor:
@@ -43,24 +171,19 @@ class AlignedEvaluation(Protocol):
 AlignedVelocity = Callable[[Tensor, Tensor], AlignedEvaluation]
 
 
-@dataclass(frozen=True)
-class _TwoCalls:
+class _TwoCalls(NamedTuple):
     features: Tensor
     velocity: Callable[[], Tensor]
 
 
 def aligned_velocity(velocity: Velocity, project_features: Velocity) -> AlignedVelocity:
-    """An aligned velocity of two functions that share no work.
+    """An aligned velocity of two functions that share no work, such as an autoguided velocity.
 
-    For velocities that are not those of one network, such as an autoguided one; a network's own
-    ``aligned_pass`` does not evaluate its first blocks twice.
+    A network's own ``aligned_pass`` does not evaluate its first blocks twice.
 
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
         project_features: ``(x (B, ...), time (B,)) -> (B, N, F)``, differentiable in ``x``.
-
-    Returns:
-        Function of both.
     """
 
     def evaluate(x: Tensor, time: Tensor) -> AlignedEvaluation:
@@ -79,7 +202,7 @@ class FeatureTarget:
 
     Args:
         features: ``(B, N, F)``, any length per vector; a zero vector is a cell without points.
-        token_mask: ``(B, N)`` bool, tokens to guide; all of them if left out.
+        token_mask: ``(B, N)`` bool, tokens to guide. Default: all.
         weight: Share of this target in the energy.
 
     Raises:
@@ -91,7 +214,6 @@ class FeatureTarget:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check shapes and weight."""
         features, mask = self.features, self.token_mask
         if features.dim() != 3:
             raise ValueError(f"target must have shape (B, N, F), got {tuple(features.shape)}")
@@ -105,17 +227,13 @@ class FeatureTarget:
 
     @classmethod
     def stitched(cls, sources: Sequence[Tensor], token_weights: Tensor) -> Self:
-        """One target from the features of several scenes.
+        """One target from the features of several scenes: weighted means of unit vectors.
 
-        Each token gets the weighted mean of the sources' unit vectors; a source without points in
-        a cell has no say there.
+        A source without points in a cell does not count there.
 
         Args:
             sources: S features ``(B, N, F)``.
             token_weights: ``(S, N)`` of 0 or above: share of each source in each token.
-
-        Returns:
-            Target of all tokens that have points in a source of weight above 0.
 
         Raises:
             ValueError: If the shapes do not fit or a weight is below 0 or not finite.
@@ -136,7 +254,7 @@ class FeatureTarget:
 
 
 class GuidanceRecord(NamedTuple):
-    """What one guided evaluation did, one value per sample.
+    """One guided evaluation, one value per sample.
 
     Attributes:
         energy: ``(B,)`` minus the mean cosine over the selected tokens, summed over the targets
@@ -185,13 +303,13 @@ class FeatureGuidance:
 
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` without guidance.
-        aligned: The same with features on the way, see :class:`AlignedEvaluation`: the
+        aligned: The same with projected features, see :class:`AlignedEvaluation`: the
             ``aligned_pass`` of a network, or :func:`aligned_velocity`.
         targets: What to reach, of one shape; at least one.
         scale: Strength, 0 or above.
         relative: Measure the strength in velocities rather than in gradients.
-        interval: First and last time that is guided, in [0, 1]. Shorter ones look at the times,
-            for which a GPU is waited for.
+        interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
+            waits for a GPU.
         max_ratio: Longest term, see above; infinity for any length.
         legacy: Quirks of the official code. The energy is averaged over all selected tokens of
             the batch, cells without points included, so that the strength depends on batch and
@@ -204,7 +322,8 @@ class FeatureGuidance:
 
     Raises:
         ValueError: If there is no target or they differ in shape, or an option is out of its
-            range: ``relative`` takes no scale above ``max_ratio`` and is not ``legacy``.
+            range: ``relative`` takes no scale above ``max_ratio`` and is not ``legacy``. When
+            called, if the projected features have another shape than the targets.
     """
 
     def __init__(
@@ -226,11 +345,7 @@ class FeatureGuidance:
             raise ValueError(f"scale of the guidance must be 0 or above, got {scale}")
         if not max_ratio >= 0:
             raise ValueError(f"max_ratio of the guidance must be 0 or above, got {max_ratio}")
-        if not 0 <= interval[0] < interval[1] <= 1:
-            raise ValueError(
-                "the interval of guidance must be two times 0 <= first < last <= 1 (0 data, 1 "
-                f"noise), got {interval[0]} and {interval[1]}"
-            )
+        _check_interval(interval, "guidance")
         if relative and (legacy or scale > max_ratio):
             raise ValueError(
                 f"relative guidance is not legacy, and its scale at most max_ratio ({max_ratio}), "
@@ -254,18 +369,7 @@ class FeatureGuidance:
         self._idle = scale == 0 or max_ratio == 0 or not bool(selected.any())
 
     def __call__(self, x: Tensor, time: Tensor) -> Tensor:
-        """Guided velocity.
-
-        Args:
-            x: ``(B, ...)`` noisy latents.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B, ...)`` velocity plus guidance term.
-
-        Raises:
-            ValueError: If the projected features have another shape than the targets.
-        """
+        """Guided velocity ``(B, ...)`` at noisy latents ``(B, ...)`` and flow times ``(B,)``."""
         first, last = self._interval
         everywhere = (first, last) == (0, 1)
         inside = (time >= first) & (time <= last)
@@ -275,42 +379,23 @@ class FeatureGuidance:
         velocity = evaluation.velocity()
         term = self._limited(gradient, velocity)
         if not everywhere:
-            term = torch.where(inside.reshape(-1, *[1] * (x.dim() - 1)), term, 0.0)
+            term = torch.where(per_sample(inside, x), term, 0.0)
         guided = velocity + term
         self._record(energy, guided if self._legacy else velocity, term)
         return guided
 
     def term(self, x: Tensor, time: Tensor) -> Tensor:
-        """``scale`` times the gradient of the energy: what is added, but for the limits.
-
-        Args:
-            x: ``(B, ...)`` latents.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B, ...)``, float32 or wider; zero for a sample without selected tokens.
+        """``scale`` times the gradient ``(B, ...)`` of the energy: the term before its limits.
 
         Raises:
-            ValueError: If the guidance is relative, or the projected features have another shape
-                than the targets.
+            ValueError: If the guidance is relative.
         """
         if self._relative:
             raise ValueError("relative guidance has no term without a velocity")
         return self._scale * self._evaluate(x, time)[2]
 
     def energy(self, x: Tensor, time: Tensor) -> Tensor:
-        """Energy of samples, guided or not: minus the mean cosine that was reached.
-
-        Args:
-            x: ``(B, ...)`` latents.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B,)`` float32 or wider; not recorded.
-
-        Raises:
-            ValueError: If the projected features have another shape than the targets.
-        """
+        """Energy ``(B,)`` of samples, guided or not; not recorded."""
         with torch.no_grad():
             return self._energy(self._aligned(_at_least_float32(x), time).features)
 
@@ -326,7 +411,7 @@ class FeatureGuidance:
 
     @property
     def change_drift(self) -> DriftChange | None:
-        """What the SDE solver does to its drift: nothing, but for ``legacy``."""
+        """Change of the SDE drift: none, but for ``legacy``."""
         return self._add_to_drift if self._legacy else None
 
     @property
@@ -340,20 +425,19 @@ class FeatureGuidance:
         _, energy, gradient = self._evaluate(x, time)
         term = self._scale * gradient
         self._record(energy, drift, term)
-        return drift + time.reshape(-1, *[1] * (x.dim() - 1)) * term
+        return drift + per_sample(time, x) * term
 
     def _evaluate(self, x: Tensor, time: Tensor) -> tuple[AlignedEvaluation, Tensor, Tensor]:
         """Unfinished evaluation, energies ``(B,)`` and their gradient ``(B, ...)``."""
         with torch.inference_mode(False), torch.enable_grad():
             leaf = _at_least_float32(x.detach().clone()).requires_grad_()
-            # A view: what watches modules, such as torch's FLOP counter, takes no leaf.
+            # A view: module hooks, such as those of torch's FLOP counter, take no leaf.
             evaluation = self._aligned(leaf.view_as(leaf), time.clone())
             energy = self._energy(evaluation.features)
             (gradient,) = torch.autograd.grad(energy.sum(), leaf)
         finite = gradient.flatten(1).isfinite().all(dim=1)
         self._num_dropped += (~finite).sum()
-        usable = finite.reshape(-1, *[1] * (x.dim() - 1))
-        return evaluation, energy.detach(), torch.where(usable, gradient, 0.0)
+        return evaluation, energy.detach(), torch.where(per_sample(finite, x), gradient, 0.0)
 
     def _energy(self, features: Tensor) -> Tensor:
         unit = _unit(_at_least_float32(features))
@@ -370,7 +454,7 @@ class FeatureGuidance:
         return energy
 
     def _limited(self, gradient: Tensor, velocity: Tensor) -> Tensor:
-        """The term of each sample: its gradient in the length that it is to have."""
+        """Gradient of each sample, scaled to the length of its term."""
         if not self._relative and self._max_ratio == math.inf:
             return self._scale * gradient
         # float64: the square of a long float32 gradient is infinite.
@@ -384,8 +468,7 @@ class FeatureGuidance:
         else:
             wanted = torch.minimum(self._scale * length, self._max_ratio * reach)
         factor = torch.where(length > 0, wanted / length, 0.0)
-        factor = factor.reshape(-1, *[1] * (gradient.dim() - 1))
-        return (gradient.double() * factor).to(gradient.dtype)
+        return (gradient.double() * per_sample(factor, gradient)).to(gradient.dtype)
 
     def _record(self, energy: Tensor, direction: Tensor, term: Tensor) -> None:
         cosine = torch.cosine_similarity(direction.flatten(1), term.flatten(1), dim=1)
@@ -406,6 +489,14 @@ def _prepared(target: FeatureTarget, count_empty_cells: bool) -> _Prepared:
     if not count_empty_cells:
         mask &= features.abs().amax(dim=-1) > 0
     return _Prepared(_unit(features), mask, target.weight)
+
+
+def _check_interval(interval: tuple[float, float], what: str) -> None:
+    if not 0 <= interval[0] < interval[1] <= 1:
+        raise ValueError(
+            f"the interval of {what} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "
+            f"got {interval[0]} and {interval[1]}"
+        )
 
 
 def _at_least_float32(values: Tensor) -> Tensor:

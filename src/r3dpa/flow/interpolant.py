@@ -1,6 +1,8 @@
 """Path between data and noise: coefficients, velocity target, conversions, time sampling.
 
 Time runs from t = 0 (data) to t = 1 (noise) everywhere. Letters: B batch, ``...`` any further axes.
+Data, noise, ``x`` and velocities are ``(B, ...)``, flow times ``(B,)``; methods raise a
+``ValueError`` for other times.
 """
 
 from __future__ import annotations
@@ -12,17 +14,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from r3dpa.flow.times import per_sample
+
 __all__ = ["Interpolant", "PathCoefficients", "sample_time"]
 
 
 class PathCoefficients(NamedTuple):
     """Coefficients of ``x_t = alpha data + sigma noise`` and their time derivatives.
 
-    Attributes:
-        alpha: Weight of the data, 1 at t = 0 and 0 at t = 1.
-        sigma: Weight of the noise, 0 at t = 0 and 1 at t = 1.
-        d_alpha: d alpha / d t.
-        d_sigma: d sigma / d t.
+    ``alpha`` falls from 1 at t = 0 to 0 at t = 1, ``sigma`` rises from 0 to 1.
     """
 
     alpha: Tensor
@@ -54,19 +54,11 @@ class Interpolant:
     path: Literal["linear", "cosine"] = "linear"
 
     def __post_init__(self) -> None:
-        """Check the path."""
         if self.path not in ("linear", "cosine"):
             raise ValueError(f"path must be 'linear' or 'cosine', got {self.path!r}")
 
     def coefficients(self, time: Tensor) -> PathCoefficients:
-        """Path coefficients at the given times.
-
-        Args:
-            time: Flow times in [0, 1], any shape.
-
-        Returns:
-            Four tensors of the shape and dtype of ``time``.
-        """
+        """Path coefficients at times in [0, 1] of any shape, in their shape and dtype."""
         if self.path == "linear":
             one = torch.ones_like(time)
             return PathCoefficients(1 - time, time, -one, one)
@@ -75,102 +67,45 @@ class Interpolant:
         return PathCoefficients(cosine, sine, -quarter * sine, quarter * cosine)
 
     def interpolate(self, data: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Point of the path, ``alpha data + sigma noise``.
-
-        Args:
-            data: ``(B, ...)`` samples at t = 0.
-            noise: ``(B, ...)`` standard Gaussian samples.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B, ...)`` noisy samples.
-
-        Raises:
-            ValueError: If ``time`` does not hold one value per sample.
-        """
-        alpha, sigma, _, _ = self.coefficients(_per_sample(time, data))
+        """Noisy samples, ``alpha data + sigma noise``."""
+        alpha, sigma, _, _ = self.coefficients(per_sample(time, data))
         return alpha * data + sigma * noise
 
     def target(self, data: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Velocity the network learns, ``d_alpha data + d_sigma noise``.
-
-        Args:
-            data: ``(B, ...)`` samples at t = 0.
-            noise: ``(B, ...)`` standard Gaussian samples.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B, ...)`` d x_t / d t; ``noise - data`` on the linear path.
-
-        Raises:
-            ValueError: If ``time`` does not hold one value per sample.
-        """
-        _, _, d_alpha, d_sigma = self.coefficients(_per_sample(time, data))
+        """Velocity to learn, ``d_alpha data + d_sigma noise``; linear path: ``noise - data``."""
+        _, _, d_alpha, d_sigma = self.coefficients(per_sample(time, data))
         return d_alpha * data + d_sigma * noise
 
     def denoise(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Expected data given a noisy sample and its velocity, finite at all times.
+        """Expected data given noisy samples and their velocity, finite at all times.
 
         Formula: linear ``x - t v``; cosine ``cos(u) x - (2 / pi) sin(u) v`` with ``u = pi t / 2``.
-
-        Args:
-            velocity: ``(B, ...)`` velocity at ``x``.
-            x: ``(B, ...)`` noisy samples.
-            time: ``(B,)`` flow times.
-
-        Returns:
-            ``(B, ...)`` expected data.
-
-        Raises:
-            ValueError: If ``time`` does not hold one value per sample.
         """
-        time = _per_sample(time, x)
+        time = per_sample(time, x)
         if self.path == "linear":
             return x - time * velocity
         alpha, sigma, _, _ = self.coefficients(time)
         return alpha * x - (2 / math.pi) * sigma * velocity
 
     def score(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Gradient of the log density; divides by t and is for inspection only.
+        """Gradient of the log density at times above 0; for inspection only.
 
         Formula: linear ``(-(1 - t) v - x) / t``; cosine ``-(2 / pi) cot(pi t / 2) v - x``. Not
         finite at t = 0; samplers use :meth:`sde_drift`.
-
-        Args:
-            velocity: ``(B, ...)`` velocity at ``x``.
-            x: ``(B, ...)`` noisy samples.
-            time: ``(B,)`` flow times in (0, 1].
-
-        Returns:
-            ``(B, ...)`` score.
-
-        Raises:
-            ValueError: If ``time`` does not hold one value per sample.
         """
-        time = _per_sample(time, x)
+        time = per_sample(time, x)
         if self.path == "linear":
             return (-(1 - time) * velocity - x) / time
         alpha, sigma, _, _ = self.coefficients(time)
         return -(2 / math.pi) * (alpha / sigma) * velocity - x
 
     def sde_drift(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Drift ``v - t score`` of the SDE with diffusion ``w = 2 t``, without the division.
+        """Drift ``v - t score`` of the SDE with diffusion ``w = 2 t``, finite on [0, 1].
 
-        Formula: linear ``(2 - t) v + x``; cosine ``(1 + (4 / pi^2) u cot(u)) v + t x`` with
-        ``u = pi t / 2``. Finite for all t in [0, 1].
-
-        Args:
-            velocity: ``(B, ...)`` velocity at ``x``.
-            x: ``(B, ...)`` noisy samples.
-            time: ``(B,)`` flow times in [0, 1].
-
-        Returns:
-            ``(B, ...)`` drift d x / d t of the SDE that runs from t = 1 to t = 0.
-
-        Raises:
-            ValueError: If ``time`` does not hold one value per sample.
+        Formula, without the division: linear ``(2 - t) v + x``; cosine
+        ``(1 + (4 / pi^2) u cot(u)) v + t x`` with ``u = pi t / 2``.
         """
-        time = _per_sample(time, x)
+        time = per_sample(time, x)
         if self.path == "linear":
             return (2 - time) * velocity + x
         u_cot_u = torch.cos(math.pi / 2 * time) / torch.sinc(time / 2)
@@ -184,7 +119,7 @@ def sample_time(
     generator: torch.Generator | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Draw one flow time per sample.
+    """Draw one flow time per sample, ``(B,)`` float32 in [0, 1].
 
     ``uniform`` on [0, 1); ``lognormal`` is ``sigmoid(n)`` with n standard Gaussian, denser in the
     middle (Esser et al. 2024, logit-normal).
@@ -192,12 +127,8 @@ def sample_time(
     Args:
         batch_size: Number of samples B.
         kind: Distribution of the times.
-        generator: Source of randomness, which also says where to draw; torch's default one if
-            left out.
-        device: Where to put the times; that of the generator if left out.
-
-    Returns:
-        ``(B,)`` float32 in [0, 1].
+        generator: Source of randomness; the draw is made on its device. Default: torch's own.
+        device: Device of the result; default: that of the generator.
 
     Raises:
         ValueError: If ``kind`` is neither ``uniform`` nor ``lognormal``.
@@ -212,11 +143,3 @@ def sample_time(
     else:
         raise ValueError(f"times are drawn 'uniform' or 'lognormal', got {kind!r}")
     return time if device is None else time.to(device)
-
-
-def _per_sample(time: Tensor, x: Tensor) -> Tensor:
-    if time.shape != x.shape[:1]:
-        raise ValueError(
-            f"time must hold one value per sample, shape ({x.shape[0]},), got {tuple(time.shape)}"
-        )
-    return time.reshape(-1, *[1] * (x.dim() - 1))

@@ -1,7 +1,4 @@
-"""SDE sampler from t = 1 (noise) to t = 0 (data).
-
-Follows the conventions of :mod:`r3dpa.flow.solvers`. Letters: B batch, ``...`` further axes.
-"""
+"""SDE sampler from t = 1 (noise) to t = 0 (data), with the conventions of the ODE solvers."""
 
 from __future__ import annotations
 
@@ -51,8 +48,8 @@ def euler_maruyama(
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
         x: ``(B, ...)`` Gaussian noise, the state at t = 1.
         times: ``(T,)`` decreasing times, see :func:`r3dpa.flow.times.sde_times`.
-        noise: The T - 2 Gaussian draws ``(B, ...)`` in order, or where to draw them from. Draws
-            that are given per sample make a sample independent of its batch.
+        noise: The T - 2 Gaussian draws ``(B, ...)`` in order, or the generator to draw them with.
+            Draws that are given per sample make a sample independent of its batch.
         eta: How much noise is added and removed again; 0 is the ODE, and then
             :func:`r3dpa.flow.solvers.euler` but for ``change_drift``.
         interpolant: Path of the velocity.
@@ -105,7 +102,7 @@ def euler_maruyama(
 def _draws(
     noise: torch.Generator | Iterable[Tensor], x: Tensor, num_draws: int
 ) -> Iterator[Tensor]:
-    """Draws of the shape, dtype and device of ``x``, taken one by one as they are asked for."""
+    """Draws of the shape, dtype and device of ``x``, each made when it is needed."""
     given = iter(()) if isinstance(noise, torch.Generator) else iter(noise)
     for index in range(num_draws):
         draw: Tensor | None

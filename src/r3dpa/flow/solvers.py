@@ -12,8 +12,8 @@ any dtype. Every solver is called ``(velocity, x, times) -> x`` with
 
 returns the ``(B, ...)`` state at the last time, and raises a ``ValueError`` for other times. The
 orders hold on grids whose steps shrink alike. On a fixed grid ``after_step(x, time, index)`` gets
-the state at ``times[index]`` after every step and returns that to go on from; multistep solvers
-keep the velocities that they have seen.
+the state at ``times[index]`` after every step and returns the state to continue from; multistep
+solvers keep the velocities that they have seen. Only ``dopri5`` waits for a GPU.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -62,13 +63,7 @@ def unchanged(x: Tensor, time: float, index: int) -> Tensor:
 
 
 class CountingVelocity:
-    """A velocity function that counts how often it is evaluated.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-
-    Attributes:
-        nfe: Network evaluations per sample so far.
+    """A velocity function that counts its evaluations in ``nfe``.
 
     Example:
         >>> counted = CountingVelocity(lambda x, time: -x)
@@ -91,7 +86,7 @@ class CountingVelocity:
 def euler(
     velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by Euler steps; order 1, one evaluation per step."""
+    """Euler steps; order 1, one evaluation per step."""
     for index, (now, then) in enumerate(step_pairs(times), 1):
         x = after_step(x + (then - now) * _slope(velocity, x, now), then, index)
     return x
@@ -106,23 +101,11 @@ def heun(
     corrector_velocity: Velocity | None = None,
     after_step: AfterStep = unchanged,
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by Heun steps; order 2, two evaluations per step but the last.
+    """Heun steps; order 2, two evaluations per step but the last.
 
     The last step is an Euler step, as in EDM (Karras et al. 2022, alg. 1) and R3DPA: one local
-    error of order 2 leaves the order as it is.
-
-    Args:
-        velocity: See the module.
-        x: See the module.
-        times: See the module.
-        corrector_velocity: Velocity of the second slope, if it is another one.
-        after_step: See the module.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
-    Raises:
-        ValueError: If ``times`` are not those of a solver.
+    error of order 2 leaves the order as it is. ``corrector_velocity`` gives the second slope, if
+    another function is to.
     """
     corrector_velocity = corrector_velocity or velocity
     *steps, (now, then) = step_pairs(times)
@@ -138,10 +121,7 @@ def heun(
 def midpoint(
     velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by the explicit midpoint rule; order 2, two evaluations per step.
-
-    The velocity is never asked at the last time.
-    """
+    """Explicit midpoint rule; order 2, two evaluations per step, none at the last time."""
     for index, (now, then) in enumerate(step_pairs(times), 1):
         middle = (now + then) / 2
         halfway = x + (middle - now) * _slope(velocity, x, now)
@@ -152,7 +132,7 @@ def midpoint(
 def ab2(
     velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 2, one evaluation per step.
+    """Adams-Bashforth method; order 2, one evaluation per step.
 
     With step ``h`` and the step before ``h0``, after one Euler step::
 
@@ -164,7 +144,7 @@ def ab2(
 def ab3(
     velocity: Velocity, x: Tensor, times: Tensor, *, after_step: AfterStep = unchanged
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by the Adams-Bashforth method; order 3, one evaluation per step.
+    """Adams-Bashforth method; order 3, one evaluation per step.
 
     The parabola through the last three velocities is integrated. The first step is an Euler step,
     the second an AB2 step. The error of the Euler step alone would leave order 2; the second
@@ -181,7 +161,7 @@ def dpm_solver_pp_2m(
     interpolant: Interpolant = _LINEAR,
     after_step: AfterStep = unchanged,
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by DPM-Solver++(2M); order 2, one evaluation per step.
+    """DPM-Solver++(2M) on the path of ``interpolant``; order 2, one evaluation per step.
 
     With the expected data ``D(x, t)`` and ``lambda = log(alpha / sigma)`` the ODE is
     ``d(x / sigma) = D d(alpha / sigma)``: where D is constant a step of any length is exact, and
@@ -201,19 +181,6 @@ def dpm_solver_pp_2m(
     order 2 a logarithm: measured 1.6 to 1.8 over all of [0, 1].
 
     Source: DPM-Solver++ (Lu et al. 2022), alg. 2.
-
-    Args:
-        velocity: See the module.
-        x: See the module.
-        times: See the module.
-        interpolant: Path of the velocity.
-        after_step: See the module.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
-    Raises:
-        ValueError: If ``times`` are not those of a solver.
     """
     return _data_prediction(velocity, x, times, interpolant, after_step, correct=False)
 
@@ -226,7 +193,7 @@ def unipc(
     interpolant: Interpolant = _LINEAR,
     after_step: AfterStep = unchanged,
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by UniPC-2 with ``B_2(h)``; one evaluation per step.
+    """UniPC-2 with ``B_2(h)`` on the path of ``interpolant``; one evaluation per step.
 
     Its predictor is :func:`dpm_solver_pp_2m`. The evaluation at the predicted point serves twice:
     as the start of the next step, and before that to correct the last one by the parabola through
@@ -235,19 +202,6 @@ def unipc(
     where lambda stays finite; with the first-order steps at both ends of [0, 1] order 2.
 
     Source: UniPC (Zhao et al. 2023), alg. 5 to 8, multistep with data prediction.
-
-    Args:
-        velocity: See the module.
-        x: See the module.
-        times: See the module.
-        interpolant: Path of the velocity.
-        after_step: See the module.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
-    Raises:
-        ValueError: If ``times`` are not those of a solver.
     """
     return _data_prediction(velocity, x, times, interpolant, after_step, correct=True)
 
@@ -256,25 +210,14 @@ def unipc(
 def dopri5(
     velocity: Velocity, x: Tensor, times: Tensor, *, rtol: float = 1e-5, atol: float = 1e-5
 ) -> Tensor:
-    """Solve ``dx/dt = v(x, t)`` by adaptive Dormand-Prince steps of ``torchdiffeq``; order 5.
+    """Adaptive Dormand-Prince steps of ``torchdiffeq``; order 5.
 
     Only the first and the last time count. The solver chooses its steps, the same for the whole
-    batch: a sample depends within the tolerance on the batch it is in, and the number of
-    evaluations is known afterwards (:class:`CountingVelocity`). A state below float32 is carried
+    batch: a sample depends within the tolerances of a step on the batch it is in, and the number
+    of evaluations is known afterwards (:class:`CountingVelocity`). A state below float32 is carried
     in float32.
 
-    Args:
-        velocity: See the module.
-        x: See the module.
-        times: See the module.
-        rtol: Relative tolerance of a step.
-        atol: Absolute tolerance of a step.
-
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
     Raises:
-        ValueError: If ``times`` are not those of a solver.
         ImportError: If ``torchdiffeq`` is not installed.
     """
     try:
@@ -316,34 +259,17 @@ def ode_solver(
 ) -> OdeSolver:
     """The solver of that name, for velocities of that path.
 
-    Args:
-        name: A key of :data:`ODE_SOLVERS`.
-        interpolant: Path of the velocity, which only ``dpmpp_2m`` and ``unipc`` use.
-        after_step: See the module.
-
-    Returns:
-        ``(velocity, x, times) -> x``.
-
     Raises:
-        ValueError: If there is no solver of that name.
+        ValueError: If :data:`ODE_SOLVERS` has none of that name.
     """
     _check_name(name)
-    if name == "dpmpp_2m":
-        return partial(dpm_solver_pp_2m, interpolant=interpolant, after_step=after_step)
-    if name == "unipc":
-        return partial(unipc, interpolant=interpolant, after_step=after_step)
+    if name in ("dpmpp_2m", "unipc"):
+        return partial(ODE_SOLVERS[name], interpolant=interpolant, after_step=after_step)
     return partial(ODE_SOLVERS[name], after_step=after_step)
 
 
 def evaluations(solver: str, steps: int) -> int:
     """Network evaluations per sample of a solver, known before it runs.
-
-    Args:
-        solver: A key of :data:`ODE_SOLVERS`.
-        steps: Number of steps, at least 1.
-
-    Returns:
-        The NFE.
 
     Raises:
         ValueError: If there is no solver of that name or no step.
@@ -356,13 +282,6 @@ def evaluations(solver: str, steps: int) -> int:
 
 def steps_for(solver: str, nfe: int) -> int:
     """Largest number of steps of a solver within a number of network evaluations.
-
-    Args:
-        solver: A key of :data:`ODE_SOLVERS`.
-        nfe: Evaluations per sample that are allowed.
-
-    Returns:
-        The number of steps, at least 1.
 
     Raises:
         ValueError: If there is no solver of that name or one step takes more evaluations.
@@ -404,6 +323,24 @@ def _adams_bashforth_weights(nodes: list[float], then: float) -> list[float]:
     return (step * weights).tolist()
 
 
+class _Nodes(NamedTuple):
+    """Path coefficients at each time and the width of each step in lambda, on the host."""
+
+    alpha: list[float]
+    sigma: list[float]
+    d_alpha: list[float]
+    d_sigma: list[float]
+    widths: list[float]
+
+
+def _path_nodes(interpolant: Interpolant, times: Tensor) -> _Nodes:
+    time = times.double().cpu()
+    path = interpolant.coefficients(time)
+    log_snr = (path.alpha / path.sigma).log()
+    log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
+    return _Nodes(*(values.tolist() for values in path), log_snr.diff().tolist())
+
+
 @torch.no_grad()
 def _data_prediction(
     velocity: Velocity,
@@ -420,12 +357,7 @@ def _data_prediction(
     it predicts, from the next evaluation too when it corrects.
     """
     steps = step_pairs(times)
-    time = times.double().cpu()
-    path = interpolant.coefficients(time)
-    alpha, sigma, d_alpha, d_sigma = (values.tolist() for values in path)
-    log_snr = (path.alpha / path.sigma).log()
-    log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
-    widths = log_snr.diff().tolist()
+    alpha, sigma, d_alpha, d_sigma, widths = _path_nodes(interpolant, times)
     ratio = bend_factor = 0.0
     data = change = bend = torch.zeros_like(x)
     for index, (now, then) in enumerate(steps):

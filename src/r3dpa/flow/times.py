@@ -1,4 +1,4 @@
-"""Time grids of the solvers: float64, with both ends, between t = 1 (noise) and t = 0 (data)."""
+"""Time grids of the solvers: float64 with both ends, between t = 1 (noise) and t = 0 (data)."""
 
 from __future__ import annotations
 
@@ -7,29 +7,20 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-__all__ = ["batch_time", "ode_times", "sde_times", "step_pairs"]
+__all__ = ["batch_time", "ode_times", "per_sample", "sde_times", "step_pairs"]
 
 
 def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0, shift: float = 1.0) -> Tensor:
-    """Times of an ODE solver, equidistant in the unshifted time.
+    """Times ``(num_steps + 1,)`` of an ODE solver, equidistant in the unshifted time u.
 
     The shift spends steps near the noise (``s > 1``) or near the data (``s < 1``)::
 
         t = s u / (1 + (s - 1) u)        u = t / (s - (s - 1) t)
 
-    with ``u`` equidistant between the values that give ``start`` and ``stop``: a part of the way
-    follows the same curve as the whole.
+    A part of the way, from ``start`` to ``stop``, follows the same curve as the whole. ``stop``
+    above ``start`` goes from data towards noise.
 
     Source: resolution-dependent shift of Stable Diffusion 3 (Esser et al. 2024, eq. 23).
-
-    Args:
-        num_steps: Number of steps, at least 1.
-        start: First time.
-        stop: Last time; above ``start`` to go from data towards noise.
-        shift: ``s`` above; 1 for equidistant times.
-
-    Returns:
-        ``(num_steps + 1,)`` float64.
 
     Raises:
         ValueError: If there is no step, the times are not two different ones in [0, 1] or the
@@ -43,20 +34,15 @@ def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0, shift: floa
     first, last = (time / (shift - (shift - 1) * time) for time in (start, stop))
     unshifted = torch.linspace(first, last, num_steps + 1, dtype=torch.float64)
     times = shift * unshifted / (1 + (shift - 1) * unshifted)
-    times[0], times[-1] = start, stop  # not to the last bit after there and back
+    times[0], times[-1] = start, stop  # not exact after there and back
     return times
 
 
 def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
-    """Times of the SDE solver: equidistant from 1 to ``last``, then one step to 0.
+    """Times ``(num_steps + 1,)`` of the SDE: equidistant from 1 to ``last``, then one step to 0.
 
-    Args:
-        num_steps: Number of network evaluations, at least 1.
-        last: Time from which the last, noise-free step starts. Detail finer than about ``last``
-            standard deviations is lost with few steps near the data; 0.005 keeps it.
-
-    Returns:
-        ``(num_steps + 1,)`` float64.
+    The last step is noise-free. Detail finer than about ``last`` standard deviations is lost with
+    few steps near the data; 0.005 keeps it.
 
     Raises:
         ValueError: If there is no step or ``last`` is not in (0, 1).
@@ -70,12 +56,6 @@ def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
 def step_pairs(times: Tensor) -> list[tuple[float, float]]:
     """Start and end of every step.
 
-    Args:
-        times: ``(T,)`` times that all increase or all decrease.
-
-    Returns:
-        T - 1 pairs.
-
     Raises:
         ValueError: If there is no step, or the times turn round or repeat.
     """
@@ -88,17 +68,22 @@ def step_pairs(times: Tensor) -> list[tuple[float, float]]:
 
 
 def batch_time(time: float, x: Tensor) -> Tensor:
-    """One time for every sample of a batch.
-
-    Args:
-        time: Flow time.
-        x: ``(B, ...)`` state.
-
-    Returns:
-        ``(B,)`` on the device of ``x``, in its dtype but at least float32.
-    """
+    """One time for every sample: ``(B,)`` on the device of ``x``, at least float32."""
     dtype = torch.promote_types(x.dtype, torch.float32)
     return torch.full((len(x),), time, dtype=dtype, device=x.device)
+
+
+def per_sample(values: Tensor, x: Tensor) -> Tensor:
+    """``(B,)`` values with the axes of ``x``, to be broadcast.
+
+    Raises:
+        ValueError: If there is not one value per sample.
+    """
+    if values.shape != x.shape[:1]:
+        raise ValueError(
+            f"time must hold one value per sample, shape ({x.shape[0]},), got {tuple(values.shape)}"
+        )
+    return values.reshape(-1, *[1] * (x.dim() - 1))
 
 
 def _check_num_steps(num_steps: int) -> None:
