@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Literal, Self
 
 import numpy as np
 import torch
@@ -18,9 +16,9 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.guidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sde import euler_maruyama
-from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
-from r3dpa.flow.times import ode_times, sde_times
+from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
+from r3dpa.flow.solvers import Velocity, dopri5
+from r3dpa.flow.times import ode_times
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
@@ -37,98 +35,7 @@ __all__ = [
     "scene_random",
 ]
 
-Solver = Literal[
-    "euler",
-    "heun",
-    "midpoint",
-    "ab2",
-    "ab3",
-    "dpmpp_2m",
-    "unipc",
-    "dopri5",
-    "euler_maruyama",
-]
-Quality = Literal["draft", "good", "best"]
-
-_SDE: tuple[Solver, ...] = ("euler_maruyama",)
-#: Settings that only some solvers read.
-_READ_BY: dict[str, tuple[Solver, ...]] = {
-    "eta": _SDE,
-    "sde_last": _SDE,
-    "sde_last_time": _SDE,
-    "shift": tuple(s for s in get_args(Solver) if s not in ("euler_maruyama", "dopri5")),
-    "steps": tuple(s for s in get_args(Solver) if s != "dopri5"),
-}
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
-
-
-@dataclass(frozen=True)
-class SamplerConfig:
-    """How noise becomes latents.
-
-    Args:
-        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``dopri5`` chooses its steps
-            itself.
-        steps: Solver steps; not of ``dopri5``.
-        sde_last_time: Time from which the SDE takes its last, noise-free step.
-        sde_last: ``denoise``, or ``mean`` as in the official sampler.
-        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE and ``dopri5``.
-        eta: Strength of the noise of the SDE; 1 as published, 0 for none.
-
-    Raises:
-        ValueError: If the solver is unknown, a number out of its range, or a setting other than its
-            default is one that the solver does not read.
-    """
-
-    solver: Solver = "euler_maruyama"
-    steps: int = 256
-    sde_last_time: float = 0.04
-    sde_last: Literal["denoise", "mean"] = "denoise"
-    shift: float = 1.0
-    eta: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check name and numbers."""
-        if self.solver not in get_args(Solver):
-            raise ValueError(
-                f"solver must be one of {', '.join(get_args(Solver))}, got {self.solver!r}"
-            )
-        if self.steps < 1 or self.shift <= 0 or self.eta < 0:
-            raise ValueError(
-                "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
-                f"{self.steps}, {self.shift} and {self.eta}"
-            )
-        for name, solvers in _READ_BY.items():
-            changed = getattr(self, name) != getattr(type(self), name)
-            if changed and self.solver not in solvers:
-                raise ValueError(
-                    f"solver {self.solver} does not read {name}, which is for "
-                    f"{', '.join(solvers)}; drop one"
-                )
-
-    @classmethod
-    def of_quality(cls, quality: Quality) -> Self:
-        """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
-        level = _qualities()["levels"][quality]
-        return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
-
-    @staticmethod
-    def quality_line(quality: Quality) -> str:
-        """What :meth:`of_quality` picks, in words."""
-        table = _qualities()
-        level = table["levels"][quality]
-        line = (
-            f"quality {quality}: {level['solver']}, {level['steps']} steps, "
-            f"shift {level['shift']:g}"
-        )
-        return (
-            f"{line}: error {level['error']:.2g}, {level['seconds_share']:.0%} of the time of best "
-            f"(measured on: {table['measured_on']})"
-        )
-
-
-def _qualities() -> dict[str, Any]:
-    return json.loads((files("r3dpa") / "quality.json").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +87,8 @@ class SceneGenerator:
     """Draws scenes from a velocity network and decodes them.
 
     The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU:
-    a scene is the same whatever the batch size and, up to rounding, the device. The modulations
-    of a solver's times are computed once, so weights must not change after the first scene.
+    up to rounding, a scene depends on neither batch size nor device. The modulations of a solver's
+    times are computed once, so weights must not change after the first scene.
 
     Args:
         vae: Decoder of the latents.
@@ -194,9 +101,8 @@ class SceneGenerator:
             :meth:`VelocityNetwork.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay
             float32.
         autoguidance: Weak model and strength; no guidance where None.
-        batch_size: Fill up smaller batches, so that the networks meet a single shape; the scenes
-            do not depend on what fills it.
-        decode_batch_size: Scenes decoded together; all of a batch where None.
+        batch_size: Pad smaller batches with zeros, so that the networks see a single shape.
+        decode_batch_size: Scenes decoded together. Default: the whole batch.
         compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a
             GPU batches of at most 8 scenes are replayed as CUDA graphs.
 
@@ -237,7 +143,7 @@ class SceneGenerator:
             self.vae = copy.deepcopy(vae).halve_decoder_()
             self.sit = copy.deepcopy(sit).halve_()
             weak = copy.deepcopy(weak).halve_() if weak is not None else None
-        if self.device.type == "cuda":  # where the kernels for half precision are made for it
+        if self.device.type == "cuda":  # its half-precision kernels expect this layout
             self.vae = copy.deepcopy(self.vae).to(  # type: ignore[call-overload]
                 memory_format=torch.channels_last
             )
@@ -338,7 +244,7 @@ class SceneGenerator:
 
     @torch.inference_mode()
     def prepare(self) -> None:
-        """Does now what the first scene would wait for, and says now what cannot be.
+        """Does the set-up of the first scene and checks the sampler.
 
         Raises:
             ValueError: If the numbers of the solver do not fit together.
@@ -348,16 +254,11 @@ class SceneGenerator:
 
     @torch.inference_mode()
     def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
-        """Draws one scene per index.
-
-        Nothing waits for a GPU here: its results are ready when they are copied.
+        """Draws one scene per index, asynchronously on a GPU.
 
         Args:
             indices: Numbers of the scenes, or how many: 4 for ``range(4)``.
             seed: Number of the collection.
-
-        Returns:
-            Scenes on the networks' device.
 
         Raises:
             ValueError: If there are more than ``batch_size`` of them.
@@ -375,13 +276,12 @@ class SceneGenerator:
                 yield _filled(noise, size).to(self.device)
 
         self._schedule()
-        networks = [network for network in (self._strong, self._weak) if network is not None]
-        for network in networks:
+        for network in self._networks:
             network.calls = 0
         noise = draws()
         latents = self._solve(next(noise), noise)[: len(indices)]
         range_m = self.decode(latents)
-        nfe = sum(network.calls for network in networks)
+        nfe = sum(network.calls for network in self._networks)
         return SceneBatch(range_m, latents, nfe, self.geometry.projection)
 
     @torch.no_grad()
@@ -398,43 +298,32 @@ class SceneGenerator:
             parts.append(torch.where(finite, range_m, torch.nan))
         return torch.cat(parts)
 
-    def _schedule(self) -> None:
-        """Computes the modulations of all times that the solver will ask for.
+    @property
+    def _networks(self) -> list[_ScheduledNetwork]:
+        return [self._strong, *([] if self._weak is None else [self._weak])]
 
-        One run with velocities of 0 tells which, in what order. An adaptive solver asks for others.
+    def _schedule(self) -> None:
+        """Computes the modulations of all times of the solver.
+
+        One run with velocities of 0 lists them in order; those of an adaptive solver are unknown.
         """
         if self._scheduled == self.sampler:
             return
-        networks = [network for network in (self._strong, self._weak) if network is not None]
         adaptive = self.sampler.solver == "dopri5"
         if adaptive:  # its package may be missing
             dopri5(lambda x, _: torch.zeros_like(x), torch.zeros(1), ode_times(1))
-        for network in networks:
+        for network in self._networks:
             network.times = None if adaptive else []
             network.table = None
         if not adaptive:
             noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
             self._solve(noise, iter(lambda: noise, None))
-            for network in networks:
+            for network in self._networks:
                 network.fill_table()
         self._scheduled = self.sampler
 
     def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
-        sampler, velocity = self.sampler, self._velocity()
-        if sampler.solver == "euler_maruyama":
-            return euler_maruyama(
-                velocity,
-                noise,
-                sde_times(sampler.steps, sampler.sde_last_time),
-                draws,
-                interpolant=self.interpolant,
-                last=sampler.sde_last,
-                eta=sampler.eta,
-            )
-        times = ode_times(sampler.steps, shift=sampler.shift)
-        if sampler.solver == "dopri5":
-            return dopri5(velocity, noise, times)
-        return ode_solver(sampler.solver, self.interpolant)(velocity, noise, times)
+        return self.sampler.solve(self._velocity(), noise, draws, self.interpolant)
 
     def _velocity(self) -> Velocity:
         guidance = self._autoguidance
@@ -515,12 +404,11 @@ def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
 class _ScheduledNetwork:
     """A network as the velocity function of a solver whose times are known.
 
-    All samples of a call have the same time. It first notes the times of a trial run, then takes
-    the modulations of the k-th call from row k of a table: nothing depends on the value of a
-    time, for which a GPU would be waited for.
+    All samples of a call have the same time. A trial run records the times; afterwards the k-th
+    call takes row k of their modulations, so that no value of a time is read back from a GPU.
 
     Attributes:
-        times: Those of the trial run, each ``(1,)``; None where they are not known beforehand.
+        times: Those of the trial run, each ``(1,)``; None for an adaptive solver.
         table: ``(T, M)`` their modulations, after the trial run.
         calls: Evaluations since it was set to 0.
     """

@@ -21,9 +21,9 @@ from r3dpa.bench.hardware import flop_of, peak_memory, synchronise
 from r3dpa.bench.mixture import GaussianMixture
 from r3dpa.bench.timing import Spent
 from r3dpa.data import write_bin
-from r3dpa.flow.sde import euler_maruyama
-from r3dpa.flow.solvers import ODE_SOLVERS, CountingVelocity, heun
-from r3dpa.flow.times import ode_times, sde_times
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.solvers import CountingVelocity, heun
+from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import points_of
 
@@ -134,26 +134,12 @@ class MixtureProblem:
         generator = torch.Generator().manual_seed(_SEED)
         noise = self._draw(num, generator)
         velocity = CountingVelocity(self.mixture.velocity)
-        latents = self._solve(setting.sampler, velocity, noise, generator)
+        latents = setting.sampler.solve(velocity, noise, generator, Interpolant())
         return Solved(latents, None, velocity.nfe)
 
     def _draw(self, num: int, generator: torch.Generator) -> Tensor:
         shape = (num, self.mixture.means.shape[1])
         return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    def _solve(
-        self,
-        sampler: SamplerConfig,
-        velocity: CountingVelocity,
-        noise: Tensor,
-        generator: torch.Generator,
-    ) -> Tensor:
-        if sampler.solver == "euler_maruyama":
-            times = sde_times(sampler.steps, sampler.sde_last_time)
-            last, eta = sampler.sde_last, sampler.eta
-            return euler_maruyama(velocity, noise, times, generator, last=last, eta=eta)
-        times = ode_times(sampler.steps, shift=sampler.shift)
-        return ODE_SOLVERS[sampler.solver](velocity, noise, times)
 
     def converged(self, steps: int, num: int) -> Solved:
         """Heun's method with the exact velocity."""

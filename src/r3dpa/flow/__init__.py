@@ -19,6 +19,7 @@ from r3dpa.flow.guidance import (
     renormalised,
 )
 from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
+from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
 from r3dpa.flow.sde import DriftChange, euler_maruyama
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
@@ -53,6 +54,9 @@ __all__ = [
     "Interpolant",
     "OdeSolver",
     "PathCoefficients",
+    "Quality",
+    "SamplerConfig",
+    "Solver",
     "Trajectory",
     "Velocity",
     "ab2",

@@ -22,7 +22,6 @@ import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -323,22 +322,13 @@ def _adams_bashforth_weights(nodes: list[float], then: float) -> list[float]:
     return (step * weights).tolist()
 
 
-class _Nodes(NamedTuple):
-    """Path coefficients at each time and the width of each step in lambda, on the host."""
-
-    alpha: list[float]
-    sigma: list[float]
-    d_alpha: list[float]
-    d_sigma: list[float]
-    widths: list[float]
-
-
-def _path_nodes(interpolant: Interpolant, times: Tensor) -> _Nodes:
+def _path_nodes(interpolant: Interpolant, times: Tensor) -> list[list[float]]:
+    """Alpha, sigma and their derivatives at each time, and the width of each step in lambda."""
     time = times.double().cpu()
     path = interpolant.coefficients(time)
     log_snr = (path.alpha / path.sigma).log()
     log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
-    return _Nodes(*(values.tolist() for values in path), log_snr.diff().tolist())
+    return [*(values.tolist() for values in path), log_snr.diff().tolist()]
 
 
 @torch.no_grad()

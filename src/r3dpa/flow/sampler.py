@@ -1,0 +1,136 @@
+"""Sampler settings: one solver with its steps, from noise to latents."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, Literal, Self, get_args
+
+import torch
+from torch import Tensor
+
+from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.sde import euler_maruyama
+from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
+from r3dpa.flow.times import ode_times, sde_times
+
+__all__ = ["Quality", "SamplerConfig", "Solver"]
+
+Solver = Literal[
+    "euler",
+    "heun",
+    "midpoint",
+    "ab2",
+    "ab3",
+    "dpmpp_2m",
+    "unipc",
+    "dopri5",
+    "euler_maruyama",
+]
+Quality = Literal["draft", "good", "best"]
+
+_SDE: tuple[Solver, ...] = ("euler_maruyama",)
+#: Settings that only some solvers read.
+_READ_BY: dict[str, tuple[Solver, ...]] = {
+    "eta": _SDE,
+    "sde_last": _SDE,
+    "sde_last_time": _SDE,
+    "shift": tuple(s for s in get_args(Solver) if s not in ("euler_maruyama", "dopri5")),
+    "steps": tuple(s for s in get_args(Solver) if s != "dopri5"),
+}
+
+
+@dataclass(frozen=True)
+class SamplerConfig:
+    """How noise becomes latents.
+
+    Args:
+        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``dopri5`` chooses its steps
+            itself.
+        steps: Solver steps; not of ``dopri5``.
+        sde_last_time: Time from which the SDE takes its last, noise-free step.
+        sde_last: ``denoise``, or ``mean`` as in the official sampler.
+        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE and ``dopri5``.
+        eta: Strength of the noise of the SDE; 1 as published, 0 for none.
+
+    Raises:
+        ValueError: If the solver is unknown, a number out of its range, or a setting other than its
+            default is one that the solver does not read.
+    """
+
+    solver: Solver = "euler_maruyama"
+    steps: int = 256
+    sde_last_time: float = 0.04
+    sde_last: Literal["denoise", "mean"] = "denoise"
+    shift: float = 1.0
+    eta: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.solver not in get_args(Solver):
+            raise ValueError(
+                f"solver must be one of {', '.join(get_args(Solver))}, got {self.solver!r}"
+            )
+        if self.steps < 1 or self.shift <= 0 or self.eta < 0:
+            raise ValueError(
+                "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
+                f"{self.steps}, {self.shift} and {self.eta}"
+            )
+        for name, solvers in _READ_BY.items():
+            changed = getattr(self, name) != getattr(type(self), name)
+            if changed and self.solver not in solvers:
+                raise ValueError(
+                    f"solver {self.solver} does not read {name}, which is for "
+                    f"{', '.join(solvers)}; drop one"
+                )
+
+    @classmethod
+    def of_quality(cls, quality: Quality) -> Self:
+        """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
+        level = _qualities()["levels"][quality]
+        return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
+
+    @staticmethod
+    def quality_line(quality: Quality) -> str:
+        """One line of text about the sampler of :meth:`of_quality`."""
+        table = _qualities()
+        level = table["levels"][quality]
+        return (
+            f"quality {quality}: {level['solver']}, {level['steps']} steps, "
+            f"shift {level['shift']:g}: error {level['error']:.2g}, "
+            f"{level['seconds_share']:.0%} of the time of best "
+            f"(measured on: {table['measured_on']})"
+        )
+
+    def solve(
+        self,
+        velocity: Velocity,
+        noise: Tensor,
+        draws: torch.Generator | Iterable[Tensor],
+        interpolant: Interpolant,
+    ) -> Tensor:
+        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``.
+
+        Raises:
+            ValueError: If the numbers of the solver do not fit together.
+            ImportError: If the package of ``dopri5`` is missing.
+        """
+        if self.solver == "euler_maruyama":
+            return euler_maruyama(
+                velocity,
+                noise,
+                sde_times(self.steps, self.sde_last_time),
+                draws,
+                interpolant=interpolant,
+                last=self.sde_last,
+                eta=self.eta,
+            )
+        times = ode_times(self.steps, shift=self.shift)
+        if self.solver == "dopri5":
+            return dopri5(velocity, noise, times)
+        return ode_solver(self.solver, interpolant)(velocity, noise, times)
+
+
+def _qualities() -> dict[str, Any]:
+    return json.loads((files("r3dpa") / "quality.json").read_text(encoding="utf-8"))
