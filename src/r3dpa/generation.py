@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.flow.guidance import autoguided, renormalised
+from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
 from r3dpa.flow.solvers import Velocity, dopri5
@@ -192,11 +192,6 @@ class SceneGenerator:
             FileNotFoundError: If there is no such file.
             ValueError: If it cannot be read, or a network, the latent statistics or the scan
                 geometry is missing.
-
-        Example:
-            >>> scenes = SceneGenerator.from_checkpoint("last.ckpt").generate(4)  # doctest: +SKIP
-            >>> scenes.range_m.shape, scenes.points(0).shape  # doctest: +SKIP
-            (torch.Size([4, 64, 1024]), torch.Size([58012, 3]))
         """
         checkpoint = _opened(checkpoint)
         if checkpoint.stage == "vae_alignment":

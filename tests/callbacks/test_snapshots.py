@@ -17,7 +17,7 @@ from r3dpa.callbacks import EMASnapshots
 from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint, weights_sha256
 from r3dpa.checkpoints.snapshots import read_snapshot
 from r3dpa.cli import main
-from r3dpa.flow.guidance import renormalised
+from r3dpa.flow.autoguidance import renormalised
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import FlowMatching, VAEAlignment
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from r3dpa.flow import CountingVelocity, Interpolant, heun, ode_times
-from r3dpa.flow.guidance import autoguided, renormalised
+from r3dpa.flow.autoguidance import autoguided, renormalised
 
 MEANS = torch.tensor([0.3, -0.8], dtype=torch.float64)
 SHIFT = torch.tensor([0.7, -0.2], dtype=torch.float64)

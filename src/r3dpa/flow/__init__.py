@@ -1,5 +1,6 @@
 """Flow matching without networks: paths, solvers, guidance and editing over velocity functions."""
 
+from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.editing import (
     Trajectory,
     invert,
@@ -15,8 +16,6 @@ from r3dpa.flow.guidance import (
     FeatureTarget,
     GuidanceRecord,
     aligned_velocity,
-    autoguided,
-    renormalised,
 )
 from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
 from r3dpa.flow.sampler import Quality, SamplerConfig, Solver

@@ -1,7 +1,6 @@
-"""Guidance: velocity functions pulled towards 3D features, or away from a weaker model.
+"""Feature guidance: a velocity function that pulls tokens towards given 3D features.
 
-Letters: B batch, C latent channels, N tokens, F feature width, S sources, ``...`` further axes of
-the latents.
+Letters: B batch, N tokens, F feature width, S sources, ``...`` axes of the latents.
 """
 
 from __future__ import annotations
@@ -9,15 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import DriftChange
 from r3dpa.flow.solvers import Velocity
-from r3dpa.flow.times import per_sample
+from r3dpa.flow.times import check_interval, per_sample
 
 __all__ = [
     "AlignedEvaluation",
@@ -26,134 +25,9 @@ __all__ = [
     "FeatureTarget",
     "GuidanceRecord",
     "aligned_velocity",
-    "autoguided",
-    "renormalised",
 ]
 
 _COSINE_EPS = 1e-6
-_LINEAR = Interpolant("linear")
-
-
-def autoguided(
-    velocity: Velocity,
-    weak: Velocity,
-    scale: float,
-    interval: tuple[float, float] = (0.0, 1.0),
-) -> Velocity:
-    """Velocity extrapolated from that of a weak model through that of the model itself.
-
-    Both models err in the same direction, the weak one further: the difference points to the data.
-    It needs no classes. Formula: ``weak + scale (velocity - weak)`` at times inside the interval,
-    ``velocity`` outside, where ``weak`` is not evaluated.
-
-    Source: Karras et al., "Guiding a diffusion model with a bad version of itself" (2024), eq. 3;
-    interval: Kynkäänniemi et al. 2024.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` of the model.
-        weak: The same of a weaker one, in the same normalised latents: see :func:`renormalised`.
-        scale: Strength, at least 1; at 1 the result is ``velocity`` itself.
-        interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
-            waits for a GPU.
-
-    Returns:
-        Guided velocity, in at least float32 where it is guided.
-
-    Raises:
-        ValueError: If ``scale`` or ``interval`` is out of range or, when called, the two velocities
-            have different shapes.
-
-    Example:
-        >>> guided = autoguided(lambda x, time: 2 * x, lambda x, time: x, scale=3.0)
-        >>> guided(torch.ones(1, 2), torch.tensor([0.5]))
-        tensor([[4., 4.]])
-    """
-    first, last = interval
-    if not (math.isfinite(scale) and scale >= 1):
-        raise ValueError(
-            f"the scale of autoguidance must be a number of 1 or more, got {scale}; 1 is no "
-            "guidance, and less would move towards the weak model"
-        )
-    _check_interval(interval, "autoguidance")
-    if scale == 1:
-        return velocity
-    everywhere = first == 0 and last == 1
-
-    def guided(x: Tensor, time: Tensor) -> Tensor:
-        strong = velocity(x, time)
-        inside = per_sample((time >= first) & (time <= last), strong)
-        if not (everywhere or inside.any()):
-            return strong
-        weaker = weak(x, time)
-        if weaker.shape != strong.shape:
-            raise ValueError(
-                f"the weak model answers {tuple(weaker.shape)}, the model {tuple(strong.shape)}; "
-                "both must be of the same latents"
-            )
-        dtype = torch.promote_types(strong.dtype, torch.float32)  # a small difference, magnified
-        pushed = torch.lerp(weaker.to(dtype), strong.to(dtype), scale)
-        return pushed if everywhere else torch.where(inside, pushed, strong.to(dtype))
-
-    return guided
-
-
-def renormalised(
-    weak: Velocity, scale: float, shift: Tensor, interpolant: Interpolant = _LINEAR
-) -> Velocity:
-    """Velocity of a model whose latents are ``scale * latents + shift``, for these latents.
-
-    Exact. A noisy latent is ``x = alpha z + sigma e``; the model knows ``z' = scale z + shift``
-    and, since the noise of its path has unit variance too, another ratio of data and noise. At the
-    time t' of its path with ``sigma' / alpha' = scale sigma / alpha`` its noisy latent is::
-
-        x' = alpha' z' + sigma' e = (alpha' / alpha) scale x + alpha' shift
-
-    with the same noise ``e``, so what it expects of ``z'`` and ``e`` given ``x'`` holds given
-    ``x``, and ``v = d_alpha (z' - shift) / scale + d_sigma e``. Nothing is divided by t or 1 - t.
-
-    One number ``scale`` serves all channels: with one for each, ``e`` would have to differ in
-    strength between channels, which the model never saw.
-
-    Args:
-        weak: ``(x' (B, C, ...), time' (B,)) -> (B, C, ...)`` in its own latents.
-        scale: Positive number.
-        shift: ``(C,)`` on the device of the latents.
-        interpolant: Path of both models.
-
-    Returns:
-        ``weak`` itself at scale 1 and shift 0.
-
-    Raises:
-        ValueError: If ``scale`` is not positive and finite, or ``shift`` has not one axis.
-    """
-    if not (math.isfinite(scale) and scale > 0) or shift.dim() != 1:
-        raise ValueError(
-            "scale must be positive and finite and shift have shape (C,), got "
-            f"{scale} and {tuple(shift.shape)}"
-        )
-    if scale == 1 and not shift.any():
-        return weak
-
-    def velocity(x: Tensor, time: Tensor) -> Tensor:
-        here = interpolant.coefficients(per_sample(time, x))
-        scaled = scale * here.sigma
-        if interpolant.path == "linear":
-            length = here.alpha + scaled
-            there_time = scaled / length
-        else:
-            length = torch.hypot(here.alpha, scaled)
-            there_time = torch.atan2(scaled, here.alpha) * (2 / math.pi)
-        there = interpolant.coefficients(there_time)
-        offset = shift.to(there_time.dtype).reshape(-1, *[1] * (x.dim() - 2))
-        there_x = scale / length * x + there.alpha * offset
-        slope = weak(there_x.to(x.dtype), there_time.flatten())
-        # x' and its slope are two mixtures of data and noise: solved for both.
-        determinant = there.alpha * there.d_sigma - there.sigma * there.d_alpha
-        data = (there.d_sigma * there_x - there.sigma * slope) / determinant
-        noise = (there.alpha * slope - there.d_alpha * there_x) / determinant
-        return here.d_alpha * (data - offset) / scale + here.d_sigma * noise
-
-    return velocity
 
 
 class AlignedEvaluation(Protocol):
@@ -171,19 +45,11 @@ class AlignedEvaluation(Protocol):
 AlignedVelocity = Callable[[Tensor, Tensor], AlignedEvaluation]
 
 
-class _TwoCalls(NamedTuple):
-    features: Tensor
-    velocity: Callable[[], Tensor]
-
-
 def aligned_velocity(velocity: Velocity, project_features: Velocity) -> AlignedVelocity:
     """An aligned velocity of two functions that share no work, such as an autoguided velocity.
 
-    A network's own ``aligned_pass`` does not evaluate its first blocks twice.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        project_features: ``(x (B, ...), time (B,)) -> (B, N, F)``, differentiable in ``x``.
+    A network's own ``aligned_pass`` does not evaluate its first blocks twice. ``project_features``
+    is ``(x (B, ...), time (B,)) -> (B, N, F)``, differentiable in ``x``.
     """
 
     def evaluate(x: Tensor, time: Tensor) -> AlignedEvaluation:
@@ -191,7 +57,7 @@ def aligned_velocity(velocity: Velocity, project_features: Velocity) -> AlignedV
             with torch.no_grad():
                 return velocity(x.detach(), time)
 
-        return _TwoCalls(project_features(x, time), finish)
+        return SimpleNamespace(features=project_features(x, time), velocity=finish)
 
     return evaluate
 
@@ -254,14 +120,10 @@ class FeatureTarget:
 
 
 class GuidanceRecord(NamedTuple):
-    """One guided evaluation, one value per sample.
+    """One guided evaluation: energy ``(B,)``, and cosine ``(B,)`` between velocity and term.
 
-    Attributes:
-        energy: ``(B,)`` minus the mean cosine over the selected tokens, summed over the targets
-            with their weights; with ``legacy`` the share of each sample in the mean over the whole
-            batch (its sum is the official log).
-        cosine: ``(B,)`` cosine between the direction of the sampler and the guidance term. With
-            ``legacy`` the direction of an ODE step already contains the guidance.
+    With ``legacy`` the energy is the share of each sample in the mean over the whole batch (its sum
+    is the official log), and the velocity of an ODE step already contains the guidance.
     """
 
     energy: Tensor
@@ -345,7 +207,7 @@ class FeatureGuidance:
             raise ValueError(f"scale of the guidance must be 0 or above, got {scale}")
         if not max_ratio >= 0:
             raise ValueError(f"max_ratio of the guidance must be 0 or above, got {max_ratio}")
-        _check_interval(interval, "guidance")
+        check_interval(interval, "guidance")
         if relative and (legacy or scale > max_ratio):
             raise ValueError(
                 f"relative guidance is not legacy, and its scale at most max_ratio ({max_ratio}), "
@@ -489,14 +351,6 @@ def _prepared(target: FeatureTarget, count_empty_cells: bool) -> _Prepared:
     if not count_empty_cells:
         mask &= features.abs().amax(dim=-1) > 0
     return _Prepared(_unit(features), mask, target.weight)
-
-
-def _check_interval(interval: tuple[float, float], what: str) -> None:
-    if not 0 <= interval[0] < interval[1] <= 1:
-        raise ValueError(
-            f"the interval of {what} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "
-            f"got {interval[0]} and {interval[1]}"
-        )
 
 
 def _at_least_float32(values: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-__all__ = ["batch_time", "ode_times", "per_sample", "sde_times", "step_pairs"]
+__all__ = ["batch_time", "check_interval", "ode_times", "per_sample", "sde_times", "step_pairs"]
 
 
 def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0, shift: float = 1.0) -> Tensor:
@@ -84,6 +84,15 @@ def per_sample(values: Tensor, x: Tensor) -> Tensor:
             f"time must hold one value per sample, shape ({x.shape[0]},), got {tuple(values.shape)}"
         )
     return values.reshape(-1, *[1] * (x.dim() - 1))
+
+
+def check_interval(interval: tuple[float, float], what: str) -> None:
+    """Raises a ``ValueError`` if the interval is not two increasing times in [0, 1]."""
+    if not 0 <= interval[0] < interval[1] <= 1:
+        raise ValueError(
+            f"the interval of {what} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "
+            f"got {interval[0]} and {interval[1]}"
+        )
 
 
 def _check_num_steps(num_steps: int) -> None:
