@@ -10,24 +10,20 @@ __all__ = ["PatchDiscriminator"]
 
 
 class PatchDiscriminator(nn.Module):
-    """Convolutional discriminator that judges overlapping patches of a range image.
+    """Convolutional discriminator of overlapping patches of a range image.
 
     4x4 convolutions, leaky ReLU 0.2, batch norm after all but the first and last convolution;
-    ``num_layers`` of them halve the image, two more keep the stride. The padding is zero on all
-    sides: unlike in the VAE, columns do not wrap. With the defaults 661,313 parameters and a
-    receptive field of 34 x 34 pixels.
+    ``num_layers`` of them have stride 2, two more stride 1. All sides are padded with zeros: unlike
+    in the VAE, columns do not wrap. The defaults have 661,313 parameters and a receptive field of
+    34 x 34 pixels.
 
     Source: Isola et al., "Image-to-image translation with conditional adversarial networks"
-    (CVPR 2017), from where the initialisation N(0, 0.02) comes too. State-dict keys are those of
-    the official discriminator checkpoint.
+    (CVPR 2017), including the initialisation N(0, 0.02). State-dict keys are the official ones.
 
     Args:
         in_channels: Channels of the range image.
         channels: Width of the first layer; it doubles per layer, up to eight times.
-        num_layers: Number of convolutions with stride 2, at least 1.
-
-    Raises:
-        ValueError: If ``num_layers`` is below 1.
+        num_layers: Convolutions with stride 2, at least 1.
     """
 
     def __init__(self, in_channels: int = 1, channels: int = 64, num_layers: int = 2) -> None:
@@ -49,13 +45,10 @@ class PatchDiscriminator(nn.Module):
         self.main.apply(_initialise)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Logits of the patches of a range image, positive for real ones.
+        """Logits ``(B, 1, H / 2^num_layers - 2, W / 2^num_layers - 2)``, positive for real patches.
 
         Args:
             image: ``(B, in_channels, H, W)`` encoded range.
-
-        Returns:
-            ``(B, 1, H / 2^num_layers - 2, W / 2^num_layers - 2)``.
         """
         return self.main(image)
 

@@ -20,20 +20,13 @@ class EMA(nn.Module):
     Parameters follow ``average = decay * average + (1 - decay) * weight`` after every optimiser
     step. Buffers (the latent statistics, which are an average already) are copied by default: at
     decay 0.9999 an averaged statistic lags about 1e4 steps behind the VAE. The official code
-    averages floating-point buffers too; ``buffers="decay"`` does the same.
+    averages floating-point buffers too, as does ``buffers="decay"``.
 
     Args:
         sit: Network to average; copied, never changed.
-        latent_norm: Statistics that belong to it.
+        latent_norm: Its statistics.
         decay: Weight of the old average, in [0, 1).
         buffers: ``copy`` or ``decay``.
-
-    Attributes:
-        sit: Averaged network.
-        latent_norm: Its statistics.
-
-    Raises:
-        ValueError: If ``decay`` or ``buffers`` is out of range.
     """
 
     def __init__(
@@ -55,7 +48,7 @@ class EMA(nn.Module):
 
     @torch.no_grad()
     def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Moves the averages one step towards the present weights."""
+        """Moves the averages one step towards the current weights."""
         for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
             pairs: list[tuple[Tensor, Tensor]] = list(
                 zip(average.parameters(), network.parameters(), strict=True)
@@ -73,10 +66,10 @@ class EMA(nn.Module):
 
     @torch.no_grad()
     def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Sets the averages to the present weights, as at the start of a training stage."""
+        """Sets the averages to the current weights, as at the start of a training stage."""
         self.sit.load_state_dict(sit.state_dict())
         self.latent_norm.load_state_dict(latent_norm.state_dict())
 
     def train(self, mode: bool = True) -> EMA:
-        """Keeps the averages in evaluation mode whatever the surrounding module does."""
+        """Stays in evaluation mode."""
         return super().train(False)

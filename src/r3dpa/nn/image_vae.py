@@ -5,11 +5,13 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.posterior import Posterior
+from r3dpa.nn.vae import Posterior
 
 __all__ = ["ImageVAE"]
 
@@ -20,9 +22,8 @@ _RGB = 3
 class ImageVAE(nn.Module):
     """Convolutional autoencoder of RGB images; the defaults are Stable Diffusion's, f8d4.
 
-    Level i has ``channels[i]`` channels, and half as many rows and columns as the one before.
-    Latents are not scaled: :class:`r3dpa.nn.LatentNorm` takes the place of the usual factor
-    0.18215.
+    Level i has ``channels[i]`` channels and half the rows and columns of level i - 1. Latents are
+    not scaled: :class:`r3dpa.nn.LatentNorm` replaces the usual factor 0.18215.
 
     Source: Rombach et al., "High-resolution image synthesis with latent diffusion models" (CVPR
     2022). State-dict keys are those of ``AutoencoderKL`` in diffusers, whose safetensors files
@@ -33,9 +34,6 @@ class ImageVAE(nn.Module):
         channels: Width of each level, multiples of ``norm_groups``.
         num_res_blocks: Residual blocks per encoder level; decoder levels have one more.
         norm_groups: Groups of all group norms.
-
-    Raises:
-        ValueError: If a width is not a multiple of ``norm_groups``.
     """
 
     def __init__(
@@ -58,24 +56,17 @@ class ImageVAE(nn.Module):
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
 
     def latent_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image.
-
-        Raises:
-            ValueError: If the stride does not divide the image.
-        """
+        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image."""
         rows, columns = image_size
         if rows % self.stride or columns % self.stride:
             raise ValueError(f"image sides must be multiples of {self.stride}, got {image_size}")
         return rows // self.stride, columns // self.stride
 
     def encode(self, image: Tensor) -> Posterior:
-        """Distribution of the raw latents of images.
-
-        Args:
-            image: ``(B, 3, H, W)`` red, green, blue in [-1, 1].
+        """Posterior of the raw latents of images ``(B, 3, H, W)`` in [-1, 1], red, green, blue.
 
         Raises:
-            ValueError: If ``image`` has another shape, or sides that the stride does not divide.
+            ValueError: If the image has another shape, or the stride does not divide its sides.
         """
         if image.dim() != 4 or image.shape[1] != _RGB:
             raise ValueError(f"image must be (B, 3, H, W), got {tuple(image.shape)}")
@@ -91,12 +82,7 @@ class _Encoder(nn.Module):
     def __init__(self, out_channels: int, widths: list[int], num_blocks: int, groups: int) -> None:
         super().__init__()
         self.conv_in = nn.Conv2d(_RGB, widths[0], 3, padding=1)
-        before = [widths[0], *widths[:-1]]
-        last = len(widths) - 1
-        self.down_blocks = nn.ModuleList(
-            _DownLevel(before[i], widths[i], num_blocks, groups, shrinks=i < last)
-            for i in range(len(widths))
-        )
+        self.down_blocks = _levels(widths, num_blocks, groups, "downsamplers", _Downsample)
         self.mid_block = _Middle(widths[-1], groups)
         self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
         self.conv_out = nn.Conv2d(widths[-1], out_channels, 3, padding=1)
@@ -114,12 +100,7 @@ class _Decoder(nn.Module):
         widths = widths[::-1]  # up_blocks.0 is the lowest resolution
         self.conv_in = nn.Conv2d(in_channels, widths[0], 3, padding=1)
         self.mid_block = _Middle(widths[0], groups)
-        before = [widths[0], *widths[:-1]]
-        last = len(widths) - 1
-        self.up_blocks = nn.ModuleList(
-            _UpLevel(before[i], widths[i], num_blocks, groups, grows=i < last)
-            for i in range(len(widths))
-        )
+        self.up_blocks = _levels(widths, num_blocks, groups, "upsamplers", _Upsample)
         self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
         self.conv_out = nn.Conv2d(widths[-1], _RGB, 3, padding=1)
 
@@ -130,47 +111,41 @@ class _Decoder(nn.Module):
         return self.conv_out(F.silu(self.conv_norm_out(hidden)))
 
 
-class _Level(nn.Module):
-    """Residual blocks of one resolution."""
+def _levels(
+    widths: list[int], num_blocks: int, groups: int, name: str, resampler: type[nn.Module]
+) -> nn.ModuleList:
+    """Levels of the given widths; all but the last end with a resampling layer called ``name``."""
+    before = [widths[0], *widths[:-1]]
+    resamplers = [*[resampler] * (len(widths) - 1), None]
+    return nn.ModuleList(
+        _Level(*level, num_blocks, groups, name)
+        for level in zip(before, widths, resamplers, strict=True)
+    )
 
-    def __init__(self, in_channels: int, out_channels: int, num_blocks: int, groups: int) -> None:
+
+class _Level(nn.Module):
+    """Residual blocks of one resolution, and the layer that leaves it."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        resampler: type[nn.Module] | None,
+        num_blocks: int,
+        groups: int,
+        name: str,
+    ) -> None:
         super().__init__()
         self.resnets = nn.ModuleList(
             _ResBlock(out_channels if index else in_channels, out_channels, groups)
             for index in range(num_blocks)
         )
+        self.add_module(name, nn.ModuleList([resampler(out_channels)] if resampler else []))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        for block in self.resnets:
-            hidden = block(hidden)
-        return hidden
-
-
-class _DownLevel(_Level):
-    def __init__(
-        self, in_channels: int, out_channels: int, num_blocks: int, groups: int, shrinks: bool
-    ) -> None:
-        super().__init__(in_channels, out_channels, num_blocks, groups)
-        self.downsamplers = nn.ModuleList([_Downsample(out_channels)] if shrinks else [])
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        hidden = super().forward(hidden)
-        for layer in self.downsamplers:
-            hidden = layer(hidden)
-        return hidden
-
-
-class _UpLevel(_Level):
-    def __init__(
-        self, in_channels: int, out_channels: int, num_blocks: int, groups: int, grows: bool
-    ) -> None:
-        super().__init__(in_channels, out_channels, num_blocks, groups)
-        self.upsamplers = nn.ModuleList([_Upsample(out_channels)] if grows else [])
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        hidden = super().forward(hidden)
-        for layer in self.upsamplers:
-            hidden = layer(hidden)
+        for layers in self.children():
+            for layer in cast(nn.ModuleList, layers):
+                hidden = layer(hidden)
         return hidden
 
 
@@ -180,7 +155,7 @@ class _Downsample(nn.Module):
         self.conv = nn.Conv2d(channels, channels, 3, stride=2)
 
     def forward(self, hidden: Tensor) -> Tensor:
-        return self.conv(F.pad(hidden, (0, 1, 0, 1)))  # below and to the right alone
+        return self.conv(F.pad(hidden, (0, 1, 0, 1)))  # right and bottom only, as released
 
 
 class _Upsample(nn.Module):

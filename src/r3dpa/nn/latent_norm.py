@@ -17,10 +17,9 @@ __all__ = ["LatentNorm"]
 class LatentNorm(nn.Module):
     """Per-channel normalisation of latents with running statistics and an exact inverse.
 
-    A batch norm without weights whose two roles are two methods: :meth:`update` (training, batch
-    statistics) and :meth:`normalise` (running statistics). The mode of the module plays no part.
-    Both compute in at least float32 and return that dtype. State-dict names are those of
-    ``torch.nn.BatchNorm2d``.
+    A batch norm without weights: :meth:`update` uses batch statistics (training), :meth:`normalise`
+    running statistics; the mode of the module plays no part. Latents are ``(B, C, h, w)``; results
+    are in float32 or wider. State-dict keys are those of ``torch.nn.BatchNorm2d``.
 
     Source: the batch norm inside SiT of REPA-E (Leng et al. 2025) and R3DPA (ICRA 2026).
 
@@ -28,14 +27,10 @@ class LatentNorm(nn.Module):
         channels: Latent channels C.
         eps: Added to the variance inside the root.
         momentum: Weight of the new batch in the running statistics.
-        legacy_inverse: Leave ``eps`` out of :meth:`denormalise`, as the official code does; it is
-            then 5e-5 off at variance 1 and 29 % at variance 1e-4.
-        replace_non_finite: Official handling of broken latents: NaN becomes 0 and infinities the
-            largest number. It hides the fault from the loss; the running statistics are safe
-            either way.
-
-    Raises:
-        ValueError: If ``channels`` is below 1 or ``eps`` is not above 0.
+        legacy_inverse: Leave ``eps`` out of :meth:`denormalise`, as the official code does: an
+            error of 5e-5 at variance 1 and of 29 % at variance 1e-4.
+        replace_non_finite: As the official code, replace NaN by 0 and infinities by the largest
+            number. It hides the fault from the loss; the running statistics are safe either way.
     """
 
     running_mean: Tensor
@@ -64,26 +59,14 @@ class LatentNorm(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether the running statistics have seen a batch or come from a checkpoint that has.
+        """Whether the running statistics, loaded or not, have seen a batch.
 
         Generation must check it: fresh statistics (0, 1) denormalise to the wrong scale.
         """
         return bool(self.num_batches_tracked > 0)
 
     def normalise(self, latents: Tensor) -> Tensor:
-        """Normalise with the running statistics; a later :meth:`update` does not touch this pass.
-
-        Formula: ``(x - mean) / sqrt(var + eps)``.
-
-        Args:
-            latents: ``(B, C, h, w)`` raw latents.
-
-        Returns:
-            ``(B, C, h, w)`` latents, float32 or wider.
-
-        Raises:
-            ValueError: If ``latents`` has another number of axes or channels.
-        """
+        """Latents ``(x - mean) / sqrt(var + eps)`` of raw latents, with the running statistics."""
         latents = self._repair(self._widen(latents))
         # The root is a new tensor, so the graph holds no buffer that a later update overwrites
         # (an eval-mode BatchNorm2d reads its buffers again in backward).
@@ -92,23 +75,15 @@ class LatentNorm(nn.Module):
         )
 
     def update(self, latents: Tensor) -> Tensor:
-        """Normalise with the statistics of this batch and move the running statistics.
+        """Latents normalised with the statistics of this batch, which move the running ones.
 
-        The batch is that of all processes when ``torch.distributed`` is initialised; gradients
-        then flow through the shared statistics too, so every process must call it. The biased
-        variance normalises, the unbiased one enters the running statistics. A batch with a
-        non-finite latent anywhere, or whose variance is too large for the running one, leaves mean,
-        variance and count as they were.
-
-        Args:
-            latents: ``(B, C, h, w)`` raw latents.
-
-        Returns:
-            ``(B, C, h, w)`` latents, float32 or wider.
+        The batch is that of all processes when ``torch.distributed`` is initialised; every process
+        must then call it, as gradients flow through the shared statistics. The biased variance
+        normalises, the unbiased one enters the running statistics. A batch with a non-finite
+        latent, or whose variance overflows, leaves mean, variance and count unchanged.
 
         Raises:
-            ValueError: If ``latents`` has another number of axes or channels, or a single value
-                per channel, which has no variance.
+            ValueError: If there is a single value per channel, which has no variance.
         """
         latents = self._widen(latents)
         positions = latents.numel() // self.channels
@@ -139,19 +114,7 @@ class LatentNorm(nn.Module):
         return normalised.to(latents.dtype)
 
     def denormalise(self, latents: Tensor) -> Tensor:
-        """Exact inverse of :meth:`normalise`.
-
-        Formula: ``x * sqrt(var + eps) + mean``; ``eps`` is left out with ``legacy_inverse``.
-
-        Args:
-            latents: ``(B, C, h, w)`` latents.
-
-        Returns:
-            ``(B, C, h, w)`` raw latents, float32 or wider.
-
-        Raises:
-            ValueError: If ``latents`` has another number of axes or channels.
-        """
+        """Raw latents ``x * sqrt(var + eps) + mean``, the exact inverse of :meth:`normalise`."""
         latents = self._widen(latents)
         variance = self.running_var if self.legacy_inverse else self.running_var + self.eps
         return latents * _per_channel(variance.sqrt(), latents) + _per_channel(

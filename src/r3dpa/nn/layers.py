@@ -1,10 +1,11 @@
-"""Layers of the range-image networks: columns wrap around, rows end at the field of view.
+"""Layers that several networks share; in those of range images columns wrap around.
 
-Letters: B batch, C channels, H x W image or latent size.
+Letters: B batch, C channels, H x W image or latent size, N tokens, D token width.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -20,11 +21,13 @@ __all__ = [
     "Downsample",
     "GroupNorm",
     "ResBlock",
+    "SelfAttention",
     "SyncedBatchNorm2d",
     "Upsample",
     "WideCircularConv2d",
     "at_least_float32",
     "no_autocast",
+    "sum_over_processes",
 ]
 
 Size = tuple[int, int]
@@ -41,29 +44,22 @@ _UPSAMPLE = {(1, 2): (1, 5), (1, 4): (1, 7), (2, 1): (5, 1), (2, 2): (3, 3)}
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """The same numbers in float32, or in float64 if they came so (islands under autocast)."""
+    """The tensor in float32, or unchanged in float64."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def no_autocast(device: torch.device) -> AbstractContextManager[Any]:
-    """Island in which nothing is rounded; the device ``meta`` knows no autocast."""
+    """Disables autocast; does nothing on ``meta``, which has none."""
     if device.type == "meta":
         return nullcontext()
     return torch.autocast(device.type, enabled=False)
 
 
 class CircularConv2d(nn.Conv2d):
-    """Convolution over a range image whose first and last column are neighbours.
+    """Convolution with circular padding of columns and zero padding of rows.
 
-    Columns wrap around and rows are padded with zeros, by default so that the size stays the
-    same; an even kernel then looks further right and down than left and up.
-
-    Args:
-        in_channels: Input channels.
-        out_channels: Output channels.
-        kernel_size: Rows and columns of the kernel.
-        stride: Step in rows and columns.
-        pads: Padded ``(left, right, top, bottom)`` pixels, ``top <= bottom``.
+    The default padding keeps the size; an even kernel then reaches further right and down than
+    left and up. ``pads`` are ``(left, right, top, bottom)`` pixels, ``top <= bottom``.
     """
 
     def __init__(
@@ -83,7 +79,7 @@ class CircularConv2d(nn.Conv2d):
         self.extra_row_pads = (0, 0, 0, bottom - top)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Convolve ``(B, C, H, W)``."""
+        """Convolution of ``(B, C, H, W)``."""
         if any(self.column_pads):
             image = F.pad(image, self.column_pads, mode="circular")
         if any(self.extra_row_pads):
@@ -92,28 +88,19 @@ class CircularConv2d(nn.Conv2d):
 
 
 class WideCircularConv2d(CircularConv2d):
-    """The same in at least float32, whatever the rest of the network runs in.
+    """:class:`CircularConv2d` in at least float32, also under autocast.
 
-    For the layer that makes a range image: rounded to bfloat16, a range of 50 m would be off by
-    0.1 m.
+    For the layer that outputs a range image: in bfloat16 a range of 50 m would be off by 0.1 m.
     """
 
     def forward(self, image: Tensor) -> Tensor:
-        """Convolve ``(B, C, H, W)``."""
+        """Convolution of ``(B, C, H, W)``."""
         with no_autocast(image.device):
             return super().forward(image.to(at_least_float32(self.weight).dtype))
 
 
 class Downsample(nn.Module):
-    """Strided convolution, as in LiDM: one layer per stride, with the pads of official weights.
-
-    Args:
-        channels: Input and output channels.
-        stride: Reduction of rows and columns: (1, 2), (1, 4), (2, 1) or (2, 2).
-
-    Raises:
-        ValueError: If ``stride`` is another one.
-    """
+    """Strided convolution of LiDM, by ``stride`` (1, 2), (1, 4), (2, 1) or (2, 2)."""
 
     def __init__(self, channels: int, stride: Size) -> None:
         super().__init__()
@@ -126,21 +113,12 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Bilinear interpolation and a convolution.
+    """Bilinear interpolation and a convolution, by ``stride`` (1, 2), (1, 4), (2, 1) or (2, 2).
 
-    The image is padded with its opposite border columns before it is interpolated (corners not
-    aligned) and cropped afterwards, so rotating the input by one column rotates the output by
-    exactly ``stride`` columns. LiDM and R3DPA interpolate with aligned corners and without
-    wrapping, which breaks that symmetry (numerics: error as large as the signal); their weights
-    need ``legacy``.
-
-    Args:
-        channels: Input and output channels.
-        stride: Enlargement of rows and columns: (1, 2), (1, 4), (2, 1) or (2, 2).
-        legacy: Interpolate as the official weights expect.
-
-    Raises:
-        ValueError: If ``stride`` is another one.
+    Columns are padded circularly before the interpolation (corners not aligned) and cropped
+    afterwards, so that rotating the input by one column rotates the output by ``stride`` columns.
+    LiDM and R3DPA interpolate with aligned corners and without wrapping, which breaks the symmetry
+    by an error as large as the signal; their weights need ``legacy``.
     """
 
     def __init__(self, channels: int, stride: Size, legacy: bool = False) -> None:
@@ -169,15 +147,7 @@ def _supported(stride: Size) -> Size:
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group norm with 32 groups, whose statistics are never in half precision.
-
-    Args:
-        channels: Channels of the image, a multiple of 32.
-        eps: Added to the variance.
-
-    Raises:
-        ValueError: If ``channels`` is not a multiple of 32.
-    """
+    """Group norm with 32 groups and statistics in at least float32."""
 
     def __init__(self, channels: int, eps: float = 1e-6) -> None:
         if channels % 32:
@@ -185,8 +155,8 @@ class GroupNorm(nn.GroupNorm):
         super().__init__(32, channels, eps=eps)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Normalise ``(B, C, H, W)``; the result has the dtype of the input."""
-        if image.is_cpu:  # its kernel keeps float32 statistics, and reads half as much memory
+        """Normalised ``(B, C, H, W)`` in the dtype of the input."""
+        if image.is_cpu:  # its kernel keeps float32 statistics and reads half as much memory
             return super().forward(image).to(image.dtype)
         values = at_least_float32(image)
         weight, bias = self.weight.to(values.dtype), self.bias.to(values.dtype)
@@ -194,13 +164,7 @@ class GroupNorm(nn.GroupNorm):
 
 
 class ResBlock(nn.Module):
-    """Two convolutions, each after group norm and swish, around a shortcut.
-
-    Args:
-        in_channels: Input channels, a multiple of 32.
-        out_channels: Output channels, a multiple of 32; a 1x1 convolution adapts the shortcut.
-        kernel_size: Rows and columns of both kernels.
-    """
+    """Two convolutions, each after group norm and swish, around a shortcut."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel_size: Size = (3, 3)) -> None:
         super().__init__()
@@ -222,11 +186,7 @@ class ResBlock(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """Attention with one head between all pixels, added to the input.
-
-    Args:
-        channels: Channels of the image, a multiple of 32.
-    """
+    """Single-head attention between all pixels, added to the input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -237,7 +197,7 @@ class AttentionBlock(nn.Module):
         self.proj_out = nn.Conv2d(channels, channels, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Attend within each image of ``(B, C, H, W)``."""
+        """``(B, C, H, W)`` to the same shape."""
         hidden = self.norm(image)
         query, key, value = (
             rearrange(layer(hidden), "b c h w -> b 1 (h w) c") for layer in (self.q, self.k, self.v)
@@ -247,47 +207,74 @@ class AttentionBlock(nn.Module):
         return image + self.proj_out(hidden)
 
 
-class SyncedBatchNorm2d(nn.BatchNorm2d):
-    """Batch norm whose training statistics run over the batches of all processes.
-
-    With one process it is ``nn.BatchNorm2d``, number for number; the state dict has the same
-    keys. Unlike ``nn.SyncBatchNorm`` it also runs on a CPU (gloo), and processes may hold
-    batches of different sizes. The variance is computed in two passes around the global mean,
-    in float32. Gradients are those of the sum of the losses of all processes, as data-parallel
-    training averages them. A batch whose statistics are not finite leaves the running ones as they
-    were: they would never be finite again.
+class SelfAttention(nn.Module):
+    """Multi-head attention between the tokens of each sample.
 
     Args:
-        channels: Channels of the image.
-        eps: Added to the variance.
-        momentum: Weight of the new statistics in the running ones.
+        width: Token width D.
+        num_heads: Heads, a divisor of ``width``.
+        qk_norm: Layer norm on queries and keys.
+        linear: Builds the linear layers from input and output width.
     """
 
-    momentum: float
+    def __init__(
+        self,
+        width: int,
+        num_heads: int,
+        qk_norm: bool = False,
+        linear: Callable[[int, int], nn.Linear] = nn.Linear,
+    ) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.qkv = linear(width, 3 * width)
+        self.q_norm = nn.LayerNorm(width // num_heads) if qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(width // num_heads) if qk_norm else nn.Identity()
+        self.proj = linear(width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """``(B, N, D)`` to the same shape."""
+        query, key, value = rearrange(
+            self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads
+        )
+        # Layer norm returns float32 under autocast; attention needs one dtype.
+        query, key = self.q_norm(query).to(value.dtype), self.k_norm(key).to(value.dtype)
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
+
+
+class SyncedBatchNorm2d(nn.BatchNorm2d):
+    """Batch norm whose training statistics cover the batches of all processes.
+
+    With one process it equals ``nn.BatchNorm2d`` bitwise; the state-dict keys are the same. Unlike
+    ``nn.SyncBatchNorm`` it also runs on a CPU (gloo), and batch sizes may differ between
+    processes. The variance takes two passes around the global mean, in float32. Gradients are those
+    of the sum of the losses of all processes. A batch with non-finite statistics leaves the running
+    statistics unchanged.
+    """
+
     running_mean: Tensor
     running_var: Tensor
     num_batches_tracked: Tensor
 
-    def __init__(self, channels: int, eps: float = 1e-5, momentum: float = 0.1) -> None:
-        super().__init__(channels, eps, momentum)
-
     def forward(self, image: Tensor) -> Tensor:
-        """Normalise ``(B, C, H, W)``."""
+        """Normalised ``(B, C, H, W)``."""
         if not self.training:
             return super().forward(image)
         moved = self.running_mean.clone(), self.running_var.clone()
+        # None, as StochasticWeightAveraging sets it, is the plain mean over all batches.
+        momentum = self.momentum
+        if momentum is None:
+            momentum = 1.0 / (int(self.num_batches_tracked) + 1)
         if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
             mean, variance, count = _global_moments(image)
             unbiased = variance * (count / (count - 1))
             for running, value in zip(moved, (mean, unbiased), strict=True):
-                running.lerp_(value.detach(), self.momentum)
+                running.lerp_(value.detach(), momentum)
             scale = torch.rsqrt(variance + self.eps) * self.weight
             centred = at_least_float32(image) - mean.view(-1, 1, 1)
             result = (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
         else:
-            result = F.batch_norm(
-                image, *moved, self.weight, self.bias, True, self.momentum, self.eps
-            )
+            result = F.batch_norm(image, *moved, self.weight, self.bias, True, momentum, self.eps)
         self._take_statistics(*moved)
         return result
 
@@ -312,19 +299,12 @@ class _SumOverProcesses(torch.autograd.Function):
 
 
 def sum_over_processes(values: Tensor) -> Tensor:
-    """Elementwise sum over all processes, with the gradient of every process's share.
-
-    Args:
-        values: Any shape, the same on all processes, each of which must call this.
-
-    Returns:
-        Same shape, equal on all processes.
-    """
+    """Elementwise sum over all processes, differentiable; every process must call it."""
     return _SumOverProcesses.apply(values)
 
 
 def _global_moments(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance (C,) and number of values per channel over all processes."""
+    """Mean and biased variance ``(C,)`` and values per channel, over all processes."""
     values = at_least_float32(image)
     count = values.new_tensor([values.numel() / values.shape[1]])
     sums = sum_over_processes(torch.cat([values.sum(dim=(0, 2, 3)), count]))

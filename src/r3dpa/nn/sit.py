@@ -16,8 +16,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.attention import SelfAttention
-from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.layers import SelfAttention, at_least_float32
 from r3dpa.nn.velocity_network import (
     TIME_WIDTH,
     VelocityNetwork,

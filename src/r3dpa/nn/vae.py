@@ -1,4 +1,4 @@
-"""Variational autoencoder of range images: image <-> raw latents.
+"""Variational autoencoder of range images, and the posterior of its latents.
 
 Letters: B batch, C latent channels, H x W image size, h x w latent size.
 """
@@ -6,8 +6,9 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 from __future__ import annotations
 
 import math
-from typing import Self
+from typing import Any, Self
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -19,12 +20,62 @@ from r3dpa.nn.layers import (
     ResBlock,
     Upsample,
     WideCircularConv2d,
+    at_least_float32,
 )
-from r3dpa.nn.posterior import Posterior
 
 __all__ = ["VAE", "Posterior"]
 
 Size = tuple[int, int]
+
+
+class _StraightThroughClamp(torch.autograd.Function):
+    """Clamp with the identity as gradient, so that a value outside can return."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, low: float, high: float) -> Tensor:
+        return values.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return gradient, None, None
+
+
+class Posterior:
+    """Diagonal Gaussian over the raw latents of each image, in float32.
+
+    The log-variance is clamped to [-30, 20] with a straight-through gradient: with the plain clamp
+    of the official code a value outside would stay there for ever.
+
+    Args:
+        moments: ``(B, 2C, h, w)`` means, then log-variances.
+
+    Attributes:
+        mean: ``(B, C, h, w)``.
+        logvar: ``(B, C, h, w)`` natural logarithm of the variance, in [-30, 20].
+        std: ``(B, C, h, w)`` standard deviation.
+    """
+
+    def __init__(self, moments: Tensor) -> None:
+        self.mean, logvar = at_least_float32(moments).chunk(2, dim=1)
+        self.logvar: Tensor = _StraightThroughClamp.apply(logvar, -30.0, 20.0)
+        self.std = torch.exp(0.5 * self.logvar)
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """Raw latents ``mean + std * noise`` for standard normal noise ``(B, C, h, w)``."""
+        return self.mean + self.std * noise
+
+    def kl(self) -> Tensor:
+        """Kullback-Leibler divergence from N(0, 1), ``(B,)`` nats summed over C, h and w.
+
+        Formula: ``0.5 * sum(mean^2 + exp(logvar) - 1 - logvar)``.
+        """
+        terms = self.mean.square() + self.logvar.exp() - 1.0 - self.logvar
+        return 0.5 * terms.flatten(1).sum(dim=1)
+
+    def nll(self, latents: Tensor) -> Tensor:
+        """Negative log-likelihood of raw latents, ``(B,)`` nats summed over C, h and w."""
+        squares = (latents - self.mean).square() * torch.exp(-self.logvar)
+        return 0.5 * (math.log(2 * math.pi) + self.logvar + squares).flatten(1).sum(dim=1)
 
 
 class VAE(nn.Module):
@@ -56,12 +107,7 @@ class VAE(nn.Module):
             (2, 2).
         num_res_blocks: Residual blocks per encoder level; decoder levels have one more.
         attention_levels: Levels with an attention block after each residual block.
-        legacy_upsample: Interpolate with aligned corners and without wrapping columns; needed
-            for official weights.
-
-    Raises:
-        ValueError: If the numbers of levels and strides do not fit, a stride is not supported,
-            or a width is not a multiple of 32.
+        legacy_upsample: Interpolation of the official weights, see :class:`Upsample`.
     """
 
     def __init__(
@@ -92,27 +138,16 @@ class VAE(nn.Module):
         widths = [channels * multiplier for multiplier in channel_multipliers]
         steps = [(rows, columns) for rows, columns in strides]
         attention = [level in attention_levels for level in range(num_levels)]
-        self.encoder = _Encoder(
-            in_channels, 2 * latent_channels, widths, steps, num_res_blocks, attention
-        )
+        levels = (widths, steps, attention)
+        self.encoder = _Encoder(in_channels, 2 * latent_channels, *levels, num_res_blocks)
         self.decoder = _Decoder(
-            latent_channels,
-            in_channels,
-            widths,
-            steps,
-            num_res_blocks + 1,
-            attention,
-            legacy_upsample,
+            latent_channels, in_channels, *levels, num_res_blocks + 1, legacy_upsample
         )
         self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
 
     def latent_size(self, image_size: Size) -> Size:
-        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image.
-
-        Raises:
-            ValueError: If the image cannot be divided by the strides.
-        """
+        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image."""
         rows, columns = image_size
         if rows % self.stride[0] or columns % self.stride[1]:
             raise ValueError(
@@ -121,14 +156,13 @@ class VAE(nn.Module):
         return rows // self.stride[0], columns // self.stride[1]
 
     def encode(self, image: Tensor) -> Posterior:
-        """Distribution of the raw latents of range images.
+        """Posterior of the raw latents.
 
         Args:
             image: ``(B, in_channels, H, W)`` encoded range in [-1, 1].
 
         Raises:
-            ValueError: If ``image`` has another number of channels or a size that the strides
-                do not divide.
+            ValueError: If the channels differ, or the strides do not divide the size.
         """
         if image.shape[1] != self.in_channels:
             raise ValueError(
@@ -138,21 +172,13 @@ class VAE(nn.Module):
         return Posterior(self.quant_conv(self.encoder(image)))
 
     def decode(self, latents: Tensor) -> Tensor:
-        """Range images of raw latents.
-
-        Args:
-            latents: ``(B, C, h, w)`` raw latents.
-
-        Returns:
-            ``(B, in_channels, H, W)`` encoded range, not limited to [-1, 1].
-        """
+        """Encoded range ``(B, in_channels, H, W)`` of raw latents, not limited to [-1, 1]."""
         return self.decoder(self.post_quant_conv(latents))
 
     def halve_decoder_(self) -> Self:
-        """Casts the convolutions of the decoder to bfloat16 in place, for sampling.
+        """Casts the convolutions of the decoder, but for the last, to bfloat16 for sampling.
 
-        Float32 stay the statistics of the norms and the first and the last layer: the result of
-        :meth:`decode` is float32.
+        Statistics of the norms and the result of :meth:`decode` stay float32.
         """
         for layer in self.decoder.modules():
             if isinstance(layer, nn.Conv2d) and layer is not self.decoder.conv_out:
@@ -167,8 +193,8 @@ class _Encoder(nn.Module):
         out_channels: int,
         widths: list[int],
         strides: list[Size],
-        num_blocks: int,
         attention: list[bool],
+        num_blocks: int,
     ) -> None:
         super().__init__()
         self.conv_in = CircularConv2d(in_channels, widths[0], (3, 3))
@@ -195,8 +221,8 @@ class _Decoder(nn.Module):
         out_channels: int,
         widths: list[int],
         strides: list[Size],
-        num_blocks: int,
         attention: list[bool],
+        num_blocks: int,
         legacy_upsample: bool,
     ) -> None:
         super().__init__()
@@ -221,16 +247,11 @@ class _Level(nn.Module):
     """Residual blocks of one resolution, each followed by attention if asked for."""
 
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        attention: bool,
-        num_blocks: int,
-        kernel_size: Size,
+        self, in_channels: int, out_channels: int, attention: bool, num_blocks: int, kernel: Size
     ) -> None:
         super().__init__()
         self.block = nn.ModuleList(
-            ResBlock(out_channels if index else in_channels, out_channels, kernel_size)
+            ResBlock(out_channels if index else in_channels, out_channels, kernel)
             for index in range(num_blocks)
         )
         self.attn = nn.ModuleList(
@@ -245,37 +266,30 @@ class _Level(nn.Module):
 
 class _DownLevel(_Level):
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        attention: bool,
-        stride: Size | None,
-        num_blocks: int,
+        self, inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int
     ) -> None:
-        super().__init__(in_channels, out_channels, attention, num_blocks, (3, 3))
-        self.downsample = nn.Identity() if stride is None else Downsample(out_channels, stride)
+        super().__init__(inside, outside, attention, num_blocks, (3, 3))
+        self.downsample = nn.Identity() if stride is None else Downsample(outside, stride)
 
     def forward(self, hidden: Tensor) -> Tensor:
         return self.downsample(super().forward(hidden))
 
 
 class _UpLevel(_Level):
-    """Level whose kernels extend over columns only, unless it is enlarged in rows afterwards."""
+    """Level whose kernels extend over columns only, unless its rows are upsampled afterwards."""
 
     def __init__(
         self,
-        in_channels: int,
-        out_channels: int,
+        inside: int,
+        outside: int,
         attention: bool,
         stride: Size | None,
         num_blocks: int,
-        legacy_upsample: bool,
+        legacy: bool,
     ) -> None:
-        kernel_size = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
-        super().__init__(in_channels, out_channels, attention, num_blocks, kernel_size)
-        self.upsample = (
-            nn.Identity() if stride is None else Upsample(out_channels, stride, legacy_upsample)
-        )
+        kernel = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
+        super().__init__(inside, outside, attention, num_blocks, kernel)
+        self.upsample = nn.Identity() if stride is None else Upsample(outside, stride, legacy)
 
     def forward(self, hidden: Tensor) -> Tensor:
         return self.upsample(super().forward(hidden))

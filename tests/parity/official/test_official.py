@@ -36,7 +36,7 @@ from r3dpa.flow import euler, ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.nn import SiT
-from r3dpa.nn.attention import SelfAttention
+from r3dpa.nn.layers import SelfAttention
 
 SIT = {
     "input_size": [4, 8],

@@ -14,7 +14,7 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS, first_line
-from r3dpa.nn.attention import SelfAttention
+from r3dpa.nn.layers import SelfAttention
 
 __all__ = ["DINOv2"]
 

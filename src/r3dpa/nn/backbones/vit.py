@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.attention import SelfAttention
+from r3dpa.nn.layers import SelfAttention
 
 _HEAD_WIDTH = 64  # of every released ViT
 _MLP_RATIO = 4
