@@ -30,8 +30,7 @@ def case(load_case):
 def build(case):
     config = case.config
     (feature_dim,) = config["z_dims"]
-    levels = range(len(config["channel_mult"]))
-    assert {2**level for level in levels} <= set(config["attention_resolutions"])
+    reductions = [2**level for level in range(len(config["channel_mult"]))]
     assert config["use_ape"]
     unet = UNet(
         input_size=tuple(config["input_size"]),
@@ -43,6 +42,7 @@ def build(case):
         feature_dim=feature_dim,
         projector_dim=config["projector_dim"],
         num_classes=config["num_classes"],
+        attention_resolutions=[r for r in reductions if r in config["attention_resolutions"]],
     )
     weights = case.weights().items()
     unet.load_state_dict({our_name(k): v for k, v in weights if not k.startswith("bn.")})

@@ -313,6 +313,9 @@ def _unet_args(unet: StateDict, given: Mapping[str, Any]) -> dict[str, Any]:
         }
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise ValueError(f"the weights are not those of an official UNet ({error})") from error
+    attends = [f"input_blocks.{i}.1.qkv.weight" in unet for i in last_blocks]
+    if not all(attends):
+        inferred["attention_resolutions"] = [2**i for i in range(num_levels) if attends[i]]
     if channels in _UNET_NAMES:
         inferred["head_channels"] = _UNET_HEAD_CHANNELS
     init_args = inferred | dict(given)

@@ -32,20 +32,10 @@ _TABLE_STD = 0.02
 
 
 def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
-    """Fixed sine-cosine code of the token positions on a grid, row-major.
+    """Sine-cosine code ``(1, rows * columns, width)`` of positions on a token grid, row-major.
 
     The first half of the channels encodes the column, the second half the row; each half holds
     sines, then cosines, of ``position * 10000^(-k / (width / 4))``.
-
-    Args:
-        width: Token width, a multiple of 4.
-        grid_size: Rows and columns of the token grid.
-
-    Returns:
-        ``(1, rows * columns, width)`` in [-1, 1], float32.
-
-    Raises:
-        ValueError: If ``width`` is not a multiple of 4.
     """
     if width % 4:
         raise ValueError(f"position embedding needs a width divisible by 4, got {width}")
@@ -57,15 +47,9 @@ def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
         angles = positions.double()[:, None] * frequencies
         return torch.cat([angles.sin(), angles.cos()], dim=1)
 
-    row_index, column_index = torch.arange(rows), torch.arange(columns)
-    code = torch.cat(
-        [
-            axis_code(column_index.repeat(rows)),
-            axis_code(row_index.repeat_interleave(columns)),
-        ],
-        dim=1,
-    )
-    return code[None].float()
+    column_code = axis_code(torch.arange(columns).repeat(rows))
+    row_code = axis_code(torch.arange(rows).repeat_interleave(columns))
+    return torch.cat([column_code, row_code], dim=1)[None].float()
 
 
 class SiT(VelocityNetwork):
@@ -91,16 +75,10 @@ class SiT(VelocityNetwork):
         feature_dim: Width F of the 3D features.
         projector_dim: Width of the projection head.
         num_classes: Rows of the class table.
-        class_dropout: Add a last row to the class table for "no class", as models trained with
-            label dropout have; pass its index ``num_classes`` as label to use it.
+        class_dropout: Add a last row to the class table for "no class", label ``num_classes``, as
+            models trained with label dropout have.
         qk_norm: Layer-normalise queries and keys.
         learn_pos_embed: Train the position embedding, which is otherwise a fixed buffer.
-
-    Attributes:
-        grid_size: Rows and columns of the token grid, ``(h / patch_size, w / patch_size)``.
-
-    Raises:
-        ValueError: If sizes do not divide or ``alignment_depth`` is not in [1, depth].
     """
 
     pos_embed: Tensor
@@ -182,27 +160,17 @@ class SiT(VelocityNetwork):
         return [*self.blocks]
 
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Shifts, scales and gates of all blocks and of the output layer at some times.
+        """Shifts, scales and gates ``(T, M)`` of times ``(T,)`` and classes ``(T,)``.
 
-        Args:
-            time: ``(T,)`` flow times, 0 data, 1 noise.
-            labels: ``(T,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(T, M)``: six vectors of ``hidden_size`` for each block, then two for the output.
-
-        Raises:
-            ValueError: If ``time`` or ``labels`` is not one number per row, or a model of several
-                classes gets no labels.
+        Six vectors of ``hidden_size`` for each block, then two for the output layer.
         """
-        conditioning = self._conditioning(time, labels)
-        return _rows([*self.blocks, self.final_layer], conditioning)
+        return _rows([*self.blocks, self.final_layer], self._conditioning(time, labels))
 
     def halve_(self) -> Self:
-        """Casts the weights of attention and MLPs, nearly all of the work, to bfloat16 in place.
+        """Casts the weights of attention and MLPs to bfloat16 in place, for sampling.
 
-        For sampling without autocast. Float32 stay the time embedding and the modulations, the
-        token stream between the blocks, the statistics of all norms, and the output layer.
+        Time embedding, modulations, the token stream between the blocks, statistics of the norms
+        and the output layer stay float32.
         """
         for block in self.blocks:
             block.attn.bfloat16()
@@ -210,7 +178,7 @@ class SiT(VelocityNetwork):
         return self
 
     def _conditioning(self, time: Tensor, labels: Tensor | None) -> Tensor:
-        """Embedding ``(T, D)`` of times and classes, in the dtype of the modulation layers."""
+        """Embedding ``(T, D)`` in the dtype of the modulation layers."""
         labels = self._labels(time, labels)
         conditioning = self.t_embedder(time) + self.y_embedder(labels)
         return conditioning.to(self.final_layer.linear.weight.dtype)
@@ -248,7 +216,7 @@ class SiT(VelocityNetwork):
 
 
 def _rows(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
-    """Modulations ``(T, M)`` of some layers, one after the other."""
+    """Concatenated modulations of the layers."""
     rows = [layer.get_submodule("adaLN_modulation")(conditioning) for layer in layers]
     return torch.cat(rows, dim=1)
 
@@ -261,7 +229,7 @@ def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
 
 
 def _zero(layer: nn.Linear) -> nn.Linear:
-    """Start of all modulations and of the output: every block is the identity, the velocity 0."""
+    """Zero initialisation: every block starts as the identity, the velocity as 0."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
@@ -279,8 +247,6 @@ class _PatchEmbedding(nn.Module):
 
 
 class _TimeEmbedding(nn.Module):
-    """Time to token width, kept apart from bfloat16, in which neighbouring times coincide."""
-
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
         first, second = WideLinear(TIME_WIDTH, hidden_size), WideLinear(hidden_size, hidden_size)

@@ -8,37 +8,32 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Self, TypeVar
 
 import torch
+import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import CircularConv2d, WideCircularConv2d, at_least_float32
-from r3dpa.nn.unet_blocks import (
-    KERNEL,
-    DoubleSize,
-    HalfSize,
-    HeadsAttention,
-    Layers,
-    PositionBias,
-    TimedResBlock,
-    unet_norm,
-    zeroed,
-)
+from r3dpa.nn.layers import CircularConv2d, GroupNorm, WideCircularConv2d, at_least_float32
 from r3dpa.nn.velocity_network import VelocityNetwork, WideLinear, time_frequencies
 
 __all__ = ["UNet"]
+
+_KERNEL = (3, 3)
+_NORM_EPS = 1e-5  # the VAE of the same authors has 1e-6
+
+_Layer = TypeVar("_Layer", nn.Conv1d, CircularConv2d)
 
 
 class UNet(VelocityNetwork):
     """UNet over the latents, whose middle block is aligned with 3D features (U-REPA).
 
-    Residual and attention blocks at every resolution; columns wrap around, and a learned bias on
-    every latent pixel tells where it is (absolute position encoding). Each step down halves rows
-    and columns, so latents of 16 x 128 have a middle of 4 x 32: feature grids must have this size,
-    which ``grid_size`` of the data sets. The default is the size of the paper's ablation (258.3 M
-    parameters and 7.9 M of the head); ``channels`` 160 is the official small one (101.1 M).
+    Columns wrap around, and a learned bias on every latent pixel is the position encoding. Each
+    step down halves rows and columns, so latents of 16 x 128 have a middle of 4 x 32: feature grids
+    must have this size (``grid_size`` of the data). The default is the network of the paper's
+    ablation (258.3 M parameters and 7.9 M of the head); ``channels`` 160 is the official small one
+    (101.1 M).
 
     Source: LiDM (Ran et al. 2024), as used by R3DPA (ICRA 2026), table IV.
 
@@ -52,9 +47,8 @@ class UNet(VelocityNetwork):
         feature_dim: Width F of the 3D features.
         projector_dim: Width of the projection head.
         num_classes: Rows of the class table.
-
-    Raises:
-        ValueError: If sizes do not divide.
+        attention_resolutions: Reductions (1, 2, 4, ...) at which residual blocks are followed by
+            attention, as in LiDM's configurations; the middle block always has it. Default: all.
     """
 
     def __init__(
@@ -68,6 +62,7 @@ class UNet(VelocityNetwork):
         feature_dim: int = 768,
         projector_dim: int = 2048,
         num_classes: int = 1,
+        attention_resolutions: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         rows, columns = input_size
@@ -80,6 +75,11 @@ class UNet(VelocityNetwork):
         if channels % head_channels:
             raise ValueError(
                 f"channels {channels} is not a multiple of head_channels {head_channels}"
+            )
+        reductions = [2**level for level in range(len(channel_multipliers))]
+        if not set(attention_resolutions or ()) <= set(reductions):
+            raise ValueError(
+                f"attention_resolutions must be among {reductions}, got {attention_resolutions}"
             )
         self.input_size = (rows, columns)
         self.in_channels = in_channels
@@ -96,25 +96,28 @@ class UNet(VelocityNetwork):
         )
         self.label_emb = nn.Embedding(num_classes, embedding)
 
-        def blocks(inside: int, outside: int) -> list[nn.Module]:
-            return [
-                TimedResBlock(inside, outside, embedding),
-                HeadsAttention(outside, head_channels),
-            ]
+        attends = [
+            attention_resolutions is None or reduction in attention_resolutions
+            for reduction in reductions
+        ]
 
-        first = Layers(CircularConv2d(in_channels, channels, KERNEL))
+        def blocks(inside: int, outside: int, attention: bool = True) -> list[nn.Module]:
+            layers: list[nn.Module] = [_TimedResBlock(inside, outside, embedding)]
+            return [*layers, _HeadsAttention(outside, head_channels)] if attention else layers
+
+        first = _Layers(CircularConv2d(in_channels, channels, _KERNEL))
         self.input_blocks = nn.ModuleList([first])
-        kept, width = [channels], channels  # of what the way up is given
+        kept, width = [channels], channels  # widths of the skip connections
         for level, wider in enumerate(widths):
             for _ in range(num_res_blocks):
-                self.input_blocks.append(Layers(*blocks(width, wider)))
+                self.input_blocks.append(_Layers(*blocks(width, wider, attends[level])))
                 width = wider
                 kept.append(width)
             if level < len(widths) - 1:
-                self.input_blocks.append(Layers(HalfSize(width)))
+                self.input_blocks.append(_Layers(_HalfSize(width)))
                 kept.append(width)
-        self.ape = PositionBias(channels, self.input_size)
-        self.middle_block = Layers(*blocks(width, width), TimedResBlock(width, width, embedding))
+        self.ape = _PositionBias(channels, self.input_size)
+        self.middle_block = _Layers(*blocks(width, width), _TimedResBlock(width, width, embedding))
         self.projector = nn.Sequential(
             nn.Conv2d(width, projector_dim, 1),
             nn.SiLU(),
@@ -125,18 +128,18 @@ class UNet(VelocityNetwork):
         self.output_blocks = nn.ModuleList()
         for level, wider in reversed(list(enumerate(widths))):
             for index in range(num_res_blocks + 1):
-                layers = blocks(width + kept.pop(), wider)
+                layers = blocks(width + kept.pop(), wider, attends[level])
                 width = wider
                 if level and index == num_res_blocks:
-                    layers.append(DoubleSize(width))
-                self.output_blocks.append(Layers(*layers))
+                    layers.append(_DoubleSize(width))
+                self.output_blocks.append(_Layers(*layers))
         self.out = nn.Sequential(
-            unet_norm(width), nn.SiLU(), zeroed(WideCircularConv2d(width, in_channels, KERNEL))
+            _norm(width), nn.SiLU(), _zeroed(WideCircularConv2d(width, in_channels, _KERNEL))
         )
 
     @property
     def modulation_width(self) -> int:
-        """Width of the embedding that every residual block is given."""
+        """Width E of the embedding that every residual block receives."""
         return 4 * self.channels
 
     @property
@@ -150,27 +153,16 @@ class UNet(VelocityNetwork):
         return [*self.input_blocks, self.middle_block, *self.output_blocks]
 
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Embeddings of times and classes, which every residual block is given.
-
-        Args:
-            time: ``(T,)`` flow times, 0 data, 1 noise.
-            labels: ``(T,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(T, E)``, at least float32.
-
-        Raises:
-            ValueError: As :meth:`VelocityNetwork.modulations`.
-        """
+        """Embeddings ``(T, E)`` of times ``(T,)`` and classes ``(T,)``, at least float32."""
         labels = self._labels(time, labels)
         frequencies = time_frequencies(at_least_float32(time), self.channels)
         return self.time_embed(frequencies) + self.label_emb(labels)
 
     def halve_(self) -> Self:
-        """Casts all convolutions between the first and the last to bfloat16 in place.
+        """Casts all convolutions between the first and the last to bfloat16, for sampling.
 
-        For sampling without autocast. Float32 stay the embedding of the time, the statistics of
-        all norms, the first layer with the position bias, and the output layer.
+        Time embedding, statistics of the norms, the first layer with the position bias and the
+        output layer stay float32.
         """
         for part in (*self.input_blocks[1:], self.middle_block, *self.output_blocks):
             for layer in part.modules():
@@ -180,7 +172,7 @@ class UNet(VelocityNetwork):
 
     @property
     def _narrow(self) -> torch.dtype:
-        """That of the activations between the first layer and the last: bfloat16 once halved."""
+        """Dtype of the activations between the first and the last layer: bfloat16 once halved."""
         return self.middle_block.get_parameter("0.in_layers.2.weight").dtype
 
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
@@ -199,3 +191,105 @@ class UNet(VelocityNetwork):
         for block, skipped in zip(self.output_blocks, reversed(kept), strict=True):
             hidden = block(torch.cat([hidden, skipped], dim=1), modulations)
         return self.out(at_least_float32(hidden))
+
+
+def _norm(channels: int) -> GroupNorm:
+    return GroupNorm(channels, _NORM_EPS)
+
+
+def _zeroed(layer: _Layer) -> _Layer:
+    """Zero initialisation: every block starts as its shortcut, the velocity as 0."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
+
+
+class _Layers(nn.ModuleList):
+    """Sequential layers, of which residual blocks receive the time embedding."""
+
+    def __init__(self, *layers: nn.Module) -> None:
+        super().__init__(layers)
+
+    def forward(self, hidden: Tensor, embedding: Tensor) -> Tensor:
+        """``(B, D, H, W)`` through all layers; ``embedding`` is ``(B, E)`` or ``(1, E)``."""
+        for layer in self:
+            timed = isinstance(layer, _TimedResBlock)
+            hidden = layer(hidden, embedding) if timed else layer(hidden)
+        return hidden
+
+
+class _TimedResBlock(nn.Module):
+    """Two convolutions around a shortcut, with a shift by the time embedding between them."""
+
+    def __init__(self, in_channels: int, out_channels: int, embedding: int) -> None:
+        super().__init__()
+        self.in_layers = nn.Sequential(
+            _norm(in_channels), nn.SiLU(), CircularConv2d(in_channels, out_channels, _KERNEL)
+        )
+        self.emb_layers = nn.Sequential(nn.SiLU(), nn.Linear(embedding, out_channels))
+        self.out_layers = nn.Sequential(
+            _norm(out_channels),
+            nn.SiLU(),
+            nn.Identity(),  # a dropout of 0 in the official code, which counts in the names
+            _zeroed(CircularConv2d(out_channels, out_channels, _KERNEL)),
+        )
+        self.skip_connection = (
+            nn.Identity()
+            if in_channels == out_channels
+            else CircularConv2d(in_channels, out_channels, (1, 1))
+        )
+
+    def forward(self, hidden: Tensor, embedding: Tensor) -> Tensor:
+        branch = self.in_layers(hidden)
+        shift = self.emb_layers(embedding).to(branch.dtype)
+        branch = self.out_layers(branch + shift[:, :, None, None])
+        return self.skip_connection(hidden) + branch
+
+
+class _HeadsAttention(nn.Module):
+    """Multi-head attention between all pixels, added to the input."""
+
+    def __init__(self, channels: int, head_channels: int) -> None:
+        super().__init__()
+        self.num_heads = channels // head_channels
+        self.norm = _norm(channels)
+        self.qkv = nn.Conv1d(channels, 3 * channels, 1)
+        self.proj_out = _zeroed(nn.Conv1d(channels, channels, 1))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        pixels = self.norm(hidden).flatten(2)
+        query, key, value = rearrange(
+            self.qkv(pixels), "B (head three d) N -> three B head N d", three=3, head=self.num_heads
+        )
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        mixed = self.proj_out(rearrange(mixed, "B head N d -> B (head d) N"))
+        return hidden + mixed.view(hidden.shape)
+
+
+class _HalfSize(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.op = CircularConv2d(channels, channels, _KERNEL, (2, 2))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.op(hidden)
+
+
+class _DoubleSize(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = CircularConv2d(channels, channels, _KERNEL)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.conv(F.interpolate(hidden, scale_factor=2, mode="nearest"))
+
+
+class _PositionBias(nn.Module):
+    """Learned bias on every latent pixel: the absolute position encoding."""
+
+    def __init__(self, channels: int, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(1, channels, *size))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return hidden + self.bias

@@ -1,7 +1,7 @@
-"""What training and sampling ask of a network that predicts velocities and projected features.
+"""Interface of the networks that predict velocities and projected features.
 
 Letters: B batch, C latent channels, h x w latent size, N tokens, F feature width, T times,
-M numbers of a modulation.
+M width of a modulation row.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_PERIOD = 10_000.0
 
 
 class VelocityOutput(NamedTuple):
-    """What one evaluation of a :class:`VelocityNetwork` predicts.
+    """Result of one evaluation of a :class:`VelocityNetwork`.
 
     Attributes:
         velocity: ``(B, C, h, w)`` d x_t / d t of the normalised latents.
@@ -45,11 +45,11 @@ class VelocityOutput(NamedTuple):
 
 @dataclass(frozen=True)
 class AlignedPass:
-    """An evaluation that has come as far as the features, and may be finished.
+    """Evaluation up to the features, which :attr:`velocity` completes.
 
     Args:
         features: ``(B, N, F)`` projected features, differentiable in latents and weights.
-        velocity: Finishes the evaluation: ``(B, C, h, w)``, without a gradient.
+        velocity: Returns the velocity ``(B, C, h, w)``, without a gradient.
     """
 
     features: Tensor
@@ -59,17 +59,21 @@ class AlignedPass:
 class VelocityNetwork(nn.Module, ABC):
     """Network with two heads: velocity of the latents, and features at an inner depth (REPA).
 
-    It only predicts: times, noise, targets and losses live outside. A subclass says how times
-    become modulations, what is computed up to the depth where features are taken
-    (:meth:`_begin`), the features from there (:meth:`_project`), and the rest (:meth:`_finish`).
-    All evaluations are made of these, so that none computes what it does not need.
+    It only predicts: times, noise, targets and losses live outside. A subclass implements
+    :meth:`modulations`, the layers up to the aligned depth (:meth:`_begin`), the features from
+    there (:meth:`_project`) and the remaining layers (:meth:`_finish`). Every evaluation is
+    composed of these and computes nothing that it does not return.
+
+    Arguments of all evaluations: ``latents`` ``(B, C, h, w)`` noisy normalised latents, ``time``
+    ``(B,)`` flow times (0 data, 1 noise), ``labels`` ``(B,)`` int64 classes, which a one-class
+    model does not need. A wrong shape, or missing labels, is a ``ValueError``.
 
     Attributes:
         input_size: Latent rows and columns ``(h, w)``.
         in_channels: Latent channels C.
-        grid_size: Rows and columns of the feature grid that it is aligned with, N = their product.
+        grid_size: Rows and columns of the aligned feature grid; N is their product.
         feature_dim: Width F of the features.
-        num_classes: Classes that labels may name.
+        num_classes: Number of classes.
         projector: Head of the features.
     """
 
@@ -83,39 +87,14 @@ class VelocityNetwork(nn.Module, ABC):
     def forward(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
     ) -> VelocityOutput:
-        """Velocity and projected features from one pass through all layers.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            Velocity ``(B, C, h, w)`` and features ``(B, N, F)``.
-
-        Raises:
-            ValueError: If a shape does not fit the network, or a model of several classes gets
-                no labels.
-        """
+        """Velocity ``(B, C, h, w)`` and projected features ``(B, N, F)``, from one pass."""
         self._check(latents, time)
         modulations = self.modulations(time, labels)
         activations = self._begin(latents, modulations)
         return VelocityOutput(self._finish(activations, modulations), self._project(activations[0]))
 
     def velocity(self, latents: Tensor, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Velocity alone; the projection head is not evaluated.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(B, C, h, w)`` d x_t / d t.
-
-        Raises:
-            ValueError: As :meth:`forward`.
-        """
+        """Velocity ``(B, C, h, w)`` alone; the projection head is not evaluated."""
         self._check(latents, time)
         modulations = self.modulations(time, labels)
         return self._finish(self._begin(latents, modulations), modulations)
@@ -123,19 +102,7 @@ class VelocityNetwork(nn.Module, ABC):
     def project_features(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
     ) -> Tensor:
-        """Projected features alone; nothing behind the depth of alignment is evaluated.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(B, N, F)``, not of unit length.
-
-        Raises:
-            ValueError: As :meth:`forward`.
-        """
+        """Projected features ``(B, N, F)`` alone; layers behind the aligned depth are not run."""
         self._check(latents, time)
         activations = self._begin(latents, self._first_modulations(time, labels))
         return self._project(activations[0])
@@ -143,48 +110,35 @@ class VelocityNetwork(nn.Module, ABC):
     def aligned_pass(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
     ) -> AlignedPass:
-        """Features with a gradient, and the velocity without one, of a single evaluation.
+        """Features with a gradient and the velocity without one, from a single evaluation.
 
-        Feature guidance needs both: the layers before the alignment run forward and back, those
-        behind it forward only.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            time: ``(B,)`` flow times, 0 data, 1 noise.
-            labels: ``(B,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            Features, and what finishes the velocity; the same numbers as :meth:`forward`.
-
-        Raises:
-            ValueError: As :meth:`forward`.
+        Feature guidance needs both: layers up to the aligned depth run forward and backward, the
+        others forward only.
         """
         self._check(latents, time)
         modulations = self.modulations(time, labels)
         activations = self._begin(latents, modulations)
-        # Else the function would keep the graph alive, long after the gradient was taken.
-        detached = tuple(values.detach() for values in activations)
-        told = modulations.detach()
+        # Detached, or the closure would keep the graph alive after the gradient was taken.
+        detached, constant = tuple(values.detach() for values in activations), modulations.detach()
 
         def velocity() -> Tensor:
             with torch.no_grad():
-                return self._finish(detached, told)
+                return self._finish(detached, constant)
 
         return AlignedPass(self._project(activations[0]), velocity)
 
     def velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
-        """Velocity at times whose modulations are known: all of :meth:`velocity` but those.
+        """Velocity ``(B, C, h, w)`` from precomputed modulations.
 
-        A schedule meets the same times for every sample, and much of a network's weights may do
-        nothing but turn times into modulations: the rows of a whole schedule are computed once.
+        All samples of a schedule share their times, and much of a network's weights may only turn
+        times into modulations, so the rows of a whole schedule are computed once.
 
         Args:
             latents: ``(B, C, h, w)`` noisy normalised latents.
             modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
 
         Returns:
-            ``(B, C, h, w)`` d x_t / d t; equal to :meth:`velocity` up to the rounding of another
-            batch size.
+            As :meth:`velocity`, up to the rounding of another batch size.
 
         Raises:
             ValueError: If a shape does not fit the network.
@@ -211,45 +165,33 @@ class VelocityNetwork(nn.Module, ABC):
     @property
     @abstractmethod
     def modulation_width(self) -> int:
-        """Numbers M in a row of :meth:`modulations`."""
+        """Width M of :meth:`modulations`."""
 
     @property
     @abstractmethod
     def input_layer(self) -> nn.Module:
-        """The layer that takes the latents, which VAE alignment trains with the projector."""
+        """First layer, which VAE alignment trains with the projector."""
 
     @property
     @abstractmethod
     def compiled_parts(self) -> list[nn.Module]:
-        """Modules that make up nearly all of the work, to be compiled one by one."""
+        """Modules with nearly all of the computation, to be compiled one by one."""
 
     @abstractmethod
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """What the layers are told of some times and classes.
-
-        Args:
-            time: ``(T,)`` flow times, 0 data, 1 noise.
-            labels: ``(T,)`` int64 classes; may be left out of a one-class model.
-
-        Returns:
-            ``(T, M)``, a row for each time.
-
-        Raises:
-            ValueError: If ``time`` or ``labels`` is not one number per row, or a model of several
-                classes gets no labels.
-        """
+        """Modulation vectors ``(T, M)`` of times ``(T,)`` and classes ``(T,)``."""
 
     @abstractmethod
     def halve_(self) -> Self:
-        """Casts the weights that are nearly all of the work to bfloat16 in place.
+        """Casts the weights of nearly all of the computation to bfloat16 in place.
 
-        For sampling without autocast. The velocity is float32, and so is what makes the
-        modulations, whose neighbouring times coincide in bfloat16.
+        For sampling without autocast. The velocity stays float32, and so does the time embedding:
+        neighbouring times coincide in bfloat16.
         """
 
     @abstractmethod
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
-        """What later layers need: first the activations that features are taken from."""
+        """Activations at the aligned depth first, then others that :meth:`_finish` needs."""
 
     @abstractmethod
     def _project(self, activations: Tensor) -> Tensor:
@@ -260,7 +202,7 @@ class VelocityNetwork(nn.Module, ABC):
         """Velocity ``(B, C, h, w)``."""
 
     def _first_modulations(self, time: Tensor, labels: Tensor | None) -> Tensor:
-        """Modulations of the layers in :meth:`_begin`, where they can be had apart."""
+        """Modulations of the layers in :meth:`_begin`, if they can be computed separately."""
         return self.modulations(time, labels)
 
     def _labels(self, time: Tensor, labels: Tensor | None) -> Tensor:
@@ -296,19 +238,12 @@ class VelocityNetwork(nn.Module, ABC):
 
 
 def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:
-    """Sinusoidal features of the flow time, cosines before sines.
+    """Sinusoidal features ``(B, width)`` of flow times ``(B,)``, cosines before sines.
 
-    The time enters unscaled, so that the features of t in [0, 1] stay those of the official
-    weights. In bfloat16 neighbouring times would coincide: pass float32 or float64.
+    The time in [0, 1] enters unscaled, as the official weights expect. Pass float32 or float64:
+    neighbouring times coincide in bfloat16.
 
     Formula: ``cos(t f_k), sin(t f_k)`` with ``f_k = 10000^(-k / (width / 2))``.
-
-    Args:
-        time: ``(B,)`` flow times in [0, 1].
-        width: Even number of features.
-
-    Returns:
-        ``(B, width)`` in [-1, 1], dtype of ``time``.
     """
     half = width // 2
     exponents = torch.arange(half, dtype=time.dtype, device=time.device) / half
@@ -317,10 +252,10 @@ def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:
 
 
 class WideLinear(nn.Linear):
-    """Linear layer in at least float32, whatever the rest of the network runs in."""
+    """Linear layer in at least float32, also under autocast."""
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Map ``(..., in_features)``."""
+        """``(..., in_features)`` to ``(..., out_features)``."""
         weight, bias = at_least_float32(self.weight), at_least_float32(self.bias)
         with no_autocast(inputs.device):
             return F.linear(inputs.to(weight.dtype), weight, bias)
