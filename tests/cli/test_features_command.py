@@ -23,7 +23,7 @@ from r3dpa.cli import main
 from r3dpa.data import FeatureGrids, features_lock, find_scans, stored_source
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import WaffleIron
-from r3dpa.nn.backbones.scalr import _official_name
+from r3dpa.nn.backbones.point_features import official_name
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -176,7 +176,7 @@ class TestForms:
 
     def test_scalr_by_its_checkpoint_in_the_configuration(self, data, tmp_path):
         network = WaffleIron(width=4, depth=1, head_dim=5)
-        weights = {f"module.{_official_name(k)}": v for k, v in network.state_dict().items()}
+        weights = {f"module.{official_name(k)}": v for k, v in network.state_dict().items()}
         torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
         words = ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
         words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]

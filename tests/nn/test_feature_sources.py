@@ -1,6 +1,4 @@
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -11,15 +9,16 @@ from r3dpa.nn.backbones import (
     ScaLR,
     WaffleIron,
     feature_source,
+    point_features,
 )
-from r3dpa.nn.backbones.scalr import _official_name
+from r3dpa.nn.backbones.point_features import official_name
 
 
 @pytest.fixture
 def scalr_file(tmp_path):
     """Checkpoint as the distillation writes it, of width 4."""
     weights = WaffleIron(width=4, depth=1, head_dim=5).state_dict()
-    weights = {_official_name(key): value for key, value in weights.items()}
+    weights = {official_name(key): value for key, value in weights.items()}
     torch.save({"model_point": weights}, tmp_path / "ckpt_last.pth")
     return tmp_path / "ckpt_last.pth"
 
@@ -39,9 +38,7 @@ def test_each_name_gives_its_extractor(scalr_file):
 
 def test_waffleiron_s_takes_weights_or_has_its_own(monkeypatch):
     """With a stand-in for the network, whose weights are not part of this test."""
-    module = ModuleType("r3dpa.nn.backbones.pretrained")
-    module.WaffleIronS = lambda weights, dim: (weights, dim)
-    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(point_features, "WaffleIronS", lambda weights, dim: (weights, dim))
     assert feature_source("waffleiron-s") == (None, 768)
     assert feature_source("waffleiron-s", "a.safetensors", 64) == (Path("a.safetensors"), 64)
 

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.nn.backbones.geometric import CENTRES, SPREADS, _symmetric_eigen
-from r3dpa.nn.backbones.kernel import _BANDWIDTH
+from r3dpa.nn.backbones.geometric import _BANDWIDTH, CENTRES, SPREADS, _symmetric_eigen
 
 LINEARITY, PLANARITY, SPHERICITY, ALONG, ACROSS, UP, HEIGHT, LOG_RANGE, INTENSITY = range(9)
 

@@ -122,6 +122,32 @@ def test_a_fresh_network_has_velocity_zero():
     assert not UNet(**SMALL).velocity(latents, time).any()
 
 
+def test_attention_at_chosen_resolutions():
+    """LiDM's names: the residual block is layer 0, attention layer 1, a step up the last one."""
+    unet = build(channel_multipliers=(1, 2, 1), attention_resolutions=[2])
+    kinds = [
+        [type(layer).__name__.strip("_") for layer in block]
+        for block in (*unet.input_blocks[1:], unet.middle_block, *unet.output_blocks)
+    ]
+    res, attention = "TimedResBlock", "HeadsAttention"
+    down = [[res], ["HalfSize"], [res, attention], ["HalfSize"], [res]]
+    up = [
+        [res],
+        [res, "DoubleSize"],
+        [res, attention],
+        [res, attention, "DoubleSize"],
+        [res],
+        [res],
+    ]
+    assert kinds == [*down, [res, attention, res], *up]
+    latents, time = inputs()
+    assert unet.velocity(latents, time).isfinite().all()
+    every = build(attention_resolutions=[2, 1])
+    assert every.state_dict().keys() == build().state_dict().keys()
+    with pytest.raises(ValueError, match=r"among \[1, 2\], got \[4\]"):
+        build(attention_resolutions=[4])
+
+
 def test_time_and_class_matter():
     unet, (latents, time) = build(num_classes=3), inputs()
     with pytest.raises(ValueError, match="3 classes needs labels"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import ScaLR, ScanGrid, WaffleIron, collate_scans, prepare_scan
-from r3dpa.nn.backbones.scalr import _official_name
+from r3dpa.nn.backbones.point_features import official_name
 from r3dpa.nn.backbones.waffleiron import SpatialMixing
 
 GRID = ScanGrid(
@@ -204,7 +204,7 @@ def test_compiles_as_one_graph(network):
 
 def official_file(network, path, prefix="module.", **changes):
     """The network as the distillation saves it; a change of None leaves the weight out."""
-    weights = {_official_name(key): value for key, value in network.state_dict().items()} | changes
+    weights = {official_name(key): value for key, value in network.state_dict().items()} | changes
     weights = {prefix + key: value for key, value in weights.items() if value is not None}
     torch.save({"model_point": weights, "epoch": 1, "optim": {"state": {}}}, path)
     return path

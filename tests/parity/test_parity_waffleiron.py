@@ -19,7 +19,7 @@ from r3dpa.nn.backbones import (
     collate_scans,
     prepare_scan,
 )
-from r3dpa.nn.backbones.scalr import load_official
+from r3dpa.nn.backbones.point_features import load_official
 
 # parity/README.md: tokens reach 69, float32 and float64 runs differ by 3.4e-5.
 TOKENS = {"atol": 1e-4, "rtol": 0.0}

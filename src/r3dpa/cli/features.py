@@ -20,7 +20,7 @@ from r3dpa.data.feature_grids import Extractor, GridPlan, features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
 from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
-from r3dpa.nn.backbones.sources import SOURCES, feature_source
+from r3dpa.nn.backbones.point_features import SOURCES, feature_source
 
 # Of the trainer's options, those that matter where nothing is trained and every scan counts.
 _TRAINER_OPTIONS = {

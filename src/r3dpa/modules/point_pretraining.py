@@ -17,7 +17,7 @@ from r3dpa.data.point_datamodule import PointDataModule
 from r3dpa.data.scans import evenly
 from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
 from r3dpa.nn.backbones.masking import NUM_TARGETS, MaskedScan, Masking
-from r3dpa.nn.backbones.pretrained import save_weights
+from r3dpa.nn.backbones.point_features import save_weights
 
 _SCANS_TO_QUANTISE = 16
 

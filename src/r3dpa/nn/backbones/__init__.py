@@ -5,10 +5,8 @@ from r3dpa.nn.backbones.geometric import GeometricFeatures
 from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.masking import MaskedScan, Masking
 from r3dpa.nn.backbones.minkowski import MinkowskiNet
-from r3dpa.nn.backbones.pretrained import WaffleIronS
+from r3dpa.nn.backbones.point_features import SOURCES, ScaLR, WaffleIronS, feature_source
 from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.scalr import ScaLR
-from r3dpa.nn.backbones.sources import SOURCES, feature_source
 from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
 from r3dpa.nn.backbones.spvcnn import SPVCNN
 from r3dpa.nn.backbones.voxels import (

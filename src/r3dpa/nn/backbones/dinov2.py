@@ -10,18 +10,15 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS, first_line
-from r3dpa.nn.layers import SelfAttention
+from r3dpa.nn.backbones.vit import Block, resized_positions, with_class_token
 
 __all__ = ["DINOv2"]
 
 _PATCH = 14
 _EPS = 1e-6
-_MLP_RATIO = 4
-_LAYER_SCALE = 1.0
 _MEAN = (0.485, 0.456, 0.406)  # of ImageNet, red, green, blue in [0, 1]
 _STD = (0.229, 0.224, 0.225)
 
@@ -30,14 +27,14 @@ class DINOv2(nn.Module):
     """Vision transformer of DINOv2 without registers; the defaults are ViT-B/14.
 
     State-dict keys and shapes are those of the released ``dinov2_vit{s,b,l}14_pretrain.pth``. The
-    features are the normalised patch tokens of the last block. Positions are resized to the
-    tokens asked for by antialiased bicubic interpolation.
+    features are the normalised patch tokens of the last block; positions are resized by antialiased
+    bicubic interpolation.
 
     Source: Oquab et al., "DINOv2: learning robust visual features without supervision" (TMLR
     2024); resizing and input size as in REPA (Yu et al. 2025) and REPA-E.
 
     Args:
-        weights: Released file; random weights where None, with which no fit starts.
+        weights: Released file. Default: random weights, with which no fit starts.
         dim: Token width D, a multiple of ``num_heads``.
         depth: Number of blocks.
         num_heads: Attention heads.
@@ -68,7 +65,7 @@ class DINOv2(nn.Module):
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + grid_size**2, dim) * 0.02)
         self.mask_token = nn.Parameter(torch.zeros(1, dim))  # of its training; not used here
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, dim, _PATCH, stride=_PATCH)})
-        self.blocks = nn.ModuleList(_Block(dim, num_heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(Block(dim, num_heads, _EPS, True) for _ in range(depth))
         self.norm = nn.LayerNorm(dim, _EPS)
         self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_STD)[:, None, None], persistent=False)
@@ -77,31 +74,24 @@ class DINOv2(nn.Module):
             self._load(Path(weights))
 
     def forward(self, image: Tensor, grid_size: tuple[int, int]) -> Tensor:
-        """Features of the cells of a grid.
+        """Features ``(B, N, D)`` of the cells of a grid, row-major.
 
         Args:
             image: ``(B, 3, S, S)`` red, green, blue in [-1, 1]; resized to 14 pixels a cell.
             grid_size: Rows and columns ``(h, w)`` of the cells.
-
-        Returns:
-            ``(B, N, D)``, row-major.
         """
         sides = [_PATCH * cells for cells in grid_size]
         image = ((image + 1) / 2 - self.mean) / self.std
         image = F.interpolate(image, sides, mode="bicubic")
-        patches = rearrange(self.patch_embed["proj"](image), "B D h w -> B (h w) D")
-        tokens = torch.cat([self.cls_token.expand(len(image), -1, -1), patches], dim=1)
+        tokens = with_class_token(self.cls_token, self.patch_embed["proj"](image))
         tokens = tokens + self._positions(grid_size)
         for block in self.blocks:
             tokens = block(tokens)
         return self.norm(tokens)[:, 1:]
 
     def _positions(self, grid_size: tuple[int, int]) -> Tensor:
-        if grid_size == (self.grid_size, self.grid_size):
-            return self.pos_embed
-        table = rearrange(self.pos_embed[:, 1:], "1 (h w) D -> 1 D h w", h=self.grid_size)
-        table = F.interpolate(table, grid_size, mode="bicubic", antialias=True)
-        return torch.cat([self.pos_embed[:, :1], rearrange(table, "1 D h w -> 1 (h w) D")], dim=1)
+        table_size = (self.grid_size, self.grid_size)
+        return resized_positions(self.pos_embed, table_size, grid_size, "bicubic", antialias=True)
 
     def _load(self, path: Path) -> None:
         if not path.is_file():
@@ -116,37 +106,3 @@ class DINOv2(nn.Module):
                 f"({first_line(error)}): give a released dinov2_vit?14_pretrain.pth, without "
                 "registers, with dim, depth and num_heads of its size"
             ) from error
-
-
-class _Block(nn.Module):
-    def __init__(self, dim: int, num_heads: int) -> None:
-        super().__init__()
-        self.norm1 = nn.LayerNorm(dim, _EPS)
-        self.attn = SelfAttention(dim, num_heads)
-        self.ls1 = _Scale(dim)
-        self.norm2 = nn.LayerNorm(dim, _EPS)
-        self.mlp = _Mlp(dim)
-        self.ls2 = _Scale(dim)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
-        return tokens + self.ls2(self.mlp(self.norm2(tokens)))
-
-
-class _Scale(nn.Module):
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.full((dim,), _LAYER_SCALE))
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return tokens * self.gamma
-
-
-class _Mlp(nn.Module):
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, _MLP_RATIO * dim)
-        self.fc2 = nn.Linear(_MLP_RATIO * dim, dim)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(tokens)))

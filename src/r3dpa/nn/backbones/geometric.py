@@ -1,15 +1,15 @@
-"""Point features without any training: local shape, height and direction, lifted at random."""
+"""Point features without training: local shape, height and direction, lifted at random."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
-from r3dpa.nn.backbones.kernel import KernelFeatures
 
 # Neighbourhood in pixels: wider than high, as a spinning sensor samples more densely in azimuth.
 _ROW_OFFSETS = (-2, -1, 0, 1, 2)
@@ -30,42 +30,60 @@ _GATE_M, _GATE_SHARE = 0.3, 0.05
 # Spread below which a direction counts as not covered: the noise of a range measurement.
 _NOISE_M = 0.01
 _SENSOR_HEIGHT_M = 1.73
+_BANDWIDTH = 2.0  # of the Gaussian kernel, in standard deviations
+_KERNEL_WIDTH = 64  # K: the kernel is met up to 1 / sqrt(K)
 #: Mean and standard deviation of the nine `GeometricFeatures.descriptors` over points of real
 #: HDL-64E scans.
 CENTRES = (0.47, 0.67, 0.13, -0.28, 0.23, 0.52, 0.63, 2.3, 0.26)
 SPREADS = (0.18, 0.24, 0.13, 0.34, 0.28, 0.63, 0.86, 0.65, 0.15)
 
 
-class GeometricFeatures(KernelFeatures):
-    """Frozen, label-free feature extractor: what a point's surroundings look like.
+class GeometricFeatures(nn.Module):
+    """Frozen, label-free feature extractor: the local surroundings of a point.
 
-    Nine values per point (see :meth:`descriptors`), lifted as :class:`KernelFeatures` says. A scan
-    and its mirror image have the same features, as have a scan and the same scan rotated.
+    The nine values of :meth:`descriptors`, standardised with fixed constants, are lifted to
+    features of unit norm whose inner product approximates a Gaussian kernel of the values::
 
-    Source of the shape values: eigenvalue features as in Demantké et al., "Dimensionality based
-    scale selection in 3D LiDAR point clouds" (2011).
+        phi(x) = [cos(W x), sin(W x)] / sqrt(K / 2),    features = Q phi(x),    Q^T Q = I
+
+    A scan, its mirror image and the rotated scan have the same features.
+
+    Source: eigenvalue features as in Demantké et al., "Dimensionality based scale selection in 3D
+    LiDAR point clouds" (2011); Rahimi and Recht, "Random Features for Large-Scale Kernel Machines"
+    (NeurIPS 2007).
 
     Args:
         dim: Width D of the features, even.
-        seed: Seed of the lift.
+        seed: Seed of W and Q.
 
     Attributes:
         name: ``"geometric"``.
-        num_headings: Rotations by multiples of this part of a turn keep the features.
-        mirror_invariant: Swapping left and right keeps the features.
-        settings: What determines the features, see :class:`r3dpa.data.Extractor`.
-
-    Raises:
-        ValueError: If ``dim`` is odd or below 2.
+        num_headings: Rotations by multiples of this part of a turn leave the features unchanged.
+        mirror_invariant: Swapping left and right leaves the features unchanged.
+        settings: Everything that determines the features, see :class:`r3dpa.data.Extractor`.
     """
 
     name = "geometric"
     num_headings = _IMAGE.columns
     mirror_invariant = True
+    centres: Tensor
+    spreads: Tensor
+    frequencies: Tensor
+    basis: Tensor
 
     def __init__(self, dim: int = 768, seed: int = 0) -> None:
-        super().__init__(dim, seed, CENTRES, SPREADS)
+        super().__init__()
+        if dim < 2 or dim % 2:
+            raise ValueError(f"dim must be even and at least 2, got {dim}.")
+        self.dim = dim
         self.settings: dict[str, Any] = {"seed": seed, "version": 2}
+        width = min(dim, _KERNEL_WIDTH)
+        generator = torch.Generator().manual_seed(seed)
+        frequencies = torch.randn(len(CENTRES), width // 2, generator=generator) / _BANDWIDTH
+        self.register_buffer("centres", torch.tensor(CENTRES), persistent=False)
+        self.register_buffer("spreads", torch.tensor(SPREADS), persistent=False)
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.register_buffer("basis", random_basis(dim, width, generator), persistent=False)
 
     @staticmethod
     def descriptors(points: Tensor) -> Tensor:
@@ -106,6 +124,36 @@ class GeometricFeatures(KernelFeatures):
         return torch.cat([shape, torch.stack(own, dim=1)], dim=1)
 
     prepare = descriptors
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Features ``(P, dim)`` float32 of unit norm.
+
+        Args:
+            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
+        """
+        return self.lift(self.point_features([self.prepare(points)])[0])
+
+    def point_features(self, prepared: Sequence[Tensor]) -> list[Tensor]:
+        """Kernel features ``phi`` ``(P_i, K)`` float32 of each scan, before the linear lift.
+
+        Args:
+            prepared: ``(P_i, 9)`` of each scan, as ``prepare`` returns them.
+        """
+        return [self._kernel_features(values.to(self.basis.device)) for values in prepared]
+
+    def _kernel_features(self, values: Tensor) -> Tensor:
+        phase = ((values - self.centres) / self.spreads) @ self.frequencies
+        return torch.cat([phase.cos(), phase.sin()], dim=1) / math.sqrt(phase.shape[1])
+
+    def lift(self, values: Tensor) -> Tensor:
+        """Linear, norm-preserving map of ``point_features``, or of means of them, to ``dim``."""
+        return values @ self.basis.T
+
+
+def random_basis(dim: int, width: int, generator: torch.Generator) -> Tensor:
+    """Random ``(dim, width)`` float32 matrix with orthonormal columns, ``width <= dim``."""
+    q, r = torch.linalg.qr(torch.randn(dim, width, generator=generator, dtype=torch.float64))
+    return (q * r.diagonal().sign()).float()  # LAPACK libraries differ in the signs of Q
 
 
 def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,8 +213,8 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
 def _symmetric_eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues ``(3, N)``, descending, and unit eigenvector ``(3, N)`` of the smallest one.
 
-    Closed form (trigonometric solution of the characteristic cubic); LAPACK needs ten times
-    longer for so many small matrices.
+    Closed form (trigonometric solution of the characteristic cubic), ten times faster than LAPACK
+    for so many small matrices.
 
     Args:
         matrix: ``(6, N)`` float64 entries xx, yy, zz, xy, xz, yz.

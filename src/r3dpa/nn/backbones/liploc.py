@@ -36,17 +36,11 @@ class LIPLoc(nn.Module):
     Source: LIP-Loc (Puligilla et al. 2024) as ``eval/models/liploc`` of valeoai/R3DPA uses it.
 
     Args:
-        picture_side: Rows and columns of the square pictures.
+        picture_side: Rows and columns of the square pictures, a multiple of ``patch_side``.
         patch_side: Rows and columns of a patch.
-        width: Token width D.
+        width: Token width D, also that of the features (``dim``).
         depth: Number of transformer blocks.
         num_heads: Attention heads.
-
-    Attributes:
-        dim: Width of the features, that of the tokens.
-
-    Raises:
-        ValueError: If sizes do not divide.
     """
 
     def __init__(
@@ -71,13 +65,11 @@ class LIPLoc(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path, *, num_heads: int | None = None) -> Self:
-        """Network with the weights of an official checkpoint; other sizes are those it has.
-
-        Of the whole model only ``encoder_lidar`` is read.
+        """Network with the weights and sizes of ``encoder_lidar`` in an official checkpoint.
 
         Args:
-            path: ``model.ckpt`` of the release; nothing in it is executed.
-            num_heads: Attention heads; those of the ViT of this width where None.
+            path: ``model.ckpt`` of the release.
+            num_heads: Attention heads. Default: those of the released ViT of this width.
 
         Raises:
             ValueError: If the file is missing or unreadable, holds no such encoder, or if a weight
@@ -102,30 +94,13 @@ class LIPLoc(nn.Module):
         return super().train(False)
 
     def forward(self, range_m: Tensor) -> Tensor:
-        """Features of range images of any size.
-
-        Args:
-            range_m: ``(B, H, W)`` metres, -1 without a return.
-
-        Returns:
-            ``(B, dim)``.
-
-        Raises:
-            ValueError: If there is no such batch, or a value is not finite.
-        """
+        """Features ``(B, dim)`` of range images ``(B, H, W)`` in metres, -1 without a return."""
         return self.encode(wrapped_picture(range_m, (self.picture_side, self.picture_side)))
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Features of pictures.
+        """Features ``(B, dim)`` of pictures ``(B, 3, picture_side, picture_side)``.
 
-        Args:
-            pictures: ``(B, 3, picture_side, picture_side)``, normalised as on ImageNet.
-
-        Returns:
-            ``(B, dim)``.
-
-        Raises:
-            ValueError: If the pictures are of another size.
+        Pictures are normalised with the constants of ImageNet.
         """
         side = self.picture_side
         if pictures.shape[1:] != (3, side, side):
@@ -137,22 +112,16 @@ class LIPLoc(nn.Module):
 
 
 def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tensor:
-    """Range images as the pictures that LIP-Loc's published numbers were computed with.
+    """Pictures ``(B, 3, *size)`` float32 of range images, as in LIP-Loc's published numbers.
 
-    Grey levels are bytes, see :func:`wrapped_grey_levels`; the picture is resized bilinearly with
-    antialiasing, repeated for three colours, and normalised with the constants of ImageNet.
+    The bytes of :func:`wrapped_grey_levels`, resized bilinearly with antialiasing, repeated for
+    three colours, and normalised with the constants of ImageNet.
 
     Source: ``createRangeImage`` and ``Model.preprocess`` of valeoai/R3DPA.
 
     Args:
-        range_m: ``(B, H, W)`` metres, -1 without a return.
+        range_m: ``(B, H, W)`` metres, -1 without a return, all finite.
         size: Rows and columns of the pictures.
-
-    Returns:
-        ``(B, 3, *size)`` float32.
-
-    Raises:
-        ValueError: If there is no such batch, or a value is not finite.
     """
     if range_m.ndim != 3 or not range_m.numel():
         raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
@@ -163,22 +132,11 @@ def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tens
 
 
 def wrapped_grey_levels(range_m: Tensor) -> Tensor:
-    """Range in bytes: 5.1 levels a metre, cut to whole ones, modulo 256.
+    """Range as bytes, ``trunc(5.1 * range_m) mod 256`` in float32; any shape, metres, finite.
 
-    Empty pixels (-1) become 251, nearly white, and ranges from 256 / 5.1 = 50.2 m on start from
-    black again. The official code leaves this to a C cast, which is undefined outside of
-    0..255 and does the same on x86.
-
-    Formula: ``trunc(5.1 * range_m) mod 256`` in float32.
-
-    Args:
-        range_m: Any shape, metres, finite.
-
-    Returns:
-        Same shape, uint8.
-
-    Raises:
-        ValueError: If a value is not finite.
+    Empty pixels (-1) become 251, nearly white; ranges from 256 / 5.1 = 50.2 m on start from black
+    again. The official code leaves this to a C cast, which is undefined outside of 0..255 and gives
+    the same on x86.
     """
     if not range_m.isfinite().all():
         raise ValueError("range images must be finite, got NaN or infinite values; drop these")
@@ -187,20 +145,12 @@ def wrapped_grey_levels(range_m: Tensor) -> Tensor:
 
 
 def load_official(network: LIPLoc, weights: Mapping[str, Tensor]) -> None:
-    """Load the official state dict of the encoder, every key of it.
-
-    Args:
-        network: Network of the same sizes.
-        weights: Tensors by official name, without ``encoder_lidar.model.``.
-
-    Raises:
-        ValueError: If a weight is missing, left over or of another shape, by official name.
-    """
+    """Loads every key of the official encoder, named without ``encoder_lidar.model.``."""
     load_strictly(network, weights, renamed(_NAMES))
 
 
 def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:
-    """Sizes of the network that the weights are of, but for its number of heads."""
+    """Sizes of the network with these weights, but for its number of heads."""
     patches, positions = weights.get("patch_embed.proj.weight"), weights.get("pos_embed")
     if patches is None or positions is None or patches.ndim != 4 or positions.ndim != 3:
         raise ValueError(

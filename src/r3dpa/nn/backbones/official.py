@@ -16,19 +16,16 @@ _MODEL = "the model.ckpt of the released weights"
 
 
 def read_released(path: Path, released: str = _MODEL) -> Any:
-    """Content of a file of ``torch.save``, tensors on the CPU; nothing in it is executed.
-
-    Args:
-        path: The file.
-        released: What to give instead, for the message.
+    """Content of a file of ``torch.save``, tensors on the CPU.
 
     Raises:
-        ValueError: If the file is missing, damaged, or holds more than tensors and plain values.
+        ValueError: If the file is missing, damaged, or holds more than tensors and plain values;
+            the message recommends ``released``.
     """
     if not path.is_file():
         raise ValueError(f"no such file; give {released}.")
     try:
-        # Memory-mapped, so that an optimiser beside the weights is not read.
+        # Memory-mapped, so that optimiser states are not read.
         return torch.load(
             path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
         )
@@ -41,17 +38,7 @@ def read_released(path: Path, released: str = _MODEL) -> Any:
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:
-    """The ``state_dict`` of a training checkpoint, see :func:`read_released`.
-
-    Args:
-        path: File written by ``torch.save``: a dictionary with the entry ``state_dict``.
-
-    Returns:
-        Tensors by official name, on the CPU.
-
-    Raises:
-        ValueError: If the file is missing, damaged, or holds something else.
-    """
+    """Entry ``state_dict`` of a training checkpoint, see :func:`read_released`."""
     content = read_released(path)
     weights = content.get("state_dict") if isinstance(content, Mapping) else None
     if not isinstance(weights, Mapping) or not all(
@@ -64,13 +51,9 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
 def load_strictly(
     network: nn.Module, weights: Mapping[str, Tensor], official_name: Callable[[str], str]
 ) -> None:
-    """Load an official state dict, every key of it.
+    """Loads every key of an official state dict.
 
-    Args:
-        network: Network of the same sizes.
-        weights: Tensors by official name. Axes of size 1 at the end may be more than ours: linear
-            layers are convolutions in some official networks.
-        official_name: Official name of each of our keys.
+    Official weights may have additional last axes of size 1: some linear layers are convolutions.
 
     Raises:
         ValueError: If a weight is missing, left over or of another shape, by official name.
@@ -94,7 +77,7 @@ def load_strictly(
 
 
 def renamed(names: Mapping[str, str]) -> Callable[[str], str]:
-    """Function of a key that replaces its beginning by the table's first entry that fits."""
+    """Function that replaces the prefix of a key by the first entry of the table that fits."""
 
     def official_name(key: str) -> str:
         for ours, official in names.items():

@@ -43,21 +43,20 @@ Size = tuple[int, int]
 class RangeViT(nn.Module):
     """Features of range images for FRID: decoder channels averaged over bands of rows.
 
-    Always in evaluation mode: norms never use the statistics of a batch, and dropout is absent.
-    The defaults are the sizes of the released networks: ``in_channels`` 4 for ``rangevit_wo_i``
-    and 5 for ``rangevit_w_i``, which also reads the intensity.
+    Always in evaluation mode. The defaults are the sizes of the released networks: ``in_channels``
+    4 for ``rangevit_wo_i`` and 5 for ``rangevit_w_i``, which also reads the intensity.
 
     Source: RangeViT (Ando et al., CVPR 2023) as ``eval/models/rangevit`` of valeoai/R3DPA uses it.
     LiDAR-Diffusion's FRID has another network: its numbers do not compare.
 
     Args:
-        sensor: Image size, field of view and range limits; those of R3DPA where None.
-        in_channels: How many of range, x, y, z and intensity the network reads.
+        sensor: Image size, field of view and range limits. Default: those of R3DPA.
+        in_channels: Number of input channels, of range, x, y, z and intensity, 1..5.
         width: Token width D.
         depth: Number of transformer blocks.
         num_heads: Attention heads.
         stem_channels: Channels of the first convolutions.
-        skip_channels: Channels of the convolutions' result, which the decoder reads again.
+        skip_channels: Channels of the result of the convolutions, which the decoder reads too.
         decoder_channels: Channels C of the decoder.
         trained_size: Rows and columns of the images in training, for the position table.
         patch_size: Rows and columns of a patch, even numbers.
@@ -65,9 +64,6 @@ class RangeViT(nn.Module):
 
     Attributes:
         dim: Width of the features, ``C * H / band_rows``.
-
-    Raises:
-        ValueError: If ``in_channels`` is not in 1..5, patches are odd, or sizes do not divide.
     """
 
     image_mean: Tensor
@@ -131,12 +127,12 @@ class RangeViT(nn.Module):
         trained_size: Size = (64, 384),
         patch_size: Size = (2, 8),
     ) -> Self:
-        """Network with the weights of an official checkpoint; other sizes are those it has.
+        """Network with the weights of an official checkpoint, which determine the other sizes.
 
         Args:
-            path: ``model.ckpt`` of the release; nothing in it is executed.
-            sensor: Image size, field of view and range limits; those of R3DPA where None.
-            num_heads: Attention heads; those of the ViT of this width where None.
+            path: ``model.ckpt`` of the release.
+            sensor: Image size, field of view and range limits. Default: those of R3DPA.
+            num_heads: Attention heads. Default: those of the released ViT of this width.
             trained_size: Rows and columns of the images in training.
             patch_size: Rows and columns of a patch.
 
@@ -166,21 +162,15 @@ class RangeViT(nn.Module):
         return network
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: statistics of the batch would change the features."""
+        """Stays in evaluation mode: batch statistics would change the features."""
         return super().train(False)
 
     def forward(self, range_m: Tensor, intensity: Tensor | None = None) -> Tensor:
-        """Features of range images.
+        """Features ``(B, dim)``: for each channel the means of bands of rows, from the top.
 
         Args:
             range_m: ``(B, H, W)`` metres, ``EMPTY_RANGE_M`` without a return.
             intensity: ``(B, H, W)`` in [0, 1]; read with ``in_channels`` 5 only.
-
-        Returns:
-            ``(B, dim)``: for each channel the means of the bands of rows, from the highest.
-
-        Raises:
-            ValueError: If an image is of another size, or the network lacks the intensity.
         """
         bands = reduce(
             self.feature_map(range_m, intensity),
@@ -208,9 +198,9 @@ class RangeViT(nn.Module):
         return self.output(self.merge(torch.cat([pixels, skip], dim=1)))
 
     def embed(self, skip: Tensor) -> Tensor:
-        """Patches ``(B, D, h, w)`` of the stem's result ``(B, skip_channels, H, W)``.
+        """Patches ``(B, D, h, w)`` of the result ``(B, skip_channels, H, W)`` of the stem.
 
-        They overlap by a pixel, and zeros beyond the border count in their means.
+        Patches overlap by a pixel, and zeros beyond the border count in their means.
         """
         rows, columns = self.patch_size
         pooled = F.avg_pool2d(
@@ -220,11 +210,10 @@ class RangeViT(nn.Module):
 
 
 def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | None = None) -> Tensor:
-    """Input of RangeViT before it is normalised.
+    """Input of RangeViT before normalisation: range, x, y, z in metres (and intensity).
 
-    The point of a pixel lies on the ray through its upper left corner, as in the official code,
-    which the network was trained with. Pixels not strictly inside the range limits have
-    x = y = z = -1; their range stays as it is.
+    The point of a pixel lies on the ray through its upper left corner, as in the official training.
+    Pixels not strictly inside the range limits have x = y = z = -1; their range is unchanged.
 
     Source: ``preprocess_range`` and ``range2xyz`` of valeoai/R3DPA.
 
@@ -234,10 +223,7 @@ def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | Non
         intensity: ``(B, H, W)`` in [0, 1].
 
     Returns:
-        ``(B, 4, H, W)`` float32 range, x, y, z in metres; a fifth channel is the intensity.
-
-    Raises:
-        ValueError: If an image is not of the size of the sensor.
+        ``(B, 4, H, W)`` float32, with intensity ``(B, 5, H, W)``.
     """
     if range_m.ndim != 3:
         raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
@@ -257,17 +243,10 @@ def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | Non
 
 
 def load_official(network: RangeViT, weights: Mapping[str, Tensor]) -> None:
-    """Load an official state dict of RangeViT, every key of it that the features depend on.
+    """Loads every key of an official state dict but for the point classifier behind the features.
 
-    The point classifier behind the features is left out. Files of the original training lack
-    the normalisation of the input, for which the official code has the constants of KITTI-360.
-
-    Args:
-        network: Network of the same sizes.
-        weights: Tensors by official name.
-
-    Raises:
-        ValueError: If a weight is missing, left over or of another shape, by official name.
+    Files of the original training lack the normalisation of the input, for which the official code
+    has the constants of KITTI-360.
     """
     constants = {"image_mean": network.image_mean, "image_std": network.image_std}
     features = {name: value for name, value in weights.items() if not name.startswith(_CLASSIFIER)}
@@ -285,7 +264,7 @@ def _activated(convolution: nn.Conv2d) -> nn.Sequential:
 
 
 class _ContextBlock(nn.Module):
-    """Two convolutions, the second with holes, added to a 1 x 1 convolution (SalsaNext)."""
+    """Two convolutions, the second dilated, added to a 1 x 1 convolution (SalsaNext)."""
 
     def __init__(self, in_channels: int, channels: int) -> None:
         super().__init__()
@@ -302,7 +281,7 @@ class _ContextBlock(nn.Module):
 
 
 class _DenseBlock(nn.Module):
-    """Three convolutions one after the other, all merged by a fourth (SalsaNext)."""
+    """Three sequential convolutions, merged by a fourth (SalsaNext)."""
 
     def __init__(self, in_channels: int, channels: int) -> None:
         super().__init__()
