@@ -1,4 +1,4 @@
-"""Scans with hidden parts, and what a network shall tell of all their points.
+"""Scans with hidden parts, and the descriptors of all points that a network shall predict.
 
 Letters: M kept points, T descriptors.
 """
@@ -19,8 +19,8 @@ from r3dpa.nn.backbones.voxels import PreparedScan, ScanGrid, prepare_scan
 
 # Surroundings of a point on the xy plane: squares of 1, 3 and 9 cells.
 _WINDOWS = (1, 3, 9)
-# Descriptors that are averaged over the surroundings: linearity, planarity, sphericity, normal
-# upwards, intensity.
+# Descriptors averaged over the surroundings: linearity, planarity, sphericity, normal upwards,
+# intensity.
 _AVERAGED = (0, 1, 2, 5, 8)
 _LOCAL = (0, 1, 2, 3, 4, 5, 6, 8)  # all but the range, which is known from the cells
 NUM_TARGETS = len(_LOCAL) + len(_WINDOWS) * (3 + len(_AVERAGED))
@@ -33,7 +33,7 @@ class MaskedScan(NamedTuple):
 
     Attributes:
         scan: The whole scan, prepared.
-        hidden: ``(M,)`` bool: kept points that the network shall not see.
+        hidden: ``(M,)`` bool: kept points that the network must not see.
         targets: ``(M, T)`` float32 descriptors of the kept points within the whole scan.
     """
 
@@ -44,15 +44,12 @@ class MaskedScan(NamedTuple):
 
 @dataclass(frozen=True)
 class Masking:
-    """Turns scans about z and mirrors them at random, hides blocks of rays, describes all points.
+    """Rotates scans about z and mirrors them at random, hides blocks of rays, describes all points.
 
     Args:
-        grid: How scans are prepared.
-        max_hidden: Share of the blocks that are hidden: between none and this, drawn for each scan,
-            so that whole scans, as met afterwards, are among those of the training.
-
-    Raises:
-        ValueError: If ``max_hidden`` is not in [0, 1).
+        grid: Preparation of scans.
+        max_hidden: Upper limit, below 1, of the share of hidden blocks, which is drawn for each
+            scan from 0 on, so that training includes whole scans.
     """
 
     grid: ScanGrid = field(default_factory=ScanGrid)
@@ -64,12 +61,7 @@ class Masking:
             raise ValueError(f"max_hidden must be at least 0 and below 1, got {self.max_hidden}.")
 
     def __call__(self, points: Tensor, rng: np.random.Generator) -> MaskedScan:
-        """Draw a view of a scan.
-
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-            rng: Source of all that is random.
-        """
+        """Random view of the points ``(P, 4)``: x, y, z in metres, intensity 0..1."""
         angle = rng.uniform(-math.pi, math.pi)
         side = rng.choice([-1.0, 1.0])
         x, y = points[:, 0], points[:, 1] * side
@@ -84,15 +76,12 @@ class Masking:
         return MaskedScan(scan, hidden, self.describe(points, scan))
 
     def describe(self, points: Tensor, scan: PreparedScan) -> Tensor:
-        """Local shape of each kept point and what surrounds it, from the whole scan.
+        """Descriptors ``(M, T)`` float32 of each kept point and its surroundings in the whole scan.
 
         The values of ``GeometricFeatures.descriptors`` but the range, and for each of three squares
         on the xy plane (1, 3 and 9 cells wide): height over its lowest point, depth below its
         highest, logarithm of the number of points, and means of linearity, planarity, sphericity,
         the normal's upward part and the intensity.
-
-        Returns:
-            ``(M, T)`` float32.
         """
         local = GeometricFeatures.descriptors(points)[scan.kept]
         z, cells = scan.features[:, 3], scan.cells[0]
@@ -118,7 +107,7 @@ class Masking:
 
 
 def _block(points: Tensor) -> Tensor:
-    """Number of the block of rays that each point belongs to."""
+    """Index of the block of rays of each point."""
     x, y, z = points[:, :3].unbind(dim=1)
     row = ((torch.atan2(z, torch.hypot(x, y)) + math.pi / 2) / _BLOCK_RAD[0]).long()
     column = ((torch.atan2(y, x) + math.pi) / _BLOCK_RAD[1]).long()

@@ -35,13 +35,7 @@ def scaled_widths(rate: float, widths: Sequence[int] = WIDTHS) -> tuple[int, ...
 
 
 class ConvNorm(nn.Module):
-    """Sparse convolution and batch norm.
-
-    Args:
-        in_channels: Input channels.
-        out_channels: Output channels.
-        kernel_size: 1, 2 or 3, see :class:`SparseConv`.
-    """
+    """Sparse convolution and batch norm."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int) -> None:
         super().__init__()
@@ -49,17 +43,12 @@ class ConvNorm(nn.Module):
         self.norm = nn.BatchNorm1d(out_channels)
 
     def forward(self, features: Tensor, kernel_map: KernelMap | None = None) -> Tensor:
-        """Features ``(N', out_channels)``, not rectified."""
+        """``(N, in_channels)`` to ``(N', out_channels)``, not rectified."""
         return self.norm(self.conv(features, kernel_map))
 
 
 class Residual(nn.Module):
-    """Two convolutions of size 3 beside a shortcut, which has weights where the width changes.
-
-    Args:
-        in_channels: Input channels.
-        out_channels: Output channels.
-    """
+    """Two convolutions of size 3 beside a shortcut, which has weights if the width changes."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -69,19 +58,15 @@ class Residual(nn.Module):
         self.skip = nn.Identity() if same else ConvNorm(in_channels, out_channels, 1)
 
     def forward(self, features: Tensor, kernel_map: KernelMap) -> Tensor:
-        """Features ``(N, out_channels)`` at the same voxels."""
+        """``(N, in_channels)`` to ``(N, out_channels)``."""
         inner = functional.relu(self.first(features, kernel_map), inplace=True)
         return functional.relu(self.second(inner, kernel_map) + self.skip(features), inplace=True)
 
 
 class Stage(nn.Module):
-    """Change of the stride, then two residual blocks at the new one.
+    """Change of the stride to ``resampled`` channels, then two residual blocks.
 
-    Args:
-        in_channels: Input channels.
-        resampled: Channels behind the change of the stride.
-        joined: Channels that the encoder adds there.
-        out_channels: Output channels.
+    The blocks also read ``joined`` channels of the encoder.
     """
 
     def __init__(self, in_channels: int, resampled: int, joined: int, out_channels: int) -> None:
@@ -94,7 +79,7 @@ class Stage(nn.Module):
     def forward(
         self, features: Tensor, change: KernelMap, voxels: Voxels, joined: Tensor | None = None
     ) -> Tensor:
-        """Features ``(N', out_channels)`` at ``voxels``, to which the map ``change`` leads."""
+        """Features ``(N', out_channels)`` at ``voxels``, the output of the map ``change``."""
         features = functional.relu(self.resample(features, change), inplace=True)
         if joined is not None:
             features = torch.cat([features, joined], dim=1)
@@ -110,10 +95,7 @@ class MinkowskiNet(nn.Module):
         widths: Channels of the stem, four encoder and four decoder stages; the default is the
             network of FSVD, whose pooled feature has 768 = 16 rings x 48 numbers.
         in_channels: Input channels C.
-        num_classes: Outputs of the linear layer ``head``, which the forward pass leaves out.
-
-    Raises:
-        ValueError: If there are not nine widths, or one is not positive.
+        num_classes: Outputs of the linear layer ``head``, which the forward pass does not use.
     """
 
     def __init__(
@@ -139,12 +121,12 @@ class MinkowskiNet(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> Self:
-        """Network with the weights of an official checkpoint; its widths are those it has.
+        """Network with the weights of an official checkpoint, which determine its widths.
 
         Args:
             path: ``model.ckpt`` of the release, a state dict below ``state_dict`` or a bare one.
-                Nothing in it is executed. Where the network is one module of several, its prefix
-                is taken off and the weights of the others are not used.
+                If the network is one module of several, its prefix is removed and the other
+                weights are ignored.
 
         Raises:
             ValueError: If the file is missing or unreadable, holds no such network, or if a
@@ -160,11 +142,7 @@ class MinkowskiNet(nn.Module):
         return network
 
     def load_official(self, weights: Mapping[str, Tensor]) -> None:
-        """Load an official state dict, every key of it.
-
-        Raises:
-            ValueError: If a weight is missing, left over or of another shape, by official name.
-        """
+        """Loads every key of an official state dict."""
         load_strictly(self, weights, official_name)
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
@@ -173,9 +151,6 @@ class MinkowskiNet(nn.Module):
         Args:
             coordinates: ``(P, 4)`` integers x, y, z, batch, each voxel once.
             features: ``(P, C)``.
-
-        Raises:
-            ValueError: If a voxel is given twice or is out of bounds, or shapes do not fit.
         """
         self._check(coordinates, features)
         voxels, rows = Voxels.from_coordinates(coordinates)
@@ -252,7 +227,7 @@ def _sizes(weights: Mapping[str, Tensor]) -> tuple[list[int], int, int]:
 
 
 def _network_weights(content: Any) -> dict[str, Tensor]:
-    """Official state dict of the one network in the content of a checkpoint."""
+    """Official state dict of the only network in a checkpoint."""
     weights = content.get("state_dict", content) if isinstance(content, Mapping) else None
     keys = [key for key in weights or () if isinstance(key, str)]
     prefixes = [key.removesuffix(_STEM) for key in keys if re.search(rf"(^|\.){_STEM}$", key)]

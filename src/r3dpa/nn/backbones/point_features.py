@@ -290,11 +290,11 @@ def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
-        tuples = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in about["grid"].items()
+        lists = about["grid"]
+        settings: dict[str, Any] = {
+            key: tuple(lists[key]) if isinstance(lists[key], list) else lists[key] for key in lists
         }
-        grid = ScanGrid(**tuples)
+        grid = ScanGrid(**settings)
         network = WaffleIron(about["width"], about["depth"], grid.cells)
         prefix = "network."
         network.load_state_dict(

@@ -1,9 +1,8 @@
 """Sparse 3D convolution in plain PyTorch: occupied voxels, kernel maps, and the layer.
 
-A voxel is one int64 key; the keys of a stride are sorted, so that neighbours are found by
-bisection. A convolution gathers the rows that an offset pairs, multiplies them by the matrix of the
-offset and adds them to the rows of the result. Runs on every device, and autograd gives the
-gradients.
+A voxel is one int64 key; keys are sorted, so that neighbours are found by bisection. For each offset
+of the kernel, a convolution gathers the paired rows, multiplies them by the matrix of the offset
+and adds them to the rows of the result.
 
 Source: Choy, Gwak and Savarese, "4D Spatio-Temporal ConvNets" (CVPR 2019); same numbers as
 torchsparse 1.4.0 (``tests/parity``).
@@ -21,13 +20,13 @@ from torch import Tensor, nn
 
 from r3dpa.nn.layers import at_least_float32
 
-# A key is batch, x, y, z from the highest bits to the lowest, x, y, z of 16 bits each and shifted
-# so that they are not negative; it grows with (batch, x, y, z).
+# A key is batch, x, y, z from the highest bits to the lowest; x, y, z have 16 bits each and are
+# shifted to be non-negative.
 _BITS = 16
 _SHIFT = 1 << (_BITS - 1)
 _PLACES = (2 * _BITS, _BITS, 0)  # lowest bit of x, y, z
-_UNITS = tuple(1 << bits for bits in _PLACES)  # what one step along x, y, z adds to a key
-#: Largest stride: a neighbour at this stride cannot run over into the next axis of a key.
+_UNITS = tuple(1 << bits for bits in _PLACES)  # a step along x, y, z in a key
+#: Largest stride: a neighbour at this stride cannot overflow into the next axis of a key.
 MAX_STRIDE = 512
 #: Coordinates lie in ``[-MAX_COORDINATE, MAX_COORDINATE)``: 1.5 km at voxels of 5 cm.
 MAX_COORDINATE = _SHIFT - 2 * MAX_STRIDE
@@ -49,11 +48,11 @@ def kernel_offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class KernelMap(NamedTuple):
-    """Which rows of the input are added to which rows of the result, for each offset of a kernel.
+    """Pairs of input rows and result rows for each offset of a kernel.
 
     Attributes:
         pairs: For each of the K offsets ``(inputs, outputs)``, int64 of equal length; no row of
-            the result appears twice at an offset. None where all rows pair with themselves.
+            the result appears twice at an offset. None if all rows pair with themselves.
         num_inputs: Rows of the input.
         num_outputs: Rows of the result.
     """
@@ -63,18 +62,18 @@ class KernelMap(NamedTuple):
     num_outputs: int
 
     def transposed(self) -> KernelMap:
-        """The same pairs with exchanged roles, as a transposed convolution needs them."""
+        """Map of the transposed convolution."""
         swapped = [pair and (pair[1], pair[0]) for pair in self.pairs]
         return KernelMap(swapped, self.num_outputs, self.num_inputs)
 
 
 class Voxels:
-    """Occupied voxels of B clouds at one stride, each once, sorted by (batch, x, y, z).
+    """Distinct occupied voxels of B clouds at one stride, sorted by (batch, x, y, z).
 
-    Kernel maps and the coarser voxels are computed at their first use and kept.
+    Kernel maps and coarser voxels are computed at their first use and cached.
 
     Args:
-        keys: ``(N,)`` int64, sorted; :meth:`from_coordinates` makes them.
+        keys: ``(N,)`` int64, sorted, see :meth:`from_coordinates`.
         stride: Edge of a voxel in units of the coordinates, a power of two.
     """
 
@@ -85,13 +84,10 @@ class Voxels:
 
     @classmethod
     def from_coordinates(cls, coordinates: Tensor) -> tuple[Voxels, Tensor]:
-        """Voxels of stride 1 from rows in any order, and the voxel ``(P,)`` int64 of each row.
+        """Voxels of stride 1, and the voxel ``(P,)`` int64 of each row of coordinates.
 
         Args:
-            coordinates: ``(P, 4)`` integers x, y, z, batch; rows may repeat.
-
-        Raises:
-            ValueError: As :func:`voxel_keys`.
+            coordinates: ``(P, 4)`` integers x, y, z, batch, in any order; rows may repeat.
         """
         keys, rows = torch.unique(voxel_keys(coordinates), return_inverse=True)
         return cls(keys), rows
@@ -107,23 +103,19 @@ class Voxels:
         return torch.stack([*fields, self.keys >> 3 * _BITS], dim=1)
 
     def find(self, keys: Tensor) -> tuple[Tensor, Tensor]:
-        """Row of each key, and whether it is occupied; rows of the others mean nothing.
-
-        Args:
-            keys: Any shape, int64.
-        """
+        """Row of each key (any shape, int64), and whether that voxel is occupied."""
         rows = torch.searchsorted(self.keys, keys)
         return rows, self._padded[rows] == keys
 
     def corners(self, keys: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`find`, ``(P, 8)`` for the voxels at the offsets of size 2 from each key."""
+        """As :meth:`find`, ``(P, 8)``, for the voxels at the offsets of size 2 from each key."""
         offsets = keys.new_tensor(kernel_offsets(2))
         steps = (offsets * offsets.new_tensor(_UNITS)).sum(dim=1) * self.stride
         return self.find(keys[:, None] + steps)
 
     @cached_property
     def _padded(self) -> Tensor:
-        # A search may end one row behind the last one, and looks at up to two rows beyond it.
+        # A search may end one row behind the last one, and reads up to two rows beyond it.
         beyond = self.keys.new_full((3,), torch.iinfo(torch.int64).max)
         return torch.cat([self.keys, beyond])
 
@@ -143,8 +135,8 @@ class Voxels:
         rows = torch.arange(1, len(self) + 1, device=self.keys.device)
         keep((0, 0, 1), self._padded[rows] == self.keys + self.stride, rows)
         for x, y in _COLUMNS:
-            # z is fastest in the keys: of three voxels on top of each other, those that are
-            # occupied lie in adjacent rows, and one search finds them all.
+            # z is fastest in the keys: three voxels on top of each other lie in adjacent rows, so
+            # that one search finds all that are occupied.
             keys = self.keys + self.stride * (x * _UNITS[0] + y * _UNITS[1] - _UNITS[2])
             rows = torch.searchsorted(self.keys, keys)
             for z in (-1, 0, 1):
@@ -156,7 +148,7 @@ class Voxels:
     @cached_property
     def _halved(self) -> tuple[Voxels, KernelMap]:
         """Voxels of twice the stride, and the map of a convolution of size 2 to them."""
-        dropped = (2 * self.stride - 1) * sum(_UNITS)  # bits that the coarser grid has not
+        dropped = (2 * self.stride - 1) * sum(_UNITS)  # bits below the coarser grid
         keys, parents = torch.unique(self.keys & ~dropped, return_inverse=True)
         lowest_bit = self.stride.bit_length() - 1
         x, y, z = ((self.keys >> bits + lowest_bit) & 1 for bits in _PLACES)
@@ -177,14 +169,11 @@ class Voxels:
 
 
 def voxel_keys(coordinates: Tensor) -> Tensor:
-    """Keys ``(P,)`` int64 of voxels, which grow with (batch, x, y, z).
+    """Keys ``(P,)`` int64 of voxels, in the order of (batch, x, y, z).
 
     Args:
         coordinates: ``(P, 4)`` integers x, y, z in ``[-MAX_COORDINATE, MAX_COORDINATE)`` and batch
-            in ``[0, MAX_CLOUDS)``.
-
-    Raises:
-        ValueError: If they have another shape or type, or lie outside, where keys would collide.
+            in ``[0, MAX_CLOUDS)``; other keys would collide.
     """
     if coordinates.ndim != 2 or coordinates.shape[1] != 4 or coordinates.is_floating_point():
         raise ValueError(
@@ -207,20 +196,14 @@ def voxel_keys(coordinates: Tensor) -> Tensor:
 
 
 class SparseConv(nn.Module):
-    """Convolution over occupied voxels; which one is up to the map given to it.
+    """Convolution over occupied voxels with the given kernel map.
 
-    ``voxels.neighbors`` for size 3, ``voxels.to_coarser`` for size 2 and stride 2, its
-    ``transposed()`` for the way back, none for size 1::
+    The map is ``voxels.neighbors`` for size 3, ``voxels.to_coarser`` for size 2 and stride 2, its
+    ``transposed()`` for the way back, None for size 1::
 
         result[p] = sum over offsets k of features[p + offset k] @ kernel[k]
 
-    Products are summed in float32 also where features have half precision.
-
-    Args:
-        in_channels: Input channels.
-        out_channels: Output channels.
-        kernel_size: 1, 2 or 3.
-        bias: Whether a learnt offset is added to each channel.
+    Products of half-precision features are summed in float32.
     """
 
     def __init__(
@@ -235,15 +218,7 @@ class SparseConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
 
     def forward(self, features: Tensor, kernel_map: KernelMap | None = None) -> Tensor:
-        """Features ``(N', out_channels)`` at the voxels that the map leads to.
-
-        Args:
-            features: ``(N, in_channels)``, one row for each input voxel of the map.
-            kernel_map: Map of a kernel of this size; None for size 1.
-
-        Raises:
-            ValueError: If the map is of another kernel size or number of voxels.
-        """
+        """Features ``(N', out_channels)`` at the output voxels of the map, from ``(N, channels)``."""
         if kernel_map is None:
             result = features @ self.kernel
         else:

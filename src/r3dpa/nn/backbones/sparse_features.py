@@ -1,4 +1,4 @@
-"""From a scan to voxels, and from features of voxels to one feature of a scan.
+"""Voxels of a scan, and pooling of voxel features to one feature of a scan.
 
 Source: valeoai/R3DPA, the features of FSVD and FPVD (``tests/parity``).
 Letters: P points, N voxels of all B clouds of a batch, F channels of the features.
@@ -41,18 +41,14 @@ def voxelize(
         voxel = round(point / voxel_m), minus its minimum over the points
 
     Args:
-        points: ``(P, 3)`` x, y, z in metres; further columns are not looked at.
+        points: ``(P, 3)`` x, y, z in metres, finite; further columns are ignored.
         voxel_m: Edge of a voxel in metres.
-        range_min_m: Nearest range; points below are dropped.
-        range_max_m: Farthest range; points beyond are dropped.
+        range_min_m: Points nearer than this are dropped.
+        range_max_m: Points farther than this are dropped.
 
     Returns:
         Voxels ``(N, 3)`` int64 from 0, and inputs ``(N, 4)`` float32: x, y, z of the point of
         lowest index in the voxel, and -1 in place of the intensity.
-
-    Raises:
-        ValueError: If ``points`` has another shape, holds NaN or infinite values, or spreads over
-            too many voxels.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"points must be (P, 3) x, y, z in metres, got {tuple(points.shape)}.")
@@ -82,9 +78,9 @@ def pool_voxels(
 ) -> Tensor:
     """One feature per cloud: means over its voxels, in bins around the mean of its coordinates.
 
-    ``rings``: 16 distances, with borders at 0, 7.25, 10.5, ..., 56 m; voxels beyond are left out.
-    The distance is that in space. ``sectors``: 16 azimuths, counter-clockwise from behind.
-    ``all``: a single bin. FSVD and FPVD use rings.
+    ``rings``: 16 distances in space with borders at 0, 7.25, 10.5, ..., 56 m; voxels beyond are
+    left out. ``sectors``: 16 azimuths, counter-clockwise from behind. ``all``: a single bin. FSVD
+    and FPVD use rings.
 
     Args:
         features: ``(N, F)``.
@@ -95,9 +91,6 @@ def pool_voxels(
 
     Returns:
         ``(B, bins * F)`` at least float32, bin after bin; zeros where a bin is empty.
-
-    Raises:
-        ValueError: If ``pooling`` is not known.
     """
     features = at_least_float32(features)
     # In float64 the mean of whole numbers is exact: it does not depend on the order of the voxels.

@@ -41,16 +41,7 @@ class Points(NamedTuple):
 
 
 def to_voxels(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
-    """Mean of the points in each voxel.
-
-    Args:
-        features: ``(P, C)``.
-        points: Where they are.
-        voxels: Voxels of any stride.
-
-    Returns:
-        ``(N, C)``, zeros for a voxel without a point. Points outside all voxels are left out.
-    """
+    """Mean ``(N, C)`` of the point features ``(P, C)`` in each voxel, zeros without a point."""
     rows, occupied = voxels.find(voxel_keys(points.voxel_of(voxels.stride)))
     rows = torch.where(occupied, rows, len(voxels))  # one row more, which is cut off
     wide = at_least_float32(features)
@@ -60,20 +51,13 @@ def to_voxels(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
 
 
 def to_points(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
-    """Trilinear interpolation between the eight voxels that follow each point.
+    """Voxel features ``(N, C)`` interpolated trilinearly at the points, ``(P, C)``.
 
-    A voxel stands at its lowest corner; weights of empty ones go to the others in proportion.
-
-    Args:
-        features: ``(N, C)`` of the voxels.
-        points: Where to interpolate.
-        voxels: Voxels of any stride.
-
-    Returns:
-        ``(P, C)``, zeros for a point without an occupied voxel around it.
+    A voxel is located at its lowest corner; weights of empty voxels are distributed to the others in
+    proportion. A point without an occupied voxel around it gives zeros.
     """
     rows, weights = corners(points, voxels)
-    # One row for voxels that are not there; their weight is 0.
+    # The last row stands for empty voxels, whose weight is 0.
     table = torch.cat([features, features.new_zeros(1, features.shape[1])])
     return functional.embedding_bag(
         rows, table, mode="sum", per_sample_weights=weights.to(features.dtype)
@@ -81,11 +65,10 @@ def to_points(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
 
 
 def corners(points: Points, voxels: Voxels) -> tuple[Tensor, Tensor]:
-    """Rows of the eight voxels that follow each point, and their weights.
+    """Rows ``(P, 8)`` int64 of the voxels around each point, N if empty, and weights ``(P, 8)``.
 
-    Returns:
-        ``(P, 8)`` int64, N where the voxel is empty, and ``(P, 8)`` float32, which is 0 there and
-        else sums to 1. Corners are ordered as the offsets of a kernel of size 2.
+    Weights of empty voxels are 0, the others sum to 1. Corners are in the order of
+    ``kernel_offsets(2)``.
     """
     lowest = points.voxel_of(voxels.stride)
     rows, occupied = voxels.corners(voxel_keys(lowest))
@@ -97,12 +80,7 @@ def corners(points: Points, voxels: Voxels) -> tuple[Tensor, Tensor]:
 
 
 class PointTransform(nn.Module):
-    """Linear layer, batch norm and ReLU on single points.
-
-    Args:
-        in_channels: Input channels.
-        out_channels: Output channels.
-    """
+    """Linear layer, batch norm and ReLU on single points."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -110,24 +88,21 @@ class PointTransform(nn.Module):
         self.norm = nn.BatchNorm1d(out_channels)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features ``(P, out_channels)``."""
+        """``(P, in_channels)`` to ``(P, out_channels)``."""
         return functional.relu(self.norm(self.linear(features)), inplace=True)
 
 
 class SPVCNN(MinkowskiNet):
-    """Features of points: the U-Net, and between its parts the points themselves.
+    """Features of points: the U-Net with a point branch between its parts.
 
-    Coordinates take the way of the official code: times the voxel size and divided by it again, in
-    float32, which moves them by up to 2e-4 of a voxel below 4000 voxels.
+    As in the official code, coordinates are multiplied and divided by the voxel size in float32,
+    which moves them by up to 2e-4 of a voxel below 4000 voxels.
 
     Args:
         widths: As for :class:`MinkowskiNet`; the default is the network of FPVD.
         in_channels: Input channels C.
-        num_classes: Outputs of the linear layer ``head``, which the forward pass leaves out.
+        num_classes: Outputs of the linear layer ``head``, which the forward pass does not use.
         voxel_m: Edge of the finest voxels in metres.
-
-    Raises:
-        ValueError: If there are not nine widths, or one is not positive.
     """
 
     def __init__(
@@ -146,11 +121,8 @@ class SPVCNN(MinkowskiNet):
         """Features ``(P, F)`` before the head, in the order of the input.
 
         Args:
-            coordinates: ``(P, 4)`` integers x, y, z, batch; a voxel takes the mean of its rows.
+            coordinates: ``(P, 4)`` integers x, y, z, batch; rows of one voxel are averaged.
             features: ``(P, C)``.
-
-        Raises:
-            ValueError: If coordinates are out of bounds, or shapes do not fit.
         """
         self._check(coordinates, features)
         points = self._points(coordinates)
@@ -158,7 +130,7 @@ class SPVCNN(MinkowskiNet):
         stem = self._stem(to_voxels(features, points, voxels), voxels)
         at_points = to_points(stem, points, voxels)
         levels = self._encode(to_voxels(at_points, points, voxels), voxels)
-        levels[0] = (voxels, stem)  # which the last decoder stage joins, as it was before
+        levels[0] = (voxels, stem)  # the last decoder stage joins the stem without the points
         inner, index = levels[-1][1], 0
         at_points = self.points[0](at_points) + to_points(inner, points, levels[-1][0])
         for transform in self.points[1:]:
@@ -173,6 +145,6 @@ class SPVCNN(MinkowskiNet):
         # The size is a tensor of the same device: division by a number may multiply by its inverse.
         size = torch.tensor(self.voxel_m, device=coordinates.device)
         xyz = coordinates[:, :3].float()
-        # The official way never moves a coordinate down, but for negative ones, which would fall
-        # into the voxel before; it does not have any.
+        # Rounding must not move a negative coordinate into the voxel below; the official code has
+        # non-negative ones only, which never move down.
         return Points(torch.maximum(xyz * size / size, xyz), coordinates[:, 3].long())

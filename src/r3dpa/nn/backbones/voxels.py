@@ -1,4 +1,4 @@
-"""A scan made ready for WaffleIron: voxels, neighbours, cells, and the way back to all points.
+"""Preparation of a scan for WaffleIron: voxels, neighbours, cells, and the map to all points.
 
 Letters: P points of a scan, M of them kept, N kept points of all B scans of a batch, K neighbours.
 """
@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-#: Axes that span the planes, x y z = 0 1 2: the first is the row of the cell, the second the column
+#: Axes of the planes, x y z = 0 1 2: the first is the row of a cell, the second its column.
 PLANES = ((0, 1), (0, 2), (1, 2))
 NUM_FEATURES = 5
 # Points this close to the border of the field of view are dropped, as in the official code.
@@ -23,25 +23,21 @@ _BORDER_M = 1e-4
 
 @dataclass(frozen=True)
 class ScanGrid:
-    """How a scan is thinned, cropped and cut into cells; the defaults are those of ScaLR.
+    """Settings that thin, crop and grid a scan; the defaults are those of ScaLR.
 
     Args:
         minimum_m: Lowest x, y, z of the field of view, metres in the sensor frame.
         maximum_m: Highest x, y, z.
-        cell_m: Edge of the square cells of the planes, a divisor of the field of view.
-        voxel_m: Edge of the voxels, of which each keeps one point.
+        cell_m: Edge of the cells along all axes, or along x, y, z; divides the field of view.
+        voxel_m: Edge of the voxels, each of which keeps one point.
         num_neighbors: Neighbours K of a point, itself not counted.
-        intensity_mean: Mean of the intensity (0..1), which is subtracted.
-        intensity_std: Its standard deviation, by which is divided.
-
-    Raises:
-        ValueError: If a length, a count or the deviation is not positive, or the field of view not
-            a whole number of cells along each axis.
+        intensity_mean: Mean of the intensity (0..1), for standardisation.
+        intensity_std: Its standard deviation.
     """
 
     minimum_m: tuple[float, float, float] = (-64.0, -64.0, -8.0)
     maximum_m: tuple[float, float, float] = (64.0, 64.0, 8.0)
-    cell_m: float = 0.5
+    cell_m: float | tuple[float, float, float] = 0.5
     voxel_m: float = 0.1
     num_neighbors: int = 16
     intensity_mean: float = 0.294584
@@ -50,7 +46,7 @@ class ScanGrid:
     def __post_init__(self) -> None:
         """Check that sizes are positive and that cells fill the field of view."""
         for name in ("cell_m", "voxel_m", "num_neighbors", "intensity_std"):
-            if not getattr(self, name) > 0:
+            if not np.all(np.greater(getattr(self, name), 0)):
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
         extent = np.subtract(self.maximum_m, self.minimum_m)
         if (extent <= 0).any() or not np.allclose(extent, np.multiply(self.cells, self.cell_m)):
@@ -62,13 +58,13 @@ class ScanGrid:
     @property
     def cells(self) -> tuple[int, int, int]:
         """Number of cells along x, y, z."""
-        extent = np.subtract(self.maximum_m, self.minimum_m) / self.cell_m
+        extent = np.subtract(self.maximum_m, self.minimum_m) / np.asarray(self.cell_m)
         x, y, z = np.rint(extent).astype(int).tolist()
         return x, y, z
 
 
 class PreparedScan(NamedTuple):
-    """One scan as WaffleIron sees it; what depends on its points alone, computed once.
+    """Input of WaffleIron for one scan, computed from its points alone.
 
     Attributes:
         features: ``(M, 5)`` float32: intensity (standardised), x, y, z, distance to the sensor
@@ -89,7 +85,7 @@ class PreparedScan(NamedTuple):
 
 
 class PointCloudBatch(NamedTuple):
-    """Kept points of B scans of any length, one after another and without padding.
+    """Concatenated kept points of B scans of any length, without padding.
 
     Attributes:
         features: ``(N, 5)`` as in :class:`PreparedScan`.
@@ -111,23 +107,20 @@ class PointCloudBatch(NamedTuple):
 def prepare_scan(
     points: np.ndarray, grid: ScanGrid | None = None, *, workers: int = 1
 ) -> PreparedScan:
-    """Thin, crop and index one scan.
+    """Thinned, cropped and indexed scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
-    scan and sorted by (x, y, z). Of these, the points within the field of view are kept, in that
-    order. All of it is float32 arithmetic: in double precision other points would be kept, as
-    coordinates are often multiples of a millimetre that lie on the border of a voxel.
+    scan and sorted by (x, y, z). Of these points, those within the field of view are kept. All of it
+    is float32 arithmetic: coordinates are often multiples of a millimetre on the border of a voxel,
+    and double precision would keep other points.
 
     Source: Puy et al., "Using a Waffle Iron for Automotive Point Cloud Semantic Segmentation"
     (ICCV 2023); settings of ScaLR (Puy et al., CVPR 2024).
 
     Args:
-        points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-        grid: Settings; those of ScaLR where None.
+        points: ``(P, 4)`` x, y, z in metres, intensity 0..1, finite.
+        grid: Settings. Default: those of ScaLR.
         workers: Threads of the neighbour search, -1 for all cores.
-
-    Raises:
-        ValueError: If ``points`` has another shape, or holds NaN or infinite values.
     """
     grid = grid or ScanGrid()
     points = np.asarray(points, dtype=np.float32)
@@ -147,7 +140,7 @@ def prepare_scan(
 
     intensity = (points[kept, 3] - np.float32(grid.intensity_mean)) / np.float32(grid.intensity_std)
     radius = np.linalg.norm(xyz, axis=1)
-    place = np.floor((xyz - minimum) / np.float32(grid.cell_m)).astype(np.int64)
+    place = np.floor((xyz - minimum) / np.asarray(grid.cell_m, dtype=np.float32)).astype(np.int64)
     cells = np.stack([place[:, row] * grid.cells[col] + place[:, col] for row, col in PLANES])
 
     tree = cKDTree(xyz)
@@ -165,11 +158,7 @@ def prepare_scan(
 
 
 def collate_scans(scans: Sequence[PreparedScan]) -> PointCloudBatch:
-    """Batch of scans, in the given order; ``torch.split`` by ``num_points`` takes it apart.
-
-    Raises:
-        ValueError: If ``scans`` is empty.
-    """
+    """Batch of at least one scan; ``torch.split`` by ``num_points`` takes it apart."""
     if not scans:
         raise ValueError("a batch needs at least one scan, got none.")
     num_points = torch.tensor([len(scan.features) for scan in scans])

@@ -26,21 +26,17 @@ class WaffleIron(nn.Module):
     """Tokens of all points from their features, neighbours and cells.
 
     ``depth`` layers, each a spatial mixing on one plane (xy, xz, yz, xy, ...) and a channel mixing
-    of each token by itself. The default sizes are WI-48-768, the backbone of ScaLR.
+    of each token. The default sizes are WI-48-768, the backbone of ScaLR.
 
-    Batch norms (in the embedding) see the points of all scans and nothing else; in training, a
-    batch therefore needs two points. Under ``torch.autocast`` coordinates, statistics, means over
-    cells and the running sum of the tokens stay float32.
+    Under ``torch.autocast`` coordinates, statistics, means over cells and the residual stream of
+    the tokens stay float32. A training batch needs two points for the batch norms.
 
     Args:
         width: Width F of the tokens.
         depth: Number of layers.
         cells: Number of cells along x, y, z, see :attr:`ScanGrid.cells`.
-        head_dim: Outputs of the linear layer ``head``, which the forward pass leaves out; without
-            one ``head`` is the identity.
-
-    Raises:
-        ValueError: If ``width`` or ``depth`` is not positive.
+        head_dim: Outputs of the linear layer ``head``, which the forward pass does not use.
+            Default: ``head`` is the identity.
     """
 
     def __init__(
@@ -65,16 +61,13 @@ class WaffleIron(nn.Module):
         return self.mix(self.embedding(batch.features, batch.neighbors), batch)
 
     def mix(self, tokens: Tensor, batch: PointCloudBatch, visible: Tensor | None = None) -> Tensor:
-        """Pass embedded points through all layers.
+        """Tokens ``(N, F)`` of the last layer.
 
         Args:
-            tokens: ``(N, F)`` at the entrance of the first layer.
+            tokens: ``(N, F)`` input of the first layer.
             batch: Their cells.
-            visible: ``(N,)`` bool: the other points read the planes and write nothing there, so
-                that no point learns anything of them. All points are visible where None.
-
-        Returns:
-            Tokens ``(N, F)`` of the last layer.
+            visible: ``(N,)`` bool: the other points read the planes but write nothing there, so
+                that no point depends on them. Default: all.
         """
         planes = self._planes(batch, visible)
         for layer, (spatial, channel) in enumerate(zip(self.spatial, self.channel, strict=True)):
@@ -97,15 +90,13 @@ class WaffleIron(nn.Module):
 
 
 class Plane(NamedTuple):
-    """Where the points of a batch lie on one plane.
+    """Cells of the points of a batch on one plane.
 
     Attributes:
         cells: ``(N,)`` int64 cell of each point, ``(scan * rows + row) * columns + column``.
-        share: ``(B * rows * columns, 1)`` float32 one over the number of points that write to each
-            cell.
+        share: ``(B * rows * columns, 1)`` float32 one over the number of visible points.
         size: B, rows, columns.
-        weight: ``(N, 1)`` float32, 1 where a point writes to its cell and 0 where it only reads;
-            all write where None.
+        weight: ``(N, 1)`` float32, 1 for visible points, 0 for others; None if all are visible.
     """
 
     cells: Tensor
@@ -115,11 +106,7 @@ class Plane(NamedTuple):
 
 
 class Embedding(nn.Module):
-    """Token of each point from its features and from how its neighbours differ from it.
-
-    Args:
-        width: Width F of the tokens.
-    """
+    """Token of each point from its features and from their differences to its neighbours."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -135,15 +122,7 @@ class Embedding(nn.Module):
         self.merge = nn.Linear(2 * width, width)
 
     def forward(self, features: Tensor, neighbors: Tensor) -> Tensor:
-        """Tokens.
-
-        Args:
-            features: ``(N, 5)`` float32.
-            neighbors: ``(N, K)`` int64 rows of ``features``.
-
-        Returns:
-            ``(N, F)``.
-        """
+        """Tokens ``(N, F)`` of features ``(N, 5)`` and rows ``(N, K)`` of their neighbours."""
         # Coordinates in bfloat16 would move a point at 60 m by up to 12 cm.
         with torch.autocast(features.device.type, enabled=False):
             features = self.norm(features)
@@ -161,15 +140,11 @@ class Embedding(nn.Module):
     def _around(self, offsets: Tensor) -> Tensor:
         with torch.autocast(offsets.device.type, enabled=False):
             hidden = self.offset(offsets)
-        return self.neighbor(hidden)  # most of the work: in half precision if asked for
+        return self.neighbor(hidden)  # most of the computation, under autocast
 
 
 class SpatialMixing(nn.Module):
-    """Exchange between the points of a plane: mean over each cell, 2D convolutions, and back.
-
-    Args:
-        width: Width F of the tokens.
-    """
+    """Mixing of the tokens on a plane: mean over each cell, 2D convolutions, and back."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -182,7 +157,7 @@ class SpatialMixing(nn.Module):
         self.scale = nn.Parameter(torch.full((width,), _SCALE))
 
     def forward(self, tokens: Tensor, plane: Plane) -> Tensor:
-        """Tokens ``(N, F)`` plus what they learn from the cells around theirs."""
+        """``(N, F)`` to the same shape."""
         normed = at_least_float32(self.norm(tokens))
         if plane.weight is not None:
             normed = normed * plane.weight
@@ -191,16 +166,12 @@ class SpatialMixing(nn.Module):
         # Channels stay last in memory, so that neither permutation copies the image.
         image = means.unflatten(0, plane.size).permute(0, 3, 1, 2)
         mixed = self.convs(image).permute(0, 2, 3, 1).flatten(0, 2)
-        # Not mixed[plane.cells], whose gradient is summed in another order on every run.
+        # Not mixed[plane.cells], whose gradient is summed in a random order.
         return torch.addcmul(tokens, self.scale, mixed.index_select(0, plane.cells))
 
 
 class ChannelMixing(nn.Module):
-    """Two linear layers on each token by itself.
-
-    Args:
-        width: Width F of the tokens.
-    """
+    """Two linear layers on each token."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -211,5 +182,5 @@ class ChannelMixing(nn.Module):
         self.scale = nn.Parameter(torch.full((width,), _SCALE))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Tokens ``(N, F)`` plus what the layers make of each."""
+        """``(N, F)`` to the same shape."""
         return torch.addcmul(tokens, self.scale, self.mlp(self.norm(tokens)))
