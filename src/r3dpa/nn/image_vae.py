@@ -5,8 +5,6 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
@@ -140,12 +138,12 @@ class _Level(nn.Module):
             _ResBlock(out_channels if index else in_channels, out_channels, groups)
             for index in range(num_blocks)
         )
+        self.name = name
         self.add_module(name, nn.ModuleList([resampler(out_channels)] if resampler else []))
 
     def forward(self, hidden: Tensor) -> Tensor:
-        for layers in self.children():
-            for layer in cast(nn.ModuleList, layers):
-                hidden = layer(hidden)
+        for layer in (*self.resnets, *getattr(self, self.name)):
+            hidden = layer(hidden)
         return hidden
 
 

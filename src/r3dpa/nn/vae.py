@@ -6,6 +6,8 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
 
 import torch
@@ -200,7 +202,7 @@ class _Encoder(nn.Module):
         self.conv_in = CircularConv2d(in_channels, widths[0], (3, 3))
         before = [widths[0], *widths[:-1]]
         self.down = nn.ModuleList(
-            _DownLevel(*level, num_blocks)
+            _down_level(*level, num_blocks)
             for level in zip(before, widths, attention, [*strides, None], strict=True)
         )
         self.mid = _Middle(widths[-1])
@@ -230,7 +232,7 @@ class _Decoder(nn.Module):
         self.mid = _Middle(widths[-1])
         before = [*widths[1:], widths[-1]]
         self.up = nn.ModuleList(  # index 0 is the full resolution, as in the encoder
-            _UpLevel(*level, num_blocks, legacy_upsample)
+            _up_level(*level, num_blocks, legacy_upsample)
             for level in zip(before, widths, attention, [None, *strides], strict=True)
         )
         self.norm_out = GroupNorm(widths[0])
@@ -244,10 +246,17 @@ class _Decoder(nn.Module):
 
 
 class _Level(nn.Module):
-    """Residual blocks of one resolution, each followed by attention if asked for."""
+    """Residual blocks of one resolution, each followed by attention if asked for, and resampling."""
 
     def __init__(
-        self, in_channels: int, out_channels: int, attention: bool, num_blocks: int, kernel: Size
+        self,
+        in_channels: int,
+        out_channels: int,
+        attention: bool,
+        num_blocks: int,
+        kernel: Size,
+        name: str,
+        resample: Callable[[int], nn.Module],
     ) -> None:
         super().__init__()
         self.block = nn.ModuleList(
@@ -257,42 +266,29 @@ class _Level(nn.Module):
         self.attn = nn.ModuleList(
             AttentionBlock(out_channels) if attention else nn.Identity() for _ in self.block
         )
+        self.name = name  # of the resampling layer in the official state dict
+        self.add_module(name, resample(out_channels))
 
     def forward(self, hidden: Tensor) -> Tensor:
         for block, attn in zip(self.block, self.attn, strict=True):
             hidden = attn(block(hidden))
-        return hidden
+        return getattr(self, self.name)(hidden)
 
 
-class _DownLevel(_Level):
-    def __init__(
-        self, inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int
-    ) -> None:
-        super().__init__(inside, outside, attention, num_blocks, (3, 3))
-        self.downsample = nn.Identity() if stride is None else Downsample(outside, stride)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.downsample(super().forward(hidden))
+def _down_level(
+    inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int
+) -> _Level:
+    resample = nn.Identity if stride is None else partial(Downsample, stride=stride)
+    return _Level(inside, outside, attention, num_blocks, (3, 3), "downsample", resample)
 
 
-class _UpLevel(_Level):
+def _up_level(
+    inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int, legacy: bool
+) -> _Level:
     """Level whose kernels extend over columns only, unless its rows are upsampled afterwards."""
-
-    def __init__(
-        self,
-        inside: int,
-        outside: int,
-        attention: bool,
-        stride: Size | None,
-        num_blocks: int,
-        legacy: bool,
-    ) -> None:
-        kernel = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
-        super().__init__(inside, outside, attention, num_blocks, kernel)
-        self.upsample = nn.Identity() if stride is None else Upsample(outside, stride, legacy)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.upsample(super().forward(hidden))
+    kernel = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
+    resample = nn.Identity if stride is None else partial(Upsample, stride=stride, legacy=legacy)
+    return _Level(inside, outside, attention, num_blocks, kernel, "upsample", resample)
 
 
 class _Middle(nn.Sequential):

@@ -1,8 +1,8 @@
 """Sparse 3D convolution in plain PyTorch: occupied voxels, kernel maps, and the layer.
 
-A voxel is one int64 key; keys are sorted, so that neighbours are found by bisection. For each offset
-of the kernel, a convolution gathers the paired rows, multiplies them by the matrix of the offset
-and adds them to the rows of the result.
+A voxel is one int64 key; keys are sorted, so that neighbours are found by bisection. For each
+offset of the kernel, a convolution gathers the paired rows, multiplies them by the matrix of the
+offset and adds them to the rows of the result.
 
 Source: Choy, Gwak and Savarese, "4D Spatio-Temporal ConvNets" (CVPR 2019); same numbers as
 torchsparse 1.4.0 (``tests/parity``).
@@ -218,7 +218,7 @@ class SparseConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
 
     def forward(self, features: Tensor, kernel_map: KernelMap | None = None) -> Tensor:
-        """Features ``(N', out_channels)`` at the output voxels of the map, from ``(N, channels)``."""
+        """``(N, in_channels)`` to ``(N', out_channels)`` at the output voxels of the map."""
         if kernel_map is None:
             result = features @ self.kernel
         else:

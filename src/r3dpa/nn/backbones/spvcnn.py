@@ -53,8 +53,8 @@ def to_voxels(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
 def to_points(features: Tensor, points: Points, voxels: Voxels) -> Tensor:
     """Voxel features ``(N, C)`` interpolated trilinearly at the points, ``(P, C)``.
 
-    A voxel is located at its lowest corner; weights of empty voxels are distributed to the others in
-    proportion. A point without an occupied voxel around it gives zeros.
+    A voxel is located at its lowest corner; weights of empty voxels are distributed to the others
+    in proportion. A point without an occupied voxel around it gives zeros.
     """
     rows, weights = corners(points, voxels)
     # The last row stands for empty voxels, whose weight is 0.

@@ -110,9 +110,9 @@ def prepare_scan(
     """Thinned, cropped and indexed scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
-    scan and sorted by (x, y, z). Of these points, those within the field of view are kept. All of it
-    is float32 arithmetic: coordinates are often multiples of a millimetre on the border of a voxel,
-    and double precision would keep other points.
+    scan and sorted by (x, y, z). Of these points, those within the field of view are kept. The
+    arithmetic is float32: coordinates are often multiples of a millimetre on the border of a
+    voxel, and double precision would keep other points.
 
     Source: Puy et al., "Using a Waffle Iron for Automotive Point Cloud Semantic Segmentation"
     (ICCV 2023); settings of ScaLR (Puy et al., CVPR 2024).
