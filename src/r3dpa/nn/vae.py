@@ -246,7 +246,7 @@ class _Decoder(nn.Module):
 
 
 class _Level(nn.Module):
-    """Residual blocks of one resolution, each followed by attention if asked for, and resampling."""
+    """Residual blocks, each followed by attention if asked for, and a resampling layer."""
 
     def __init__(
         self,
