@@ -68,7 +68,7 @@ def rows(out, scans=None, size=(2, 8)):
     """Bytes of each grid by scan."""
     scans = scans or find_scans(out.parent / "scans")
     grids = FeatureGrids(out, scans, PROJECTION, size)
-    return {s.name: grids.read(s, s.path.stat().st_size).numpy().tobytes() for s in scans}
+    return {s.name: grids.read(s).numpy().tobytes() for s in scans}
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +209,7 @@ class TestForms:
         ),
         (
             ["--data", "{yaml}", "--out", "{yaml}/below"],
-            "cannot be written to .*give a features_dir",
+            "cannot be written to .*give a folder",
         ),
     ],
 )

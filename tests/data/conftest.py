@@ -59,8 +59,9 @@ def make_scans():
     def make(folder, count, seed=0):
         folder.mkdir(parents=True, exist_ok=True)
         for frame in range(count):
-            points = random_points(1000 * seed + frame)
-            (folder / f"{frame:010d}.bin").write_bytes(points.tobytes())
+            path = folder / f"{frame:010d}.bin"
+            if not path.exists():
+                path.write_bytes(random_points(1000 * seed + frame).tobytes())
         return folder
 
     return make
@@ -70,16 +71,6 @@ def make_scans():
 def scaled_points():
     """The extractor class."""
     return ScaledPoints
-
-
-@pytest.fixture
-def read_grid():
-    """Function that reads the grid of a scan as it is on disk."""
-
-    def read(grids, scan):
-        return grids.read(scan, scan.path.stat().st_size)
-
-    return read
 
 
 @pytest.fixture

@@ -1,11 +1,28 @@
+import operator
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from r3dpa.data import LidarDataset, find_scans
+from r3dpa import geometry
+from r3dpa.data import (
+    Augmentation,
+    CachedTensors,
+    FeatureGrids,
+    LatentDataset,
+    LidarDataModule,
+    LidarDataset,
+    StoreError,
+    TensorCache,
+    View,
+    datasets,
+    find_scans,
+    range_image_cache,
+    write_range_images,
+)
 from r3dpa.data.feature_grids import write_feature_grids
-from r3dpa.data.feature_store import FeatureGrids
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
 
@@ -62,3 +79,145 @@ def test_scan_in_no_ring_order_is_named(tmp_path, make_scans):
     rings = RingProjection(sensor, (0.0, -5.0, -10.0, -15.0))
     with pytest.raises(ScanError, match=r"0000000000\.bin: cannot be projected: .*ring"):
         LidarDataset(scans, rings, RangeCodec())[0]
+
+
+def test_points_are_projected_once_per_item(tmp_path, make_scans, projection, monkeypatch):
+    """Ranges are computed by the projection alone."""
+    calls, original = [], geometry.projection.range_of
+    monkeypatch.setattr(
+        geometry.projection, "range_of", lambda points: calls.append(1) or original(points)
+    )
+    LidarDataset(find_scans(make_scans(tmp_path / "s", 1)), projection, RangeCodec())[0]
+    assert len(calls) == 1
+
+
+def test_a_scan_out_of_range_is_named(tmp_path, projection):
+    scans = write(tmp_path, [[0, 0, 0.5, 1], [90, 0, 0, 1]])
+    with pytest.raises(ScanError, match=r"000000\.bin: has no point within .* 1\.\.56 m"):
+        LidarDataset(scans, projection, RangeCodec())[0]
+
+
+# --- range images and posteriors that are kept on disk
+
+
+@pytest.fixture
+def scans(tmp_path, make_scans):
+    return find_scans(make_scans(tmp_path / "scans", 5))
+
+
+@pytest.mark.parametrize("codec", [RangeCodec(), RangeCodec("log2")])
+def test_a_cached_sample_is_the_projected_one(tmp_path, scans, projection, codec):
+    root = tmp_path / "images"
+    assert write_range_images(scans, projection, codec, root) == 5
+    images = CachedTensors(range_image_cache(root, projection, codec), scans)
+    projected = LidarDataset(scans, projection, codec)
+    cached = LidarDataset(scans, projection, codec, images=images)
+    for index in range(5):
+        for key, value in projected[index].items():
+            same = torch.equal if torch.is_tensor(value) else operator.eq
+            assert same(cached[index][key], value), key
+
+
+def test_only_what_is_missing_is_projected(tmp_path, scans, projection, monkeypatch):
+    root, read = tmp_path / "images", []
+    write_range_images(scans[:3], projection, RangeCodec(), root)
+    original = datasets.read_scan
+    monkeypatch.setattr(datasets, "read_scan", lambda path: read.append(path) or original(path))
+    assert write_range_images(scans, projection, RangeCodec(), root) == 2
+    assert read == [scan.path for scan in scans[3:]]
+    assert write_range_images(scans, projection, RangeCodec(), root) == 0
+
+
+@pytest.mark.parametrize(
+    ("columns", "range_max_m", "codec"),
+    [(32, 56, RangeCodec("log2")), (64, 56, RangeCodec()), (32, 40, RangeCodec())],
+)
+def test_other_settings_never_find_these_images(
+    tmp_path, scans, projection, columns, range_max_m, codec
+):
+    write_range_images(scans, projection, RangeCodec(), tmp_path)
+    other = SphericalProjection(LidarSensor(8, columns, range_max_m=range_max_m))
+    assert range_image_cache(tmp_path, other, codec).missing(scans) == scans
+
+
+def test_a_replaced_scan_of_the_same_size_is_noticed_and_made_again(tmp_path, scans, projection):
+    root = tmp_path / "i"
+    write_range_images(scans, projection, RangeCodec(), root)
+    images = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
+    points = np.fromfile(scans[1].path, "<f4").reshape(-1, 4)
+    (2 * points).tofile(scans[1].path)
+    with pytest.raises(StoreError, match=r"0000000001\.bin was replaced"):
+        images.read(scans[1])
+    assert write_range_images(scans, projection, RangeCodec(), root) == 1
+    again = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
+    expected = LidarDataset(scans, projection, RangeCodec())[1]["range_image"]
+    assert torch.equal(again.read(scans[1]), expected)
+
+
+def test_rotating_a_cached_image_is_projecting_the_rotated_scan(tmp_path, scans, projection):
+    """By 3 of 8 grid columns, each of 4 pixels."""
+    codec, view = RangeCodec(), View(columns=3, mirrored=False, grid_columns=8)
+    write_range_images(scans, projection, codec, tmp_path)
+    images = CachedTensors(range_image_cache(tmp_path, projection, codec), scans)
+    plain = LidarDataset(scans, projection, codec)[0]["range_image"]
+    seen = view.sample(LidarDataset(scans, projection, codec, images=images)[0])
+    assert torch.equal(seen["range_image"], plain.roll(12, -1))
+    assert torch.equal(seen["valid_mask"], codec.valid_mask(plain.roll(12, -1)))
+
+
+@pytest.fixture
+def posteriors(tmp_path, scans):
+    cache = TensorCache(tmp_path / "c", "posterior", {"vae": "abc"}, (4, 2, 16))
+    with cache.writer() as writer:
+        moments = torch.randn(5, 4, 2, 16, generator=torch.Generator().manual_seed(3))
+        writer.add([scan.cache_key for scan in scans], moments)
+    return CachedTensors(cache, scans), moments
+
+
+def test_posteriors_turn_with_the_scan(scans, posteriors):
+    sample = LatentDataset(scans, posteriors[0])[1]
+    seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample)
+    assert torch.equal(seen["posterior_moments"], posteriors[1][1].roll(6, -1))
+    assert (seen["index"], seen["name"]) == (1, scans[1].name)
+
+
+def data(folder, **kwargs):
+    """Loaded like in a fit."""
+    sensor = LidarSensor(beams=8, columns=32)
+    module = LidarDataModule(
+        str(folder), sensor=sensor, grid_size=(2, 8), batch_size=2, val_every=None, **kwargs
+    )
+    module.prepare_data()
+    module.setup("fit")
+    return module
+
+
+def test_batches_of_the_data_module_are_the_same(tmp_path, scans):
+    folder, augmentation = tmp_path / "scans", Augmentation(rotate=True, flip=True)
+    plain = data(folder, augmentation=augmentation)
+    cached = data(folder, augmentation=augmentation, images_dir=str(tmp_path / "i"), num_workers=1)
+    pairs = zip(plain.train_dataloader(), cached.train_dataloader(), strict=True)
+    for number, (one, other) in enumerate(pairs):
+        assert one["name"] == other["name"], number
+        assert torch.equal(one["range_image"], other["range_image"])
+
+
+def test_the_data_module_refuses_latents_that_do_not_follow(tmp_path, posteriors):
+    module = data(tmp_path / "scans", augmentation=Augmentation(flip=True))
+    with pytest.raises(ValueError, match="mirroring"):
+        module.use_posteriors(posteriors[0])
+
+
+@pytest.mark.parametrize(
+    ("augmentation", "latent_columns", "message"),
+    [
+        (Augmentation(flip=True), 16, "flip: .*mirroring.*cache_latents: false"),
+        (Augmentation(rotate=True), 4, "rotate: 8 grid columns do not divide the 4 columns"),
+        (Augmentation(rotate=True), 16, None),
+        (Augmentation(), 4, None),
+    ],
+)
+def test_augmentation_that_latents_follow_or_not(augmentation, latent_columns, message):
+    refused = nullcontext() if message is None else pytest.raises(ValueError, match=message)
+    with refused:
+        augmentation.check_latents(latent_columns, 8)

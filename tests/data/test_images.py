@@ -15,9 +15,8 @@ from PIL import Image
 
 from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder, TarImages
 from r3dpa.data.dead_leaves import dead_leaves
-from r3dpa.data.image_latents import latent_statistics
-from r3dpa.data.images import ImageEntry, ImageError, center_crop
-from r3dpa.data.tensor_cache import CachedTensors, TensorCache, TensorCacheError
+from r3dpa.data.images import ImageEntry, ImageError, center_crop, latent_statistics
+from r3dpa.data.store import CachedTensors, TensorCache
 
 
 def encoded(pixels):
@@ -245,50 +244,17 @@ def test_dead_leaves_out_of_range(args):
         DeadLeaves(**args)
 
 
-@pytest.fixture
-def latents(tmp_path):
+def test_statistics_of_cached_latents(tmp_path):
     entries = [ImageEntry(str(i), tmp_path / "x", i) for i in range(5)]
-    return TensorCache(tmp_path, "posterior", {"vae": "a"}, (4, 2, 3)), entries
-
-
-def test_latents_come_back_and_only_missing_ones_are_asked_for(latents):
-    cache, entries = latents
-    moments = torch.randn(5, 4, 2, 3)
-    with cache.writer(0) as add:
-        add(entries[:2], moments[:2])
-    assert cache.missing(entries) == entries[2:]
-    with pytest.raises(TensorCacheError, match="lacks 3 of 5"):
-        CachedTensors(cache, entries)
-    with cache.writer(0) as add:
-        add(entries, moments)  # those known are left as they are
+    cache, moments = TensorCache(tmp_path, "posterior", {}, (4, 2, 3)), torch.randn(5, 4, 2, 3)
+    with cache.writer() as writer:
+        writer.add([entry.cache_key for entry in entries], moments)
     posteriors = CachedTensors(cache, entries)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # such as that of torch on memory that it must not write
-        for entry, expected in zip(entries, moments, strict=True):
-            assert torch.equal(posteriors.read(entry), expected)
-    posteriors.read(entries[0]).zero_()  # a copy
-    assert torch.equal(posteriors.read(entries[0]), moments[0])
-    mean, variance = latent_statistics(posteriors)
+        mean, variance = latent_statistics(posteriors)
     means, logvars = moments.chunk(2, dim=1)
     torch.testing.assert_close(mean, means.mean(dim=(0, 2, 3)))
     # Law of total variance: of the means, plus the mean of the posteriors' own.
     spread = means.var(dim=(0, 2, 3), unbiased=False) + logvars.exp().mean(dim=(0, 2, 3))
     torch.testing.assert_close(variance, spread)
-
-
-def test_other_settings_have_another_place_and_broken_latents_none(latents):
-    cache, entries = latents
-    other = TensorCache(cache.root, "posterior", {"vae": "b"}, cache.shape)
-    assert other.folder != cache.folder
-    broken = torch.zeros(2, 4, 2, 3)
-    broken[1, 0] = torch.inf
-    with (
-        cache.writer(0) as add,
-        pytest.raises(TensorCacheError, match=r"x: .* 1 as posterior is not"),
-    ):
-        add(entries[:2], broken)
-    replaced = ImageEntry("0", entries[0].path, 99)
-    with cache.writer(0) as add:
-        add(entries[:1], broken[:1])
-    with pytest.raises(TensorCacheError, match="was replaced"):
-        CachedTensors(cache, entries[:1]).read(replaced)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from r3dpa.data.mask_files import read_mask
+from r3dpa.data.images import read_mask
 
 
 def drawn(path, values, mode=None):

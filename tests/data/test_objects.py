@@ -85,13 +85,13 @@ def test_rings_are_found_in_whole_scans(tmp_path, scaled_points):
     assert {entry.name: entry.num_cells for entry in library.classes} == {"car": 1, "road": 4}
 
 
-class Labelled(torch.nn.Module):
-    """Needs labels, and lifts its features to twice their width."""
+class Lifted(torch.nn.Module):
+    """Lifts its features to twice their width."""
 
-    name, dim, settings, needs_labels = "labelled", 4, {"pair": (1, 2)}, True
+    name, dim, settings = "lifted", 4, {"pair": (1, 2)}
 
-    def prepare(self, points, labels):
-        return torch.stack([points[:, 0], labels.float()], dim=1)
+    def prepare(self, points):
+        return points[:, :2]
 
     def point_features(self, prepared):
         return prepared
@@ -100,12 +100,11 @@ class Labelled(torch.nn.Module):
         return torch.cat([values, -values], dim=1)
 
 
-def test_labels_and_the_linear_step_reach_the_extractor(tmp_path):
+def test_the_linear_step_is_taken(tmp_path):
     scan = write_scan(tmp_path, "0", [AHEAD], [CAR | 2 << 16])
-    library = object_library([scan], Labelled(), PROJECTION, (2, 4))
-    label = float(CAR | 2 << 16)
-    assert library.feature("car").tolist() == [10, label, -10, -label]
-    assert library.source == "labelled"
+    library = object_library([scan], Lifted(), PROJECTION, (2, 4))
+    assert library.feature("car").tolist() == [*AHEAD[:2], *(-value for value in AHEAD[:2])]
+    assert library.source == "lifted"
     assert library.extractor["settings"] == {"pair": [1, 2]}  # as it comes back from a file
 
 

@@ -1,6 +1,4 @@
 import pickle
-import sys
-import types
 
 import numpy as np
 import pytest
@@ -49,41 +47,6 @@ def assert_is(sample, image):
     else:
         assert sample.intensity is None
         assert sample.points.shape == (29, 3)
-
-
-def joblib_dump(clouds, path, monkeypatch, alignment=16, protocol=4):
-    """List of arrays as joblib writes it: each pickled wrapper is followed by the array's bytes."""
-    module = types.ModuleType("joblib.numpy_pickle")
-    module.NumpyArrayWrapper = type(
-        "NumpyArrayWrapper", (), {"__module__": "joblib.numpy_pickle", "__init__": set_state}
-    )
-    monkeypatch.setitem(sys.modules, "joblib", types.ModuleType("joblib"))
-    monkeypatch.setitem(sys.modules, "joblib.numpy_pickle", module)
-
-    class Pickler(pickle._Pickler):
-        def save(self, obj):
-            if type(obj) is not np.ndarray:
-                super().save(obj)
-                return
-            order = "C" if obj.flags.c_contiguous else "F"
-            state = {"subclass": np.ndarray, "shape": obj.shape, "order": order}
-            state |= {"dtype": obj.dtype, "allow_mmap": True}
-            if alignment:
-                state["numpy_array_alignment_bytes"] = alignment
-            super().save(module.NumpyArrayWrapper(state))
-            if self.proto >= 4:
-                self.framer.commit_frame(force=True)
-            if alignment:
-                padding = alignment - (stream.tell() + 1) % alignment
-                stream.write(bytes([padding]) + b"\xff" * padding)
-            stream.write(obj.tobytes(order))
-
-    with path.open("wb") as stream:
-        Pickler(stream, protocol).dump(clouds)
-
-
-def set_state(self, state):
-    self.__dict__.update(state)
 
 
 def write_text(path, points):
@@ -252,16 +215,6 @@ def test_half_precision_images_are_read(tmp_path):
     assert_is(sample, image().bfloat16().float())
 
 
-@pytest.mark.parametrize(("alignment", "protocol"), [(16, 4), (16, 5), (None, 4), (None, 3)])
-def test_joblib_list_of_clouds(tmp_path, monkeypatch, alignment, protocol):
-    clouds = [CLOUDS[0], np.asfortranarray(CLOUDS[1]), CLOUDS[1][:, :3].astype(np.float64)]
-    joblib_dump(clouds, tmp_path / "samples.pcd", monkeypatch, alignment, protocol)
-    samples = list(read_samples(tmp_path / "samples.pcd", SENSOR))
-    assert [sample.name for sample in samples] == ["000000", "000001", "000002"]
-    for sample, points in zip(samples, clouds, strict=True):
-        assert sample.points.tolist() == points.tolist()
-
-
 class Payload:
     def __reduce__(self):
         return print, ("executed",)
@@ -277,7 +230,7 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
         torch.save([Payload()], file)
     else:
         {"npy": np.save, "npz": np.savez}[suffix](file, objects)
-    reason = {"pcd": "print is no array", "pth": "cannot be read as tensors alone"}
+    reason = {"pcd": "starts with", "pth": "cannot be read as tensors alone"}
     with pytest.raises(SampleError, match=f"evil.{suffix}.*{reason.get(suffix, 'not unpickled')}"):
         list(read_samples(file, SENSOR))
     assert capsys.readouterr().out == ""
@@ -329,12 +282,6 @@ BAD = {
     "other text": (bytes_file("a.txt", b"model: r3dpa\n"), r"a\.txt: starts with b'model: r3dpa"),
     "ragged text": (bytes_file("a.txt", b"1 2 3\n4 5\n"), r"a\.txt: is not text rows"),
     "narrow text": (bytes_file("a.txt", b"9 2\n4 5\n"), r"a\.txt: has rows of 2 numbers; needs 3"),
-    "real .pcd": (
-        bytes_file("a.pcd", b"# .PCD v0.7\nVERSION 0.7"),
-        r"a\.pcd: starts with b'# .PCD",
-    ),
-    "cut .pcd": (bytes_file("a.pcd", b"\x80\x04\x95"), r"a\.pcd: is not a joblib list of clouds"),
-    "no arrays": (bytes_file("a.pcd", pickle.dumps(3)), r"a\.pcd: is not a joblib list of clouds"),
     "NaN": (bytes_file("a.txt", b"9 2 nan\n4 5 6\n"), r"a\.txt: has NaN or inf.* 1 of 2 points"),
     "NaN in .bin": (
         bytes_file("a.bin", np.full(4, np.nan, "<f4").tobytes()),
@@ -344,10 +291,10 @@ BAD = {
     "no point": (array_file(np.zeros((0, 3), np.float32)), r"a\.npy: is an empty cloud"),
     "no image": (array_file(np.zeros((0, 5, 4, 8), np.float32)), r"a\.npy: no sample .* empty"),
     "bytes": (array_file(np.ones((2, 5, 4, 8), np.uint8)), r"a\.npy: holds uint8 numbers; metres"),
-    "vector": (array_file(np.ones(3)), r"a\.npy: has 1 axes; needs \(P, 3\)"),
+    "vector": (array_file(np.ones(3)), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
     "Fortran": (array_file(np.ones((8, 4, 5, 2)).T), r"a\.npy: is in Fortran order"),
     "cut .npz": (cut, r"a\.npz: "),
-    "damaged .npz": (flipped, r"a\.npz: is damaged"),
+    "damaged .npz": (flipped, r"a\.npz.* is damaged"),
     "no member": (lambda path: np.savez(path / "a.npz"), r"a\.npz: "),
     "no tensor": (tensor_file({"model": {}}), r"a\.pth: holds keys model; needs a float tensor"),
     "no .pth": (bytes_file("a.pth", b"\x80\x02"), r"a\.pth: cannot be read as tensors alone"),
@@ -381,6 +328,12 @@ def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
         list(read_samples(tmp_path, SENSOR))
     assert str(tmp_path) in str(caught.value)
     assert isinstance(caught.value, ScanError)
+
+
+def test_another_format_is_named(tmp_path):
+    bytes_file("a.pcd", b"# .PCD v0.7\nVERSION 0.7")(tmp_path)
+    with pytest.raises(SampleError, match=r"a\.pcd: starts with b'# .PCD"):
+        list(read_samples(tmp_path / "a.pcd", SENSOR))
 
 
 def test_missing_path_and_missing_format_are_named(tmp_path):
@@ -417,22 +370,21 @@ def test_only_bad_samples_are_an_error(tmp_path):
         list(read_samples(tmp_path, SENSOR, skip_bad=True))
 
 
-def test_first_image_is_there_before_the_second_is_read(tmp_path):
+def test_a_stack_cut_short_is_refused(tmp_path):
     file = tmp_path / "a.npy"
     np.save(file, torch.stack([image(0), image(1)]).numpy())
-    file.write_bytes(file.read_bytes()[:-4])
-    samples = iter(read_samples(file, SENSOR))
-    assert_is(next(samples), image(0))
-    with pytest.raises(SampleError, match="sample 000001 of 2: ends after 636 of 640 bytes"):
-        next(samples)
+    file.write_bytes(file.read_bytes()[:-300])
+    with pytest.raises(SampleError, match=r"a\.npy: an array .* needs 1280 bytes, but there are"):
+        list(read_samples(file, SENSOR))
 
 
-@pytest.mark.parametrize("kind", ["pth", "joblib"])
+@pytest.mark.parametrize("kind", ["pth", "npz"])
 def test_one_of_many_samples_is_read_at_a_time(tmp_path, monkeypatch, kind):
+    stack = torch.stack([image(seed) for seed in range(3)])
     if kind == "pth":
-        torch.save(torch.stack([image(seed) for seed in range(3)]), tmp_path / "a.pth")
+        torch.save(stack, tmp_path / "a.pth")
     else:
-        joblib_dump(CLOUDS, tmp_path / "a.pcd", monkeypatch)
+        np.savez(tmp_path / "a.npz", stack.numpy())
     module, name = (torch, "cat") if kind == "pth" else (np, "frombuffer")
     original, calls = getattr(module, name), []
     monkeypatch.setattr(module, name, lambda *a, **k: calls.append(a) or original(*a, **k))

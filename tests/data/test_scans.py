@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from r3dpa.data.checks import check
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     ScanError,
-    check,
     find_scans,
     kitti360_scans,
     read_npz,
@@ -22,6 +22,40 @@ from r3dpa.geometry import LidarSensor
 from r3dpa.io import atomic_path
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
+
+
+def five_columns(count, times=None):
+    """Rows x, y, z, intensity 0..255 and ring, as nuScenes has them."""
+    generator = np.random.default_rng(0)
+    xyz = generator.uniform(-40, 40, (count, 3))
+    ring = np.arange(count) % 32 if times is None else np.full(count, times)
+    return np.column_stack([xyz, generator.integers(0, 256, count), ring]).astype("<f4")
+
+
+@pytest.mark.parametrize("count", [37, 40])  # 740 bytes are no multiple of 16, 800 are
+@pytest.mark.parametrize("times", [None, 0.25])
+def test_five_columns_are_told_from_their_values(tmp_path, count, times):
+    file = tmp_path / "a.bin"
+    five_columns(count, times).tofile(file)
+    with pytest.raises(ScanError, match=r"a\.bin: .* 5 columns, as nuScenes .* divided by 255"):
+        read_scan(file)
+
+
+def test_four_columns_of_a_size_that_fits_five(tmp_path):
+    generator = np.random.default_rng(0)
+    points = np.column_stack([generator.uniform(-40, 40, (40, 3)), generator.random(40)])
+    for intensity in (points[:, 3], np.zeros(40), 255 * points[:, 3]):
+        points[:, 3] = intensity
+        points.astype("<f4").tofile(tmp_path / "a.bin")
+        assert np.array_equal(read_scan(tmp_path / "a.bin"), points.astype("<f4"))
+
+
+@pytest.mark.parametrize(
+    ("scale", "says"), [(1, "intensity: 0..1\n"), (255, "0..255 (expected 0..1: divide by 255)\n")]
+)
+def test_check_says_the_intensity_scale(tmp_path, scale, says):
+    write_bin(tmp_path / "a.bin", POINTS * [1, 1, 1, scale])
+    assert says in str(check(tmp_path))
 
 
 def test_points_are_little_endian_float32_rows(tmp_path):

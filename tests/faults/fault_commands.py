@@ -29,7 +29,7 @@ import yaml
 from PIL import Image
 from safetensors.torch import load_file
 
-from r3dpa.data.grid_settings import GridSettings
+from r3dpa.data.feature_grids import GridSettings
 from r3dpa.data.scans import read_ply, read_scan
 
 CONTEXT = multiprocessing.get_context("forkserver")

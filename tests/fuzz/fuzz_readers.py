@@ -30,8 +30,8 @@ from PIL import Image
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.data import FeatureGrids, FeatureGridWriter, GridSettings, Scan, read_samples
+from r3dpa.data.images import read_mask
 from r3dpa.data.labels import read_labels
-from r3dpa.data.mask_files import read_mask
 from r3dpa.data.objects import ObjectClass, ObjectLibrary
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
@@ -160,13 +160,15 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
         precision="32-true",
     )
     scans = [Scan("drive", f"{n}", folder / f"{n}.bin") for n in range(3)]
+    for scan in scans:
+        scan.path.write_bytes(bytes(160))
     with FeatureGridWriter(store, settings) as writer:
-        writer.add([(scan, 160) for scan in scans], torch.randn(3, 8, 3))
+        writer.add([scan.cache_key for scan in scans], torch.randn(3, 8, 3))
 
     def read() -> None:
         grids = FeatureGrids(store, scans, projection, (2, 4))
         for scan in scans:
-            grids.read(scan, 160)
+            grids.read(scan)
 
     for name in ("shard_00000.jsonl", "shard_00000.rows", "settings.json"):
         add(f"store, {name}", store / "2x4" / name, read)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from lightning import Trainer
 
-from r3dpa.data import FeatureGridError, FeatureGrids, find_scans, write_feature_grids
+from r3dpa.data import FeatureGrids, StoreError, find_scans, write_feature_grids
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.modules import FeatureExtraction, MissingScans
 from r3dpa.nn.backbones import GeometricFeatures
@@ -50,7 +50,7 @@ def extract(scans, out, extractor=None, sizes=SIZES, dtype="float16", batch_size
 
 def read(out, scans, size):
     grids = FeatureGrids(out, scans, PROJECTION, size)
-    return torch.stack([grids.read(scan, scan.path.stat().st_size) for scan in scans])
+    return torch.stack([grids.read(scan) for scan in scans])
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_processes_share_the_scans(num_scans, shards, scans, expected, tmp_path)
 def test_bad_features_name_the_scan_and_what_was_made_before_stays(scans, tmp_path):
     bad = tmp_path / "bad.bin"
     bad.write_bytes(scans[0].path.read_bytes()[:-16])
-    with pytest.raises(FeatureGridError, match=r"bad\.bin: extractor threefold gave NaN"):
+    with pytest.raises(StoreError, match=r"bad\.bin: extractor threefold gave NaN"):
         extract([*scans[:2], *find_scans(bad)], tmp_path, Threefold(), batch_size=1)
     assert len((tmp_path / "2x8" / "shard_00000.jsonl").read_text().splitlines()) == 2
 

@@ -145,7 +145,7 @@ def grids(out, data):
     """Bytes of each grid by scan."""
     found = find_scans(data.parent / "scans")
     store = FeatureGrids(out, found, SphericalProjection(LidarSensor(beams=16, columns=64)), (2, 8))
-    return {s.name: store.read(s, s.path.stat().st_size).numpy().tobytes() for s in found}
+    return {s.name: store.read(s).numpy().tobytes() for s in found}
 
 
 def wait_for_checkpoint(run_dir, jobs):

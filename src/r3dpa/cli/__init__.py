@@ -119,7 +119,7 @@ def check(path: Path) -> None:
     Args:
         path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans.
     """
-    from r3dpa.data.scans import check as check_scans
+    from r3dpa.data.checks import check as check_scans
 
     report = check_scans(path)
     print_text(report)

@@ -27,7 +27,6 @@ from r3dpa.data import (
     Scan,
     ScanError,
     pooled_grids,
-    read_beside,
     read_npz,
     read_ply,
     read_scan,
@@ -155,17 +154,9 @@ class EditDesk:
 
     def grid(self, scan: ScanView, extractor: Extractor) -> Tensor:
         """Feature grid ``(N, F)`` of a scan, as ``r3dpa features`` makes it."""
-        labels = []
-        if getattr(extractor, "needs_labels", False):
-            known = read_beside(scan.path, "labels")
-            if known is None:
-                raise ScanError(
-                    f"{scan.path}: has no labels beside it, which {extractor.name} reads"
-                )
-            labels.append(torch.from_numpy(known.astype("int64")))
-        prepared = extractor.prepare(scan.points, *labels)
         file = Scan(scan.path.parent.name, scan.path.stem, scan.path)
-        sample = PointSample(file, scan.points.nbytes, scan.points, prepared)
+        prepared = extractor.prepare(scan.points)
+        sample = PointSample(file, file.cache_key, scan.points, prepared)
         grids = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
         return grids[self.grid_size][0].clone()
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.edit_desk import EditDesk, Guidance, Parts, without_features
 from r3dpa.cli.edits import EditJob
-from r3dpa.data.mask_files import read_mask
+from r3dpa.data.images import read_mask
 from r3dpa.data.objects import ObjectLibrary
 from r3dpa.editing import EditResult
 from r3dpa.generation import SamplerConfig, SceneGenerator

@@ -13,8 +13,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
-from r3dpa.data.sample_files import SampleError
-from r3dpa.data.samples import Samples, read_samples
+from r3dpa.data.samples import SampleError, Samples, read_samples
 from r3dpa.data.scans import Scan, evenly
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import source_commit

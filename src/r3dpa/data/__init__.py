@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from r3dpa.data.augmentation import Augmentation, View
+from r3dpa.data.checks import CheckReport, check
 from r3dpa.data.datasets import (
     LatentBatch,
     LatentDataset,
@@ -14,33 +15,32 @@ from r3dpa.data.datasets import (
     LidarBatch,
     LidarDataset,
     LidarSample,
+    PointDataset,
+    PointSample,
+    list_collate,
+    range_image_cache,
+    write_range_images,
 )
 from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import (
     Extractor,
+    FeatureGrids,
+    FeatureGridWriter,
     GridPlan,
+    GridSettings,
     default_features_dir,
     features_lock,
     pooled_grids,
-    write_feature_grids,
-)
-from r3dpa.data.feature_store import (
-    FeatureGrids,
-    FeatureGridWriter,
     stored_feature_dim,
     stored_source,
+    write_feature_grids,
 )
-from r3dpa.data.grid_settings import FeatureGridError, GridSettings
 from r3dpa.data.images import ImageFolder, ImageSource, TarImages
-from r3dpa.data.points import PointDataset, PointSample, list_collate
 from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
-from r3dpa.data.scan_cache import range_image_cache, write_range_images
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
-    CheckReport,
     Scan,
     ScanError,
-    check,
     find_scans,
     kitti360_scans,
     read_beside,
@@ -51,12 +51,20 @@ from r3dpa.data.scans import (
     write_npz,
     write_ply,
 )
+from r3dpa.data.store import CachedTensors, Store, StoreError, TensorCache
 
 if TYPE_CHECKING:
     from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
     from r3dpa.data.image_datamodule import ImageDataModule
     from r3dpa.data.point_datamodule import PointDataModule
-from r3dpa.data.tensor_cache import CachedTensors, TensorCache, TensorCacheError
+
+_ON_FIRST_USE = {
+    "ImageDataModule": "image_datamodule",
+    "KITTI360DataModule": "datamodules",
+    "LidarDataModule": "datamodules",
+    "PointDataModule": "point_datamodule",
+    "SimulatedDataModule": "datamodules",
+}
 
 __all__ = [
     "KITTI360_DRIVES",
@@ -65,7 +73,6 @@ __all__ = [
     "CheckReport",
     "DeadLeaves",
     "Extractor",
-    "FeatureGridError",
     "FeatureGridWriter",
     "FeatureGrids",
     "GridPlan",
@@ -90,9 +97,10 @@ __all__ = [
     "Scan",
     "ScanError",
     "SimulatedDataModule",
+    "Store",
+    "StoreError",
     "TarImages",
     "TensorCache",
-    "TensorCacheError",
     "View",
     "check",
     "default_features_dir",
@@ -119,10 +127,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load the data modules on first use."""
-    if name in {"KITTI360DataModule", "LidarDataModule", "SimulatedDataModule"}:
-        return getattr(import_module("r3dpa.data.datamodules"), name)
-    if name == "ImageDataModule":
-        return import_module("r3dpa.data.image_datamodule").ImageDataModule
-    if name == "PointDataModule":
-        return import_module("r3dpa.data.point_datamodule").PointDataModule
+    if name in _ON_FIRST_USE:
+        return getattr(import_module(f"r3dpa.data.{_ON_FIRST_USE[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

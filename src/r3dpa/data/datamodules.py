@@ -10,17 +10,26 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import LatentDataset, LidarDataset
-from r3dpa.data.feature_grids import Extractor, default_features_dir, write_feature_grids
-from r3dpa.data.feature_store import FeatureGrids, stored_feature_dim, stored_source
-from r3dpa.data.grid_settings import GridSettings
-from r3dpa.data.loaders import ordered_sampler, training_loader
-from r3dpa.data.scan_cache import range_image_cache, write_range_images
+from r3dpa.data.datasets import (
+    LatentDataset,
+    LidarDataset,
+    range_image_cache,
+    write_range_images,
+)
+from r3dpa.data.feature_grids import (
+    Extractor,
+    FeatureGrids,
+    GridSettings,
+    any_settings,
+    default_features_dir,
+    write_feature_grids,
+)
+from r3dpa.data.loaders import module_loader
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
-from r3dpa.data.tensor_cache import CachedTensors
+from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
     LidarSensor,
     Projection,
@@ -150,22 +159,24 @@ class LidarDataModule(LightningDataModule):
         """Width D of the feature grids; 768, that of ScaLR, where none are used.
 
         Raises:
-            FeatureGridError: If ``features_dir`` is given, is empty and there is no extractor.
+            StoreError: If ``features_dir`` is given, is empty and there is no extractor.
         """
         if self.extractor is not None:
             return cast(Extractor, self.extractor).dim
-        return _SCALR_DIM if self.features_dir is None else stored_feature_dim(self.features_dir)
+        return _SCALR_DIM if self.features_dir is None else any_settings(self.features_dir).dim
 
     @property
     def feature_source(self) -> str | None:
-        """Name of what makes, or made, the feature grids; None where none are used.
+        """Name of the extractor of the feature grids; None where none are used.
 
         Raises:
-            FeatureGridError: If ``features_dir`` is given, is empty and there is no extractor.
+            StoreError: If ``features_dir`` is given, is empty and there is no extractor.
         """
         if self.extractor is not None:
             return cast(Extractor, self.extractor).name
-        return None if self.features_dir is None else stored_source(self.features_dir)
+        if self.features_dir is None:
+            return None
+        return str(any_settings(self.features_dir).extractor["name"])
 
     @property
     def geometry(self) -> ScanGeometry:
@@ -211,7 +222,8 @@ class LidarDataModule(LightningDataModule):
             return
         train, val, projection = self._scans_and_projection()
         extractor = cast(Extractor, self.extractor.eval())
-        gigabytes = GridSettings.of(extractor, projection, self.grid_size).row.itemsize / 1e9
+        settings = GridSettings.of(extractor, projection, self.grid_size)
+        gigabytes = settings.store(self.features_dir).row.itemsize / 1e9
 
         def log(done: int, total: int) -> None:
             if done == 1 or done * 20 // total > (done - 1) * 20 // total:
@@ -262,7 +274,7 @@ class LidarDataModule(LightningDataModule):
         Raises:
             ValueError: If they do not follow the augmentation.
         """
-        self.augmentation.check_latents(posteriors.cache.shape[-1], self.grid_size[1])
+        self.augmentation.check_latents(posteriors.store.shape[-1], self.grid_size[1])
         self._posteriors = posteriors
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -274,28 +286,17 @@ class LidarDataModule(LightningDataModule):
         if self._posteriors is not None:
             dataset = LatentDataset(train_set.scans, self._posteriors, train_set.grids)
         if getattr(self.trainer, "overfit_batches", 0) > 0:
-            return self._ordered_loader(dataset)
-        num_replicas, rank = self._place()
-        augmented = self.augmentation.active
-        return training_loader(
-            AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
-            if augmented
-            else dataset,
-            self.batch_size,
-            num_workers=self.num_workers,
-            seed=self.seed,
-            num_replicas=num_replicas,
-            rank=rank,
-            limit_batches=1.0 if self.trainer is None else self.trainer.limit_train_batches,
-            pin_memory=torch.cuda.is_available(),
-            with_epoch=augmented,
-        )
+            return module_loader(self, dataset, train=False)
+        drawn: Dataset[Any] = dataset
+        if self.augmentation.active:
+            drawn = AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
+        return module_loader(self, drawn, train=True, with_epoch=self.augmentation.active)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """Held-out scans in order, none twice; no loader in a fit where nothing is held out."""
         dataset = _ready(self.val_set)
         if len(dataset):
-            return self._ordered_loader(dataset)
+            return module_loader(self, dataset, train=False)
         if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
             raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
         return []
@@ -306,7 +307,7 @@ class LidarDataModule(LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """All scans in order, none twice."""
-        return self._ordered_loader(_ready(self.all_set))
+        return module_loader(self, _ready(self.all_set), train=False)
 
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
         if features_dir is not None:
@@ -337,23 +338,6 @@ class LidarDataModule(LightningDataModule):
             for scan in scans[:_SCANS_TO_FIT]
         )
         return RingProjection.fit(points, self.sensor)
-
-    def _place(self) -> tuple[int, int]:
-        """Number of processes and which of them this is."""
-        return (
-            (1, 0) if self.trainer is None else (self.trainer.world_size, self.trainer.global_rank)
-        )
-
-    def _ordered_loader(self, dataset: LidarDataset | LatentDataset) -> DataLoader[Any]:
-        return DataLoader(
-            dataset,
-            batch_size=self.batch_size,
-            sampler=ordered_sampler(dataset, *self._place()),
-            num_workers=self.num_workers,
-            pin_memory=torch.cuda.is_available(),
-            persistent_workers=self.num_workers > 0,
-            generator=torch.Generator(),  # the default would draw from the global random state
-        )
 
 
 class KITTI360DataModule(LidarDataModule):

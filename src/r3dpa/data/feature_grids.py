@@ -1,26 +1,32 @@
-"""Making feature grids: point features of a frozen extractor, averaged over the cells of a grid.
+"""Feature grids: point features of a frozen extractor, averaged over the cells of a grid, on disk.
 
-Letters: P points, K values before the linear step, N = h * w cells, D feature width, B batch.
+``features_dir`` belongs to one extractor. Each grid size has a store ``features_dir/<h>x<w>``, see
+:mod:`r3dpa.data.store`. Letters: P points, K values before the linear step, N = h * w cells, D
+feature width, B batch.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from r3dpa.data.feature_store import FeatureGridWriter, folder_lock, known_grids
-from r3dpa.data.grid_settings import FeatureGridError, GridSettings, check_settings
-from r3dpa.data.points import PointDataset, PointSample, list_collate
+from r3dpa.data.datasets import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import Scan
-from r3dpa.geometry import Projection, pool_cells
+from r3dpa.data.store import CachedTensors, Store, StoreError, StoreWriter, store_lock
+from r3dpa.geometry import Projection, pool_cells, projection_to_dict
+
+REMEDY = "with `r3dpa features --data <data YAML or folder>`"
+_SETTINGS = "settings.json"
 
 
 class Extractor(Protocol):
@@ -32,8 +38,7 @@ class Extractor(Protocol):
 
     It may also say which augmentation its features follow: ``num_headings``, if rotating a scan by
     any multiple of ``2 * pi / num_headings`` about the vertical axis leaves the features of its
-    points alone, and ``mirror_invariant``, if swapping left and right does. With ``needs_labels``,
-    labels ``(P,)`` int64 of the simulator are the second argument of ``prepare`` and of a call.
+    points alone, and ``mirror_invariant``, if swapping left and right does.
 
     Attributes:
         name: Short name, that of the default folder.
@@ -58,8 +63,209 @@ class Extractor(Protocol):
 
 
 @dataclass(frozen=True)
+class GridSettings:
+    """How the grids of one store were made.
+
+    Args:
+        projection: That of the range images, as plain values.
+        grid_size: Rows and columns (h, w).
+        extractor: ``name`` and ``settings`` of what made the features.
+        dim: Width D of the features.
+        dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.store.Store`; an empty cell is
+            zero in both.
+        precision: Arithmetic that the extractor ran in, as Lightning names it.
+
+    Raises:
+        ValueError: If ``dtype`` is none of the two.
+    """
+
+    projection: dict[str, Any]
+    grid_size: tuple[int, int]
+    extractor: dict[str, Any]
+    dim: int
+    dtype: Literal["float16", "int8"]
+    precision: str
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown ``dtype``."""
+        if self.dtype not in ("float16", "int8"):
+            raise ValueError(f"dtype must be float16 or int8, got {self.dtype!r}")
+
+    @classmethod
+    def of(
+        cls,
+        extractor: Extractor,
+        projection: Projection,
+        grid_size: tuple[int, int],
+        dtype: Literal["float16", "int8"] = "float16",
+        precision: str = "32-true",
+    ) -> Self:
+        """Settings of the grids that an extractor would make.
+
+        Raises:
+            ValueError: If the grid does not divide the range image, or ``dtype`` is unknown.
+        """
+        projection.sensor.cell_size(grid_size)
+        wanted = _wanted(projection, extractor)
+        size = (grid_size[0], grid_size[1])
+        return cls(grid_size=size, dtype=dtype, precision=precision, **wanted)
+
+    def store(self, features_dir: str | Path) -> Store[Scan]:
+        """The store of these grids, each ``(N, D)``."""
+        return Store(
+            folder=Path(features_dir) / f"{self.grid_size[0]}x{self.grid_size[1]}",
+            settings=json.dumps(vars(self), indent=1),
+            shape=(math.prod(self.grid_size), self.dim),
+            dtype=self.dtype,
+            what="feature grids",
+            remedy=f"{REMEDY}, or give the data module an extractor",
+        )
+
+    def check(self, features_dir: str | Path) -> None:
+        """Refuse to add grids to those of other settings, or to a folder of another extractor.
+
+        Raises:
+            StoreError: Names both values.
+        """
+        for size, stored in stored_settings(features_dir).items():
+            same_size = size == self.grid_size
+            stored.compare(
+                {k: v for k, v in vars(self).items() if same_size or k in ("extractor", "dim")},
+                stored.store(features_dir).folder,
+            )
+
+    def compare(self, wanted: Mapping[str, Any], folder: Path) -> None:
+        """Refuse these stored grids where other settings are wanted.
+
+        Raises:
+            StoreError: Names both values.
+        """
+        for key, value in wanted.items():
+            if getattr(self, key) != value:
+                raise _made_otherwise(key, getattr(self, key), value, folder)
+
+
+def _wanted(projection: Projection, extractor: Extractor | None) -> dict[str, Any]:
+    """Settings that a user of grids needs, as they come back from a file; any extractor if None."""
+    wanted: dict[str, Any] = {"projection": projection_to_dict(projection)}
+    if extractor is not None:
+        wanted["extractor"] = {"name": extractor.name, "settings": extractor.settings}
+        wanted["dim"] = extractor.dim
+    return json.loads(json.dumps(wanted))
+
+
+def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreError:
+    return StoreError(
+        f"Feature grids in {folder} were made with {key} {stored}, but {key} {wanted} is asked "
+        f"for: restore that setting, or give another features_dir and make new grids {REMEDY}."
+    )
+
+
+def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSettings]:
+    """Settings of the stores of a folder by grid size; empty if there are none.
+
+    Raises:
+        StoreError: If a file of settings is damaged.
+    """
+    found = {}
+    for path in sorted(Path(features_dir).glob(f"*/{_SETTINGS}")):
+        try:
+            values = json.loads(path.read_text())
+            settings = GridSettings(**values | {"grid_size": tuple(values["grid_size"])})
+            store = settings.store(features_dir)
+            if path.parent != store.folder:
+                raise ValueError(f"it is of grid_size {list(settings.grid_size)}")
+            _ = store.row, settings.extractor["name"]  # can be made
+        except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            raise StoreError(
+                f"{path} is damaged ({error!r:.200}): delete {path.parent} and make its grids "
+                f"again {REMEDY}."
+            ) from error
+        found[settings.grid_size] = settings
+    return found
+
+
+def any_settings(features_dir: str | Path) -> GridSettings:
+    """Settings of some grids of a folder; extractor and width are the same for all sizes.
+
+    Raises:
+        StoreError: If there are none.
+    """
+    stored = stored_settings(features_dir)
+    if not stored:
+        raise StoreError(
+            f"No feature grids in {features_dir}: make them {REMEDY}, or give an extractor."
+        )
+    return next(iter(stored.values()))
+
+
+def stored_feature_dim(features_dir: str | Path) -> int:
+    """Width D of the grids of a folder; ``StoreError`` if there are none."""
+    return any_settings(features_dir).dim
+
+
+def stored_source(features_dir: str | Path) -> str:
+    """Name of the extractor that made the grids of a folder; ``StoreError`` if there are none."""
+    return str(any_settings(features_dir).extractor["name"])
+
+
+class FeatureGrids(CachedTensors[Scan]):
+    """Grids ``(N, D)`` of one size, cells row by row; safe to hand to loader processes.
+
+    Args:
+        features_dir: Folder of one extractor.
+        scans: Scans that will be asked for; each must have a grid.
+        projection: That of the range images.
+        grid_size: Rows and columns (h, w) of the grids.
+        extractor: The extractor that must have made them; any if None.
+
+    Attributes:
+        dim: Width D of the features.
+
+    Raises:
+        StoreError: If a grid is missing or was made with another sensor, projection, grid size or
+            extractor, or if the store is damaged.
+    """
+
+    def __init__(
+        self,
+        features_dir: str | Path,
+        scans: Sequence[Scan],
+        projection: Projection,
+        grid_size: tuple[int, int],
+        extractor: Extractor | None = None,
+    ) -> None:
+        stored, size = stored_settings(features_dir), (grid_size[0], grid_size[1])
+        if stored and size not in stored:
+            sizes = ", ".join(str(list(other)) for other in stored)
+            raise _made_otherwise("grid_size", sizes, list(size), Path(features_dir))
+        settings = stored[size] if stored else any_settings(features_dir)
+        store = settings.store(features_dir)
+        settings.compare(_wanted(projection, extractor), store.folder)
+        super().__init__(store, scans)
+        self.dim = settings.dim
+
+
+class FeatureGridWriter(StoreWriter):
+    """Appends grids of given settings to a shard of its own, see :class:`StoreWriter`.
+
+    Args:
+        features_dir: Folder of one extractor.
+        settings: How the grids are made; must be those of the store, if there is one.
+        shard: The first free shard from this number on is taken.
+
+    Raises:
+        StoreError: If the store was made with other settings, is damaged, or cannot be written.
+    """
+
+    def __init__(self, features_dir: str | Path, settings: GridSettings, shard: int = 0) -> None:
+        settings.check(features_dir)
+        super().__init__(settings.store(features_dir), shard)
+
+
+@dataclass(frozen=True)
 class GridPlan:
-    """What is to be made.
+    """Grids that are to be made.
 
     Attributes:
         features_dir: Folder of the extractor.
@@ -89,7 +295,7 @@ def plan(
     projection: Projection,
     grid_sizes: Sequence[tuple[int, int]],
     features_dir: str | Path,
-    dtype: str = "float16",
+    dtype: Literal["float16", "int8"] = "float16",
     precision: str = "32-true",
 ) -> GridPlan:
     """Find the grids that are missing, and refuse what cannot work before anything is written.
@@ -106,27 +312,27 @@ def plan(
         precision: Arithmetic of the extractor, as Lightning names it.
 
     Raises:
-        FeatureGridError: If there are grids that were made with other settings, or the disk has
+        StoreError: If there are grids that were made with other settings, or the disk has
             not enough space left.
         ValueError: If there are no grid sizes, or one does not divide the range image.
     """
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
     features_dir, scans = Path(features_dir), sorted(scans)
-    keys = [(scan.name, scan.num_bytes) for scan in scans]
     settings, missing, num_bytes = {}, set(), 0
     for h, w in grid_sizes:
         own = GridSettings.of(extractor, projection, (h, w), dtype, precision)
-        known = known_grids(features_dir, own)
-        new = {key for key in keys if key not in known}
+        stored = stored_settings(features_dir).get((h, w), own)
+        stored.compare(_wanted(projection, extractor), stored.store(features_dir).folder)
+        new = stored.store(features_dir).missing(scans)
         if new:
-            check_settings(features_dir, own)
+            own.check(features_dir)
         settings[h, w] = own
-        missing |= new
-        num_bytes += len(new) * own.row.itemsize
+        missing |= set(new)
+        num_bytes += len(new) * own.store(features_dir).row.itemsize
     free_bytes = shutil.disk_usage(_existing(features_dir)).free
     if num_bytes > free_bytes:
-        raise FeatureGridError(
+        raise StoreError(
             f"The feature grids of {len(missing)} scans need {num_bytes / 1e9:.1f} GB, but "
             f"{features_dir} has {free_bytes / 1e9:.1f} GB free: make space, give a features_dir "
             "on another disk, use dtype int8, or fewer scans (limit)."
@@ -134,7 +340,7 @@ def plan(
     return GridPlan(
         features_dir=features_dir,
         settings=settings,
-        missing=[scan for scan, key in zip(scans, keys, strict=True) if key in missing],
+        missing=sorted(missing),
         num_kept=len(scans) - len(missing),
         num_bytes=num_bytes,
         free_bytes=free_bytes,
@@ -160,7 +366,7 @@ def pooled_grids(
         ``(B, N, D)`` float32 on the CPU for each grid size; empty cells are zero.
 
     Raises:
-        FeatureGridError: If a feature is NaN or infinite; names the file of the scan.
+        StoreError: If a feature is NaN or infinite; names the file of the scan.
     """
     features = extractor.point_features([sample.prepared for sample in samples])
     lift = getattr(extractor, "lift", torch.nn.Identity())
@@ -172,7 +378,7 @@ def pooled_grids(
                 means, _ = pool_cells(points, values, projection, size)
                 made.append(lift(means).float().cpu())
                 if not made[-1].isfinite().all():
-                    raise FeatureGridError(
+                    raise StoreError(
                         f"{sample.scan.path}: extractor {extractor.name} gave NaN or infinite "
                         "features; run it in float32 or leave this scan out."
                     )
@@ -188,7 +394,7 @@ def write_feature_grids(
     *,
     workers: int = 0,
     batch_size: int = 1,
-    dtype: str = "float16",
+    dtype: Literal["float16", "int8"] = "float16",
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Make the grids that are missing for ``scans`` in this process; those that exist are kept.
@@ -211,7 +417,7 @@ def write_feature_grids(
         Number of scans whose grids were made.
 
     Raises:
-        FeatureGridError: If ``features_dir`` has grids that were made with other settings, cannot
+        StoreError: If ``features_dir`` has grids that were made with other settings, cannot
             be written, or has not enough space left.
         ScanError: If a scan cannot be used; the message names the file.
         ValueError: If there are no grid sizes, or one does not divide the range image.
@@ -221,9 +427,8 @@ def write_feature_grids(
         return 0  # complete grids may lie on a read-only disk
     with features_lock(features_dir):
         todo = plan(*arguments)  # another process may have made some
-        needs_labels = getattr(extractor, "needs_labels", False)
         loader = DataLoader(
-            PointDataset(todo.missing, projection.sensor, extractor.prepare, needs_labels),
+            PointDataset(todo.missing, projection.sensor, extractor.prepare),
             batch_size=batch_size,
             collate_fn=list_collate,
             num_workers=workers,
@@ -238,7 +443,7 @@ def write_feature_grids(
             for samples in loader:
                 grids = pooled_grids(extractor, samples, projection, grid_sizes)
                 for size, writer in writers.items():
-                    writer.add([(sample.scan, sample.num_bytes) for sample in samples], grids[size])
+                    writer.add([sample.key for sample in samples], grids[size])
                 for _ in samples:
                     done += 1
                     if progress is not None:
@@ -247,13 +452,8 @@ def write_feature_grids(
 
 
 def features_lock(features_dir: str | Path) -> AbstractContextManager[None]:
-    """The lock of the one job that makes grids in a folder; another job waits for it.
-
-    Raises:
-        FeatureGridError: If the folder cannot be written.
-    """
-    waiting = f"waiting for another process that makes feature grids in {features_dir}"
-    return folder_lock(Path(features_dir), waiting)
+    """Lock of the one job that makes grids in a folder; another job waits for it."""
+    return store_lock(Path(features_dir), f"makes feature grids in {features_dir}")
 
 
 def _existing(folder: Path) -> Path:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
-from r3dpa.data.loaders import ordered_sampler, training_loader
-from r3dpa.data.tensor_cache import CachedTensors
+from r3dpa.data.loaders import module_loader
+from r3dpa.data.store import CachedTensors
 
 
 class ImageDataModule(LightningDataModule):
@@ -92,31 +91,11 @@ class ImageDataModule(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
-        trainer = self.trainer
-        return training_loader(
-            _ready(self.train_set),
-            self.batch_size,
-            num_workers=self.num_workers,
-            seed=self.seed,
-            num_replicas=1 if trainer is None else trainer.world_size,
-            rank=0 if trainer is None else trainer.global_rank,
-            limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
-            pin_memory=torch.cuda.is_available(),
-            kind="images",
-        )
+        return module_loader(self, _ready(self.train_set), train=True, kind="images")
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out images in order, none twice."""
-        trainer, dataset = self.trainer, _ready(self.val_set)
-        replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
-        return DataLoader(
-            dataset,
-            self.batch_size,
-            sampler=ordered_sampler(dataset, replicas, rank, "held-out images"),
-            num_workers=self.num_workers,
-            pin_memory=torch.cuda.is_available(),
-            generator=torch.Generator(),  # the default would draw from the global random state
-        )
+        return module_loader(self, _ready(self.val_set), train=False, kind="held-out images")
 
     test_dataloader = val_dataloader
 

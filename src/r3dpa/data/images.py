@@ -8,12 +8,13 @@ from __future__ import annotations
 import io
 import os
 import tarfile
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 import torch
@@ -22,25 +23,16 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from r3dpa.data.scans import evenly
+from r3dpa.data.store import CachedTensors
+from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
-
-if TYPE_CHECKING:
-    from r3dpa.data.tensor_cache import CachedTensors
-
-__all__ = [
-    "ImageBatch",
-    "ImageDataset",
-    "ImageEntry",
-    "ImageError",
-    "ImageFolder",
-    "ImageSource",
-    "TarImages",
-    "center_crop",
-]
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 # A SyntaxError is what Pillow makes of a damaged PNG.
 _DECODING_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+_IMAGES_TO_MEASURE = 10_000
+_BRIGHT = 128
 _MIRRORED = ".mirrored"  # end of the name of an entry that is seen from the other side
 
 
@@ -335,3 +327,57 @@ class ImageDataset(Dataset[ImageSample]):
         if self.posteriors is not None:
             sample["posterior_moments"] = self.posteriors.read(entry)
         return sample
+
+
+def latent_statistics(posteriors: CachedTensors[ImageEntry]) -> tuple[Tensor, Tensor]:
+    """Mean and variance ``(C,)`` of the raw latents, samples of the posteriors.
+
+    Args:
+        posteriors: Moments ``(2C, h, w)``; at most 10 000 of them, spread evenly, are read.
+
+    Raises:
+        StoreError: If an image was replaced since it was encoded.
+    """
+    chosen = evenly(posteriors.items, _IMAGES_TO_MEASURE)
+    channels, rows, columns = posteriors.store.shape
+    sums = torch.zeros(3, channels // 2, dtype=torch.float64)
+    for entry in chosen:
+        mean, logvar = posteriors.read(entry).double().flatten(1).chunk(2)
+        sums += torch.stack([mean.sum(1), mean.square().sum(1), logvar.exp().sum(1)])
+    mean, square, noise = sums / (len(chosen) * rows * columns)
+    return mean.float(), (square - mean.square() + noise).float()
+
+
+def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
+    """Mask from a picture: True where it is bright in any colour, and opaque.
+
+    Args:
+        path: Picture of H x W pixels, one for each of the range image; PNG keeps them exact.
+        sensor: Size of the range image.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        ValueError: If the file is no picture of 8 bits a colour, or of another size; it is named.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # refused by size below
+            with Image.open(path) as picture:
+                if picture.size != (sensor.columns, sensor.beams):
+                    width, height = picture.size
+                    raise ValueError(
+                        f"{path}: has {height} x {width} pixels (rows x columns), but the range "
+                        f"image {sensor.beams} x {sensor.columns}: draw one pixel for each"
+                    )
+                if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+                    raise ValueError(
+                        f"{path}: has pixels of type {picture.mode}; save it with 8 bits a colour"
+                    )
+                pixels = np.asarray(picture.convert("RGBA"))
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read as a picture ({reason})") from error
+    bright = pixels[..., :3].max(axis=2) >= _BRIGHT
+    return torch.from_numpy(bright & (pixels[..., 3] >= _BRIGHT))

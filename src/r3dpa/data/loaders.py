@@ -189,6 +189,50 @@ def training_loader(
     return loader
 
 
+def module_loader(
+    module: Any, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
+) -> DataLoader[Any]:
+    """Loader of a data module, for the processes of its trainer.
+
+    Args:
+        module: Data module with ``batch_size``, ``num_workers``, ``seed`` and ``trainer``, which
+            may be None.
+        dataset: What is loaded.
+        train: Whether shuffled and resumable, see :func:`training_loader`, or in order.
+        kind: What the samples are, for messages.
+        options: ``collate_fn``; for training also ``with_epoch``.
+
+    Raises:
+        ValueError: If there are too few samples for the processes.
+    """
+    trainer = module.trainer
+    replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
+    pinned = torch.cuda.is_available()
+    if train:
+        return training_loader(
+            dataset,
+            module.batch_size,
+            num_workers=module.num_workers,
+            seed=module.seed,
+            num_replicas=replicas,
+            rank=rank,
+            limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
+            pin_memory=pinned,
+            kind=kind,
+            **options,
+        )
+    return DataLoader(
+        dataset,
+        batch_size=module.batch_size,
+        sampler=ordered_sampler(dataset, replicas, rank, kind),
+        num_workers=module.num_workers,
+        pin_memory=pinned,
+        persistent_workers=module.num_workers > 0,
+        generator=torch.Generator(),  # the default would draw from the global random state
+        **options,
+    )
+
+
 def ordered_sampler(
     dataset: Dataset[Any], num_replicas: int, rank: int, kind: str = "scans"
 ) -> UnrepeatedDistributedSampler:

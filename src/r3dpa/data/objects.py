@@ -295,8 +295,7 @@ def _features(
     """Points ``(P, 3)`` and labels ``(P,)`` of a scan on the CPU, and values ``(P, K)``."""
     points = torch.from_numpy(read_scan(scan.path, projection.sensor))
     labels = torch.from_numpy(read_labels(scan.path, points.numpy()))
-    own = (labels,) if getattr(extractor, "needs_labels", False) else ()
-    values = extractor.point_features([extractor.prepare(points, *own)])[0]
+    values = extractor.point_features([extractor.prepare(points)])[0]
     return points[:, :3], labels, values
 
 

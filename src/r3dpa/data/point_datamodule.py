@@ -2,53 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import torch
 from lightning.pytorch import LightningDataModule
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.loaders import ordered_sampler, training_loader
-from r3dpa.data.points import list_collate
-from r3dpa.data.scans import Scan, read_scan
-from r3dpa.geometry import LidarSensor
-
-
-class DrawnPoints(Dataset[Any]):
-    """What a preparation draws from each scan: a function of seed, epoch and index alone.
-
-    Args:
-        scans: The scans, in the order of the indices.
-        sensor: At least one point of a scan must lie within its range limits.
-        prepare: Function of the points ``(P, 4)`` and a generator.
-        seed: Seed of the draws.
-    """
-
-    def __init__(
-        self,
-        scans: Sequence[Scan],
-        sensor: LidarSensor,
-        prepare: Callable[[torch.Tensor, np.random.Generator], Any],
-        seed: int,
-    ) -> None:
-        self.scans, self.sensor, self.prepare, self.seed = list(scans), sensor, prepare, seed
-
-    def __len__(self) -> int:
-        """Number of scans."""
-        return len(self.scans)
-
-    def __getitem__(self, key: tuple[int, int] | int) -> Any:
-        """What is drawn of ``(epoch, index)``; of the epoch 0 where only an index is given.
-
-        Raises:
-            ScanError: If the scan cannot be used; the message names the file.
-        """
-        epoch, index = key if isinstance(key, tuple) else (0, key)
-        points = torch.from_numpy(read_scan(self.scans[index].path, self.sensor))
-        return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
+from r3dpa.data.datasets import DrawnPoints, list_collate
+from r3dpa.data.loaders import module_loader
 
 
 class PointDataModule(LightningDataModule):
@@ -102,29 +64,11 @@ class PointDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
         assert self.train_set is not None
-        trainer = self.trainer
-        return training_loader(
-            self.train_set,
-            self.batch_size,
-            num_workers=self.num_workers,
-            seed=self.seed,
-            num_replicas=1 if trainer is None else trainer.world_size,
-            rank=0 if trainer is None else trainer.global_rank,
-            limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
-            with_epoch=True,
-            collate_fn=list_collate,
+        return module_loader(
+            self, self.train_set, train=True, with_epoch=True, collate_fn=list_collate
         )
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out scans in order, none twice, each drawn the same every time."""
         assert self.val_set is not None
-        trainer = self.trainer
-        replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
-        return DataLoader(
-            self.val_set,
-            self.batch_size,
-            sampler=ordered_sampler(self.val_set, replicas, rank),
-            num_workers=self.num_workers,
-            collate_fn=list_collate,
-            generator=torch.Generator(),  # the default would draw from the global random state
-        )
+        return module_loader(self, self.val_set, train=False, collate_fn=list_collate)

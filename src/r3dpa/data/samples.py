@@ -15,11 +15,11 @@ format       content, and who writes it
 ``npy``      one such array
 ``pth``      an image ``(C, H, W)``: R2DM (``sample_and_save.py``); a dictionary of ``depth``,
              ``xyz``, ``reflectance`` ``(c, H, W)``: R2Flow (``sample.py``); or stacks of these
-``joblib``   uncompressed list of clouds: ``numpy/samples.pcd`` of R3DPA and LiDAR-Diffusion
 ===========  =====================================================================================
 
 The channels of an image are range; range and intensity; range, x, y, z; or these and intensity, all
-in metres. R3DPA marks empty pixels by ranges outside its limits, R2DM and R2Flow by 0.
+in metres. R3DPA marks empty pixels by ranges outside its limits, R2DM and R2Flow by 0. No file can
+run code: pickled lists of clouds, ``numpy/samples.pcd``, are not read; ``pcd/*.txt`` lie beside it.
 
 Sources: valeoai/R3DPA 2789885, hancyran/LiDAR-Diffusion 1d1bba5, kazuto1011/r2dm 004a1e4,
 kazuto1011/r2flow 819d7d3, WoodwindHu/RangeLDM 4358507.
@@ -28,6 +28,7 @@ kazuto1011/r2flow 819d7d3, WoodwindHu/RangeLDM 4358507.
 from __future__ import annotations
 
 import warnings
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -38,13 +39,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.sample_files import READABLE, SUFFIXES, SampleError, SampleFormat, arrays_of
-from r3dpa.data.scans import ScanError, find_scans
+from r3dpa.data.scans import ArrayReader, ScanError, find_scans, npz_members, read_ply, read_scan
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
+from r3dpa.io import UNPICKLING_ERRORS, first_line
 
 T = TypeVar("T")
+SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth"]
+SUFFIXES: dict[SampleFormat, tuple[str, ...]] = {
+    "bin_xyz": (".bin",),
+    "bin": (".bin",),  # the later one is meant where no format is given
+    "ply": (".ply",),
+    "txt": (".txt",),
+    "npz": (".npz",),
+    "npy": (".npy",),
+    "pth": (".pth", ".pt"),
+}
+READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
 _LENGTH_TOLERANCE = 0.02
+
+
+class SampleError(ScanError):
+    """A sample that cannot be judged; the message names the file and the reason."""
 
 
 class Sample(NamedTuple):
@@ -72,7 +88,7 @@ class Samples:
     Args:
         files: Name and path of every file; an empty name where one file holds all samples.
         sensor: Image size and range limits.
-        format: Of all files; each is asked for its own where None.
+        format: Of all files; found for each where None.
         corner: Whether pixels stand for their corners, where an image comes without points.
         skip_bad: Leave out samples that cannot be used.
         num_read: Usable samples of the current or last iteration.
@@ -98,7 +114,7 @@ class Samples:
         """
         self.num_read, self.bad = 0, []
         for prefix, file in self.files:
-            arrays = arrays_of(file, self.format)
+            arrays = _arrays_of(file, self.format)
             # An error of `next` ends the file, one of `_sample` only costs that sample.
             while entry := self._attempt(next, arrays, None):
                 part, array = entry
@@ -139,8 +155,7 @@ def read_samples(
     """Samples of a file, or of all files of one format in a folder and its sub-folders.
 
     Points and pixels outside the sensor's range limits are left out, as they are from real scans.
-    Never more than one sample is in memory. No file can run code: pickles are read with nothing
-    but arrays allowed in them.
+    Never more than one sample is in memory.
 
     The folders that ``r3dpa sample`` and the official R3DPA write hold each scene several times;
     of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
@@ -211,6 +226,106 @@ def _find(
         except ValueError as error:
             raise SampleError(error) from error
     return named, wanted
+
+
+def _format_of(file: Path) -> SampleFormat:
+    """Format of a file by its first bytes; ``.bin`` by its name, since it has no head."""
+    with file.open("rb") as stream:
+        head = stream.read(128)
+    suffix = file.suffix.lower()
+    if not head:
+        raise SampleError(f"{file}: is empty")
+    if suffix == ".bin":
+        return "bin"
+    if head.startswith(b"\x93NUMPY"):
+        return "npy"
+    if head.startswith(b"ply"):
+        return "ply"
+    if suffix in SUFFIXES["pth"]:
+        return "pth"
+    if head.startswith(b"PK"):
+        return "npz"
+    if head[:1].isdigit() or head[:1] in b"+-. ":
+        return "txt"
+    raise SampleError(
+        f"{file}: starts with {head[:16]!r}, which is no known format; what can be read: {READABLE}"
+    )
+
+
+def _arrays_of(file: Path, given: SampleFormat | None) -> Iterator[tuple[str, np.ndarray]]:
+    """Name within the file, if it holds many, and cloud ``(P, ...)`` or image ``(C, H, W)``."""
+    kind = given or _format_of(file)
+    if kind == "bin":
+        yield "", read_scan(file)
+    elif kind == "bin_xyz":
+        data = file.read_bytes()
+        if len(data) % 12:
+            raise SampleError(f"{file}: has {len(data)} bytes, not a multiple of 12 (x, y, z)")
+        yield "", np.frombuffer(data, "<f4").reshape(-1, 3)
+    elif kind == "ply":
+        yield "", read_ply(file)
+    elif kind == "txt":
+        try:
+            rows = np.loadtxt(file, dtype=np.float32, ndmin=2)
+        except (ValueError, UnicodeDecodeError) as error:
+            raise SampleError(f"{file}: is not text rows of numbers ({error})") from error
+        yield "", rows[:, :3] if rows.shape[1] == 6 else rows  # without colours
+    elif kind == "npy":
+        with file.open("rb") as stream:
+            yield from _parts(ArrayReader(stream, file.stat().st_size, str(file)))
+    elif kind == "npz":
+        for number, (key, reader) in enumerate(npz_members(file)):
+            unnamed = key == "arr_0" and number == 0  # NumPy's name where none is given
+            for part, array in _parts(reader):
+                yield "/".join(filter(None, ("" if unnamed else key, part))), array
+    else:
+        yield from _tensors(file)
+
+
+def _parts(reader: ArrayReader) -> Iterator[tuple[str, np.ndarray]]:
+    """A cloud, or each image of a stack; without a channel axis, these are ranges."""
+    if reader.dtype.kind != "f":
+        raise SampleError(f"{reader.where}: holds {reader.dtype} numbers; metres must be floats")
+    if len(reader.shape) == 2:
+        yield "", reader.whole()
+        return
+    if len(reader.shape) not in (3, 4) or 0 in reader.shape[1:]:
+        raise SampleError(
+            f"{reader.where}: has shape {reader.shape}; needs (P, 3) or (P, 4) points or "
+            "(N, C, H, W) images"
+        )
+    for index, image in enumerate(reader.rows()):
+        yield f"{index:06d}", image if image.ndim == 3 else image[None]
+
+
+def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Images or a cloud of a file of ``torch.save``; stacks stay on disk until they are read."""
+    try:
+        mapped = zipfile.is_zipfile(file)  # not before torch 1.6
+        content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    except UNPICKLING_ERRORS as error:
+        raise SampleError(
+            f"{file}: cannot be read as tensors alone ({first_line(error)})"
+        ) from error
+    if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
+        parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
+    else:
+        parts = [content]
+    if not all(isinstance(part, Tensor) and part.is_floating_point() for part in parts):
+        found = f"keys {', '.join(map(str, content))}" if isinstance(content, dict) else "no tensor"
+        raise SampleError(
+            f"{file}: holds {found}; needs a float tensor (C, H, W) or (N, C, H, W), or a "
+            "dictionary of depth, xyz and reflectance"
+        )
+    sizes = [tuple(part.shape) for part in parts]
+    agree = len({(*s[:-3], *s[-2:]) for s in sizes}) == 1
+    if len(sizes[0]) not in (2, 3, 4) or not agree or (len(parts) > 1 and len(sizes[0]) == 2):
+        raise SampleError(f"{file}: holds tensors {sizes}; needs (C, H, W) or (N, C, H, W)")
+    if len(sizes[0]) < 4:
+        yield "", torch.cat(parts).detach().float().numpy()
+        return
+    for index, images in enumerate(zip(*parts, strict=True)):
+        yield f"{index:06d}", torch.cat(images).detach().float().numpy()
 
 
 def _sample(name: str, where: str, array: np.ndarray, sensor: LidarSensor, corner: bool) -> Sample:

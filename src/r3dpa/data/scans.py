@@ -1,4 +1,4 @@
-"""LiDAR scans on disk: finding, reading, checking and writing them."""
+"""LiDAR scans on disk: finding, reading and writing them."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import IO, Literal, TypeVar
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
+from r3dpa.data.store import ItemKey, item_key
 from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, refuse_name
-from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
-from r3dpa.unpickling import array_header
+from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name
 
 Split = Literal["train", "val"]
 T = TypeVar("T")
@@ -31,8 +29,8 @@ KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
     "train": tuple(drive_name(number) for number in TRAIN_DRIVES),
     "val": tuple(drive_name(number) for number in VAL_DRIVES),
 }
-_RAW = "data_3d_raw"
-_VELODYNE = Path("velodyne_points") / "data"
+RAW = "data_3d_raw"
+VELODYNE = Path("velodyne_points") / "data"
 _BYTES_PER_POINT = 16
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -44,11 +42,11 @@ _PLY_TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
-
-
-#: Bytes of an array in an archive that are read at most: a few packed ones may stand for many.
-MOST_BYTES = 2**32
-#: Of archives that are damaged, or packed or encrypted in a way that is not read.
+_FIVE_COLUMNS = (
+    "its values are those of 5 columns, as nuScenes has them (x, y, z, intensity 0..255, ring): "
+    "save the first 4 as float32, the intensity divided by 255"
+)
+#: Raised for archives that are damaged, or packed or encrypted in a way that is not read.
 ARCHIVE_ERRORS = (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError)
 
 
@@ -76,27 +74,16 @@ class Scan:
         return f"{self.drive}/{self.frame}"
 
     @property
-    def num_bytes(self) -> int:
-        """Size of the file now.
+    def cache_key(self) -> ItemKey:
+        """Name, size and time of change of the file, see :func:`r3dpa.data.store.item_key`.
 
         Raises:
-            ScanError: If it cannot be told, as when the file is gone; names it.
+            ScanError: If the file cannot be read; names it.
         """
         try:
-            return self.path.stat().st_size
+            return item_key(self.name, self.path.stat())
         except OSError as error:
             raise ScanError(f"{self.path}: cannot be read ({error.strerror or error})") from error
-
-    @property
-    def cache_key(self) -> tuple[str, int, int]:
-        """Name, size and time of change: a file written anew has another time, if not another size.
-
-        A copied file has another time as well: what was cached of it is made again.
-
-        Raises:
-            ScanError: As :attr:`num_bytes`.
-        """
-        return self.name, self.num_bytes, self.path.stat().st_mtime_ns
 
 
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
@@ -113,7 +100,7 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """
     entries = [source] if isinstance(source, str | Path) else list(source)
     single = len(entries) == 1 and Path(entries[0]).is_dir()
-    files = sorted(file.absolute() for entry in entries for file in _files(entry))
+    files = sorted(file.absolute() for entry in entries for file in scan_files(entry))
     if not files:
         raise ValueError(
             f"No scan found in {', '.join(str(e) for e in entries)}: give a folder that holds .bin "
@@ -139,15 +126,15 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     Raises:
         ValueError: If there is no scan of the split, and none of the other one either.
     """
-    raw = Path(root).absolute() / _RAW
+    raw = Path(root).absolute() / RAW
     scans = {
         part: [Scan(name, file.stem, file) for name in drives for file in _drive_files(raw / name)]
         for part, drives in KITTI360_DRIVES.items()
     }
     if not any(scans.values()):
         raise ValueError(
-            f"No scan of the {split} split in {root}, nor of the other one: expected {_RAW}/<drive>"
-            f"/{_VELODYNE}/*.bin for a drive of {', '.join(KITTI360_DRIVES[split])}. `r3dpa check "
+            f"No scan of the {split} split in {root}, nor of the other one: expected {RAW}/<drive>"
+            f"/{VELODYNE}/*.bin for a drive of {', '.join(KITTI360_DRIVES[split])}. `r3dpa check "
             f"{root}` names what is missing; use LidarDataModule for scans in other folders."
         )
     return sorted(scans[split])
@@ -163,41 +150,60 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     """Points of one ``.bin`` scan, checked.
 
     Args:
-        path: KITTI ``.bin`` file, float32 rows x, y, z (metres) and intensity.
+        path: KITTI ``.bin`` file, float32 rows x, y, z (metres) and intensity 0..1.
         sensor: If given, at least one point must lie within its range limits.
 
     Returns:
         ``(P, 4)`` float32 in storage order, P >= 1.
 
     Raises:
-        ScanError: If the file is unreadable, empty, not made of 16-byte points, holds NaN or
-            infinite values, or has no point in range; the message names the file.
+        ScanError: If the file is unreadable, empty, of another layout, holds NaN or infinite
+            values, or has no point in range; the message names the file.
     """
     path = Path(path)
     data = _read_bytes(path)
     if not data:
         raise ScanError(f"{path}: is empty")
-    if len(data) % _BYTES_PER_POINT:
-        raise ScanError(
-            f"{path}: has {len(data)} bytes, not a multiple of 16 (x, y, z, intensity as float32)"
-        )
+    if wrong := _wrong_layout(data):
+        raise ScanError(f"{path}: {wrong}")
     points = np.frombuffer(data, dtype="<f4").reshape(-1, 4).copy()
     bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
     if bad:
         raise ScanError(f"{path}: has NaN or infinite values in {bad} of {len(points)} points")
     if sensor is not None and not in_range(torch.from_numpy(points[:, :3]), sensor).any():
-        limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
-        raise ScanError(f"{path}: has no point within the sensor's range {limits}")
+        raise out_of_range(path, sensor)
     return points
 
 
+def _wrong_layout(data: bytes) -> str | None:
+    """Why bytes are not rows of 4 float32; None if they are.
+
+    Of a size that fits 4 and 5 columns, the values decide: an intensity is never negative.
+    """
+    whole = len(data) % _BYTES_PER_POINT == 0
+    if len(data) % 20 == 0:
+        values = np.frombuffer(data, dtype="<f4")
+        four = whole and not (values[3::4] < 0).any()
+        if not four and (values[3::5] >= 0).all():
+            return f"has {len(data)} bytes, and {_FIVE_COLUMNS}"
+    if whole:
+        return None
+    return f"has {len(data)} bytes, not a multiple of 16 (x, y, z, intensity as float32)"
+
+
+def out_of_range(path: Path, sensor: LidarSensor) -> ScanError:
+    """Error of a scan none of whose points lies within the range limits."""
+    limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
+    return ScanError(f"{path}: has no point within the sensor's range {limits}")
+
+
 def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndarray | None:
-    """What the simulator knows of each point of one of its scans.
+    """Label or origin of each point of a simulated scan.
 
     Args:
         scan: The scan's ``data/<frame>.bin``.
         kind: ``"labels"``: uint32, KITTI-360 class in the lower 16 bits and instance in the upper;
-            ``"origins"``: uint8, what made the point, see :class:`r3dpa.simulation.Origin`.
+            ``"origins"``: uint8, see :class:`r3dpa.simulation.Origin`.
 
     Returns:
         ``(P,)``; None where there is no such file, as for real scans.
@@ -322,154 +328,96 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Scans of a ``.npz`` file by name, each ``(P, 3)`` or ``(P, 4)`` float32, metres.
 
     Raises:
-        ScanError: If the file is damaged, or holds what :func:`check_archive` refuses.
+        ScanError: If the file is damaged, or holds what :func:`npz_members` refuses.
     """
-    path = Path(path)
+    return {name: reader.whole() for name, reader in npz_members(Path(path))}
+
+
+class ArrayReader:
+    """Array in NumPy's format, read whole or row by row from a stream; objects are refused.
+
+    Args:
+        stream: Positioned at the start of the array.
+        size: Bytes that the stream holds, so that a few cannot ask for much memory.
+        where: For messages.
+
+    Raises:
+        ScanError: If it is not such an array, or larger than the stream.
+    """
+
+    def __init__(self, stream: IO[bytes], size: int, where: str) -> None:
+        self._stream, self.where = stream, where
+        try:
+            if np.lib.format.read_magic(stream) != (1, 0):
+                raise ValueError("needs version 1.0 of the format")
+            header = np.lib.format.read_array_header_1_0(stream)
+        except zipfile.BadZipFile:  # the archive itself is damaged
+            raise
+        except UNPICKLING_ERRORS as error:
+            raise ScanError(f"{where}: is not an array in NumPy's format ({error})") from error
+        self.shape, self._fortran, self.dtype = header
+        if self.dtype.hasobject:
+            raise ScanError(f"{where}: holds objects, which are not unpickled")
+        needed = math.prod(self.shape) * self.dtype.itemsize
+        if min(self.shape, default=0) < 0 or not self.dtype.itemsize or needed > size:
+            raise ScanError(
+                f"{where}: an array {self.shape} of {self.dtype} needs {needed} bytes, but there "
+                f"are {size}; copy the file again"
+            )
+
+    def whole(self) -> np.ndarray:
+        """The array."""
+        return self._next(self.shape, "F" if self._fortran else "C")
+
+    def rows(self) -> Iterator[np.ndarray]:
+        """Each part along the first axis, one at a time."""
+        if self._fortran:
+            raise ScanError(f"{self.where}: is in Fortran order; save np.ascontiguousarray of it")
+        for _ in range(self.shape[0]):
+            yield self._next(self.shape[1:], "C")
+
+    def _next(self, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
+        size = math.prod(shape) * self.dtype.itemsize
+        try:
+            data = self._stream.read(size)
+        except ARCHIVE_ERRORS as error:
+            raise ScanError(f"{self.where}: is damaged ({error})") from error
+        if len(data) < size:
+            raise ScanError(f"{self.where}: ends after {len(data)} of {size} bytes; copy it again")
+        return np.frombuffer(data, self.dtype).reshape(shape, order=order)
+
+
+def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
+    """Name and reader of each array of a ``.npz`` file, each to be read before the next.
+
+    Raises:
+        ScanError: If the file is damaged, or a name leads out of a folder; file and member are
+            named.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
-            check_archive(archive, path)
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            for info in archive.infolist():
+                where = f"{path}, member {info.filename!r:.80}"
+                if not info.filename.endswith(".npy"):
+                    continue
+                if reason := refuse_name(info.filename):
+                    raise ScanError(f"{where}: its name {reason}; save it with another name")
+                # A damaged directory may claim more than the whole file holds.
+                packed = info.compress_size <= path.stat().st_size
+                with archive.open(info) as stream:
+                    size = info.file_size if packed else 0
+                    yield info.filename.removesuffix(".npy"), ArrayReader(stream, size, where)
     except ScanError:
         raise
     except ARCHIVE_ERRORS as error:
         raise ScanError(f"{path}: is damaged or no .npz file of scans ({error})") from error
 
 
-def check_archive(archive: zipfile.ZipFile, path: Path) -> list[str]:
-    """Names of the arrays of a ``.npz`` file, after a look at what reading them would take.
-
-    Raises:
-        ScanError: If a name leads out of a folder, an array holds objects, is larger than its
-            member says, or than any scan or stack of images; file and member are named.
-    """
-    members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-    for info in members:
-        where = f"{path}, member {info.filename!r:.80}"
-        if reason := refuse_name(info.filename):
-            raise ScanError(f"{where}: its name {reason}; write the file again with other names")
-        with archive.open(info) as stream:
-            shape, _, dtype = read_array_header(stream, where)
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject:
-            raise ScanError(f"{where}: holds objects, which are not unpickled")
-        if not 0 <= size <= min(info.file_size, MOST_BYTES):
-            raise ScanError(
-                f"{where}: an array {shape} of {dtype} needs {size} bytes, but the member has "
-                f"{info.file_size}, and at most {MOST_BYTES} are read"
-            )
-    return [info.filename for info in members]
-
-
-def read_array_header(stream: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether in Fortran order, and type of an array in NumPy's format.
-
-    Raises:
-        ScanError: If it is none.
-    """
-    try:
-        return array_header(stream)
-    except zipfile.BadZipFile:  # what holds the array is damaged
-        raise
-    except UNPICKLING_ERRORS as error:
-        raise ScanError(f"{where}: is not an array in NumPy's format ({error})") from error
-
-
-@dataclass(frozen=True)
-class CheckReport:
-    """What :func:`check` found.
-
-    Args:
-        root: The checked folder.
-        num_scans: Scans by drive, bad ones included.
-        bad: ``(file, reason)`` of every scan that cannot be used.
-        missing: Folders that should exist or hold scans.
-    """
-
-    root: Path
-    num_scans: dict[str, int]
-    bad: tuple[tuple[Path, str], ...]
-    missing: tuple[Path, ...]
-
-    @property
-    def ok(self) -> bool:
-        """Whether every scan is usable and no folder is missing."""
-        return not self.bad and not self.missing
-
-    def __str__(self) -> str:
-        """Report for the terminal."""
-        lines = [f"{drive}: {count} scans" for drive, count in self.num_scans.items()]
-        lines += [f"missing: {folder}" for folder in self.missing]
-        lines += [f"bad: {file}: {reason}" for file, reason in self.bad]
-        total = sum(self.num_scans.values())
-        summary = f"{self.root}: {total} scans in {len(self.num_scans)} drives, "
-        if self.ok:
-            return "\n".join([*lines, f"{summary}all usable"])
-        problems = f"{len(self.bad)} bad, {len(self.missing)} folders missing or without scans"
-        return "\n".join([*lines, summary + problems])
-
-
-def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
-    """Read every scan of a data set or folder and report all that is wrong with it.
-
-    A folder with ``data_3d_raw``, or without any scan, is held against the KITTI-360 layout with
-    its nine LiDAR drives; a simulated one against the scans that its manifest asks for. A terminal
-    shows the progress.
-
-    Args:
-        path: Root of a data set, or any folder or file of scans.
-        sensor: Every scan must have a point within its range limits; default sensor if None.
-        workers: Threads that read.
-
-    Raises:
-        ValueError: If the manifest of a simulated data set cannot be understood.
-    """
-    root = Path(path).absolute()
-    sensor = sensor or LidarSensor()
-    scans = find_scans(root) if any(_files(root)) else []
-    counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
-    missing, bad = _compare_layout(root, counts)
-
-    def reason(scan: Scan) -> str | None:
-        try:
-            read_scan(scan.path, sensor)
-        except ScanError as error:
-            return str(error).removeprefix(f"{scan.path}: ")
-        return None
-
-    with ThreadPool(workers) as pool:
-        reasons = tqdm(pool.imap(reason, scans), total=len(scans), unit="scan", disable=None)
-        bad += [(s.path, why) for s, why in zip(scans, reasons, strict=True) if why is not None]
-    return CheckReport(root, counts, tuple(bad), tuple(missing))
-
-
-def _compare_layout(
-    root: Path, counts: dict[str, int]
-) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Folders that a data set lacks, and drives that lack scans, with the reason."""
-    raw, simulated = root / _RAW, expected_scans(root)
-    if not root.exists():
-        return [root], []
-    if not raw.is_dir():
-        return ([] if counts and simulated is None else [raw]), []
-    missing, incomplete = [], []
-    official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
-    for drive, expected in sorted((simulated or official).items()):
-        folder, count = raw / drive, counts.get(drive, 0)
-        if not folder.is_dir():
-            missing.append(folder)
-        elif not count:
-            missing.append(folder / _VELODYNE)
-        elif count < expected:
-            reason = f"holds {count} of {expected} scans; simulate again to complete it"
-            incomplete.append((folder, reason))
-    return missing, incomplete
-
-
-def _files(entry: str | Path) -> Iterator[Path]:
+def scan_files(entry: str | Path) -> Iterator[Path]:
+    """Files of a folder, file or glob that are scans."""
     path = Path(entry)
-    if (path / _RAW).is_dir():
-        for drive in (path / _RAW).iterdir():
+    if (path / RAW).is_dir():
+        for drive in (path / RAW).iterdir():
             yield from _drive_files(drive)
     elif path.is_dir():
         seen = set()
@@ -490,7 +438,7 @@ def _files(entry: str | Path) -> Iterator[Path]:
 
 def _drive_files(drive: Path) -> Iterator[Path]:
     """Scans of a drive in the KITTI-360 layout."""
-    return filter(_is_scan, (drive / _VELODYNE).glob("*"))
+    return filter(_is_scan, (drive / VELODYNE).glob("*"))
 
 
 def _is_scan(file: Path) -> bool:
@@ -511,9 +459,9 @@ def _common_parent(files: list[Path]) -> Path:
 
 def _drive_name(folder: Path, root: Path) -> str:
     parts = folder.relative_to(root).parts
-    if parts[-2:] == _VELODYNE.parts:
+    if parts[-2:] == VELODYNE.parts:
         parts = parts[:-2]
-    if parts[:1] == (_RAW,):
+    if parts[:1] == (RAW,):
         parts = parts[1:]
     return "/".join(parts) or root.name
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.row_store import append
 from r3dpa.data.scans import write_bin, write_npz, write_ply
+from r3dpa.data.store import append
 from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
 from r3dpa.io import atomic_path, delete_unfinished, only_writer

@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.checkpoints import weights_sha256
-from r3dpa.data.tensor_cache import Cacheable, CachedTensors, TensorCache
+from r3dpa.data.store import Cacheable, CachedTensors, TensorCache
 from r3dpa.nn import VAE, ImageVAE
 
 __all__ = ["encoded_once"]
@@ -50,7 +50,7 @@ def encoded_once(
         shared: Whether all processes ask for the same items, so that they can share the work.
 
     Raises:
-        TensorCacheError: If the cache cannot be written or is damaged, or moments are not finite.
+        StoreError: If the cache cannot be written or is damaged, or moments are not finite.
     """
     trainer = module.trainer
     datamodule = cast(Any, trainer).datamodule
@@ -74,10 +74,11 @@ def encoded_once(
             num_workers=datamodule.num_workers,
             generator=torch.Generator(),  # the default draws from the global random state
         )
-        with cache.writer(trainer.global_rank) as add:
+        keys = [item.cache_key for item in own]
+        with cache.writer(trainer.global_rank) as writer:
             for batch in loader:
                 posterior = vae.encode(batch[image].to(module.device))
                 moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
-                add([own[index] for index in batch["index"].tolist()], moments)
+                writer.add([keys[index] for index in batch["index"]], moments)
     trainer.strategy.barrier("cached latents: all are written")
     return CachedTensors(cache, items)

@@ -10,10 +10,8 @@ import torch
 from lightning.pytorch import LightningDataModule, LightningModule
 from torch.utils.data import DataLoader, DistributedSampler
 
-from r3dpa.data.feature_grids import Extractor, pooled_grids
-from r3dpa.data.feature_store import FeatureGridWriter
-from r3dpa.data.grid_settings import GridSettings
-from r3dpa.data.points import PointDataset, PointSample, list_collate
+from r3dpa.data.datasets import PointDataset, PointSample, list_collate
+from r3dpa.data.feature_grids import Extractor, FeatureGridWriter, GridSettings, pooled_grids
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import LidarSensor, Projection
 
@@ -33,7 +31,7 @@ class FeatureExtraction(LightningModule):
         dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.FeatureGrids`.
 
     Raises:
-        FeatureGridError: While it runs, if the store was made with other settings or cannot be
+        StoreError: While it runs, if the store was made with other settings or cannot be
             written, or features are not finite.
     """
 
@@ -83,7 +81,7 @@ class FeatureExtraction(LightningModule):
         """
         extractor, projection = self._parts()
         grids = pooled_grids(extractor, batch, projection, self.grid_sizes)
-        keys = [(sample.scan, sample.num_bytes) for sample in batch]
+        keys = [sample.key for sample in batch]
         for size, writer in self._writers.items():
             writer.add(keys, grids[size])
 
@@ -151,8 +149,7 @@ class MissingScans(LightningDataModule):
     def predict_dataloader(self) -> DataLoader[Any]:
         """The share of this process, in order."""
         assert self.trainer is not None
-        needs_labels = getattr(self.extractor, "needs_labels", False)
-        dataset = PointDataset(self.scans, self.sensor, self.extractor.prepare, needs_labels)
+        dataset = PointDataset(self.scans, self.sensor, self.extractor.prepare)
         return DataLoader(
             dataset,
             batch_size=self.batch_size,

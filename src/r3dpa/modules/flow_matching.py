@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
 from r3dpa.data.scans import Scan
-from r3dpa.data.tensor_cache import CachedTensors
+from r3dpa.data.store import CachedTensors
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights

@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from r3dpa import losses
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.data.image_latents import latent_statistics
-from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry
-from r3dpa.data.tensor_cache import CachedTensors
+from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry, latent_statistics
+from r3dpa.data.store import CachedTensors
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.image_stage import ImageStage
 from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig, TimeSampling

@@ -1,0 +1,420 @@
+"""Tensors on disk, one row per scan or image: appended by any process, read from memory maps.
+
+A store is a folder::
+
+    settings.json        all that the rows depend on
+    shard_00000.rows     rows of fixed size
+    shard_00000.jsonl    journal: {"scan": name, "bytes": size, "mtime_ns": time, "row": i} per row
+
+A line of the journal is written when its row is on disk, so that a process killed at any moment
+leaves no wrong row: rows without a line and a torn last line do not count. Every writer makes a
+shard of its own. A row belongs to the name, size and time of change of its file; rows of journals
+without times, as older versions wrote them, to name and size.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import mmap
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from io import FileIO
+from itertools import count
+from pathlib import Path
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r3dpa.io import atomic_path, only_writer, refuse_name
+
+__all__ = ["CachedTensors", "Store", "StoreError", "StoreWriter", "TensorCache", "item_key"]
+
+ItemKey = tuple[str, int, int]
+"""Name, size in bytes and time of change (ns) of the file that a row was made from."""
+_VERSION = 1  # to be raised when the same settings give other numbers
+_LARGEST_CODE = 127
+
+
+def item_key(name: str, about: os.stat_result) -> ItemKey:
+    """Key of an item in a file: a file written anew has another time, if not another size."""
+    return name, about.st_size, about.st_mtime_ns
+
+
+class StoreError(ValueError):
+    """A row that is missing, or a store that is damaged or cannot be written; says the remedy."""
+
+
+class Cacheable(Protocol):
+    """Scan or image that a row is made of."""
+
+    @property
+    def name(self) -> str:
+        """Unique within the data set."""
+
+    @property
+    def path(self) -> Path:
+        """File that holds it, for messages."""
+
+    @property
+    def cache_key(self) -> ItemKey:
+        """See :func:`item_key`."""
+
+
+Item = TypeVar("Item", bound=Cacheable)
+
+
+@dataclass(frozen=True)
+class Store(Generic[Item]):
+    """Place of one tensor per item.
+
+    Args:
+        folder: Where it lies.
+        settings: All that the tensors depend on beside the item, as JSON text.
+        shape: Shape of each tensor.
+        dtype: How it is stored. ``"float16"``: larger values are clamped; ``"int8"``: codes
+            -127..127 and a float32 scale per row of the last axis, its largest magnitude / 127, so
+            that a value is off by at most half the scale.
+        what: Of the rows, for messages.
+        remedy: For messages: how rows are made again.
+    """
+
+    folder: Path
+    settings: str
+    shape: tuple[int, ...]
+    dtype: Literal["float32", "float16", "int8"] = "float32"
+    what: str = "cached tensors"
+    remedy: str = "by starting the run again"
+
+    @cached_property
+    def row(self) -> np.dtype[Any]:
+        """NumPy type of a row: ``values``, or ``scale`` and ``codes``."""
+        if self.dtype == "int8":
+            return np.dtype([("scale", "<f4", self.shape[:-1]), ("codes", "i1", self.shape)])
+        kind = {"float16": "<f2", "float32": "<f4"}[self.dtype]
+        return np.dtype([("values", kind, self.shape)])
+
+    def places(self) -> dict[ItemKey, tuple[int, int]]:
+        """Shard and row of each key.
+
+        Raises:
+            StoreError: If a journal is damaged.
+        """
+        found: dict[ItemKey, tuple[int, int]] = {}
+        for path in sorted(self.folder.glob("shard_*.jsonl")):
+            shard = int(path.stem.removeprefix("shard_"))
+            found.update((key, (shard, row)) for row, key in enumerate(self._journal(path)))
+        return found
+
+    def missing(self, items: Sequence[Item]) -> list[Item]:
+        """Those of the items that have no row.
+
+        Raises:
+            StoreError: If a journal is damaged.
+        """
+        places = self.places()
+        return [item for item in items if find_place(places, item.cache_key) is None]
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Lets one process at a time fill the store; another one waits."""
+        return store_lock(self.folder, f"fills {self.folder}")
+
+    def writer(self, shard: int = 0) -> StoreWriter:
+        """Appends to a new shard, the first free one from this number on."""
+        return StoreWriter(self, shard)
+
+    def pack(self, tensors: Tensor) -> bytes:
+        """Rows of tensors ``(B, *shape)``."""
+        values = tensors.float().cpu().numpy()
+        rows = np.empty(len(values), self.row)
+        if self.dtype == "int8":
+            scale = np.abs(values).max(axis=-1) / np.float32(_LARGEST_CODE)
+            scale[scale < np.finfo(np.float32).tiny] = 0  # too small to be exact
+            rows["scale"] = scale
+            divisor = np.where(scale > 0, scale, np.float32(np.inf))[..., None]
+            rows["codes"] = np.rint(values / divisor)
+        else:
+            largest = np.finfo(self.row["values"].base).max
+            rows["values"] = values.clip(-largest, largest)
+        return rows.tobytes()
+
+    def unpack(self, data: mmap.mmap, start: int) -> Tensor:
+        """Tensor of the row that starts at a byte, a copy in float32."""
+
+        def field(name: str) -> Tensor:
+            fields = self.row.fields
+            assert fields is not None
+            dtype, offset = fields[name][:2]
+            values = np.frombuffer(data, dtype.base, math.prod(dtype.shape), start + offset)
+            return torch.from_numpy(values.reshape(dtype.shape).copy()).float()
+
+        if self.dtype == "int8":
+            return field("codes").mul_(field("scale")[..., None])
+        return field("values")
+
+    def damaged(self, journal: Path, what: str) -> StoreError:
+        """Error that names a shard, what is wrong, and the remedy."""
+        rows = journal.with_suffix(".rows")
+        return StoreError(
+            f"{what}: delete {journal} and {rows.name} beside it, and make their {self.what} "
+            f"again {self.remedy}"
+        )
+
+    def _journal(self, path: Path) -> list[ItemKey]:
+        """Key of each row of a shard."""
+        data, rows = path.read_bytes(), path.with_suffix(".rows")
+        keys: list[ItemKey] = []
+        try:
+            # As one list: twice as fast as line by line, which matters for 80 000 lines.
+            lines = data[: data.rfind(b"\n") + 1].splitlines()
+            for entry in json.loads(b"[" + b",".join(lines) + b"]"):
+                where = f"line {len(keys) + 1}"
+                if entry["row"] != len(keys):
+                    raise ValueError(f"{where} is of row {entry['row']}")
+                if reason := refuse_name(entry["scan"]):
+                    raise ValueError(f"name of scan in {where} {reason}")
+                num_bytes, time = entry["bytes"], entry.get("mtime_ns", 0)
+                if not isinstance(num_bytes, int) or not isinstance(time, int):
+                    raise TypeError(f"size or time in {where} is no whole number")
+                keys.append((entry["scan"], num_bytes, time))
+            if keys and rows.stat().st_size < len(keys) * self.row.itemsize:
+                raise ValueError(f"{rows.name} has fewer than its {len(keys)} rows")
+        except (LookupError, TypeError, ValueError, RecursionError, OSError) as error:
+            raise self.damaged(path, f"{path} is damaged ({error!r:.200})") from error
+        return keys
+
+
+def store_lock(folder: Path, what: str) -> AbstractContextManager[None]:
+    """Lock of a folder of rows; another process that holds it is waited for.
+
+    Args:
+        folder: Made if missing.
+        what: What its holder does, for the log of those who wait.
+
+    Raises:
+        StoreError: If the folder cannot be made.
+    """
+    with _writing("rows", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return only_writer(folder / ".lock", what, wait=True)
+
+
+@contextmanager
+def _writing(what: str, folder: Path) -> Iterator[None]:
+    """Turns errors of the system into one that names the folder and the remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"{what.capitalize()} cannot be written to {folder} ({error.strerror}): give a folder "
+            "on a disk that can be written and has space"
+        ) from error
+
+
+def find_place(places: Mapping[ItemKey, tuple[int, int]], key: ItemKey) -> tuple[int, int] | None:
+    """Shard and row of a key, also of one whose time of change an older version did not store."""
+    return places.get(key) or places.get((*key[:2], 0))
+
+
+class TensorCache(Store[Item]):
+    """Store whose folder ``root/<name>_<hash>`` follows from its settings.
+
+    Other settings find another folder, never a wrong row; unused folders may be deleted.
+
+    Args:
+        root: Folder of caches.
+        name: Kind, the first part of the folder's name.
+        settings: All that the tensors depend on beside the item, as JSON values.
+        shape: Shape of each tensor, kept in float32.
+    """
+
+    def __init__(
+        self, root: Path, name: str, settings: Mapping[str, Any], shape: tuple[int, ...]
+    ) -> None:
+        about = {"version": _VERSION, "shape": shape, "settings": settings}
+        text = json.dumps(about, indent=1, sort_keys=True)
+        folder = root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+        super().__init__(folder, text, shape)
+
+
+class StoreWriter:
+    """Appends rows to a shard of its own; a context manager.
+
+    Args:
+        store: Where to; ``settings.json`` is written if it is missing.
+        shard: The first free shard from this number on is taken, with the first row.
+
+    Raises:
+        StoreError: If the store is damaged or cannot be written.
+    """
+
+    def __init__(self, store: Store[Any], shard: int = 0) -> None:
+        self._store, self._shard = store, shard
+        self._files: tuple[FileIO, FileIO] | None = None
+        self._num_rows = 0
+        self._known = store.places()
+        settings = store.folder / "settings.json"
+        if not settings.exists():
+            with _writing(store.what, store.folder), atomic_path(settings) as temporary:
+                temporary.write_text(store.settings)
+
+    def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
+        """Append the rows of those keys that the store lacks.
+
+        When this returns, the rows are on disk and other processes can read them.
+
+        Args:
+            keys: B keys, taken before the files were read.
+            tensors: ``(B, *shape)`` on any device.
+
+        Raises:
+            StoreError: If the disk is full or cannot be written, or a tensor is not finite; names
+                the folder or the item. The writer is then closed.
+            ValueError: If the shapes do not fit each other or the store.
+        """
+        expected = (len(keys), *self._store.shape)
+        if tuple(tensors.shape) != expected:
+            raise ValueError(f"{self._store.what} must be {expected}, got {tuple(tensors.shape)}")
+        new = {key: row for row, key in enumerate(keys) if find_place(self._known, key) is None}
+        if not new:
+            return
+        kept = tensors[list(new.values())]
+        for key, finite in zip(new, kept.isfinite().flatten(1).all(dim=1).tolist(), strict=True):
+            if not finite:
+                raise StoreError(
+                    f"{self._store.what} of {key[0]} are not finite; look at the file (`r3dpa "
+                    "check` for scans), and leave it out"
+                )
+        lines = [
+            json.dumps({"scan": name, "bytes": size, "mtime_ns": time, "row": row}) + "\n"
+            for row, (name, size, time) in enumerate(new, start=self._num_rows)
+        ]
+        with _writing(self._store.what, self._store.folder):
+            try:
+                rows, journal = self._open()
+                append(rows, self._store.pack(kept))
+                os.fdatasync(rows)
+                append(journal, "".join(lines).encode())
+            except BaseException:
+                self.close()  # what is unfinished is at the end, and does not count
+                raise
+        self._num_rows += len(new)
+        self._known |= dict.fromkeys(new, (self._shard, 0))
+
+    def close(self) -> None:
+        """Close the files; rows that are added later go to another shard."""
+        for file in self._files or ():
+            file.close()
+        self._files, self._num_rows = None, 0
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close it."""
+        self.close()
+
+    def _open(self) -> tuple[FileIO, FileIO]:
+        """Rows and journal; without buffers, which would be written after an error."""
+        for shard in () if self._files else count(self._shard):
+            rows = self._store.folder / f"shard_{shard:05d}.rows"
+            try:
+                file = rows.open("xb", buffering=0)
+            except FileExistsError:
+                continue
+            self._files = file, rows.with_suffix(".jsonl").open("ab", buffering=0)
+            break
+        assert self._files is not None
+        return self._files
+
+
+class CachedTensors(Generic[Item]):
+    """Rows of a store by item; safe to hand to loader processes.
+
+    Args:
+        store: Where they are.
+        items: Items that will be asked for.
+
+    Attributes:
+        store: As given.
+        items: As given.
+
+    Raises:
+        StoreError: If a row is missing, or the store is damaged.
+    """
+
+    def __init__(self, store: Store[Item], items: Sequence[Item]) -> None:
+        self.store, self.items = store, list(items)
+        names = {item.name: item for item in items}
+        self._places = {key: at for key, at in store.places().items() if key[0] in names}
+        self._maps: dict[int, mmap.mmap] = {}
+        if missing := names.keys() - {key[0] for key in self._places}:
+            raise missing_rows(store, [names[name] for name in sorted(missing)])
+
+    def read(self, item: Item) -> Tensor:
+        """Tensor ``shape`` of one item, float32, a copy.
+
+        Raises:
+            StoreError: If the item was not given to the constructor, its file was replaced since
+                the row was made, or the store was damaged.
+        """
+        place = find_place(self._places, item.cache_key)
+        if place is None and item.name not in {key[0] for key in self._places}:
+            raise missing_rows(self.store, [item])
+        if place is None:
+            raise StoreError(
+                f"{item.path} was replaced, or copied without its time of change, after its row in "
+                f"{self.store.folder} was made: make it again {self.store.remedy}"
+            )
+        shard, row = place
+        size = self.store.row.itemsize
+        start, mapping = row * size, self._mapped(shard)
+        # The size of the file now: to touch what was cut off since would kill the process.
+        if mapping.size() < start + size:
+            raise self._lost(shard, "was cut short")
+        # Read as a whole: page by page, as they are touched, a disk is slower.
+        page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
+        mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + size)
+        return self.store.unpack(mapping, start)
+
+    def _mapped(self, shard: int) -> mmap.mmap:
+        if shard not in self._maps:
+            try:
+                with (self.store.folder / f"shard_{shard:05d}.rows").open("rb") as file:
+                    # Read-only: a private copy would count as memory, 42 GB for a large shard.
+                    self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            except (FileNotFoundError, ValueError) as error:
+                raise self._lost(shard, "is gone or empty") from error
+        return self._maps[shard]
+
+    def _lost(self, shard: int, what: str) -> StoreError:
+        rows = self.store.folder / f"shard_{shard:05d}.rows"
+        what = f"{rows} {what} since its journal was read"
+        return self.store.damaged(rows.with_suffix(".jsonl"), what)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without the open files: each process maps them itself."""
+        return self.__dict__ | {"_maps": {}}
+
+
+def missing_rows(store: Store[Any], items: Sequence[Cacheable]) -> StoreError:
+    """Error that names the first of the items that have no row."""
+    more = f" and {len(items) - 1} more" if len(items) > 1 else ""
+    return StoreError(
+        f"No {store.what} of {items[0].path}{more} in {store.folder}: make what is missing "
+        f"{store.remedy}"
+    )
+
+
+def append(file: FileIO, data: bytes) -> None:
+    """Write all of the data to a file without a buffer, which may take it in parts."""
+    left = memoryview(data)
+    while left:
+        left = left[file.write(left) :]

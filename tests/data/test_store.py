@@ -1,0 +1,413 @@
+"""The store of tensors: format, keys, kills, damage, several processes."""
+
+import json
+import multiprocessing
+import os
+import pickle
+import signal
+import struct
+import tracemalloc
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from r3dpa.data import CachedTensors, Store, StoreError, TensorCache, store
+from r3dpa.data.store import StoreWriter
+
+SHAPE = (8, 4)
+
+
+class Item(NamedTuple):
+    """A scan that needs no file."""
+
+    number: int
+    num_bytes: int = 160
+    mtime_ns: int = 7
+
+    @property
+    def name(self):
+        return f"drive/{self.number:010d}"
+
+    @property
+    def path(self):
+        return Path(f"{self.name}.bin")
+
+    @property
+    def cache_key(self):
+        return self.name, self.num_bytes, self.mtime_ns
+
+
+def items(first, last, **changes):
+    return [Item(number, **changes) for number in range(first, last)]
+
+
+def tensor_of(item, shape=SHAPE):
+    """A different tensor for each item and state of its file; one of the cells is zero."""
+    generator = torch.Generator().manual_seed(hash(item) % 2**31)
+    tensor = torch.randn(shape, generator=generator)
+    tensor[3] = 0
+    return tensor
+
+
+def add(writer, given):
+    writer.add([item.cache_key for item in given], torch.stack([tensor_of(i) for i in given]))
+
+
+def fill(where, *ranges, shard=0):
+    for first, last in ranges:
+        with where.writer(shard) as writer:
+            add(writer, items(first, last))
+
+
+def assert_holds(where, given):
+    read = CachedTensors(where, given)
+    for item in given:
+        assert torch.equal(read.read(item), tensor_of(item).half().float())
+
+
+@pytest.fixture
+def halves(tmp_path):
+    return Store(tmp_path / "s", "{}", SHAPE, "float16", "grids", "with a command")
+
+
+def test_rows_and_journal_by_hand(tmp_path):
+    """One cell of width 2, two scans: 1, -0.5 are 0x3c00, 0xb800; 1e9 is clamped to 65504."""
+    where = Store(tmp_path / "s", '{"a": 1}', (1, 2), "float16")
+    with where.writer() as writer:
+        keys = [item.cache_key for item in items(5, 7)]
+        writer.add(keys, torch.tensor([[[1, -0.5]], [[1e9, -1e9]]]))
+    assert (tmp_path / "s/shard_00000.rows").read_bytes() == bytes.fromhex("003c00b8ff7bfffb")
+    assert (tmp_path / "s/shard_00000.jsonl").read_text() == (
+        '{"scan": "drive/0000000005", "bytes": 160, "mtime_ns": 7, "row": 0}\n'
+        '{"scan": "drive/0000000006", "bytes": 160, "mtime_ns": 7, "row": 1}\n'
+    )
+    assert json.loads((tmp_path / "s/settings.json").read_text()) == {"a": 1}
+
+
+def test_int8_row_by_hand(tmp_path):
+    """Largest magnitudes 254, 0 and 6.35: scales 2, 0 and 0.05."""
+    where, (item,) = Store(tmp_path / "s", "{}", SHAPE, "int8"), items(0, 1)
+    tensor = torch.zeros(1, *SHAPE)
+    tensor[0, 0] = torch.tensor([254, -254, 1.1, -2.9])
+    tensor[0, 2] = torch.tensor([6.35, 0.026, 0.024, -0.3])
+    with where.writer() as writer:
+        writer.add([item.cache_key], tensor)
+    data = (tmp_path / "s/shard_00000.rows").read_bytes()
+    assert len(data) == where.row.itemsize == 8 * 4 + 8 * 4
+    assert struct.unpack("<8f", data[:32]) == pytest.approx((2, 0, 0.05, 0, 0, 0, 0, 0))
+    codes = struct.unpack("<32b", data[32:])
+    assert codes[:12] == (127, -127, 1, -1, 0, 0, 0, 0, 127, 1, 0, -6)
+    assert not any(codes[12:])
+    assert CachedTensors(where, [item]).read(item)[0].tolist() == [254, -254, 2, -2]
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("magnitude", [1e-44, 1e-38, 1e-36, 1e-3, 1.0, 1e5, 1e37])
+def test_int8_is_off_by_half_a_scale_at_most(tmp_path, magnitude):
+    """Heavy tails, and values in the middle between two codes. One scale over all cells fails."""
+    generator = np.random.default_rng(0)
+    values = generator.standard_t(2, (40, *SHAPE)) * 10.0 ** generator.uniform(-3, 0, (40, 8, 1))
+    values *= magnitude / np.abs(values).max()
+    values[20:] = np.rint(values[20:] / magnitude * 127 - 0.5) + 0.5
+    values[20:, :, 0] = 127
+    values[20:] *= magnitude / 127
+    values[:, 3] = 0
+    values = values.astype(np.float32)
+    where = Store(tmp_path, "{}", SHAPE, "int8")
+    with where.writer() as writer:
+        writer.add([item.cache_key for item in items(0, 40)], torch.from_numpy(values))
+    stored = CachedTensors(where, items(0, 40))
+    read = np.stack([stored.read(item).numpy() for item in items(0, 40)]).astype(np.float64)
+    largest = np.abs(values.astype(np.float64)).max(axis=2, keepdims=True)
+    # The quotient and the product round to float32: 127 * 2^-24 of a scale each, and the scale
+    # itself. Below the normal numbers of float32 everything is 0.
+    bound = np.where(largest / 127 < 2.0**-126, largest, largest / 254 * (1 + 2.0**-15))
+    error = np.abs(read - values)
+    assert (error <= bound * (1 + 2.0**-23)).all()
+    assert not read[:, 3].any()
+    if magnitude > 1e-30:
+        assert (error > bound * 0.99).any()  # the bound is reached
+        common = np.abs(values).max() / 127
+        assert (np.abs(np.rint(values / common) * common - values) > bound).any()
+
+
+def test_wrong_shapes_and_unwritable_folders_are_named(halves, tmp_path):
+    keys = [items(0, 1)[0].cache_key]
+    with halves.writer() as writer:
+        for wrong in (torch.zeros(2, 8, 4), torch.zeros(1, 4, 8), torch.zeros(8, 4)):
+            with pytest.raises(ValueError, match=r"grids must be \(1, 8, 4\), got"):
+                writer.add(keys, wrong)
+    assert not list(halves.folder.glob("*.rows"))
+    (tmp_path / "file").write_text("")
+    cache = TensorCache(tmp_path / "file", "a", {}, SHAPE)
+    with pytest.raises(StoreError, match="cannot be written to"), cache.writer():
+        pass
+
+
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+def test_what_is_not_finite_is_not_kept(halves, value):
+    """It would cost a step in every epoch; the rows before it stay."""
+    tensors = torch.zeros(5, *SHAPE)
+    tensors[3, 1, 2] = value
+    keys = [item.cache_key for item in items(0, 5)]
+    with halves.writer() as writer:
+        writer.add(keys[:2], tensors[:2])
+        with pytest.raises(StoreError, match="grids of drive/0000000003 are not finite"):
+            writer.add(keys[2:], tensors[2:])
+    assert halves.missing(items(0, 5)) == items(2, 5)
+
+
+def test_shards_are_merged_and_nothing_is_written_twice(halves):
+    fill(halves, (0, 3))
+    written = (halves.folder / "settings.json").stat().st_ino
+    fill(halves, (2, 5), (5, 6), shard=3)  # number 2 is there already
+    fill(halves, (4, 8), (0, 8))  # 4 and 5 are, and all
+    sizes = {path.name: path.stat().st_size // 64 for path in halves.folder.glob("*.rows")}
+    assert sizes == {f"shard_{n:05d}.rows": rows for n, rows in ((0, 3), (1, 2), (3, 2), (4, 1))}
+    assert (halves.folder / "settings.json").stat().st_ino == written  # once
+    assert_holds(halves, items(0, 8)[::-1])
+    with halves.writer() as writer:
+        add(writer, items(8, 9) * 2)
+        add(writer, items(8, 9))
+    assert (halves.folder / "shard_00002.rows").stat().st_size == 64
+
+
+def test_writers_never_share_a_shard(halves):
+    with halves.writer() as first, halves.writer(1) as second, halves.writer() as third:
+        for start in (0, 3):
+            for place, writer in enumerate((first, second, third)):
+                add(writer, items(start + place, start + place + 1))
+    sizes = [path.stat().st_size for path in sorted(halves.folder.glob("*.rows"))]
+    assert sizes == [128] * 3
+    assert_holds(halves, items(0, 6))
+
+
+@pytest.mark.parametrize("change", [{"num_bytes": 320}, {"mtime_ns": 8}])
+def test_a_replaced_file_is_noticed_and_has_a_row_of_its_own(halves, change):
+    """Both rows stay, so that the first file, put back, has its row."""
+    old, new = items(0, 1), items(0, 1, **change)
+    fill(halves, (0, 2))
+    assert halves.missing(new) == new
+    with pytest.raises(StoreError, match=r"0000000000\.bin was replaced.*again with a command"):
+        CachedTensors(halves, old).read(*new)
+    with halves.writer(1) as writer:
+        add(writer, new)
+    assert_holds(halves, old)
+    assert_holds(halves, new)
+
+
+def test_rows_of_older_journals_are_known_by_name_and_size(halves):
+    fill(halves, (0, 2))
+    journal = halves.folder / "shard_00000.jsonl"
+    journal.write_text(journal.read_text().replace(', "mtime_ns": 7', ""))
+    assert_holds(halves, items(0, 2))
+    assert halves.missing(items(0, 3)) == items(2, 3)
+    assert halves.missing(items(0, 1, num_bytes=32)) == items(0, 1, num_bytes=32)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "shape"), [("b", {"x": 1}, SHAPE), ("a", {"x": 2}, SHAPE), ("a", {}, (4,))]
+)
+def test_other_settings_never_find_these_rows(tmp_path, name, settings, shape):
+    cache = TensorCache(tmp_path, "a", {"x": 1}, SHAPE)
+    fill(cache, (0, 5))
+    other = TensorCache(tmp_path, name, settings, shape)
+    assert other.missing(items(0, 5)) == items(0, 5)
+    with pytest.raises(StoreError, match=r"No cached tensors of drive.*0000\.bin and 4 more"):
+        CachedTensors(other, items(0, 5))
+    assert TensorCache(tmp_path, "a", {"x": 1}, SHAPE) == cache
+
+
+def in_child(function):
+    """Exit code of a forked process that runs a function."""
+    child = multiprocessing.get_context("fork").Process(target=function)
+    child.start()
+    child.join()
+    return child.exitcode
+
+
+@pytest.mark.parametrize("part", [0, 0.5, 1])
+@pytest.mark.parametrize("moment", range(4))
+def test_killed_at_every_step_of_a_batch(halves, monkeypatch, moment, part):
+    """Two batches of a row and a journal each: killed with none, half or all of one written."""
+    append, seen = store.append, []
+
+    def killing(file, data):
+        seen.append(file)
+        if len(seen) - 1 == moment:
+            append(file, data[: int(part * len(data))])
+            os.kill(os.getpid(), signal.SIGKILL)
+        append(file, data)
+
+    def write():
+        with halves.writer() as writer:
+            for first, last in ((0, 2), (2, 5)):
+                add(writer, items(first, last))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "append", killing)
+        assert in_child(write) == -signal.SIGKILL
+    there = [item for item in items(0, 5) if not halves.missing([item])]
+    # Half of a journal of two lines or three holds one whole line.
+    expected = [0, {0: 0, 0.5: 1, 1: 2}[part], 2, {0: 2, 0.5: 3, 1: 5}[part]][moment]
+    assert there == items(0, expected)
+    assert_holds(halves, there)
+    write()
+    assert_holds(halves, items(0, 5))
+
+
+def test_rows_are_on_disk_before_the_journal_names_them(halves, monkeypatch):
+    """As a power failure needs it: one flush a batch, in between."""
+    calls = []
+
+    def note(name, function):
+        return lambda file, *data: (
+            calls.append((name, Path(file.name).suffix)),
+            function(file, *data),
+        )
+
+    monkeypatch.setattr(store, "append", note("append", store.append))
+    monkeypatch.setattr(os, "fdatasync", note("sync", os.fdatasync))
+    fill(halves, (0, 5))
+    assert calls == [("append", ".rows"), ("sync", ".rows"), ("append", ".jsonl")]
+
+
+@pytest.mark.parametrize("tail", ['{"scan": "drive/0000000001", "bytes": 16', "\0" * 20, "{"])
+def test_a_torn_line_and_rows_beyond_the_journal_do_not_count(halves, tail):
+    fill(halves, (0, 1))
+    with (halves.folder / "shard_00000.jsonl").open("a") as journal:
+        journal.write(tail)
+    with (halves.folder / "shard_00000.rows").open("ab") as rows:
+        rows.write(b"\x7f" * 100)  # a row and a half
+    assert_holds(halves, items(0, 1))
+    with pytest.raises(StoreError, match=r"No grids of .*0000000001\.bin in"):
+        CachedTensors(halves, items(0, 2))
+    fill(halves, (1, 3))
+    assert_holds(halves, items(0, 3))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda lines: lines[:1] + lines[2:], "line 2 is of row 2"),
+        (lambda lines: [lines[0], b"[1]\n", lines[2]], "TypeError"),
+        (lambda lines: [lines[0][:20] + b"\n", *lines[1:]], "JSONDecodeError"),
+        (lambda lines: [b"{}\n", *lines[1:]], "KeyError"),
+        (lambda lines: [lines[0].replace(b"160", b"1.5"), *lines[1:]], "no whole number"),
+        (lambda lines: [*lines, lines[2].replace(b"2}", b"3}")], "fewer than its 4 rows"),
+    ],
+)
+def test_a_damaged_journal_is_named(halves, change, reason):
+    fill(halves, (0, 3))
+    path = halves.folder / "shard_00000.jsonl"
+    path.write_bytes(b"".join(change(path.read_bytes().splitlines(keepends=True))))
+    message = rf"shard_00000\.jsonl is damaged \(.*{reason}.*shard_00000\.rows .*with a command"
+    for attempt in (lambda: CachedTensors(halves, items(0, 3)), halves.writer):
+        with pytest.raises(StoreError, match=message):
+            attempt()
+    path.unlink()  # the remedy
+    (halves.folder / "shard_00000.rows").unlink()
+    fill(halves, (0, 3))
+    assert_holds(halves, items(0, 3))
+
+
+def test_lost_rows_are_noticed(halves):
+    fill(halves, (0, 3))
+    (halves.folder / "shard_00000.rows").unlink()
+    with pytest.raises(StoreError, match=r"damaged .*shard_00000\.rows"):
+        CachedTensors(halves, items(0, 3))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_an_unwritable_folder_is_named(halves):
+    fill(halves, (0, 1))
+    halves.folder.chmod(0o500)
+    with pytest.raises(StoreError, match=f"cannot be written to {halves.folder}"):
+        fill(halves, (1, 2))
+
+
+class Reading(Dataset):
+    def __init__(self, tensors):
+        self.tensors = tensors
+
+    def __len__(self):
+        return len(self.tensors.items)
+
+    def __getitem__(self, index):
+        return self.tensors.read(self.tensors.items[index])
+
+
+def test_readers_in_several_processes_while_another_one_writes(halves):
+    fill(halves, (0, 20))
+    fill(halves, (20, 40), shard=1)
+    given = [items(0, 40)[i] for i in torch.randperm(40).tolist()]
+    tensors = CachedTensors(halves, given)
+    tensors.read(given[0])
+    loader = DataLoader(Reading(tensors), None, num_workers=2)
+    with halves.writer() as writer:
+        for number, (item, read) in enumerate(zip(given, loader, strict=True)):
+            assert torch.equal(read, tensor_of(item).half().float())
+            add(writer, items(40 + number, 41 + number))
+    assert_holds(halves, items(0, 80))
+
+
+def test_what_a_reader_sees_of_a_growing_store_is_right(halves):
+    def write():
+        with halves.writer() as writer:
+            for first in range(0, 200, 4):
+                add(writer, items(first, first + 4))
+
+    fill(halves, (0, 4))
+    child = multiprocessing.get_context("fork").Process(target=write)
+    child.start()
+    counts = []
+    while child.is_alive():
+        counts.append(len(halves.places()))
+        assert_holds(halves, items(0, counts[-1]))
+    child.join()
+    assert child.exitcode == 0
+    assert counts == sorted(counts)
+    assert_holds(halves, items(0, 200))
+
+
+def test_processes_write_at_once(halves):
+    def share(place):
+        with StoreWriter(halves, place) as writer:
+            for item in items(0, 40)[place::2]:
+                add(writer, [item])
+
+    context = multiprocessing.get_context("fork")
+    children = [context.Process(target=share, args=[place]) for place in (0, 1)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+    assert_holds(halves, items(0, 40))
+
+
+@pytest.mark.parametrize("dtype", ["float16", "int8", "float32"])
+def test_reading_copies_one_row_only(tmp_path, dtype):
+    """256 rows of ones, 8 x 512: 16 kB each as float32, 4 MB in all."""
+    where, given = Store(tmp_path, "{}", (8, 512), dtype), items(0, 256)
+    with where.writer() as writer:
+        writer.add([item.cache_key for item in given], torch.ones(256, 8, 512))
+    tensors = CachedTensors(where, given)
+    tensors.read(given[0])
+    assert memoryview(tensors._mapped(0)).readonly  # else a map counts as memory as a whole
+    tracemalloc.start()
+    read = tensors.read(given[100])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert torch.equal(read, torch.ones(8, 512))
+    assert read.untyped_storage().nbytes() == 2**14
+    assert peak < 2**14 + 4000  # nothing of the others
+    read.zero_()
+    assert torch.equal(tensors.read(given[100]), torch.ones(8, 512))  # the store is not written
+    data = pickle.dumps(tensors)
+    assert len(data) < 50_000  # the names; a map would bring the rows
+    copy = pickle.loads(data)  # noqa: S301 - made two lines above
+    assert torch.equal(copy.read(given[7]), torch.ones(8, 512))
