@@ -65,7 +65,7 @@ def angle_box(
     inclination = _inclinations_deg(projection)
     rows = (inclination >= inclination_min_deg) & (inclination < inclination_max_deg)
     if not rows.any():
-        raise ValueError(_missed(projection, what, inclination_min_deg, inclination_max_deg))
+        raise ValueError(_missed(projection, what))
     return check_mask(rows[:, None] & columns, what)
 
 
@@ -128,19 +128,16 @@ def box3d(
     met = (entry <= end) & (entry < sensor.range_max_m) & (end > sensor.range_min_m)
     if met.any():
         return check_mask(met, what)
-    nearest = (centre.abs() - half).clamp(min=0)
-    farthest = centre.abs() + half
-    from_m, to_m = nearest.norm().item(), farthest.norm().item()
-    if from_m >= sensor.range_max_m or to_m <= sensor.range_min_m:
-        raise ValueError(
-            f"{what} lies {from_m:.1f} to {to_m:.1f} m away, but the range limits of the sensor "
-            f"are {sensor.range_min_m:g} to {sensor.range_max_m:g} m"
-        )
-    bottom, top = (centre[2] - half[2]).item(), (centre[2] + half[2]).item()
+    nearest, farthest = (centre.abs() - half).clamp(min=0), centre.abs() + half
     near, far = nearest[:2].norm().item(), farthest[:2].norm().item()
+    bottom, top = (centre[2] - half[2]).item(), (centre[2] + half[2]).item()
     lowest = math.degrees(math.atan2(bottom, near if bottom < 0 else far))
     highest = math.degrees(math.atan2(top, far if top < 0 else near))
-    raise ValueError(_missed(projection, what, lowest, highest))
+    where = (
+        f"{what}, {nearest.norm():.1f} to {farthest.norm():.1f} m away and {lowest:.1f} to "
+        f"{highest:.1f} degrees above the horizon"
+    )
+    raise ValueError(_missed(projection, where))
 
 
 def dropped_beams(projection: Projection, kept: int | Sequence[int]) -> Tensor:
@@ -338,20 +335,16 @@ def _between(projection: Projection, from_deg: float, to_deg: float, what: str) 
     return columns
 
 
-def _missed(projection: Projection, what: str, lowest_deg: float, highest_deg: float) -> str:
-    """Message: no ray meets what lies between two inclinations."""
-    inclination = _inclinations_deg(projection)
+def _missed(projection: Projection, what: str) -> str:
+    """Message that no ray meets a region, with what the rays reach."""
+    inclination, sensor = _inclinations_deg(projection), projection.sensor
     bottom, top = inclination.min().item(), inclination.max().item()
-    if lowest_deg > top or highest_deg < bottom:
-        return (
-            f"{what} lies outside the field of view: it reaches from {lowest_deg:.1f} to "
-            f"{highest_deg:.1f} degrees above the horizon, the rays of the sensor from "
-            f"{bottom:.1f} to {top:.1f}"
-        )
-    rows, columns = (top - bottom) / max(len(inclination) - 1, 1), projection.sensor.columns
+    rows = (top - bottom) / max(len(inclination) - 1, 1)
     return (
-        f"{what}: no ray meets it within the range limits. Rays are {rows:.2g} degrees apart in "
-        f"inclination and {_TURN_DEG / columns:.2g} in azimuth; make it larger"
+        f"{what}: no ray meets it. The rays of the sensor reach from {bottom:.1f} to {top:.1f} "
+        f"degrees above the horizon and {sensor.range_min_m:g} to {sensor.range_max_m:g} m, "
+        f"{rows:.2g} degrees apart in inclination and {_TURN_DEG / sensor.columns:.2g} in azimuth; "
+        "move the region there or make it larger"
     )
 
 
