@@ -4,7 +4,7 @@ import pytest
 import torch
 from einops import rearrange
 
-from r3dpa.bench.hardware import flop_of
+from r3dpa.bench.measure import flop_of
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, euler, heun, ode_solver

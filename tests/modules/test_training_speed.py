@@ -6,9 +6,7 @@ import pytest
 import torch
 from test_gradients import TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import FlopCounterMode
 
-from r3dpa.bench.training_profile import step_parts
 from r3dpa.cli import main
 from r3dpa.modules import JointAlignment, LossWeights, flow_matching
 from r3dpa.nn import Posterior
@@ -247,24 +245,3 @@ def test_a_step_waits_for_the_device_once(stage):
     module.optimizer_step = around(module.optimizer_step)
     train(module, TinyData([False] * 3))
     assert counts == [1, 1, 1]
-
-
-@pytest.mark.parametrize("stage", ["vae_alignment", "joint", "flow_matching"])
-def test_parts_of_a_step_have_the_operations_of_the_step(stage):
-    module, found = stage_module(stage), {}
-
-    def on_train_batch_end(outputs, batch, batch_idx):
-        batch = {**batch, "name": ["a", "b"]}
-        with FlopCounterMode(display=False) as counter:
-            module.training_step(batch, 0).backward()
-        found["step"] = counter.get_total_flops()
-        for name, part in step_parts(module, batch).items():
-            with FlopCounterMode(display=False) as counter:
-                part()
-            found[name] = counter.get_total_flops()
-
-    module.on_train_batch_end = on_train_batch_end
-    train(module)
-    step = found.pop("step")
-    assert step > 0
-    assert sum(found.values()) == step

@@ -1,33 +1,29 @@
-"""What samplers are judged on: a mixture whose velocity is exact, and the SiT of a checkpoint.
+"""What samplers are judged on: a mixture with an exact velocity, and the networks of a checkpoint.
 
-Letters: N scenes or samples, D dimensions, B batch.
+Letters: N scenes or samples, D dimensions.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from r3dpa.bench.front import plain_name
-from r3dpa.bench.hardware import flop_of, peak_memory, synchronise
+from r3dpa.bench.measure import Spent, flop_of, peak_bytes, synchronise, timed
 from r3dpa.bench.mixture import GaussianMixture
-from r3dpa.bench.timing import Spent
+from r3dpa.checkpoints import Checkpoint
 from r3dpa.data import write_bin
-from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import CountingVelocity, heun
+from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, heun
 from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import points_of
-
-__all__ = ["Make", "MixtureProblem", "ModelProblem", "Problem", "Setting", "Solved"]
 
 _SEED = 0
 
@@ -37,220 +33,155 @@ class Setting:
     """One way to sample.
 
     Args:
-        sampler: Solver and steps.
+        sampler: ODE solver, steps and shift.
         precision: Of the networks.
         compiled: Whether they are compiled.
         batch: Scenes computed together.
-        autoguided: Whether a weak snapshot guides.
-        tag: What solver and shift do not tell, such as ``mean``; part of the name.
     """
 
     sampler: SamplerConfig
     precision: Literal["fp32", "bf16"] = "fp32"
     compiled: bool = False
     batch: int = 1
-    autoguided: bool = False
-    tag: str = ""
 
     @property
     def name(self) -> str:
-        """Solver with its settings, without the number of steps."""
-        name = plain_name(self.sampler.solver, self.sampler.shift)
-        return " ".join(filter(None, [name, self.tag, "autoguided" if self.autoguided else ""]))
+        """Solver with its shift, without the number of steps."""
+        solver, shift = self.sampler.solver, self.sampler.shift
+        return solver if shift == 1 else f"{solver} shift {shift:g}"
 
     @property
-    def deterministic(self) -> bool:
-        """Whether noise alone decides the result, so that it can be compared scene by scene."""
-        return self.sampler.solver != "euler_maruyama"
+    def nfe(self) -> int:
+        """Network evaluations per scene."""
+        return evaluations(self.sampler.solver, self.sampler.steps)
 
     @property
     def plain(self) -> Setting:
-        """The same solver without anything that makes it faster."""
+        """The same solver in fp32, not compiled."""
         return replace(self, precision="fp32", compiled=False)
 
 
 class Solved(NamedTuple):
-    """Results of a setting.
-
-    Attributes:
-        latents: ``(N, ...)`` on the CPU.
-        range_m: ``(N, H, W)`` on the CPU; None where there is no decoder.
-        nfe: Evaluations per sample, counted.
-    """
+    """Latents ``(N, ...)`` and range images ``(N, H, W)``, none without a decoder; on the CPU."""
 
     latents: Tensor
     range_m: Tensor | None
-    nfe: int
-
-
-#: A generator of scenes in the precision of a setting, compiled and guided as it says; compiled
-#: ones for its batch. The sampler does not matter. Generators may share their networks.
-Make = Callable[[Setting], SceneGenerator]
-
-
-class Problem(Protocol):
-    """What a benchmark needs to know of a problem."""
-
-    name: str
-    device: torch.device
-
-    def solve(self, setting: Setting, num: int) -> Solved:
-        """Samples 0 to ``num`` - 1, each from its own noise."""
-        ...
-
-    def converged(self, steps: int, num: int) -> Solved:
-        """The same samples by Heun steps with a float64 state."""
-        ...
-
-    def case(self, setting: Setting, folder: Path) -> Callable[[], Spent]:
-        """One batch as a case to be timed; times are per sample."""
-        ...
-
-    def flop(self) -> tuple[float, float]:
-        """FLOP of a sample: of each evaluation, and of everything else."""
-        ...
-
-    def memory(self, setting: Setting) -> int | None:
-        """Peak memory of one batch on a GPU, bytes."""
-        ...
 
 
 class MixtureProblem:
-    """A mixture of Gaussians, whose velocity has no error.
+    """A mixture of Gaussians with its exact velocity; float64, whatever the precision of a setting.
 
     Args:
         mixture: Data.
+        num: Samples that are solved together: one generator draws all noise.
         batch: Samples that are timed together.
     """
 
-    name = "mixture"
-
-    def __init__(self, mixture: GaussianMixture, batch: int = 256) -> None:
-        self.mixture, self.batch = mixture, batch
+    def __init__(self, mixture: GaussianMixture, num: int, batch: int = 256) -> None:
+        self.mixture, self.batch, self._timed_batch = mixture, num, batch
         self.device = mixture.means.device
 
-    def solve(self, setting: Setting, num: int) -> Solved:
-        """Samples in float64 throughout; precision and compilation do not apply."""
+    def solve(self, setting: Setting, indices: range) -> Solved:
+        """Samples of these indices, each from its own noise."""
+        shape = (len(indices), self.mixture.means.shape[1])
         generator = torch.Generator().manual_seed(_SEED)
-        noise = self._draw(num, generator)
-        velocity = CountingVelocity(self.mixture.velocity)
-        latents = setting.sampler.solve(velocity, noise, generator, Interpolant())
-        return Solved(latents, None, velocity.nfe)
+        noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+        times = ode_times(setting.sampler.steps, shift=setting.sampler.shift)
+        solver = ODE_SOLVERS[setting.sampler.solver]
+        return Solved(solver(self.mixture.velocity, noise, times), None)
 
-    def _draw(self, num: int, generator: torch.Generator) -> Tensor:
-        shape = (num, self.mixture.means.shape[1])
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    def converged(self, steps: int, num: int) -> Solved:
-        """Heun's method with the exact velocity."""
-        noise = self._draw(num, torch.Generator().manual_seed(_SEED))
-        velocity = CountingVelocity(self.mixture.velocity)
-        return Solved(heun(velocity, noise, ode_times(steps)), None, velocity.nfe)
+    def converged(self, steps: int, indices: range) -> Solved:
+        """The same samples by Heun's method."""
+        return self.solve(Setting(SamplerConfig("heun", steps)), indices)
 
     def case(self, setting: Setting, folder: Path) -> Callable[[], Spent]:
-        """A batch of samples; nothing is written."""
-
-        def run() -> Spent:
-            start, core = time.perf_counter(), time.process_time()
-            self.solve(setting, self.batch)
-            wall, spent = time.perf_counter() - start, time.process_time() - core
-            return Spent(wall / self.batch, wall / self.batch, spent / self.batch)
-
-        return run
+        """A batch as a case to be timed, times per sample; nothing is written."""
+        run = timed(lambda: self.solve(setting, range(self._timed_batch)))
+        return lambda: run().over(self._timed_batch)
 
     def flop(self) -> tuple[float, float]:
-        """Two matrix products for each evaluation."""
+        """FLOP of a sample: of each evaluation, and of everything else."""
         x = self.mixture.means[:1]
         return flop_of(lambda: self.mixture.velocity(x, torch.ones(1))), 0.0
 
     def memory(self, setting: Setting) -> int | None:
-        """Not known."""
+        """Not measured."""
         return None
 
 
 class ModelProblem:
-    """The SiT and the decoder of a checkpoint.
+    """The velocity network and the decoder of a checkpoint.
 
     Args:
-        make: Generator of scenes for a setting.
+        checkpoint: Of stage joint or flow_matching.
+        device: Where it is computed.
         batch: Scenes that are solved together where nothing is timed.
     """
 
-    name = "model"
-
-    def __init__(self, make: Make, batch: int) -> None:
-        self._make, self._batch = make, batch
-        self._made: dict[Setting, SceneGenerator] = {}
-        self._plain = self._generator(Setting(SamplerConfig("euler", 1)))
+    def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
+        self.batch, self._path = batch, checkpoint.interpolant
+        self._plain = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device=device)
+        self._made = {Setting(SamplerConfig()): self._plain}
         self.device = self._plain.device
-        self.sensor = self._plain.geometry.projection.sensor
 
     def _generator(self, setting: Setting) -> SceneGenerator:
-        """A generator of its own that shares networks, and what was compiled, with others."""
-        kind = replace(
-            setting,
-            sampler=SamplerConfig(),
-            tag="",
-            batch=setting.batch if setting.compiled else 1,
-        )
+        """Generator of its own that shares networks, and what was compiled, with others."""
+        batch = setting.batch if setting.compiled else 1
+        kind, plain = replace(setting, sampler=SamplerConfig(), batch=batch), self._plain
         if kind not in self._made:
-            self._made[kind] = self._make(setting)
+            self._made[kind] = SceneGenerator(
+                plain.vae,
+                plain.sit,
+                plain.latent_norm,
+                plain.geometry,
+                setting.sampler,
+                self._path,
+                setting.precision,
+                batch_size=batch if setting.compiled else None,
+                compile=setting.compiled,
+            )
         return self._made[kind].with_sampler(setting.sampler)
 
-    def solve(self, setting: Setting, num: int) -> Solved:
-        """Scenes as :class:`SceneGenerator` makes them."""
-        generator = self._generator(setting)
-        size = setting.batch if setting.compiled else self._batch
+    def solve(self, setting: Setting, indices: range) -> Solved:
+        """Scenes of these indices as the generator draws them."""
         with _exact_products():
-            parts = [generator.generate(part, _SEED) for part in _batches(num, size)]
-        return Solved(
-            torch.cat([part.latents.cpu() for part in parts]),
-            torch.cat([part.range_m.cpu() for part in parts]),
-            parts[0].nfe,
-        )
+            found = self._generator(setting).generate(indices, _SEED)
+        return Solved(found.latents.cpu(), found.range_m.cpu())
 
     @torch.inference_mode()
-    def converged(self, steps: int, num: int) -> Solved:
-        """The network in float32 without TF32; state in float64."""
-        generator, latents, images = self._plain, [], []
-
-        def velocity(x: Tensor, moment: Tensor) -> Tensor:
-            return generator.sit.velocity(x.float(), moment.float()).double()
-
-        counted = CountingVelocity(velocity)
-        with _exact_products():
-            for part in _batches(num, self._batch):
-                counted.nfe = 0
-                noise = self._noise(part).double()
-                found = heun(counted, noise, ode_times(steps))
-                latents.append(found.cpu())
-                raw = generator.latent_norm.denormalise(found.float())
-                image = generator.vae.decode(raw)[:, 0].float()
-                images.append(generator.geometry.codec.decode(image, self.sensor).cpu())
-        return Solved(torch.cat(latents), torch.cat(images), counted.nfe)
-
-    def _noise(self, indices: Sequence[int]) -> Tensor:
-        sit = self._plain.sit
+    def converged(self, steps: int, indices: range) -> Solved:
+        """The same scenes by Heun's method: network in float32 without TF32, state in float64."""
+        generator, sit = self._plain, self._plain.sit
         shape = (sit.in_channels, *sit.input_size)
         draws = [torch.randn(shape, generator=scene_random(_SEED, i)) for i in indices]
-        return torch.stack(draws).to(self.device)
+        noise = torch.stack(draws).to(self.device)
+
+        def velocity(x: Tensor, moment: Tensor) -> Tensor:
+            return sit.velocity(x.float(), moment.float()).double()
+
+        with _exact_products():
+            found = heun(velocity, noise.double(), ode_times(steps))
+            image = generator.vae.decode(generator.latent_norm.denormalise(found.float()))
+        geometry = generator.geometry
+        range_m = geometry.codec.decode(image[:, 0].float(), geometry.projection.sensor)
+        return Solved(found.cpu(), range_m.cpu())
 
     def case(self, setting: Setting, folder: Path) -> Callable[[], Spent]:
-        """A batch of scenes: sampling and decoder; then copying, points, and ``.bin`` files."""
-        generator, indices, device = self._generator(setting), range(setting.batch), self.device
+        """A batch of scenes: sampling and decoder; then copying, points and ``.bin`` files."""
+        generator, scenes = self._generator(setting), list[Tensor]()
+        indices = range(setting.batch)
+        sampling = timed(
+            lambda: scenes.append(generator.generate(indices, _SEED).range_m), self.device
+        )
 
         def run() -> Spent:
-            clock = _device_clock(device)
-            start, core = time.perf_counter(), time.process_time()
-            scenes = generator.generate(indices, _SEED)
-            device_seconds, core = clock(), time.process_time() - core
-            for index, range_m in enumerate(scenes.range_m.cpu()):
+            scenes.clear()
+            start = time.perf_counter()
+            spent = sampling()
+            for index, range_m in enumerate(scenes[0].cpu()):
                 points = points_of(range_m, generator.geometry.projection)
                 write_bin(folder / f"{index:06d}.bin", points)
-            end = time.perf_counter() - start
-            per = setting.batch
-            on_cpu = device.type == "cpu"
-            return Spent(device_seconds / per, end / per, core / per if on_cpu else None)
+            return spent._replace(end_to_end=time.perf_counter() - start).over(setting.batch)
 
         return run
 
@@ -265,34 +196,19 @@ class ModelProblem:
         return each, counts[0] - each
 
     def memory(self, setting: Setting) -> int | None:
-        """Peak of the tensors while one batch is generated."""
+        """Peak memory of one batch on a GPU, bytes; None on a CPU."""
         if self.device.type != "cuda":
             return None
         generator = self._generator(setting)
-        return peak_memory(lambda: generator.generate(range(setting.batch), _SEED), self.device)
+        torch.cuda.reset_peak_memory_stats(self.device)
+        generator.generate(range(setting.batch), _SEED)
+        synchronise(self.device)
+        return peak_bytes(self.device)
 
 
-def _batches(num: int, size: int) -> list[range]:
-    return [range(first, min(first + size, num)) for first in range(0, num, size)]
+Problem = MixtureProblem | ModelProblem
 
 
 def _exact_products() -> AbstractContextManager[None]:
-    """Float32 convolutions in float32, as matrix products are unless told otherwise."""
+    """Convolutions in float32, as matrix products are by default."""
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
-
-
-def _device_clock(device: torch.device) -> Callable[[], float]:
-    """Starts now; tells the seconds until all work given to the device since then is done."""
-    if device.type != "cuda":
-        start = time.perf_counter()
-        return lambda: time.perf_counter() - start
-    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    synchronise(device)
-    begin.record()
-
-    def stop() -> float:
-        end.record()
-        synchronise(device)
-        return begin.elapsed_time(end) / 1000
-
-    return stop

@@ -1,51 +1,44 @@
-"""What accuracy costs in time: solvers, steps, precision and compilation, from noise to files."""
+"""``r3dpa bench sampling``: what accuracy costs in time, by solver, steps and precision."""
 
 from __future__ import annotations
 
+import json
+import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
+from tqdm import tqdm
 
-from r3dpa.bench.distributions import Distances, SceneDistances, SlicedDistance, verdicts
-from r3dpa.bench.error_budget import Errors, Reference, budget, certified_reference
-from r3dpa.bench.front import (
-    Row,
-    pareto_front,
-    resampled_errors,
-    resampled_seconds,
-    sentences,
-    steps_along,
-)
-from r3dpa.bench.hardware import Peak, control_kernel, peak_of
+from r3dpa.bench.measure import Comparison, Spent, compare, control_kernel, peak_of
 from r3dpa.bench.mixture import toy_mixture
-from r3dpa.bench.problems import Make, MixtureProblem, ModelProblem, Problem, Setting, Solved
-from r3dpa.bench.sampling_report import EVALUATIONS, Found, write_report
-from r3dpa.bench.timing import Controlled, Series, measure
+from r3dpa.bench.problems import MixtureProblem, ModelProblem, Problem, Setting, Solved
+from r3dpa.bench.report import EVALUATIONS, Finding, write_report
+from r3dpa.bench.rows import Errors, Row
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.solvers import steps_for
 from r3dpa.generation import SamplerConfig, Solver
-from r3dpa.io import command, machine, versions
+from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
-__all__ = ["Effort", "run_problem", "sampling", "settings_of"]
-
-#: Solvers of the picture, with the shift of their grids.
+#: Solvers with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
     *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.75), ("ab2", 2.0)),
     *(("ab3", 1.0), ("ab3", 1.5), ("ab3", 2.5), ("dpmpp_2m", 1.75), ("unipc", 1.0)),
 )
 _PRECISION_STEPS = 32
 _BATCH = {"cuda": 64, "cpu": 4}
-_LEAST_SHARE = 0.01
+Advance = Callable[[int], object]  # of a progress bar, by evaluations
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured of a problem.
+    """Amount of work for a problem.
 
     Args:
         samples: Solved by each row.
@@ -53,7 +46,6 @@ class Effort:
         evaluations: NFE of the rows.
         rounds: Of the timing.
         batch: Scenes timed together.
-        resamples: Of the intervals of distances between distributions, at least 40.
     """
 
     samples: int
@@ -61,113 +53,125 @@ class Effort:
     evaluations: tuple[int, ...]
     rounds: int
     batch: int
-    resamples: int = 200
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.samples < 2 or min(self.rounds, self.batch, *self.evaluations, 1) < 1:
+            raise ValueError(
+                "scenes must be at least 2, rounds, batch_size and nfe at least 1, got "
+                f"{self.samples}, {self.rounds}, {self.batch} and {list(self.evaluations)}"
+            )
+        if self.reference_steps < 2 or self.reference_steps % 2 or not self.evaluations:
+            raise ValueError(
+                f"reference_steps must be even and at least 2, got {self.reference_steps}, and nfe "
+                f"must name some, got {list(self.evaluations)}"
+            )
+
+
+_TOY = Effort(1024, 1000, EVALUATIONS, 20, 256)
+_TOY_QUICK = Effort(256, 1000, EVALUATIONS[:-2], 3, 256)
+
+
+class Work:
+    """Pieces of an interrupted run, one file each, for the next run of the same request.
+
+    Args:
+        folder: Where they are; nothing is kept if None.
+        request: Plain values that the pieces depend on.
+
+    Raises:
+        ValueError: If the folder holds pieces of another request.
+    """
+
+    def __init__(self, folder: Path | None = None, request: Any = None) -> None:
+        self.folder = folder
+        text = json.dumps(request)
+        if self.piece("request", lambda: text) != text:
+            raise ValueError(
+                f"{folder} holds unfinished work of other options or another checkpoint: repeat "
+                "the same command to go on, or delete the folder"
+            )
+
+    def piece(self, name: str, make: Callable[[], Any]) -> Any:
+        """What ``make`` returns: tensors, numbers, strings, tuples, lists, dictionaries."""
+        if self.folder is None:
+            return make()
+        path = self.folder / f"{name}.pt"
+        if not path.exists():
+            value = make()
+            with atomic_path(path) as temporary:
+                torch.save(value, temporary)
+        return torch.load(path, weights_only=True)
+
+    def finish(self) -> None:
+        """Deletes the pieces."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder)
 
 
 def sampling(
     out: Path,
-    make: Make | None = None,
-    data: Path | None = None,
+    ckpt: Path | None = None,
     quick: bool = False,
-    scenes: int | None = None,
-    batch_size: int | None = None,
-    rounds: int | None = None,
-    nfe: Sequence[int] | None = None,
-    reference_steps: int | None = None,
-    autoguided: bool = False,
-    about: Mapping[str, Any] | None = None,
-    published: Mapping[str, float] | None = None,
+    effort: Mapping[str, Any] | None = None,
+    device: str = "auto",
 ) -> str:
-    """Measure what accuracy costs in time, for an exact velocity and for a trained model.
+    """Measures what accuracy costs in time, for an exact velocity and for a trained model.
 
-    The folder gets ``sampling.json`` and ``sampling.csv`` (all rows), ``pareto.png`` and
-    ``pareto.html`` (error against seconds), ``pareto_<distance>.png`` where data tell a distance,
-    ``discretisation.png`` (error against NFE), ``summary.md``, and from a model ``quality.json``,
-    as ``r3dpa sample --quality`` reads it.
+    The folder gets ``sampling.json``, ``summary.md``, ``pareto.png`` (error against seconds),
+    ``discretisation.png`` (error against NFE), and from a model ``quality.json``, as ``r3dpa sample
+    --quality`` reads it. An interrupted run of a model goes on with the same call.
 
     Args:
         out: Folder to write.
-        make: Generators of a checkpoint, see :data:`r3dpa.bench.problems.Make`; without one only
-            the mixture of Gaussians is measured, and the summary says so.
-        data: Real scans, a folder or a file of ``r3dpa reference``: distances between
-            distributions are computed, too.
+        ckpt: Checkpoint; only the mixture of Gaussians is measured if None.
         quick: Few scenes, steps and rounds: minutes on a CPU.
-        scenes: Of the model, solved by each row; 256, or 8 with ``quick``.
-        batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
-        rounds: Of the timing; 20, or 3 with ``quick``.
-        nfe: Evaluations of the model's rows; 2 to 256, or 4 to 32 with ``quick``.
-        reference_steps: Heun steps of the model's converged solution, an even number; 1000, or 200
-            with ``quick``.
-        autoguided: Whether ``make`` can guide: one more solver in the picture.
-        about: What a reader must know of the model, such as its name, stage and step.
-        published: Values of other work by the name of the distance.
+        effort: Fields of :class:`Effort` for the model; the usual ones where missing or None.
+        device: Where the model is computed.
 
     Returns:
         Tables, what each further second buys, and where the files are.
 
     Raises:
-        ValueError: If a number is below 1, or the data cannot be used.
+        ValueError: If a number is out of its range, the checkpoint cannot be sampled from, or the
+            folder holds unfinished work of another request.
     """
-    if min(scenes or 2, rounds or 2, batch_size or 2) < 1 or scenes == 1:
-        raise ValueError(
-            f"scenes must be at least 2, rounds and batch_size at least 1, got {scenes}, {rounds} "
-            f"and {batch_size}"
+    device = usable_device(device)
+    kind = device.partition(":")[0]
+    usual = Effort(256, 1000, EVALUATIONS, 20, _BATCH[kind])
+    if quick:
+        usual = Effort(8, 200, EVALUATIONS[1:-3], 3, _BATCH[kind])
+    toy = _TOY_QUICK if quick else _TOY
+    asked = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
+    about, work = {}, Work()
+    problems: dict[str, Callable[[], Finding]] = {
+        # Without a network neither precision nor compilation applies.
+        "mixture": lambda: run_problem(
+            MixtureProblem(toy_mixture(), toy.samples, toy.batch), settings_of(toy, "cpu", ()), toy
         )
-    if nfe is not None and (not nfe or min(nfe) < 1):
-        raise ValueError(f"nfe must be numbers of evaluations, got {list(nfe)}")
-    if reference_steps is not None and (reference_steps < 2 or reference_steps % 2):
-        raise ValueError(f"reference_steps must be even and at least 2, got {reference_steps}")
-    if data is not None and make is None:
-        raise ValueError(f"data {data} tell nothing without a checkpoint to compare with them")
-    found = {}
-    mixture = toy_mixture()
-    effort = _effort("mixture", quick)
-    # A mixture has no network: what changes its speed does not apply.
-    ways = settings_of(effort, "cpu", False, ())
-    distances = SlicedDistance(mixture, effort.samples)
-    found["mixture"] = run_problem(MixtureProblem(mixture, effort.batch), ways, effort, distances)
-    if make is not None:
-        device = make(Setting(SamplerConfig("euler", 1))).device
-        effort = _effort("model", quick, scenes, batch_size or _BATCH[device.type], rounds)
-        if nfe is not None:
-            effort = replace(effort, evaluations=tuple(sorted(set(nfe))))
-        if reference_steps is not None:
-            effort = replace(effort, reference_steps=reference_steps)
-        problem = ModelProblem(make, effort.batch)
-        real = None
-        if data is not None:
-            real = SceneDistances(data, problem.sensor, effort.samples, str(device))
-        kinds = (False,) if quick else (False, True)  # compiling takes minutes
-        ways = settings_of(effort, device.type, autoguided, kinds)
-        found["model"] = run_problem(problem, ways, effort, real)
-    facts = _facts(about, make is not None)
-    return write_report(out, found, facts, dict(published or {}))
+    }
+    if ckpt is not None:
+        checkpoint = read_checkpoint(ckpt)
+        about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
+        model = ModelProblem(checkpoint, device, asked.batch)
+        written = ckpt.stat().st_mtime_ns
+        work = Work(out / "work", [about, written, str(asked), device, quick])
+        ways = settings_of(asked, kind, (False,) if quick else (False, True))
+        problems["model"] = lambda: run_problem(model, ways, asked, work)
+    found = {name: run() for name, run in problems.items()}
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    facts = {
+        "command": command(),
+        "model": about or "none given: the mixture alone",
+        "machine": machine() | {"threads": torch.get_num_threads(), "gpu": gpu},
+        "versions": versions(torch, np),
+    }
+    text = write_report(out, found, facts)
+    work.finish()
+    return text
 
 
-def _effort(
-    problem: Literal["mixture", "model"],
-    quick: bool,
-    scenes: int | None = None,
-    batch: int = 256,
-    rounds: int | None = None,
-) -> Effort:
-    nfes: tuple[int, ...]
-    if problem == "mixture":
-        samples, steps = (256, 1000) if quick else (1024, 1000)
-        nfes = EVALUATIONS[:-2] if quick else EVALUATIONS
-    else:
-        samples, steps = (8, 200) if quick else (256, 1000)
-        nfes = EVALUATIONS[1:-3] if quick else EVALUATIONS
-    rounds = rounds or (3 if quick else 20)
-    return Effort(scenes or samples, steps, nfes, rounds, batch, 40 if quick else 200)
-
-
-def settings_of(
-    effort: Effort,
-    device: str,
-    autoguided: bool,
-    compiled: Sequence[bool],
-) -> list[Setting]:
+def settings_of(effort: Effort, device: str, compiled: Sequence[bool]) -> list[Setting]:
     """All ways to sample that are measured.
 
     On a GPU they run in bf16 and compiled where that is wanted, on a CPU in fp32 as written. AB2
@@ -176,7 +180,6 @@ def settings_of(
     Args:
         effort: Gives NFE and batch.
         device: ``cuda`` or ``cpu``.
-        autoguided: Whether guided rows are wanted.
         compiled: Whether to compile that, or each; none where only the solver matters.
     """
     usual = Setting(SamplerConfig("euler", 1), batch=effort.batch)
@@ -185,18 +188,9 @@ def settings_of(
     ways = []
     for solver, shift in _SOLVERS:
         for count in dict.fromkeys(steps_for(solver, nfe) for nfe in effort.evaluations):
-            sampler = SamplerConfig(solver, count, shift=shift)
-            ways.append(replace(usual, sampler=sampler))
-    for nfe in effort.evaluations:
-        for last in ("mean", "denoise"):
-            sampler = SamplerConfig("euler_maruyama", nfe, sde_last=last)
-            ways.append(replace(usual, sampler=sampler, tag=last))
-    usual = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
-    if autoguided:
-        for steps in (8, _PRECISION_STEPS):
-            sampler = SamplerConfig("ab2", steps, shift=2.0)
-            ways.append(replace(usual, sampler=sampler, autoguided=True))
+            ways.append(replace(usual, sampler=SamplerConfig(solver, count, shift=shift)))
     if compiled:
+        usual = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
         precisions: tuple[Literal["fp32", "bf16"], ...] = ("fp32", "bf16")
         kinds = [(p, c, effort.batch) for p in precisions for c in compiled]
         kinds.append((usual.precision, usual.compiled, 1))
@@ -208,156 +202,149 @@ def settings_of(
 
 
 def run_problem(
-    problem: Problem,
-    ways: Sequence[Setting],
-    effort: Effort,
-    distances: Distances | None = None,
-) -> Found:
-    """Error, time and distance of each way to sample.
+    problem: Problem, ways: Sequence[Setting], effort: Effort, work: Work | None = None
+) -> Finding:
+    """Error and time of each way to sample, with a progress bar of all network evaluations."""
+    work, num, steps = work or Work(), effort.samples, effort.reference_steps
+    solving = sum(way.nfe for way in {*ways, *(way.plain for way in ways)})
+    timing = sum(way.nfe * way.batch for way in ways) * (effort.rounds + 1)
+    total = num * (3 * steps - 2 + solving) + timing
+    # Without a terminal there is no bar.
+    with tqdm(total=total, unit="evaluation", unit_scale=True, desc="bench", disable=None) as bar:
+        exact, self_error = reference(problem, steps, num, work, bar.update)
+        errors = errors_of(problem, ways, exact, work, bar.update)
+        labels = _labels(ways, effort.batch)
+        measured = _timed(problem, dict(zip(labels, ways, strict=True)), effort, work, bar.update)
+    flop = problem.flop()
+    peaks = {way.precision: peak_of(problem.device, way.precision) for way in ways}
+    rows = [
+        Row(
+            label,
+            way,
+            error,
+            measured.series[label],
+            way.nfe * flop[0] + flop[1],
+            peaks[way.precision].flop_s,
+            self_error,
+            problem.memory(way),
+        )
+        for label, way, error in zip(labels, ways, errors, strict=True)
+    ]
+    peak = max(peaks.values(), key=lambda peak: peak.flop_s)
+    return Finding(rows, steps, num, self_error, measured, peak, flop)
 
-    Args:
-        problem: What is sampled.
-        ways: How.
-        effort: How much.
-        distances: From data, where there are any.
-    """
-    reference = certified_reference(problem, effort.reference_steps, effort.samples)
-    prepared: list[Any] = []
 
-    def look(setting: Setting, solved: Solved) -> None:
-        if distances is not None:
-            prepared.append(distances.prepare(solved))
+def _solved(
+    num: int, size: int, solve: Callable[[range], Solved], nfe: int, advance: Advance
+) -> Solved:
+    """Samples in batches."""
+    parts = []
+    for first in range(0, num, size):
+        indices = range(first, min(first + size, num))
+        parts.append(solve(indices))
+        advance(nfe * len(indices))
+    ranges = [part.range_m for part in parts if part.range_m is not None]
+    return Solved(
+        torch.cat([part.latents for part in parts]), torch.cat(ranges) if ranges else None
+    )
 
-    errors = budget(problem, ways, reference, look)
-    labels = _labels(ways, errors, effort.batch)
+
+def reference(
+    problem: Problem, steps: int, num: int, work: Work, advance: Advance
+) -> tuple[Solved, float]:
+    """The converged solution, and the RMSE of its latents from those of half the steps."""
+
+    def solve(count: int, indices: range) -> Solved:
+        name = f"reference_{count}_{indices.start}"
+        return Solved(*work.piece(name, lambda: tuple(problem.converged(count, indices))))
+
+    solved, half = (
+        _solved(num, problem.batch, partial(solve, c), 2 * c - 1, advance)
+        for c in (steps, steps // 2)
+    )
+    return solved, _rmse(solved.latents, half.latents)
+
+
+def errors_of(
+    problem: Problem, ways: Sequence[Setting], exact: Solved, work: Work, advance: Advance
+) -> list[Errors]:
+    """Errors of each setting; those that differ only in speed share their plain companion."""
+    found: dict[int, Errors] = {}
+
+    def solve(way: Setting) -> Solved:
+        size = way.batch if way.compiled else problem.batch
+        num = len(exact.latents)
+        return _solved(num, size, partial(problem.solve, way), way.nfe, advance)
+
+    for sampler in dict.fromkeys(way.sampler for way in ways):
+        companion: list[Solved] = []
+
+        def errors(way: Setting, companion: list[Solved] = companion) -> tuple[Any, ...]:
+            if not companion:
+                companion.append(solve(way.plain))
+            solved = companion[0] if way == way.plain else solve(way)
+            return (
+                _squared(solved.latents, exact.latents).tolist(),
+                _rmse(companion[0].latents, exact.latents),
+                _rmse(solved.latents, companion[0].latents),
+                *_range_errors(solved.range_m, exact.range_m),
+            )
+
+        for index, way in enumerate(ways):
+            if way.sampler == sampler:
+                found[index] = Errors(*work.piece(f"errors_{index}", partial(errors, way)))
+    return [found[index] for index in range(len(ways))]
+
+
+def _squared(a: Tensor, b: Tensor) -> Tensor:
+    return (a.double() - b.double()).flatten(1).square().mean(dim=1)
+
+
+def _rmse(a: Tensor, b: Tensor) -> float:
+    return float(np.sqrt(_squared(a, b).numpy().mean()))
+
+
+def _range_errors(a: Tensor | None, b: Tensor | None) -> tuple[float | None, float | None]:
+    """RMSE in metres over pixels valid in both, and intersection over union of the valid ones."""
+    if a is None or b is None:
+        return None, None
+    both, either = (a > 0) & (b > 0), (a > 0) | (b > 0)
+    if not both.any():
+        return None, 0.0
+    rmse = (a - b)[both].double().square().mean().sqrt().item()
+    return rmse, (both.sum() / torch.clamp(either.sum(), min=1)).item()
+
+
+def _timed(
+    problem: Problem, ways: Mapping[str, Setting], effort: Effort, work: Work, advance: Advance
+) -> Comparison:
+    """Times of all ways; complete rounds are kept."""
+
+    def case(way: Setting, run: Callable[[], Spent]) -> Spent:
+        spent = run()
+        advance(way.nfe * way.batch)
+        return spent
+
+    def keep(number: int, run: Callable[[], Any]) -> Any:
+        found = work.piece(f"round_{number}", lambda: [(c, tuple(spent)) for c, spent in run()])
+        return [(controlled, Spent(*spent)) for controlled, spent in found]
+
     with tempfile.TemporaryDirectory(prefix="r3dpa_bench_") as folder:
         cases = {
-            label: problem.case(way, Path(folder)) for label, way in zip(labels, ways, strict=True)
+            label: partial(case, way, problem.case(way, Path(folder)))
+            for label, way in ways.items()
         }
         control = control_kernel(problem.device)
-        timing = measure(cases, effort.rounds, control, torch.get_num_threads())
-    flop = problem.flop()
-    peaks: dict[str, Peak] = {}
-    for way in ways:
-        if way.precision not in peaks:
-            peaks[way.precision] = peak_of(problem.device, way.precision)
-    metrics = [distances.values(item) for item in prepared] if distances else [{}] * len(ways)
-    rows = tuple(
-        _row(label, way, error, reference, timing.series[label], flop, peaks, values,
-             problem.memory(way))
-        for label, way, error, values in zip(labels, ways, errors, metrics, strict=True)
-    )  # fmt: skip
-    front = _front(rows, errors, timing)
-    told = sentences(
-        [rows[index] for index in front],
-        [rows[index].error or 0.0 for index in front],
-        "the error of the latents",
-    )
-    floors, model, against = {}, {}, {}
-    if distances is not None:
-        floors = distances.floors
-        converged = distances.prepare(reference.solved)
-        model = distances.values(converged)
-        against = {
-            label: verdicts(distances.difference(item, converged, effort.resamples), floors)
-            for label, item in zip(labels, prepared, strict=True)
-        }
-    unsure = tuple(row.label for row in rows if row.converged is False)
-    fastest = max(peaks.values(), key=lambda peak: peak.flop_s)
-    main = distances.main if distances else None
-    return Found(
-        rows, reference, unsure, tuple(front), tuple(told), timing, fastest, flop, floors, model,
-        against, main,
-    )  # fmt: skip
+        return compare(cases, effort.rounds, control, torch.get_num_threads(), keep)
 
 
-def _labels(ways: Sequence[Setting], errors: Sequence[Errors], batch: int) -> list[str]:
-    """Name and NFE; speed only where several rows share them."""
-    plain = [f"{way.name} {error.nfe}" for way, error in zip(ways, errors, strict=True)]
+def _labels(ways: Sequence[Setting], batch: int) -> list[str]:
+    """Name and NFE; precision, compilation and batch only where several rows share them."""
     labels: list[str] = []
-    for label, way in zip(plain, ways, strict=True):
-        extra = ""
-        if plain.count(label) > 1 and label in labels:
-            extra = f" {way.precision}{' compiled' if way.compiled else ''}"
-            extra += f" batch {way.batch}" if way.batch != batch else ""
-        labels.append(label + extra)
+    for way in ways:
+        label = f"{way.name} {way.nfe}"
+        if label in labels:
+            label += f" {way.precision}{' compiled' if way.compiled else ''}"
+            label += f" batch {way.batch}" if way.batch != batch else ""
+        labels.append(label)
     return labels
-
-
-def _row(
-    label: str,
-    way: Setting,
-    error: Errors,
-    reference: Reference,
-    series: Series,
-    flop: tuple[float, float],
-    peaks: Mapping[str, Peak],
-    metrics: dict[str, float],
-    memory: int | None,
-) -> Row:
-    taken = series.of_kept(series.device)
-    seconds = median(taken)
-    interval = None
-    if error.squared is not None:
-        low, high = np.quantile(resampled_errors(error.squared[None])[0], [0.025, 0.975]).tolist()
-        interval = (low, high)
-    work = error.nfe * flop[0] + flop[1]
-    rate = work / seconds
-    share = rate / peaks[way.precision].flop_s
-    lower, upper = np.quantile(taken, [0.25, 0.75]).tolist()
-    return Row(
-        label,
-        way.name,
-        way.sampler.solver,
-        way.sampler.steps,
-        way.sampler.shift,
-        error.nfe,
-        way.precision,
-        way.compiled,
-        way.batch,
-        error.rmse,
-        interval,
-        error.discretisation,
-        error.precision if way != way.plain else None,
-        error.range_rmse_m,
-        error.mask_iou,
-        None if error.rmse is None else reference.certifies(error.rmse),
-        seconds,
-        (lower, upper),
-        median(series.of_kept(series.end_to_end)),
-        series.enough,
-        work,
-        rate,
-        share,
-        _suspicion(share),
-        memory,
-        metrics,
-    )
-
-
-def _suspicion(share: float) -> str:
-    if share > 1:
-        return "above the peak: time or FLOP is wrong"
-    return "below 1 % of the peak: bound by something else" if share < _LEAST_SHARE else ""
-
-
-def _front(rows: Sequence[Row], errors: Sequence[Errors], timing: Controlled) -> list[int]:
-    """Indices of the rows with an error that buy something for their time."""
-    known = [
-        (index, error.squared) for index, error in enumerate(errors) if error.squared is not None
-    ]
-    spread = resampled_errors(np.stack([squared for _, squared in known]))
-    series = [timing.series[rows[index].label] for index, _ in known]
-    seconds = resampled_seconds([taken.of_kept(taken.device) for taken in series])
-    front = pareto_front(seconds, spread, timing.tolerance)
-    return [known[place][0] for place in steps_along(seconds, spread, front)]
-
-
-def _facts(about: Mapping[str, Any] | None, has_model: bool) -> dict[str, Any]:
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "command": command(),
-        "model": dict(about or {}) if has_model else "none given: the mixture alone",
-        "machine": machine() | {"threads": torch.get_num_threads(), "gpu": gpu},
-        "versions": versions(torch, np),
-    }

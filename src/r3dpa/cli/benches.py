@@ -31,77 +31,54 @@ def bench_training(
         precision: Precision as the Trainer names it.
         device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
         out: JSON file for the same figures.
-        quick: The demo's networks, with memory format, precision and fused optimiser compared.
+        quick: The demo's networks.
     """
     from r3dpa.bench.training import StepSettings, training
 
     check_file(out)
-    print_text(
-        training(conf, stages, StepSettings(batch_size, steps, precision, device), out, quick)
-    )
+    settings = StepSettings(batch_size, steps, precision, device, quick)
+    print_text(training(conf, stages, settings, out))
 
 
 def bench_sampling(
     out: Path,
     ckpt: Path | None = None,
-    data: Path | None = None,
     quick: bool = False,
     scenes: int | None = None,
     batch_size: int | None = None,
     rounds: int | None = None,
     nfe: list[int] | None = None,
     reference_steps: int | None = None,
-    autoguidance: Path | None = None,
-    guidance_scale: float = 2.0,
-    allow_other_latents: bool = False,
     device: str = "auto",
 ) -> None:
     """Measure what accuracy costs in time, for an exact velocity and a trained model; draw it.
+
+    Interrupted, the same command goes on.
 
     Args:
         out: Folder for tables, pictures and ``quality.json``.
         ckpt: Checkpoint of stage joint or flow_matching; without one only a mixture of Gaussians
             whose velocity is exact.
-        data: Real scans, a folder or a file of ``r3dpa reference``, to compare the scenes with.
         quick: Few scenes, steps and rounds: minutes on a CPU.
         scenes: Solved by each way to sample; 256, or 8 with ``--quick``.
         batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
         rounds: Of the timing; 20, or 3 with ``--quick``.
         nfe: Network evaluations a scene; 2 to 256, or 4 to 32 with ``--quick``.
-        reference_steps: Heun steps of the converged solution; 1000, or 200 with ``--quick``.
-        autoguidance: Snapshot of a weaker model: one more way is guided away from it.
-        guidance_scale: Strength of autoguidance.
-        allow_other_latents: Accept a snapshot whose latents are only about the same.
+        reference_steps: Heun steps of the converged solution, an even number; 1000, or 200 with
+            ``--quick``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     from r3dpa.bench.sampling import sampling
 
     check_folder(out)
-    make, about = None, None
-    if ckpt is not None:
-        from r3dpa.cli.scenes import WeakGuide, generators_of
-
-        guide = None
-        if autoguidance is not None:
-            guide = WeakGuide(autoguidance, guidance_scale, (0.0, 1.0), allow_other_latents)
-        make, about = generators_of(ckpt, guide, device)
-    elif autoguidance is not None:
-        raise ValueError("--autoguidance belongs to a model; give its --ckpt")
-    print_text(
-        sampling(
-            out,
-            make,
-            data,
-            quick,
-            scenes=scenes,
-            batch_size=batch_size,
-            rounds=rounds,
-            nfe=nfe,
-            reference_steps=reference_steps,
-            autoguided=autoguidance is not None,
-            about=about,
-        )
-    )
+    effort = {
+        "samples": scenes,
+        "reference_steps": reference_steps,
+        "evaluations": None if nfe is None else tuple(sorted(set(nfe))),
+        "rounds": rounds,
+        "batch": batch_size,
+    }
+    print_text(sampling(out, ckpt, quick, effort, device))
 
 
 BENCHES: dict[str, Callable[..., None]] = {

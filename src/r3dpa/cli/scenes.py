@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -27,13 +27,9 @@ from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import source_commit, usable_device
 
-if TYPE_CHECKING:
-    from r3dpa.bench.problems import Setting
-
 __all__ = [
     "WeakGuide",
     "draw_scene",
-    "generators_of",
     "report",
     "sample",
     "written",
@@ -69,35 +65,6 @@ def _autoguidance(
     }
     sit, shift = weak.sit.to(device), weak.shift.to(device)
     return Autoguidance(sit, guide.scale, guide.interval, weak.scale, shift), about
-
-
-def generators_of(
-    ckpt: Path, guide: WeakGuide | None, device: str
-) -> tuple[Callable[[Setting], SceneGenerator], dict[str, Any]]:
-    """Generators of a checkpoint as ``r3dpa bench sampling`` wants them, and what it is.
-
-    All share the networks that are read here.
-    """
-    device = usable_device(device)
-    checkpoint = read_checkpoint(ckpt)
-    plain = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device=device)
-    guidance = None if guide is None else _autoguidance(checkpoint, guide, "ema", device)[0]
-
-    def make(setting: Setting) -> SceneGenerator:
-        return SceneGenerator(
-            plain.vae,
-            plain.sit,
-            plain.latent_norm,
-            plain.geometry,
-            setting.sampler,
-            checkpoint.interpolant,
-            setting.precision,
-            autoguidance=guidance if setting.autoguided else None,
-            batch_size=setting.batch if setting.compiled else None,
-            compile=setting.compiled,
-        )
-
-    return make, {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
 
 
 def sample(

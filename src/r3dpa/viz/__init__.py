@@ -19,6 +19,7 @@ from r3dpa.viz.features import (
 )
 from r3dpa.viz.figures import birds_eye_view, reconstruction_figure, scenes_sheet
 from r3dpa.viz.page import Category, PageScan, scan_page
+from r3dpa.viz.pareto import ParetoPoint, discretisation_figure, pareto_figure
 from r3dpa.viz.pixels import save
 from r3dpa.viz.scans import birds_eye_picture, encoded_picture, range_image_picture, scene_3d
 from r3dpa.viz.sheets import birds_eye_sheet, range_strips
@@ -29,11 +30,13 @@ __all__ = [
     "FeatureColours",
     "MatchedPair",
     "PageScan",
+    "ParetoPoint",
     "Series",
     "bev_histograms",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
+    "discretisation_figure",
     "edit_page",
     "edit_sheet",
     "encoded_picture",
@@ -42,6 +45,7 @@ __all__ = [
     "latents_picture",
     "loss_curves",
     "matches_figure",
+    "pareto_figure",
     "pca_colours",
     "range_histogram",
     "range_image_picture",

@@ -35,7 +35,7 @@ from official_runs import (
 from official_step import train_ours
 from torch import Tensor, nn
 
-from r3dpa.bench.timing import Comparison, compare
+from r3dpa.bench.measure import Comparison, compare
 from r3dpa.checkpoints import Checkpoint, save_checkpoint, to_official
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.scans import read_scan
@@ -102,7 +102,7 @@ class OfficialSettings:
         return _CLOCKS[self.clock]
 
     def timed(self, function: Callable[[], object]) -> Callable[[], float]:
-        """The function as a case of :func:`r3dpa.bench.timing.compare` on this clock."""
+        """The function as a case of :func:`r3dpa.bench.measure.compare` on this clock."""
 
         def run() -> float:
             start = self.now()

@@ -1,0 +1,182 @@
+"""Files, table, pictures and advice of ``r3dpa bench sampling``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+from r3dpa import viz
+from r3dpa.bench.measure import Comparison, Peak
+from r3dpa.bench.rows import Row, duration, front_of, quality_levels, sentences
+from r3dpa.checkpoints.networks import format_table
+from r3dpa.io import atomic_path, one_line
+
+#: NFE of the rows where there is time for all; the picture shows the least time of each.
+EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
+
+_TITLES = {
+    "mixture": "exact velocity of 128 Gaussians in 64 dimensions",
+    "model": "trained model",
+}
+
+
+class Finding(NamedTuple):
+    """All figures of one problem.
+
+    Attributes:
+        rows: All ways to sample.
+        steps: Heun steps of the converged solution.
+        samples: Scenes of it.
+        self_error: Its RMSE from the solution of half the steps.
+        timing: Times of the rows, by label.
+        peak: Of the device, in the fastest precision of the rows.
+        flop: Of one evaluation, and of everything else of a scene.
+    """
+
+    rows: Sequence[Row]
+    steps: int
+    samples: int
+    self_error: float
+    timing: Comparison
+    peak: Peak
+    flop: tuple[float, float]
+
+
+def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any]) -> str:
+    """Writes all files; returns the text of the summary."""
+    content = facts | {"problems": {name: _record(part) for name, part in found.items()}}
+    _write(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    name = "model" if "model" in found else "mixture"
+    viz.save(_picture(name, found[name]), out / "pareto.png")
+    panels = {_TITLES[key]: _points(part.rows) for key, part in found.items()}
+    unsure = {_TITLES[key]: part.self_error for key, part in found.items()}
+    viz.save(viz.discretisation_figure(panels, unsure), out / "discretisation.png")
+    tail = ["no checkpoint was given: all figures are of the mixture, none of a model"]
+    if "model" in found:
+        levels = quality_levels(found[name].rows)
+        where = f"{facts['machine']['gpu'] or facts['machine']['cpu']}, {one_line(facts['model'])}"
+        table = {"levels": levels, "measured_on": where}
+        _write(out / "quality.json", json.dumps(table, indent=2, allow_nan=False) + "\n")
+        tail = [
+            f"quality {level}: {choice['solver']}, {choice['steps']} steps, shift "
+            f"{choice['shift']:g} (error {choice['error']:.3g}, {choice['seconds_share']:.0%} of "
+            "the time of best)"
+            for level, choice in levels.items()
+        ]
+    tail += [f"{key}: {one_line(values)}" for key, values in facts.items()]
+    lines = ["# What accuracy costs in time", "", "![Pareto front](pareto.png)", ""]
+    for key, part in found.items():
+        told = sentences(front_of(part.rows, part.timing.tolerance))
+        lines += [f"## {_TITLES[key]}", "", "What each further second buys:", ""]
+        lines += [*(f"- {sentence}" for sentence in told), "", "```", _table(part), *_notes(part)]
+        lines += ["```", ""]
+    _write(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
+    files = sorted(path.name for path in out.iterdir() if path.is_file())
+    return "\n".join([*lines[4:], *tail, f"files: {', '.join(files)}"])
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _record(found: Finding) -> dict[str, Any]:
+    """Plain values, without samples."""
+    front = front_of(found.rows, found.timing.tolerance)
+    unsure = [row.label for row in found.rows if not row.converged]
+    return {
+        "rows": [row.record() for row in found.rows],
+        "reference": {
+            "solver": "heun",
+            "steps": found.steps,
+            "samples": found.samples,
+            "self_error": found.self_error,
+            "certified": not unsure,
+            "not_converged": unsure,
+        },
+        "front": [row.label for row in front],
+        "sentences": sentences(front),
+        "timing": {
+            "dropped_share": found.timing.dropped,
+            "a_a": asdict(found.timing.repeat),
+            "sound": found.timing.sound,
+        },
+        "peak": asdict(found.peak),
+        "flop": {"evaluation": found.flop[0], "rest": found.flop[1]},
+    }
+
+
+def _picture(name: str, found: Finding) -> Figure:
+    """Error against time, with the least time of some NFE at the peak of the device."""
+    front = front_of(found.rows, found.timing.tolerance)
+    bf16 = [row for row in found.rows if row.way.precision == "bf16" and row.precision_error]
+    counts = sorted({row.way.nfe for row in found.rows if row.way.nfe in EVALUATIONS})
+    return viz.pareto_figure(
+        f"What accuracy costs in time: {_TITLES[name]}",
+        "RMSE of the latents from the converged solution",
+        _points(found.rows),
+        _points(front),
+        {"bf16 against fp32": bf16[0].precision_error or 0.0} if bf16 else {},
+        {nfe: (nfe * found.flop[0] + found.flop[1]) / found.peak.flop_s for nfe in counts},
+        sentences(front),
+    )
+
+
+def _points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
+    return [
+        viz.ParetoPoint(
+            row.label,
+            row.way.name,
+            row.way.nfe,
+            row.seconds,
+            row.error,
+            row.interval,
+            filled=row.way.precision == "bf16",
+        )
+        for row in rows
+        if row.error > 0
+    ]
+
+
+def _table(found: Finding) -> str:
+    """All rows."""
+    lines = []
+    for record in (row.record() for row in found.rows):
+        values = (record[key] for key in ("error", "precision_error", "range_rmse_m", "mask_iou"))
+        error, *others = ("-" if value is None else f"{value:.3g}" for value in values)
+        memory = record["memory_bytes"]
+        lines.append(
+            [
+                record["label"],
+                str(record["nfe"]),
+                error + ("" if record["converged"] else " ?"),
+                *others,
+                duration(record["seconds"]) + ("" if record["quiet"] else " ~"),
+                duration(record["end_to_end"]),
+                f"{record['flop'] / 1e9:.3g}",
+                f"{record['flop_s'] / 1e12:.3g}",
+                f"{record['peak_share']:.1%}",
+                "-" if memory is None else f"{memory / 2**30:.2f}",
+            ]
+        )
+    header = ["row", "NFE", "error", "precision", "range m", "IoU", "device s", "end to end"]
+    return format_table([*header, "GFLOP", "TFLOP/s", "of peak", "GPU GiB"], lines)
+
+
+def _notes(found: Finding) -> list[str]:
+    """Conditions of the measurement that a reader of the table needs."""
+    return [
+        f"error: RMSE from Heun-{found.steps} of {found.samples} samples, itself "
+        f"{found.self_error:.3g} from half its steps; ?: too small for that reference",
+        f"timing: {found.timing.dropped:.0%} of the measurements dropped by rule; first row over "
+        f"itself {found.timing.repeat}"
+        + ("" if found.timing.sound else ": the machine was too busy, claim nothing"),
+        "~: more than half of the rounds were disturbed, and all of them count",
+        f"peak {found.peak.flop_s / 1e12:.3g} TFLOP/s ({found.peak.source}); "
+        f"{found.flop[0] / 1e9:.3g} GFLOP an evaluation, {found.flop[1] / 1e9:.3g} the rest",
+    ]

@@ -1,0 +1,118 @@
+"""Interleaved timing: order, ratios with intervals, dropping rule, A/A check; FLOP and peak."""
+
+from __future__ import annotations
+
+import time
+from itertools import cycle
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.bench.measure import Ratio, Spent, compare, flop_of, peak_bytes, peak_of, timed
+
+
+def case(seconds, core=None):
+    values = cycle(seconds)
+    return lambda: Spent((s := next(values)), s, core)
+
+
+class TestCompare:
+    def test_runs_there_and_back_and_leaves_the_first_round_out(self):
+        calls = []
+
+        def noted(name, seconds):
+            run = case(seconds)
+            return lambda: calls.append(name) or run()
+
+        # "a" is also the repeated case: two of its times belong to each round.
+        cases = {"a": noted("a", [99, 99, 2, 4, 6, 8]), "b": noted("b", [99, 6, 12])}
+        found = compare(cases, rounds=2)
+        assert calls == ["a", "b", "a", *["a", "b", "a"], *["a", "b", "a"]]
+        # Backwards in the first round that counts: the repeat comes first there.
+        assert found.series["a"].device == (4, 6)
+        assert found.series["b"].device == (6, 12)
+        assert found.series["b"].seconds == 9
+        assert found.over_first("b").value == pytest.approx(9 / 5)
+        assert found.repeat.value == pytest.approx(5 / 5)
+        assert found.summary()["ms"] == {"a": 5000, "b": 9000}
+
+    def test_kept_rounds_are_not_run_again(self):
+        calls = []
+        kept = {1: [(1.0, Spent(1, 1)), (1.0, Spent(2, 2)), (1.0, Spent(1, 1))]}
+
+        def keep(number, run):
+            return kept[number] if number in kept else run()
+
+        cases = {"a": lambda: calls.append(1) or Spent(3, 3), "b": case([6.0])}
+        found = compare(cases, 2, keep=keep)
+        assert len(calls) == 2 * 2  # warm-up and the second round
+        assert found.series["b"].device == (2, 6)
+
+    def test_measurements_after_an_unusual_control_are_dropped(self):
+        """Three measurements a round (a, b, a again), the warm-up first.
+
+        The control is 10 % slow before "b" in its second of three rounds, and 4 % in the third.
+        """
+        usual, slow, near = 1.0, 1.1, 1.04
+        controls = case([usual] * 3 + [usual] * 3 + [usual, slow, usual] + [usual, near, usual])
+        found = compare({"a": case([1.0]), "b": case([7.0, 2.0, 9.0, 4.0])}, 3, controls)
+        assert found.series["a"].kept == (True, True, True)
+        assert found.series["b"].kept == (True, False, True)
+        assert found.series["b"].of_kept(found.series["b"].device) == [2.0, 4.0]
+        assert found.series["b"].seconds == 3
+        assert found.over_first("b").value == 3
+        assert found.dropped == pytest.approx(1 / 9)
+        assert found.sound
+
+    def test_steal_drops_measurements_of_one_thread(self):
+        stolen = case([1.0], core=0.8)
+        found = compare({"a": stolen}, 2, case([1.0]), threads=1)
+        assert found.dropped == 1
+        assert not found.series["a"].enough
+        assert found.series["a"].kept == (True, True)  # what is left would tell nothing
+        assert found.series["a"].device == (0.8, 0.8)  # the processor's own time
+        several = compare({"a": stolen}, 2, case([1.0]), threads=2)
+        assert several.dropped == 0
+        assert several.series["a"].device == (1.0, 1.0)
+
+    def test_a_case_that_differs_from_itself_is_not_sound(self):
+        """Its two runs of a round take 1 s and 2 s; every second round goes backwards."""
+        slower = case([1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 2.0, 1.0])
+        found = compare({"a": slower}, 4, case([1.0]))
+        assert not found.sound
+        assert found.tolerance >= 0.5
+
+    def test_interval_of_a_ratio(self):
+        noise = np.random.default_rng(0).uniform(0.9, 1.1, (2, 50))
+        ratio = Ratio.of((3 * noise[0]).tolist(), noise[1].tolist())
+        assert ratio.value == pytest.approx(np.median(3 * noise[0]) / np.median(noise[1]))
+        assert 2.7 < ratio.low < ratio.value < ratio.high < 3.3
+        # Rounds are drawn together: what slows both down does not widen the interval.
+        shared = Ratio.of((3 * noise[0]).tolist(), noise[0].tolist())
+        assert (shared.low, shared.high) == pytest.approx((3, 3))
+
+    def test_timed_takes_the_time_of_the_function(self):
+        spent = timed(lambda: time.sleep(0.01))()
+        assert 0.01 < spent.device == spent.end_to_end < 1
+        assert spent.core < 0.01
+        assert Spent(4.0, 8.0, 2.0).over(4) == (1, 2, 0.5)
+
+
+class TestWork:
+    def test_flop_of_a_product_and_of_attention(self):
+        """Attention: two products of (4 x 8) and (8 x 4), 2 heads."""
+        a, b, q = torch.ones(3, 5), torch.ones(5, 7), torch.ones(1, 2, 4, 8)
+        assert flop_of(lambda: a @ b) == 2 * 3 * 5 * 7
+        attention = torch.nn.functional.scaled_dot_product_attention
+        assert flop_of(lambda: attention(q, q, q)) == 2 * 2 * (2 * 4 * 8 * 4)
+
+    def test_a_processor_is_measured(self, one_thread):
+        peak = peak_of(torch.device("cpu"), "fp32")
+        assert peak.source == "measured"
+        assert 1e8 < peak.flop_s < 1e13
+
+    def test_peak_memory_grows_with_what_is_held(self):
+        before = peak_bytes(torch.device("cpu"))
+        held = torch.ones(2**26)  # 256 MiB; the peak may have been higher already
+        assert peak_bytes(torch.device("cpu")) >= max(before, held.nbytes)

@@ -1,0 +1,67 @@
+"""Sizes of the networks in conf/net, and parameter counts of the SiT sizes of the paper."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from r3dpa.nn import SiT
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "xl": (1152, 28, 16)}
+LATENTS = {
+    "vae_h2p4d8": (8, 16, 128),
+    "vae_h1p4d4": (4, 16, 256),
+    "vae_h16d4": (4, 64, 64),
+    "vae_h16p2d16": (16, 32, 32),
+}
+
+
+def build(name):
+    """Network of conf/net without memory for its weights."""
+    config = yaml.safe_load((CONF / "net" / f"{name}.yaml").read_text())
+    module, _, kind = config["class_path"].rpartition(".")
+    with torch.device("meta"):
+        return getattr(import_module(module), kind)(**config["init_args"])
+
+
+def count(network):
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def test_parameters_of_the_paper_configuration():
+    sit, vae = build("sit_b2"), build("vae_h2p4d8")
+    with_position = count(sit) + sit.pos_embed.numel()
+    assert with_position == 137_298_208
+    assert with_position - count(sit.projector) == 129_953_312
+    assert count(vae) == 59_660_649
+    assert (sit.in_channels, *sit.input_size) == LATENTS["vae_h2p4d8"]
+
+
+@pytest.mark.parametrize("patch", [1, 2, 4, 8])
+@pytest.mark.parametrize("size", SIZES)
+def test_sit_sizes(size, patch):
+    width, depth, num_heads = SIZES[size]
+    with torch.device("meta"):
+        sit = SiT(hidden_size=width, depth=depth, num_heads=num_heads, patch_size=patch)
+    values = 8 * patch**2  # of one token
+    block = 18 * width**2 + 15 * width  # qkv 3, output 1, MLP 4 + 4, modulation 6
+    embedders = values * width + width + 256 * width + width + width**2 + width + width
+    head = 2 * width**2 + 2 * width + width * values + values
+    projector = width * 2048 + 2048 + 2048**2 + 2048 + 2048 * 768 + 768
+    assert count(sit) == depth * block + embedders + head + projector
+    assert sit.grid_size == (16 // patch, 128 // patch)
+
+
+@pytest.mark.parametrize("name", LATENTS)
+def test_vae_config(name):
+    vae = build(name)
+    image = torch.empty(1, 1, 64, 1024, device="meta")
+    latents = vae.encode(image).mean
+    assert latents.shape == (1, *LATENTS[name])
+    assert (vae.latent_channels, *vae.latent_size((64, 1024))) == LATENTS[name]
+    assert vae.decode(latents).shape == image.shape
