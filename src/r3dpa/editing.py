@@ -35,8 +35,8 @@ class EditSettings:
     """How latents are carried to noise and back.
 
     Args:
-        solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. From data to noise and back, midpoint steps
-            lose least by far for their evaluations.
+        solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. Midpoint steps have by far the smallest
+            round-trip error per evaluation.
         steps: Solver steps of a whole way.
         shift: Finer steps near noise (above 1) or data (below 1).
         strength: Length of the guidance term in velocities, in [0, 1]; 0 for none.
@@ -53,7 +53,6 @@ class EditSettings:
     window: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check name and numbers."""
         if self.solver not in ODE_SOLVERS:
             raise ValueError(
                 f"edits need a solver that runs both ways, one of {', '.join(ODE_SOLVERS)}; got "
@@ -102,13 +101,12 @@ class EditResult(SceneBatch):
 class SceneEditor:
     """Edits scans with the networks of a generator.
 
-    The random numbers of a scene are a function of (seed, index) alone, as in the generator: it
-    does not depend, up to rounding, on those it is made with. The solver of the generator is not
-    used.
+    The random numbers of a scene are a function of (seed, index) alone, as in the generator. The
+    solver of the generator is not used.
 
     Args:
-        generator: Networks and geometry; float32. Their weights no longer require gradients:
-            guided edits would keep what those of the weights need.
+        generator: Networks and geometry; float32. Their weights no longer require gradients, which
+            guided edits would store activations for.
         settings: Solver and guidance.
         batch_size: Scenes made together.
 
@@ -170,10 +168,10 @@ class SceneEditor:
         start: float = 1.0,
         dilation: int = 0,
     ) -> EditResult:
-        """Generate what lies in a mask anew, guided towards an object.
+        """Generate the inside of a mask anew, guided towards an object.
 
         The scan is inverted, the tokens that the mask touches get fresh noise, and on the way back
-        all others are put where they were. Pixels outside the mask are those of the scan.
+        all others are restored after every step. Pixels outside the mask are those of the scan.
 
         Source: R3DPA (ICRA 2026), object inpainting; there the other tokens are not put back.
 
@@ -182,13 +180,9 @@ class SceneEditor:
             pixel_mask: ``(H, W)`` bool, True where the scan is to change.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
-            feature: ``(F,)`` feature of the object; no guidance where None.
-            start: Time that the way back starts from, in (0, 1]; below 1 some of what was there
-                stays.
+            feature: ``(F,)`` feature of the object. Default: no guidance.
+            start: Time that the way back starts from, in (0, 1]; below 1 part of the content stays.
             dilation: Rings of tokens around those of the mask that are generated anew too.
-
-        Returns:
-            One scene per index.
 
         Raises:
             ValueError: If the mask is empty or full, in tokens too, or a shape does not fit.
@@ -239,9 +233,6 @@ class SceneEditor:
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
 
-        Returns:
-            One scene per index.
-
         Raises:
             ValueError: If the shapes do not fit each other or the network.
         """
@@ -266,7 +257,7 @@ class SceneEditor:
         *,
         start: float = 0.3,
     ) -> EditResult:
-        """Fill what a scan lacks: a sector, beams, or any pixels.
+        """Fill missing pixels of a scan: a sector, beams, or any others.
 
         Plug-and-play with the flow as denoiser, in latents: the encoder sees the scan with its
         gaps interpolated; then, at every time t from ``start`` down, the latents x get
@@ -274,22 +265,19 @@ class SceneEditor:
         1. some steps of Adam on the absolute error, smoothed at 0, of the decoded known pixels,
         2. fresh noise and the expected data, ``x <- D((1 - t) x + t noise, t)``.
 
-        The decoded image is brought to agree with known beams nearby, see
+        The decoded image is adjusted to known beams nearby, see
         :func:`r3dpa.geometry.gaps.refined`. Known pixels are those of the scan. Tokens cannot be
-        put back as :meth:`inpaint` does: with missing beams none is known, and the encoder would
+        restored as in :meth:`inpaint`: with missing beams none is known, and the encoder would
         spread empty pixels over all latents.
 
         Source: PnP-Flow (Martin et al. 2025), alg. 3, with the data term behind the decoder.
 
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
-            missing: ``(H, W)`` bool; what the scan holds there is not used.
+            missing: ``(H, W)`` bool; the scan is not read there.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
-            start: First time, in (0, 1]; 1 forgets the interpolation, which small gaps do not need.
-
-        Returns:
-            One scene per index; ``nfe`` counts the velocity network, not the decoder.
+            start: First time, in (0, 1]; 1 discards the interpolation, which only large gaps need.
 
         Raises:
             ValueError: If the mask is empty or full.
@@ -336,10 +324,7 @@ class SceneEditor:
             range_m: ``(H, W)`` metres, -1 without a return.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
-            start: Time of the noise, in (0, 1]; the more the less like the scan.
-
-        Returns:
-            One scene per index.
+            start: Time of the noise, in (0, 1]; larger values keep less of the scan.
 
         Raises:
             ValueError: If ``start`` is outside.
@@ -357,16 +342,13 @@ class SceneEditor:
 
     @torch.no_grad()
     def interpolate(self, first_m: Tensor, second_m: Tensor, frames: int) -> EditResult:
-        """Scenes on the way from one scan to another, on the arc between their noises.
+        """Scenes between two scans, on the arc between their noises.
 
         Args:
-            first_m: ``(H, W)`` metres, -1 without a return; the first frame is what of it comes
-                back from noise.
+            first_m: ``(H, W)`` metres, -1 without a return; the first frame is its round trip
+                through noise.
             second_m: Likewise, the last frame.
             frames: How many, at least 2.
-
-        Returns:
-            One scene per frame; ``nfe`` holds an inversion for each.
 
         Raises:
             ValueError: If there are fewer than 2 frames.
@@ -425,10 +407,6 @@ class SceneEditor:
             relative=True,
             interval=self.settings.window,
         )
-
-    def _parts(self, indices: Sequence[int]) -> Iterator[Sequence[int]]:
-        for first in range(0, len(indices), self.batch_size):
-            yield indices[first : first + self.batch_size]
 
     def _draws(self, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
         """Noise after noise ``(B, C, h, w)`` for scenes, drawn on the CPU."""

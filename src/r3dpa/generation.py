@@ -68,12 +68,8 @@ class SceneBatch:
 class Autoguidance:
     """Guidance away from a weaker model, see :func:`r3dpa.flow.autoguided`.
 
-    Args:
-        weak: Its SiT, on the device of the other networks.
-        scale: Strength, at least 1.
-        interval: First and last time that is guided.
-        latent_scale: Its latents are ``latent_scale * latents + latent_shift``.
-        latent_shift: ``(C,)``, on the same device.
+    ``weak`` and ``latent_shift`` ``(C,)`` are on the device of the other networks; the latents of
+    the weak model are ``latent_scale * latents + latent_shift``.
     """
 
     weak: VelocityNetwork
@@ -159,6 +155,7 @@ class SceneGenerator:
         self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
+        self._velocity = self._guided()
         self._scheduled: SamplerConfig | None = None
 
     @classmethod
@@ -234,17 +231,13 @@ class SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
         other = copy.copy(self)
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
+        other._velocity = other._guided()
         other.sampler, other._scheduled = sampler, None
         return other
 
     @torch.inference_mode()
     def prepare(self) -> None:
-        """Does the set-up of the first scene and checks the sampler.
-
-        Raises:
-            ValueError: If the numbers of the solver do not fit together.
-            ImportError: If a package that the solver needs is missing.
-        """
+        """Does the set-up of the first scene; raises the errors of :meth:`SamplerConfig.solve`."""
         self._schedule()
 
     @torch.inference_mode()
@@ -318,9 +311,10 @@ class SceneGenerator:
         self._scheduled = self.sampler
 
     def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
-        return self.sampler.solve(self._velocity(), noise, draws, self.interpolant)
+        return self.sampler.solve(self._velocity, noise, draws, self.interpolant)
 
-    def _velocity(self) -> Velocity:
+    def _guided(self) -> Velocity:
+        """Velocity of the solver; made once, since ``renormalised`` reads the shift."""
         guidance = self._autoguidance
         if guidance is None or self._weak is None:
             return self._strong
