@@ -68,11 +68,7 @@ class EditSettings:
             )
 
     def times(self, start: float) -> Tensor:
-        """Times from ``start`` in (0, 1] to the data.
-
-        Raises:
-            ValueError: If ``start`` is outside, there is no step, or the shift is not above 0.
-        """
+        """Times from ``start`` in (0, 1] to the data."""
         if not 0 < start <= 1:
             raise ValueError(
                 f"start must be a time above 0 (the scan as it is) up to 1 (noise), got {start:g}"
@@ -139,12 +135,7 @@ class SceneEditor:
         device: str = "auto",
         batch_size: int = 8,
     ) -> Self:
-        """Rebuilds the networks of a checkpoint, as :meth:`SceneGenerator.from_checkpoint`.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If it cannot be sampled from, or ``batch_size`` is below 1.
-        """
+        """Rebuilds the networks of a checkpoint, see :meth:`SceneGenerator.from_checkpoint`."""
         generator = SceneGenerator.from_checkpoint(
             checkpoint, SamplerConfig(), weights=weights, device=device
         )
@@ -423,9 +414,9 @@ class SceneEditor:
         solve: Callable[[Tensor], tuple[Tensor, Tensor | None]],
     ) -> tuple[Tensor, Tensor | None]:
         """Latents of scenes, made of their noise in batches, and their cosines."""
-        parts = [
-            solve(next(self._draws(part, seed))) for part in self._parts(scene_indices(indices))
-        ]
+        numbers, size = scene_indices(indices), self.batch_size
+        batches = [numbers[first : first + size] for first in range(0, len(numbers), size)]
+        parts = [solve(next(self._draws(batch, seed))) for batch in batches]
         cosines = [cosine.cpu() for _, cosine in parts if cosine is not None]
         return torch.cat([made for made, _ in parts]), torch.cat(cosines) if cosines else None
 
