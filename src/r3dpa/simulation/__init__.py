@@ -9,9 +9,16 @@ from r3dpa.simulation.drives import (
     simulate,
     split_scans,
 )
-from r3dpa.simulation.effects import EFFECTS, Effect, Switch
+from r3dpa.simulation.effects import EFFECTS
+from r3dpa.simulation.effects.base import Effect, Switch
 from r3dpa.simulation.report import SimulationReport
-from r3dpa.simulation.scan import EffectRecord, SimulatedScan, effect_name, simulate_scan
+from r3dpa.simulation.scan import (
+    EffectRecord,
+    SimulatedScan,
+    Simulator,
+    effect_name,
+    simulate_scan,
+)
 from r3dpa.simulation.scene import (
     EgoMotion,
     Material,
@@ -22,11 +29,11 @@ from r3dpa.simulation.scene import (
     Semantic,
     Shape,
     Weather,
+    WeatherPrior,
 )
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, hdl64e, load_sensor
 from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Origin, Sweep
-from r3dpa.simulation.weather import WeatherPrior
 
 __all__ = [
     "EFFECTS",
@@ -46,6 +53,7 @@ __all__ = [
     "Shape",
     "SimulatedScan",
     "SimulationReport",
+    "Simulator",
     "SpinningLidar",
     "Street",
     "Sweep",

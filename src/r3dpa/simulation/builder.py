@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
+from numpy.random import Generator
 
 from r3dpa.simulation.course import BLOCK_M, Course, Section
-from r3dpa.simulation.scene import Material, Primitive, Puddle, Semantic, Shape
+from r3dpa.simulation.scene import Interval, Material, Primitive, Puddle, Semantic, Shape
 from r3dpa.simulation.vehicles import Body
 
 #: Walls and crowns reach into the ground, which falls away below them where the street is steep.
 FOOTING_M = 0.6
+
+#: Street coordinates (s, lateral).
+Place = tuple[float, float]
 
 _TERRAIN_M = 48.0
 _SLAB_M = 1.0
@@ -20,16 +23,8 @@ _SLAB_M = 1.0
 class Builder:
     """Collects the solids of one block, given in street coordinates.
 
-    Args:
-        course: The drive's course.
-        section: The block's section.
-        first_instance: Number of the block's first object.
-
-    Attributes:
-        primitives: Solids that every scan has.
-        details: Solids that only scans from nearby have.
-        puddles: Where water can stand.
-        num_objects: Numbers that were given away.
+    ``details`` are solids that only scans from nearby have, ``puddles`` places where water stands
+    if the road is wet; instances are numbered from ``first_instance`` on.
     """
 
     def __init__(self, course: Course, section: Section, first_instance: int) -> None:
@@ -49,7 +44,7 @@ class Builder:
     def solid(
         self,
         shape: Shape,
-        at: tuple[float, float],
+        at: Place,
         size: tuple[float, float, float],
         semantic: Semantic,
         material: Material,
@@ -63,45 +58,25 @@ class Builder:
     ) -> None:
         """Add a solid that stands on the ground.
 
-        Args:
-            shape: Its shape.
-            at: Its centre, (s, lateral).
-            size: Along, across and up, metres.
-            semantic: Its class.
-            material: What it is made of.
-            reflectivity: Of its surface.
-            instance: Its number.
-            bottom_m: Its lowest point above the ground.
-            yaw_rad: Its turn against the street.
-            inclined: Whether it follows the slope of the street, or stands level.
-            extinction_per_m: Of foliage and wire mesh.
-            detail: Whether only scans from nearby have it.
+        ``at``: centre (s, lateral). ``size``: along, across and up. ``bottom_m``: lowest point
+        above the ground. ``yaw_rad``: against the street. ``inclined``: follows the slope of the
+        street instead of standing level. ``detail``: only scans from nearby have it.
         """
         x, y, z = self.section.at(*at)
         z += self.course.surface_m(at[1]) + bottom_m + size[2] / 2
+        half_size = (size[0] / 2, size[1] / 2, size[2] / 2)
+        heading, still = self.section.heading_rad + yaw_rad, (0.0, 0.0)
         slopes = (self.section.slope, self.section.cross)
+        grade = _turned(slopes, yaw_rad) if inclined else (0.0, 0.0)
         (self.details if detail else self.primitives).append(
             Primitive(
-                shape,
-                (x, y, z),
-                (size[0] / 2, size[1] / 2, size[2] / 2),
-                semantic,
-                reflectivity,
-                self.section.heading_rad + yaw_rad,
-                instance,
-                material,
-                grade=_turned(slopes, yaw_rad) if inclined else (0.0, 0.0),
-                extinction_per_m=extinction_per_m,
+                shape, (x, y, z), half_size, semantic, reflectivity, heading, instance, material,
+                still, grade, extinction_per_m,
             )
-        )
+        )  # fmt: skip
 
     def body(
-        self,
-        body: Body,
-        at: tuple[float, float],
-        yaw_rad: float,
-        instance: int,
-        speed_m_s: float = 0.0,
+        self, body: Body, at: Place, yaw_rad: float, instance: int, speed_m_s: float = 0.0
     ) -> None:
         """Add a vehicle or a person at (s, lateral), which moves the way it is turned."""
         x, y, z = self.section.at(*at)
@@ -114,24 +89,18 @@ class Builder:
         for part in body:
             ahead, left, up = part.centre
             up += grade[0] * ahead + grade[1] * left
+            centre = (x + ahead * cosine - left * sine, y + ahead * sine + left * cosine, z + up)
+            half_size = (part.size[0] / 2, part.size[1] / 2, part.size[2] / 2)
             primitive = Primitive(
-                part.shape,
-                (x + ahead * cosine - left * sine, y + ahead * sine + left * cosine, z + up),
-                (part.size[0] / 2, part.size[1] / 2, part.size[2] / 2),
-                part.semantic,
-                part.reflectivity,
-                heading,
-                instance,
-                part.material,
-                velocity,
-                grade,
-            )
+                part.shape, centre, half_size, part.semantic, part.reflectivity, heading, instance,
+                part.material, velocity, grade,
+            )  # fmt: skip
             (self.details if part.detail else self.primitives).append(primitive)
 
     def slab(
         self,
-        along: tuple[float, float],
-        across: tuple[float, float],
+        along: Interval,
+        across: Interval,
         semantic: Semantic,
         material: Material,
         reflectivity: float,
@@ -139,8 +108,8 @@ class Builder:
     ) -> None:
         """Add a piece of ground between two distances along the chord and two lateral ones.
 
-        It follows the surface of the street in its middle, ``sunk_m`` below it. At the ends of the
-        block it reaches over the wedge that the bend of the street opens.
+        Its middle lies ``sunk_m`` below the surface of the street. At the ends of the block it
+        reaches over the wedge that the bend of the street opens.
         """
         first, last = along
         widest = max(map(abs, across))
@@ -151,20 +120,16 @@ class Builder:
         lateral = sum(across) / 2
         x, y, z = self.section.on_chord((first + last) / 2, lateral)
         z += self.course.surface_m(lateral) - sunk_m
+        half_size = ((last - first) / 2, abs(across[1] - across[0]) / 2, _SLAB_M / 2)
+        grade = (self.section.slope, self.section.cross + self.course.surface_cross(lateral))
         self.primitives.append(
             Primitive(
-                Shape.BOX,
-                (x, y, z - _SLAB_M / 2),
-                ((last - first) / 2, abs(across[1] - across[0]) / 2, _SLAB_M / 2),
-                semantic,
-                reflectivity,
-                self.section.heading_rad,
-                material=material,
-                grade=(self.section.slope, self.section.cross + self.course.surface_cross(lateral)),
+                Shape.BOX, (x, y, z - _SLAB_M / 2), half_size, semantic, reflectivity,
+                self.section.heading_rad, material=material, grade=grade,
             )
-        )
+        )  # fmt: skip
 
-    def puddle(self, draw: np.random.Generator, s: float, lateral: float) -> None:
+    def puddle(self, draw: Generator, s: float, lateral: float) -> None:
         """Add a place where water stands if the road is wet."""
         x, y, _ = self.section.at(s, lateral)
         self.puddles.append(Puddle(x, y, draw.uniform(0.3, 1.6)))
@@ -177,7 +142,7 @@ def _turned(slopes: tuple[float, float], yaw_rad: float) -> tuple[float, float]:
     return cosine * along + sine * across, cosine * across - sine * along
 
 
-def build_ground(builder: Builder, draw: np.random.Generator, side: float, opening: bool) -> None:
+def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) -> None:
     """Roadway, pavement or verge, and terrain; with the opening of a side street."""
     course, whole = builder.course, (0.0, BLOCK_M)
     edge_m, pavement_m = course.kerb(side).edge_m, course.kerb(side).pavement_m

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -25,14 +24,15 @@ _RISE = (-0.01, 0.08)
 _LEVELLING = 0.93
 _BLOCKS_PER_TABLE = 32
 
+#: Amplitude, length and phase.
+Wave = tuple[float, float, float]
+
 
 class Character(NamedTuple):
     """What kind of place a drive leads through; pairs are intervals to draw from.
 
     ``lanes``: possible numbers of lanes ahead and towards us. ``districts``: weights of town,
-    houses, green and yard. ``parked``: share of taken places at a kerb with parking. The rest:
-    kerbs with parking, pavements, gaps between cars and between people in
-    metres, blocks between side streets, largest slope of the road.
+    houses, green and yard. ``parked``: share of taken places. ``parking``, ``pavement``: chance.
     """
 
     lanes: tuple[tuple[int, int], ...]
@@ -49,63 +49,36 @@ class Character(NamedTuple):
 #: Dense town, suburb, park and edge of town, arterial road.
 CHARACTERS = (
     Character(
-        lanes=((1, 1), (1, 1), (1, 0)),
-        districts=(0.75, 0.1, 0.1, 0.05),
-        parked=(0.35, 0.75),
-        parking=0.8,
-        pavement=1.0,
-        car_gap_m=(40, 90),
-        people_gap_m=(50, 110),
-        crossing_every=(3, 6),
-        slope=0.02,
+        lanes=((1, 1), (1, 1), (1, 0)), districts=(0.75, 0.1, 0.1, 0.05), parked=(0.35, 0.75),
+        parking=0.8, pavement=1.0, car_gap_m=(40, 90), people_gap_m=(50, 110),
+        crossing_every=(3, 6), slope=0.02,
     ),
     Character(
-        lanes=((1, 1), (1, 0)),
-        districts=(0.1, 0.75, 0.1, 0.05),
-        parked=(0.35, 0.75),
-        parking=0.75,
-        pavement=0.95,
-        car_gap_m=(60, 140),
-        people_gap_m=(60, 160),
-        crossing_every=(4, 8),
-        slope=0.05,
+        lanes=((1, 1), (1, 0)), districts=(0.1, 0.75, 0.1, 0.05), parked=(0.35, 0.75),
+        parking=0.75, pavement=0.95, car_gap_m=(60, 140), people_gap_m=(60, 160),
+        crossing_every=(4, 8), slope=0.05,
     ),
     Character(
-        lanes=((1, 1),),
-        districts=(0.05, 0.2, 0.65, 0.1),
-        parked=(0.3, 0.7),
-        parking=0.4,
-        pavement=0.6,
-        car_gap_m=(60, 140),
-        people_gap_m=(80, 200),
-        crossing_every=(6, 10),
-        slope=0.06,
+        lanes=((1, 1),), districts=(0.05, 0.2, 0.65, 0.1), parked=(0.3, 0.7),
+        parking=0.4, pavement=0.6, car_gap_m=(60, 140), people_gap_m=(80, 200),
+        crossing_every=(6, 10), slope=0.06,
     ),
     Character(
-        lanes=((2, 2), (2, 1), (2, 2)),
-        districts=(0.25, 0.15, 0.4, 0.2),
-        parked=(0.3, 0.7),
-        parking=0.5,
-        pavement=0.8,
-        car_gap_m=(40, 70),
-        people_gap_m=(60, 160),
-        crossing_every=(5, 9),
-        slope=0.03,
+        lanes=((2, 2), (2, 1), (2, 2)), districts=(0.25, 0.15, 0.4, 0.2), parked=(0.3, 0.7),
+        parking=0.5, pavement=0.8, car_gap_m=(40, 70), people_gap_m=(60, 160),
+        crossing_every=(5, 9), slope=0.03,
     ),
-)
+)  # fmt: skip
 
 
 class Kerb(NamedTuple):
-    """One side of the road, metres: lanes, kerb, pavement (0 for a verge); places to park.
-
-    ``rise``: how much the terrain beyond it rises, or falls, per metre away from the road.
-    """
+    """One side of the road, as lateral distances."""
 
     lanes_m: float
     edge_m: float
-    pavement_m: float
+    pavement_m: float  # width, 0 for a verge
     parking: bool
-    rise: float
+    rise: float  # of the terrain beyond, per metre away from the road
 
 
 class Section(NamedTuple):
@@ -114,20 +87,17 @@ class Section(NamedTuple):
     Positions are the distance ``s`` along the chain and the lateral distance, positive to the
     left. Heights are those of a plane; on the bisectors of the corners neighbouring planes meet to
     within 2 cm over the width of the road.
-
-    ``x_m, y_m, z_m``: start. ``slope, cross``: rise per metre along and to the left.
-    ``corner_before, corner_after``: tangents of half the turns at both ends.
     """
 
     block: int
-    x_m: float
+    x_m: float  # of the start
     y_m: float
     z_m: float
     heading_rad: float
-    slope: float
-    cross: float
-    corner_before: float
-    corner_after: float
+    slope: float  # rise per metre along
+    cross: float  # rise per metre to the left
+    corner_before: float  # tangent of half the turn at the start
+    corner_after: float  # and at the end
 
     def at(self, s: float, lateral: float) -> tuple[float, float, float]:
         """World position on the plane; lines of equal lateral go on in the next block."""
@@ -172,8 +142,8 @@ class Course(NamedTuple):
     stop_every: int
     stop_from: int
     stop_scans: int
-    bends: tuple[tuple[float, float, float], ...]
-    slopes: tuple[tuple[float, float, float], ...]
+    bends: tuple[Wave, ...]
+    slopes: tuple[Wave, ...]
 
     @property
     def ego_lateral_m(self) -> float:
@@ -265,17 +235,10 @@ def course_of(seed: int, drive: int) -> Course:
         kerbs.append(Kerb(lanes_m, edge_m, pavement_m, parking, rise))
     period = draw.uniform(40.0, 90.0)
     # Sums of two waves: (amplitude, length, phase) of the heading and of the slope.
-    bends = np.stack(
-        [
-            draw.uniform(0.1, 0.28, 2),
-            draw.uniform([260, 420], [400, 700]),
-            draw.uniform(0, 6.28, 2),
-        ]
-    )
-    steepest = draw.uniform(0.2, 0.5) * character.slope
-    slopes = np.stack(
-        [np.full(2, steepest), draw.uniform([240, 520], [300, 800]), draw.uniform(0, 6.28, 2)]
-    )
+    tall = draw.uniform(0.1, 0.28, 2)
+    bends = _waves(tall, draw.uniform([260, 420], [400, 700]), draw.uniform(0, 6.28, 2))
+    steepest = np.full(2, draw.uniform(0.2, 0.5) * character.slope)
+    slopes = _waves(steepest, draw.uniform([240, 520], [300, 800]), draw.uniform(0, 6.28, 2))
     return Course(
         seed=seed,
         drive=drive,
@@ -296,26 +259,23 @@ def course_of(seed: int, drive: int) -> Course:
         stop_every=int(draw.integers(150, 400)),
         stop_from=int(draw.integers(20, 150)),
         stop_scans=int(draw.integers(10, 50)) if draw.random() < 0.7 else 0,
-        bends=_waves(bends),
-        slopes=_waves(slopes),
+        bends=bends,
+        slopes=slopes,
     )
 
 
-def _waves(columns: np.ndarray) -> tuple[tuple[float, float, float], ...]:
-    return tuple((float(a), float(b), float(c)) for a, b, c in columns.T)
+def _waves(sizes: np.ndarray, lengths: np.ndarray, phases: np.ndarray) -> tuple[Wave, ...]:
+    return tuple(zip(sizes.tolist(), lengths.tolist(), phases.tolist(), strict=True))
 
 
-def _sum(waves: tuple[tuple[float, float, float], ...], s: float) -> float:
+def _sum(waves: tuple[Wave, ...], s: float) -> float:
     return sum(size * math.sin(2 * math.pi * s / length + phase) for size, length, phase in waves)
 
 
 @lru_cache(maxsize=256)
 def _sections(course: Course, table: int) -> tuple[Section, ...]:
     """Sections of the blocks of one table; each begins where the one before ends."""
-    return tuple(_continued(course, table))
-
-
-def _continued(course: Course, table: int) -> Iterator[Section]:
+    found: list[Section] = []
     last = _sections(course, table - 1)[-1] if table else None
     first = table * _BLOCKS_PER_TABLE
     for block in range(first, first + _BLOCKS_PER_TABLE):
@@ -330,5 +290,6 @@ def _continued(course: Course, table: int) -> Iterator[Section]:
             cross = _LEVELLING * last.cross - corner * (last.slope + slope)
             end = last.on_chord(BLOCK_M, 0.0)
             section = Section(block, *end, heading, slope, cross, corner, after)
-        yield section
+        found.append(section)
         last = section
+    return tuple(found)

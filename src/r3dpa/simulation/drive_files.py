@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.io import atomic_path
+from r3dpa.io import atomic_path, delete_unfinished
 from r3dpa.simulation.scan import SimulatedScan
-from r3dpa.simulation.scene import Pose, Scene, Weather
+from r3dpa.simulation.scene import Pose, Weather
 
 # In the order in which they are written: whoever finds the points of a scan finds all of it.
 _SUFFIXES = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
@@ -40,12 +40,7 @@ _SCAN_PERIOD = timedelta(seconds=0.1)
 
 @dataclass(frozen=True)
 class DriveFiles:
-    """Reads and writes the files of a drive.
-
-    Args:
-        root: Root folder of the data set.
-        drive: Four-digit number.
-    """
+    """The files of one drive (a four-digit number) below the root folder of a data set."""
 
     root: Path
     drive: str
@@ -57,21 +52,14 @@ class DriveFiles:
 
     def missing(self, count: int) -> list[int]:
         """Numbers below ``count`` of the scans that lack any of their files."""
-        complete: set[str] | None = None
-        for kind in _SUFFIXES:
-            folder = self.points_folder / kind
-            stems = {path.stem for path in folder.iterdir()} if folder.is_dir() else set()
-            complete = stems if complete is None else complete & stems
-        return [number for number in range(count) if _stem(number) not in (complete or ())]
+        folders = (self.points_folder / kind for kind in _SUFFIXES)
+        stems = ({path.stem for path in folder.glob("[!.]*")} for folder in folders)
+        complete = set.intersection(*stems)
+        return [number for number in range(count) if _stem(number) not in complete]
 
-    def write_scan(self, number: int, scene: Scene, scan: SimulatedScan) -> None:
-        """Write the files of a scan, the points last.
-
-        Args:
-            number: Of the scan in the drive.
-            scene: What was scanned.
-            scan: What came back.
-        """
+    def write_scan(self, number: int, scan: SimulatedScan) -> None:
+        """Write the files of a scan, the points last."""
+        scene = scan.scene
         summary = {
             "drive": self.drive,
             "scan": number,
@@ -97,19 +85,11 @@ class DriveFiles:
             write(self._path(kind, number), contents[kind])
 
     def summaries(self, count: int) -> list[dict[str, Any]]:
-        """What ``sim/*.json`` says of the first ``count`` scans.
-
-        Raises:
-            ValueError: If a file is damaged; the message names it.
-        """
+        """What ``sim/*.json`` says of the first ``count`` scans; a damaged file is named."""
         return [self._summary(self._path("sim", number)) for number in range(count)]
 
     def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
-        """Write ``timestamps.txt`` and ``velodyne_to_world.txt``; equal ones are left alone.
-
-        Args:
-            summaries: Of all scans of the drive, in order.
-        """
+        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` of all scans, in order."""
         stamps = (_FIRST_SCAN + summary["scan"] * _SCAN_PERIOD for summary in summaries)
         # KITTI-360 stores nanoseconds.
         times = "".join(f"{stamp:%Y-%m-%d %H:%M:%S.%f}000\n" for stamp in stamps)
@@ -122,10 +102,10 @@ class DriveFiles:
         poses = self.root / "data_poses" / drive_name(self.drive) / "velodyne_to_world.txt"
         write(poses, "".join(lines).encode())
 
-    def partial_files(self) -> Iterator[Path]:
-        """Temporary files of this drive: of writers that are at work, or were killed."""
+    def delete_unfinished(self) -> None:
+        """Delete the temporary files of killed writers."""
         for top in ("data_3d_raw", "data_poses"):
-            yield from (self.root / top / drive_name(self.drive)).rglob(".*.partial.*")
+            delete_unfinished(self.root / top / drive_name(self.drive))
 
     def _path(self, kind: str, number: int) -> Path:
         return self.points_folder / kind / f"{_stem(number)}{_SUFFIXES[kind]}"
@@ -134,9 +114,10 @@ class DriveFiles:
         try:
             summary = json.loads(path.read_text())
             Pose(**summary["pose"])
+            summary["points"] + sum(effect["rays"] for effect in summary["effects"].values())
             for effect in summary["effects"].values():
-                effect["status"], effect["reason"], effect["rays"]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+                effect["status"], effect["reason"]
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(
                 f"{path} is damaged ({error!r}): delete it and simulate again, which completes "
                 f"the data set"
@@ -150,9 +131,9 @@ def drive_name(number: str) -> str:
 
 
 def velodyne_to_world(pose: Pose) -> NDArray[np.float64]:
-    """Matrix ``(3, 4)`` that takes points of the sensor frame, in metres, to the world frame.
+    """Matrix ``(3, 4)`` from the sensor frame (middle of the sweep) to the world frame, metres.
 
-    Of the middle of the sweep; world x east, y north, z up::
+    World x east, y north, z up::
 
         [Rz(heading) Ry(pitch) Rx(roll) | (x, y, z)]
     """
@@ -186,12 +167,6 @@ def write(path: Path, content: bytes) -> None:
         return
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
-
-
-def delete(paths: Iterable[Path]) -> None:
-    """Delete files, of which some may have just gone."""
-    for path in list(paths):
-        path.unlink(missing_ok=True)
 
 
 def _stem(number: int) -> str:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.scene import Shape
-from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids
-from r3dpa.simulation.windows import pieces, windows_of
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, pieces, windows_of
 
 # A secondary ray starts on a surface; nearer hits are that surface.
 _START_M = 1e-3
@@ -42,7 +41,7 @@ def cast(
     actor_time_s: Floats | None = None,
     optical_depth: Floats | None = None,
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Nearest surface along each ray of a turn.
+    """Nearest surface along each ray of a turn: distance (infinite for none) and solid, ``(H, W)``.
 
     Every solid is scaled to its unit shape, where a ray ``p + t d`` meets a box by its slabs and a
     cylinder or ellipsoid by a quadratic whose discriminant is written with the cross product,
@@ -54,21 +53,16 @@ def cast(
         origin: ``(3, H, W)`` where the rays start, metres.
         direction: ``(3, H, W)`` unit vectors; shots of growing azimuth that fill the turn.
         max_range_m: Hits from here on are left out.
-        actor_time_s: ``(H, W)`` time at which each ray meets the moving solids, seconds from the
-            middle of the sweep; None leaves them where they are then.
+        actor_time_s: ``(H, W)`` when each ray meets the moving solids, seconds from the middle of
+            the sweep; None leaves them where they are then.
         optical_depth: ``(H, W)`` draws of the exponential distribution: how deep each ray gets
             into foliage, see ``Primitive.extinction_per_m``; None makes foliage a surface.
-
-    Returns:
-        Distance ``(H, W)``, infinite where nothing is hit, and index of the solid, ``GROUND`` or
-        ``NO_SURFACE``.
     """
     nearest = np.full(origin.shape[1:], max_range_m, dtype=np.float32)
     surface = np.full(nearest.shape, NO_SURFACE, dtype=np.int32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        _keep_nearer(
-            (np.float32(solids.ground_m) - origin[2]) / direction[2], GROUND, nearest, surface
-        )
+        to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
+        _keep_nearer(to_ground, GROUND, nearest, surface)
         windows = windows_of(solids, origin, direction, max_range_m, actor_time_s)
         for index in windows.order:
             sloped = bool(solids.grade[index].any())
@@ -105,22 +99,11 @@ def cast_single(
     excluded: NDArray[np.int32],
     hollow: NDArray[np.int32],
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Nearest surface along single rays that start anywhere, such as reflected ones.
+    """Nearest surface along M single rays that start anywhere, such as reflected ones.
 
-    Foliage counts as a surface, and the ground is only seen from above.
-
-    Args:
-        solids: Solids and ground.
-        origin: ``(3, M)`` where the rays start.
-        direction: ``(3, M)`` unit vectors.
-        time_s: ``(M,)`` when they do, for the moving solids.
-        max_range_m: ``(M,)`` hits from here on are left out.
-        excluded: ``(M,)`` solid, or ``GROUND``, that the ray does not see.
-        hollow: ``(M,)`` solid that the ray sees from inside, such as the house behind a window;
-            ``NO_SURFACE`` for none.
-
-    Returns:
-        Distance ``(M,)``, infinite where nothing is hit, and index as for ``cast``.
+    Foliage counts as a surface, and the ground is only seen from above. A ray does not see the
+    solid, or ``GROUND``, in ``excluded``, and sees that in ``hollow`` from inside, such as the
+    house behind a window. Returns distance and solid ``(M,)`` as ``cast`` does.
     """
     nearest = max_range_m.astype(np.float32)
     surface = np.full(len(nearest), NO_SURFACE, dtype=np.int32)
@@ -163,13 +146,9 @@ def surface_distance(
 def normals(
     solids: Solids, surface: NDArray[np.integer], position: Floats, time_s: Floats | None
 ) -> Floats:
-    """Unit normals ``(3, M)`` of surfaces at points ``(3, M)`` on them, in the scene frame.
+    """Unit normals ``(3, M)`` of surfaces (M,) at positions ``(3, M)`` on them.
 
-    Args:
-        solids: Solids and ground.
-        surface: ``(M,)`` index of the solid, or ``GROUND``.
-        position: Points on these surfaces.
-        time_s: ``(M,)`` when the moving solids were hit; None in the middle of the sweep.
+    ``time_s``: ``(M,)`` when moving solids were hit; None in the middle of the sweep.
     """
     normal = np.zeros_like(position)
     normal[2] = 1
@@ -198,8 +177,7 @@ def normals(
     towards /= np.sqrt(np.einsum("im,im->m", towards, towards))
     if len(hit) == len(surface):
         return towards
-    for axis in range(3):
-        normal[axis, hit] = towards[axis]
+    normal[:, hit] = towards
     return normal
 
 
@@ -247,7 +225,7 @@ def _close_pairs(
         ray, index = np.nonzero(close)
         found.append((block[ray], some[index], ahead[ray, index]))
     if not found:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        return order, order
     ray, index, ahead_m = (np.concatenate(column) for column in zip(*found, strict=True))
     # Heights of the ray where it enters and leaves the circle, and of the solid.
     rise = (direction[2] / level_length)[ray]
@@ -261,11 +239,7 @@ def _close_pairs(
 
 
 def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -> NDArray[np.int64]:
-    """Circles (of N) that some of a block's rays may cross, seen from above.
-
-    They lie within the cone around all the rays: from the middle of the origins, as wide as the
-    directions spread, widened by the radius and by how far the origins are apart.
-    """
+    """Circles (of N) within the cone around all of a block's rays, seen from above."""
     middle = (origin.min(axis=1) + origin.max(axis=1)) / 2
     apart_m = np.hypot(*(origin - middle[:, None])).max()
     axis = along.sum(axis=1)

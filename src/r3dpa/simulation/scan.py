@@ -1,4 +1,4 @@
-"""One simulated scan: rays, cast, effects, and the points as KITTI-360 stores them."""
+"""Simulated scans: rays, cast, effects, and the points as KITTI-360 stores them."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects import EFFECTS, Draws, Effect, Stage, Switch
-from r3dpa.simulation.scene import Scene
-from r3dpa.simulation.sensor import SpinningLidar
+from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.effects import ECHO_EFFECTS, EFFECTS, RAY_EFFECTS
+from r3dpa.simulation.effects.base import Effect, Switch
+from r3dpa.simulation.scene import Scene, Weather, WeatherPrior
+from r3dpa.simulation.sensor import SpinningLidar, load_sensor
+from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Echoes, Origin, Sweep
 
 # Two echoes of one shot are told apart from here on.
@@ -26,21 +29,13 @@ _ZERO_INTENSITY, _FULL_INTENSITY = 6.0, 13.0
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """What became of one effect in one scan.
-
-    Args:
-        name: Its name, see ``effect_name``.
-        status: Whether it ran, was not called for by the scene, or was switched off.
-        reason: Why.
-        rays: Rays that it touched.
-        ms: Time that it took, its predicate included, milliseconds.
-    """
+    """Status of one effect in one scan."""
 
     name: str
     status: Literal["ran", "not_called", "off"]
     reason: str
-    rays: int
-    ms: float
+    rays: int  # that it touched
+    ms: float  # milliseconds that it took, its predicate included
 
 
 @dataclass(frozen=True)
@@ -56,13 +51,15 @@ class SimulatedScan:
         origins: ``(P,)`` uint8, the ``Origin`` of each point.
         effects: One record for each effect, in the order of ``EFFECTS``.
         parts_ms: Time of the other parts, milliseconds.
+        scene: What was scanned: solids, pose and motion of the sensor, weather.
     """
 
     points: NDArray[np.float32]
     labels: NDArray[np.uint32]
     origins: NDArray[np.uint8]
     effects: tuple[EffectRecord, ...]
-    parts_ms: Mapping[str, float]
+    parts_ms: dict[str, float]
+    scene: Scene
 
 
 def effect_name(effect: Effect) -> str:
@@ -70,29 +67,29 @@ def effect_name(effect: Effect) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", type(effect).__name__).lower()
 
 
-def check_switches(switches: Mapping[str, Switch]) -> dict[str, Switch]:
-    """Switches of named effects, checked.
+def check_switches(switches: Mapping[str, str | bool]) -> dict[str, Switch]:
+    """The switches that are not ``auto``, by effect name, sorted.
 
-    Args:
-        switches: ``auto``, ``on`` or ``off`` by effect name.
-
-    Raises:
-        ValueError: If there is no such effect or no such switch.
+    True and False, which YAML makes of a bare ``on`` and ``off``, mean the same as these words.
     """
     names = [effect_name(effect) for effect in EFFECTS]
-    for name, switch in switches.items():
+    words: dict[str | bool, Switch] = {True: "on", False: "off", "on": "on", "off": "off"}
+    checked = {}
+    for name, switch in sorted(switches.items()):
         if name not in names:
             raise ValueError(f"there is no effect {name!r}; there are {', '.join(names)}")
-        if switch not in ("auto", "on", "off"):
+        if switch in words:
+            checked[name] = words[switch]
+        elif switch != "auto":
             raise ValueError(f"effect {name} must be auto, on or off, got {switch!r}")
-    return dict(switches)
+    return checked
 
 
 def simulate_scan(
     scene: Scene,
     sensor: SpinningLidar,
     key: tuple[int | str, ...],
-    switches: Mapping[str, Switch] | None = None,
+    switches: Mapping[str, str | bool] | None = None,
 ) -> SimulatedScan:
     """Scan a scene.
 
@@ -101,33 +98,77 @@ def simulate_scan(
         sensor: Instrument; its mount height is not used, the pose holds the height.
         key: Seed of the random draws, see ``generator_for``; the name of each effect is added, so
             that no effect moves the draws of another.
-        switches: Effects that are not on ``auto``: ``off`` leaves one out, ``on`` runs it whether
-            the scene calls for it or not, which then changes nothing.
-
-    Returns:
-        The points that came back, and what each effect did.
-
-    Raises:
-        ValueError: If a switch is unknown.
+        switches: ``off`` leaves an effect out, ``on`` runs it whether the scene calls for it or
+            not, which then changes nothing; by default ``auto``.
     """
-    switches = check_switches(switches or {})
+    checked = check_switches(switches or {})
     parts_ms: dict[str, float] = {}
     with _timed(parts_ms, "rays"):
         sweep = Sweep(scene, sensor)
-    records = []
-    for effect in EFFECTS:
-        if effect.stage > Stage.RAYS and "cast" not in parts_ms:
-            with _timed(parts_ms, "cast"):
-                sweep.cast()
-        records.append(_run(effect, sweep, key, switches.get(effect_name(effect), "auto")))
+    records = [_run(effect, sweep, key, checked) for effect in RAY_EFFECTS]
+    with _timed(parts_ms, "cast"):
+        sweep.cast()
+    records += [_run(effect, sweep, key, checked) for effect in ECHO_EFFECTS]
     with _timed(parts_ms, "points"):
         points, labels, origins = _points(sweep)
-    return SimulatedScan(points, labels, origins, tuple(records), parts_ms)
+    return SimulatedScan(points, labels, origins, tuple(records), parts_ms, scene)
 
 
-def _run(effect: Effect, sweep: Sweep, key: tuple[int | str, ...], switch: Switch) -> EffectRecord:
+class Simulator:
+    """Simulates the scans of one drive, in any order and without files.
+
+    They are the scans that :func:`simulate` writes for the same seed, drive and settings.
+
+    Args:
+        seed: Seed of street and instrument, 0 or greater.
+        drive: Number of the drive; each leads through a street of its own.
+        weather: Weather of all scans, or the prior from which one is drawn every 100 scans.
+        sensor: Instrument, or what ``load_sensor`` takes.
+        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
+
+    Raises:
+        ValueError: If a value is out of range or an effect unknown.
+
+    Example:
+        >>> scan = Simulator(seed=0, weather=Weather(rain_mm_h=10)).scan(3)
+        >>> scan.points.shape[1], scan.points.dtype, len(scan.labels) == len(scan.points)
+        (4, dtype('float32'), True)
+        >>> [effect.reason for effect in scan.effects if effect.name == "rain"]
+        ['10 mm/h of rain']
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        drive: int = 0,
+        weather: Weather | WeatherPrior | None = None,
+        sensor: str | SpinningLidar = "hdl64e",
+        effects: Mapping[str, str | bool] | None = None,
+    ) -> None:
+        self.street = Street(seed, drive, weather)
+        self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+        self.switches = check_switches(effects or {})
+
+    def scene(self, number: int) -> Scene:
+        """The scene of scan ``number`` of the drive, 0 or greater."""
+        return self.street.scene(number, self.sensor.mount_height_m)
+
+    def scan(self, number: int) -> SimulatedScan:
+        """Scan ``number`` of the drive, 0 or greater; neighbours are 0.1 s apart."""
+        scene_ms: dict[str, float] = {}
+        with _timed(scene_ms, "scene"):
+            scene = self.scene(number)
+        key = (self.street.seed, "effects", self.street.drive, number)
+        scan = simulate_scan(scene, self.sensor, key, self.switches)
+        return replace(scan, parts_ms=scene_ms | scan.parts_ms)
+
+
+def _run(
+    effect: Effect, sweep: Sweep, key: tuple[int | str, ...], switches: Mapping[str, Switch]
+) -> EffectRecord:
     start = time.perf_counter()
     name = effect_name(effect)
+    switch = switches.get(name, "auto")
     if switch == "off":
         return EffectRecord(name, "off", "switched off", 0, 0.0)
     reason = effect.called_by(sweep.scene, sweep.sensor)
@@ -190,15 +231,8 @@ def calibrated_intensity(
         intensity = sqrt(power * range^2) * clip(ln(power / a) / ln(b / a), 0, 1)
         a = 6 min_power        b = 13 min_power
 
-    Source: fitted to the intensities of KITTI's scans by range and incidence.
-
-    Args:
-        power: Received power of the returns, m^-2, any shape.
-        range_m: Their ranges, metres, same shape.
-        min_power: Weakest power that the instrument detects.
-
-    Returns:
-        Float32 of the same shape.
+    with the received ``power`` in m^-2. Source: fitted to the intensities of KITTI's scans by
+    range and incidence.
     """
     weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))

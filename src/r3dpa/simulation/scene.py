@@ -6,11 +6,30 @@ A scene is a description; which effects it calls for is read from it (see ``effe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 MAX_INSTANCE = 0xFFFF
+Interval = tuple[float, float]
+Rule = Literal["be finite", "be positive", "be 0 or greater", "lie in [0, 1]"]
+
+_RULES: dict[Rule, Callable[[float], bool]] = {
+    "be finite": math.isfinite,
+    "be positive": lambda value: 0 < value < math.inf,
+    "be 0 or greater": lambda value: 0 <= value < math.inf,
+    "lie in [0, 1]": lambda value: 0 <= value <= 1,
+}
+
+
+def check_fields(values: object, rule: Rule, *names: str) -> None:
+    """Raise a ValueError that names the first of these fields that breaks a rule."""
+    for name in names:
+        if not _RULES[rule](value := getattr(values, name)):
+            raise ValueError(f"{name} must {rule}, got {value}")
 
 
 class Semantic(IntEnum):
@@ -75,49 +94,38 @@ class Primitive:
     With ``(x, y, z)`` from the centre along the turned axes::
 
         u = (x / a, y / b, (z - grade_x * x - grade_y * y) / c)
-
-    Args:
-        shape: Box, upright cylinder or ellipsoid.
-        centre: ``(x, y, z)`` in the world frame in the middle of the sweep, metres, z up.
-        half_size: ``(a, b, c)``: half edges, radii and half height, or semi-axes, metres.
-        semantic: Class of the surface.
-        reflectivity: Diffuse reflectivity in (0, 1], see ``effects.surface_power``.
-        yaw_rad: Turn about the upright axis, counter-clockwise seen from above.
-        instance: Number of the object it belongs to, 0 where the class has no objects.
-        material: What the surface is made of.
-        velocity_m_s: ``(x, y)`` in the world frame, metres per second.
-        grade: Rise per metre along the turned x and y axis; upright walls stay upright.
-        extinction_per_m: Of leaves, grass and wire mesh, which are media rather than surfaces:
-            chance of a hit per metre inside the solid; 0 for a closed surface.
-
-    Raises:
-        ValueError: If a size is not positive, the reflectivity lies outside (0, 1], the instance
-            does not fit in 16 bits, the extinction is negative, or a grade exceeds 0.2.
     """
 
     shape: Shape
-    centre: tuple[float, float, float]
+    centre: tuple[float, float, float]  # world frame in the middle of the sweep, metres, z up
+    # (a, b, c): half edges, radii and half height, or semi-axes, metres
     half_size: tuple[float, float, float]
     semantic: Semantic
-    reflectivity: float
-    yaw_rad: float = 0.0
-    instance: int = 0
+    reflectivity: float  # diffuse, in (0, 1], see effects.surface_power
+    yaw_rad: float = 0.0  # about the upright axis, counter-clockwise seen from above
+    instance: int = 0  # number of the object, 0 where the class has no objects
     material: Material = Material.CONCRETE
-    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)  # (x, y) in the world frame
+    # Rise per metre along the turned x and y axis, at most 0.2; upright walls stay upright.
     grade: tuple[float, float] = (0.0, 0.0)
+    # Chance of a hit per metre inside leaves, grass and wire mesh, which are media rather than
+    # surfaces; 0 for a closed surface.
     extinction_per_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the values."""
+        numbers = (*self.centre, *self.half_size, self.yaw_rad, *self.velocity_m_s, *self.grade)
+        if not math.isfinite(sum(numbers)):
+            raise ValueError(f"places, sizes, turns and speeds must be finite, got {self}")
         if not min(self.half_size) > 0:
             raise ValueError(f"half_size must be positive on every axis, got {self.half_size}")
-        _check_reflectivity(self.reflectivity)
+        if not 0 < self.reflectivity <= 1:
+            raise ValueError(f"reflectivity must lie in (0, 1], got {self.reflectivity}")
         if not 0 <= self.instance <= MAX_INSTANCE:
             raise ValueError(
                 f"instance must lie in 0..{MAX_INSTANCE} (16 bits of a label), got {self.instance}"
             )
-        if not 0 <= self.extinction_per_m < math.inf:
-            raise ValueError(f"extinction_per_m must be 0 or greater, got {self.extinction_per_m}")
+        check_fields(self, "be 0 or greater", "extinction_per_m")
         if max(map(abs, self.grade)) > 0.2:
             raise ValueError(f"grade must stay within 0.2, got {self.grade}")
 
@@ -128,46 +136,33 @@ class Pose:
 
     Applied to a vector of the sensor frame in the order roll (about x), pitch (about y, positive
     = nose down), heading (about z).
-
-    Args:
-        x_m: Position east.
-        y_m: Position north.
-        z_m: Height in the world frame.
-        heading_rad: Angle from +x, counter-clockwise.
-        pitch_rad: Small tilt of the body, nose down positive.
-        roll_rad: Small tilt of the body, right side down positive.
-
-    Raises:
-        ValueError: If a tilt exceeds 0.2 rad.
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 1.73
-    heading_rad: float = 0.0
-    pitch_rad: float = 0.0
-    roll_rad: float = 0.0
+    x_m: float = 0.0  # east
+    y_m: float = 0.0  # north
+    z_m: float = 1.73  # up
+    heading_rad: float = 0.0  # from +x, counter-clockwise
+    pitch_rad: float = 0.0  # nose down positive
+    roll_rad: float = 0.0  # right side down positive; both tilts together within 0.2
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self, "be finite", *(field.name for field in fields(self)))
         tilt_rad = math.hypot(self.pitch_rad, self.roll_rad)
         if tilt_rad > 0.2:
-            raise ValueError(
-                f"pitch and roll together must stay within 0.2 rad, got {tilt_rad:.3f}"
-            )
+            raise ValueError(f"pitch and roll must stay within 0.2 rad, got {tilt_rad:.3f}")
 
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """How the sensor moves during the sweep.
+    """How the sensor moves during the sweep."""
 
-    Args:
-        speed_m_s: Along the heading.
-        yaw_rate_rad_s: Counter-clockwise seen from above.
-    """
+    speed_m_s: float = 0.0  # along the heading
+    yaw_rate_rad_s: float = 0.0  # counter-clockwise seen from above
 
-    speed_m_s: float = 0.0
-    yaw_rate_rad_s: float = 0.0
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self, "be finite", "speed_m_s", "yaw_rate_rad_s")
 
 
 @dataclass(frozen=True)
@@ -175,18 +170,14 @@ class Weather:
     """State of the air, the sky and the road.
 
     Args:
-        visibility_m: Meteorological optical range (MOR): where a beam keeps 5 % of its power;
-            infinity without fog.
+        visibility_m: Meteorological optical range (MOR): where a beam keeps 5 % of its power; at
+            least 1 (the densest fogs have some 10 m), infinity without fog.
         rain_mm_h: Rain rate.
         snow_mm_h: Snow rate, as millimetres of water.
         water_film_mm: Depth of the water on the ground.
         clear_sky: Whether nothing covers the sun.
-        sun_elevation_deg: Above the horizon.
+        sun_elevation_deg: Above the horizon, -90 to 90.
         sun_azimuth_deg: In the world frame, counter-clockwise from +x.
-
-    Raises:
-        ValueError: If the visibility is not positive, a rate or depth is negative or infinite, or
-            the elevation lies outside -90..90.
     """
 
     visibility_m: float = math.inf
@@ -199,13 +190,88 @@ class Weather:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not self.visibility_m > 0:
-            raise ValueError(f"visibility_m must be positive, got {self.visibility_m}")
-        for name in ("rain_mm_h", "snow_mm_h", "water_film_mm"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be 0 or greater, got {getattr(self, name)}")
+        if not self.visibility_m >= 1:
+            raise ValueError(
+                f"visibility_m must be 1 or greater (no fog is denser), got {self.visibility_m}"
+            )
+        check_fields(self, "be 0 or greater", "rain_mm_h", "snow_mm_h", "water_film_mm")
+        check_fields(self, "be finite", "sun_azimuth_deg")
         if not -90 <= self.sun_elevation_deg <= 90:
             raise ValueError(f"sun_elevation_deg must lie in -90..90, got {self.sun_elevation_deg}")
+
+
+@dataclass(frozen=True)
+class WeatherPrior:
+    """Declared prior over the weather of a scene.
+
+    What remains of the probability is fog, rain or snow, a third each. Visibility and rates are
+    drawn evenly on a logarithmic scale, the rest evenly. In rain the road is wet; a sun below the
+    horizon is night.
+
+    Args:
+        clear_dry: Probability of clear air and a dry road.
+        wet: Probability of clear air over a wet road.
+        visibility_m: Meteorological optical range in fog.
+        rain_mm_h: Rain rate in rain.
+        snow_mm_h: Snow rate in snow, as millimetres of water.
+        water_film_mm: Depth of the water on a wet road.
+        sun_elevation_deg: Height of the sun.
+        clear_sky: Probability that nothing covers the sun in clear air over a dry road.
+    """
+
+    clear_dry: float = 0.85
+    wet: float = 0.10
+    visibility_m: Interval = (30.0, 1000.0)
+    rain_mm_h: Interval = (1.0, 30.0)
+    snow_mm_h: Interval = (0.5, 3.0)
+    water_film_mm: Interval = (0.1, 1.5)
+    sun_elevation_deg: Interval = (-18.0, 62.0)
+    clear_sky: float = 0.6
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self, "lie in [0, 1]", "clear_dry", "wet", "clear_sky")
+        if self.clear_dry + self.wet > 1:
+            raise ValueError(
+                f"clear_dry and wet must add up to 1 or less, got {self.clear_dry} and {self.wet}"
+            )
+        rates = ("visibility_m", "rain_mm_h", "snow_mm_h", "water_film_mm")
+        for name in (*rates, "sun_elevation_deg"):
+            low, high = getattr(self, name)
+            if not (low <= high < math.inf and (low > 0 or name not in rates)):
+                raise ValueError(
+                    f"{name} must be a finite interval (low, high), positive for depths, rates "
+                    f"and visibility, got {(low, high)}"
+                )
+
+    def draw(self, generator: np.random.Generator) -> Weather:
+        """One weather."""
+        air, third, sky = generator.random(3)
+        film_mm = generator.uniform(*self.water_film_mm)
+        elevation_deg = generator.uniform(*self.sun_elevation_deg)
+        azimuth_deg = generator.uniform(-180.0, 180.0)
+        if air < self.clear_dry:
+            return Weather(
+                clear_sky=sky < self.clear_sky,
+                sun_elevation_deg=elevation_deg,
+                sun_azimuth_deg=azimuth_deg,
+            )
+        visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
+        if air >= self.clear_dry + self.wet:
+            kind = int(3 * third)
+            if kind == 0:
+                visibility_m, film_mm = _even_logarithm(generator, self.visibility_m), 0.0
+            elif kind == 1:
+                rain_mm_h = _even_logarithm(generator, self.rain_mm_h)
+            else:
+                snow_mm_h, film_mm = _even_logarithm(generator, self.snow_mm_h), 0.0
+        return Weather(
+            visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg
+        )
+
+
+def _even_logarithm(generator: np.random.Generator, interval: Interval) -> float:
+    return math.exp(generator.uniform(*np.log(interval)))
 
 
 class Puddle(NamedTuple):
@@ -218,40 +284,22 @@ class Puddle(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """A scan's world.
-
-    Args:
-        primitives: Solids, in any order.
-        pose: Pose of the sensor frame in the middle of the sweep.
-        motion: Motion of the sensor.
-        weather: Air, sky and water.
-        puddles: Where water stands on the ground, if the road is wet.
-        ego_body: Parts of the recording car in the sensor frame; they move with the sensor.
-        ground_m: Height of the level ground that lies under everything.
-        ground_reflectivity: Diffuse reflectivity of that ground: asphalt, labelled as road.
-
-    Raises:
-        ValueError: If the reflectivity lies outside (0, 1] or the sensor is not above the ground.
-    """
+    """A scan's world."""
 
     primitives: tuple[Primitive, ...] = ()
-    pose: Pose = Pose()
+    pose: Pose = Pose()  # of the sensor frame in the middle of the sweep
     motion: EgoMotion = EgoMotion()
     weather: Weather = Weather()
-    puddles: tuple[Puddle, ...] = ()
-    ego_body: tuple[Primitive, ...] = ()
-    ground_m: float = 0.0
-    ground_reflectivity: float = 0.15
+    puddles: tuple[Puddle, ...] = ()  # where water stands on the ground, if the road is wet
+    ego_body: tuple[Primitive, ...] = ()  # parts of the recording car in the sensor frame
+    ground_m: float = 0.0  # height of the level ground that lies under everything
+    ground_reflectivity: float = 0.15  # of that ground: asphalt, labelled as road
 
     def __post_init__(self) -> None:
         """Check the values."""
-        _check_reflectivity(self.ground_reflectivity)
+        if not 0 < self.ground_reflectivity <= 1:
+            raise ValueError(f"reflectivity must lie in (0, 1], got {self.ground_reflectivity}")
         if not self.pose.z_m > self.ground_m:
             raise ValueError(
                 f"the sensor must be above the ground at {self.ground_m} m, got z_m={self.pose.z_m}"
             )
-
-
-def _check_reflectivity(reflectivity: float) -> None:
-    if not 0 < reflectivity <= 1:
-        raise ValueError(f"reflectivity must lie in (0, 1], got {reflectivity}")

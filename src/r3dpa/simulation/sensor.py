@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
@@ -11,6 +12,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+
+from r3dpa.simulation.scene import check_fields
 
 _LIGHT_M_S = 299_792_458.0
 _BLOCK_BEAMS = 32
@@ -30,10 +33,9 @@ _GAIN_SD = 0.2
 
 
 class Rays(NamedTuple):
-    """The shots of one turn: ``origin`` and unit ``direction``, each ``(3, H, W)`` float32.
+    """Shots of one turn: ``origin`` (metres) and unit ``direction``, each ``(3, H, W)`` float32.
 
-    H beams from top to bottom, W shots in the order of growing azimuth in ``[0, 2 pi)``; metres,
-    x forward, y left, z up.
+    H beams from top to bottom, W shots by growing azimuth in ``[0, 2 pi)``; x forward, z up.
     """
 
     origin: NDArray[np.float32]
@@ -42,27 +44,14 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True)
 class Lasers:
-    """Calibration of each laser, highest beam first.
+    """Calibration of each laser, highest beam first."""
 
-    Args:
-        inclination_rad: Elevation of the beam, falling from beam to beam.
-        azimuth_offset_rad: Horizontal angle from the heading of the spinning head to the beam.
-        height_m: Optical centre above the frame origin.
-        lateral_m: Optical centre to the left of the beam.
-        range_bias_m: What the laser measures too much.
-        intensity_gain: Factor on its intensity.
-
-    Raises:
-        ValueError: If the columns differ in length or are empty, a value is not finite, the
-            inclinations do not fall, a beam is steeper than 80 degrees, or a gain is not positive.
-    """
-
-    inclination_rad: tuple[float, ...]
-    azimuth_offset_rad: tuple[float, ...]
-    height_m: tuple[float, ...]
-    lateral_m: tuple[float, ...]
-    range_bias_m: tuple[float, ...]
-    intensity_gain: tuple[float, ...]
+    inclination_rad: tuple[float, ...]  # falling from beam to beam, within 80 degrees
+    azimuth_offset_rad: tuple[float, ...]  # from the heading of the spinning head
+    height_m: tuple[float, ...]  # optical centre above the frame origin
+    lateral_m: tuple[float, ...]  # optical centre to the left of the beam
+    range_bias_m: tuple[float, ...]  # what the laser measures too much
+    intensity_gain: tuple[float, ...]  # factor on its intensity
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -91,63 +80,38 @@ class SpinningLidar:
 
     Source: KITTI's scans (laser table, nearest range, noise), the datasheet (other limits,
     divergence), KITTI-360 (mount, spin).
-
-    Args:
-        lasers: Calibration of the lasers.
-        shots: Shots of each laser per turn.
-        spin_hz: Turns per second.
-        mount_height_m: Frame origin above the road.
-        min_power: Weakest power that is detected, m^-2: 10 % asphalt seen from 1.73 m vanishes at
-            50 m, see ``effects.surface``.
-        min_range_m: Nearest range that is reported; the datasheet says 0.9 m, KITTI's scans hold
-            nothing below 1.45 m.
-        max_range_m: Farthest range that is reported.
-        divergence_rad: Full angle of the beam; 0 for a line.
-        pulse_s: Length of the pulse; echoes nearer to each other than ``pulse_depth_m`` merge.
-        overlap_range_m: From here on the receiver sees the whole beam.
-        threshold_spread: Standard deviation of the logarithm of the detection threshold.
-        range_sigma_m: Range noise of a strong return.
-        weak_range_sigma_m: Further range noise at a signal-to-noise ratio of 1/2.
-        range_step_m: Step in which ranges are reported; 0 for none.
-        return_mode: Report the strongest return of a shot, or the two strongest.
-
-    Raises:
-        ValueError: If a value is out of its range.
     """
 
     lasers: Lasers
-    shots: int = 2083
+    shots: int = 2083  # of each laser per turn, at least 8
     spin_hz: float = 10.0
-    mount_height_m: float = 1.73
+    mount_height_m: float = 1.73  # frame origin above the road
+    # Weakest power that is detected, m^-2: 10 % asphalt seen from 1.73 m vanishes at 50 m, see
+    # ``effects.surface``.
     min_power: float = 1.43e-5
+    # Nearest range that is reported; the datasheet says 0.9 m, KITTI's scans hold nothing nearer.
     min_range_m: float = 1.45
     max_range_m: float = 120.0
-    divergence_rad: float = 2e-3
-    pulse_s: float = 5e-9
-    overlap_range_m: float = 5.0
-    threshold_spread: float = 0.3
-    range_sigma_m: float = 0.008
-    weak_range_sigma_m: float = 0.05
-    range_step_m: float = 0.002
-    return_mode: Literal["strongest", "dual"] = "strongest"
+    divergence_rad: float = 2e-3  # full angle of the beam; 0 for a line
+    pulse_s: float = 5e-9  # echoes nearer to each other than ``pulse_depth_m`` merge
+    overlap_range_m: float = 5.0  # from here on the receiver sees the whole beam
+    threshold_spread: float = 0.3  # standard deviation of the logarithm of the threshold
+    range_sigma_m: float = 0.008  # range noise of a strong return
+    weak_range_sigma_m: float = 0.05  # further noise at a signal-to-noise ratio of 1/2
+    range_step_m: float = 0.002  # in which ranges are reported; 0 for none
+    return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot
 
     def __post_init__(self) -> None:
         """Check the values."""
         if self.shots < 8:
             raise ValueError(f"shots must be at least 8 per turn, got {self.shots}")
-        for name in ("spin_hz", "mount_height_m", "min_power", "overlap_range_m"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in (
-            "divergence_rad",
-            "pulse_s",
-            "threshold_spread",
-            "range_sigma_m",
-            "weak_range_sigma_m",
-            "range_step_m",
-        ):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be 0 or greater, got {getattr(self, name)}")
+        check_fields(
+            self, "be positive", "spin_hz", "mount_height_m", "min_power", "overlap_range_m"
+        )
+        check_fields(
+            self, "be 0 or greater", "divergence_rad", "pulse_s", "threshold_spread",
+            "range_sigma_m", "weak_range_sigma_m", "range_step_m",
+        )  # fmt: skip
         if not 0 <= self.min_range_m < self.max_range_m < math.inf:
             raise ValueError(
                 f"ranges must satisfy 0 <= min_range_m < max_range_m, "
@@ -186,10 +150,7 @@ def hdl64e(shots: int = 2083, calibration_seed: int = 64) -> SpinningLidar:
 
     Args:
         shots: Shots of each laser per turn, 2083 at 10 Hz.
-        calibration_seed: Draws the small irregularities of the beam table.
-
-    Raises:
-        ValueError: If the shots are too few or the seed is negative.
+        calibration_seed: Seed of the irregularities of the beam table, 0 or greater.
     """
     if calibration_seed < 0:
         raise ValueError(f"calibration_seed must be 0 or greater, got {calibration_seed}")
@@ -201,13 +162,7 @@ def hdl32e() -> SpinningLidar:
 
     Source: the datasheet.
     """
-    none = np.zeros(32)
-    lasers = _lasers(
-        inclination_rad=np.radians(np.linspace(10.67, -30.67, 32)),
-        azimuth_offset_rad=none,
-        height_m=none,
-        lateral_m=none,
-    )
+    lasers = _lasers(np.radians(np.linspace(10.67, -30.67, 32)))
     return SpinningLidar(lasers, 2170, min_range_m=0.9, max_range_m=100.0)
 
 
@@ -220,12 +175,8 @@ def vls128() -> SpinningLidar:
     below = (6.65, 6.85, 7.15, 7.65, 8.35, 9.24, 10.35, 11.74, 13.57, 16.04, 19.58, 25)
     inclination_deg = np.concatenate([above, np.linspace(4.72, -6.5, 103), np.negative(below)])
     columns_deg = (4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354, 6.354)
-    none = np.zeros(128)
     lasers = _lasers(
-        inclination_rad=np.radians(inclination_deg),
-        azimuth_offset_rad=np.radians(np.resize(columns_deg, 128)),
-        height_m=none,
-        lateral_m=none,
+        np.radians(inclination_deg), azimuth_offset_rad=np.radians(np.resize(columns_deg, 128))
     )
     return SpinningLidar(lasers, 1800, min_range_m=0.9, max_range_m=245.0, min_power=3.4e-6)
 
@@ -241,10 +192,6 @@ def load_sensor(model: str, **changes: Any) -> SpinningLidar:
             a list ``lasers`` with ``vert_correction`` and ``rot_correction`` in radians and
             ``vert_offset_correction`` and ``horiz_offset_correction`` in metres.
         changes: Other values for fields of :class:`SpinningLidar`.
-
-    Raises:
-        ValueError: If there is no such preset or file, the file is not such a calibration, or a
-            value is out of its range.
     """
     if model in PRESETS:
         return replace(PRESETS[model](), **changes)
@@ -258,8 +205,7 @@ def load_sensor(model: str, **changes: Any) -> SpinningLidar:
 
 def sensor_to_dict(sensor: SpinningLidar) -> dict[str, Any]:
     """The sensor as plain values, as JSON returns them."""
-    values = asdict(sensor)
-    values["lasers"] = {name: list(column) for name, column in values["lasers"].items()}
+    values: dict[str, Any] = json.loads(json.dumps(asdict(sensor)))
     return values
 
 
@@ -287,11 +233,12 @@ def _read_calibration(path: Path) -> Lasers:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _lasers(**columns: NDArray[np.float64]) -> Lasers:
-    """A table of these columns; without bias and of gain 1 where these are not given."""
-    num = len(columns["inclination_rad"])
-    columns = {"range_bias_m": np.zeros(num), "intensity_gain": np.ones(num)} | columns
-    return Lasers(**{name: tuple(map(float, column)) for name, column in columns.items()})
+def _lasers(inclination_rad: NDArray[np.float64], **columns: NDArray[np.float64]) -> Lasers:
+    """Laser table of these columns; missing gains are 1, other missing values 0."""
+    zeros = np.zeros(len(inclination_rad))
+    table = {field.name: zeros for field in fields(Lasers)} | {"intensity_gain": zeros + 1}
+    table |= {"inclination_rad": inclination_rad} | columns
+    return Lasers(*(tuple(map(float, column)) for column in table.values()))
 
 
 def _block_inclinations(
@@ -339,33 +286,24 @@ def _azimuth(lasers: Lasers, shots: int) -> NDArray[np.float64]:
 def _time_s(lasers: Lasers, shots: int, spin_hz: float) -> NDArray[np.float32]:
     head = _azimuth(lasers, shots) - np.array(lasers.azimuth_offset_rad)[:, None]
     turns = head / (2 * np.pi)
-    time_s = ((turns + 0.5) % 1.0 - 0.5) / spin_hz
-    time_s = time_s.astype(np.float32)
-    time_s.flags.writeable = False
-    return time_s
+    return _frozen(((turns + 0.5) % 1.0 - 0.5) / spin_hz)
 
 
 @lru_cache(maxsize=4)
 def _rays(lasers: Lasers, shots: int) -> Rays:
     azimuth = _azimuth(lasers, shots)
-    cos_azimuth, sin_azimuth = np.cos(azimuth), np.sin(azimuth)
-    inclination = np.array(lasers.inclination_rad)[:, None]
-    lateral = np.array(lasers.lateral_m)[:, None]
-    origin = np.stack(
-        [
-            -lateral * sin_azimuth,
-            lateral * cos_azimuth,
-            np.broadcast_to(np.array(lasers.height_m)[:, None], azimuth.shape),
-        ]
+    cosine, sine = np.cos(azimuth), np.sin(azimuth)
+    inclination, lateral, height = (
+        np.array(column)[:, None] + np.zeros_like(azimuth)
+        for column in (lasers.inclination_rad, lasers.lateral_m, lasers.height_m)
     )
-    direction = np.stack(
-        [
-            np.cos(inclination) * cos_azimuth,
-            np.cos(inclination) * sin_azimuth,
-            np.broadcast_to(np.sin(inclination), azimuth.shape),
-        ]
-    )
-    rays = Rays(origin.astype(np.float32), direction.astype(np.float32))
-    for array in rays:
-        array.flags.writeable = False
-    return rays
+    origin = np.stack([-lateral * sine, lateral * cosine, height])
+    level, up = np.cos(inclination), np.sin(inclination)
+    direction = np.stack([level * cosine, level * sine, up])
+    return Rays(_frozen(origin), _frozen(direction))
+
+
+def _frozen(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    frozen = values.astype(np.float32)
+    frozen.flags.writeable = False
+    return frozen

@@ -8,15 +8,23 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
+from numpy.random import Generator
 
 from r3dpa.simulation.builder import Builder, build_ground
 from r3dpa.simulation.course import BLOCK_M, SCAN_PERIOD_S, Course, course_of
 from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.roadside import build_plots, build_side_street
-from r3dpa.simulation.scene import EgoMotion, Pose, Primitive, Puddle, Scene, Weather
+from r3dpa.simulation.scene import (
+    EgoMotion,
+    Pose,
+    Primitive,
+    Puddle,
+    Scene,
+    Weather,
+    WeatherPrior,
+    check_fields,
+)
 from r3dpa.simulation.vehicles import Body, cyclist, person, recording_car, vehicle
-from r3dpa.simulation.weather import WeatherPrior
 
 # Blocks behind and ahead of the car's own that are built: beyond lies less than 1 % of the
 # returns of real scans.
@@ -37,9 +45,6 @@ _FIRST_ACTOR = 1 + _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
 _LEVEL_GROUND_M = 4.0
 
 
-_PRIOR = WeatherPrior()
-
-
 @dataclass(frozen=True)
 class Street:
     """An endless street along which one drive is recorded.
@@ -51,38 +56,27 @@ class Street:
     town, a suburb, a green edge of town, or along an arterial road.
 
     Args:
-        seed: Seed of the data set.
-        drive: Number of the drive; each has a street of its own.
-        weather: Weather of all scans, or the prior from which one is drawn every 100 scans.
+        seed: Seed of the data set, 0 or greater.
+        drive: Number of the drive, 0 or greater; each has a street of its own.
+        weather: Weather of all scans, or the prior from which one is drawn every 100 scans; None
+            for the default prior.
 
-    Raises:
-        ValueError: If the seed or the drive is negative.
     """
 
     seed: int
     drive: int
-    weather: Weather | WeatherPrior = _PRIOR
+    weather: Weather | WeatherPrior | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.seed < 0 or self.drive < 0:
-            raise ValueError(
-                f"seed and drive must be 0 or greater, got {self.seed} and {self.drive}"
-            )
+        check_fields(self, "be 0 or greater", "seed", "drive")
 
     def scene(self, scan: int, sensor_height_m: float = 1.73) -> Scene:
-        """The scene of one scan; scans of a drive may be asked for in any order.
+        """Solids within 72 to 96 m along the street, pose and motion, weather and puddles.
 
         Args:
             scan: Number of the scan in the drive, 0 or greater.
             sensor_height_m: Frame origin of the sensor above the road.
-
-        Returns:
-            Standing and moving primitives within 72 to 96 m along the street, pose and motion of
-            the sensor, weather and puddles.
-
-        Raises:
-            ValueError: If ``scan`` is negative.
         """
         weather = self.weather_of(scan)
         course = course_of(self.seed, self.drive)
@@ -100,9 +94,9 @@ class Street:
             primitives += builder.primitives
             details += builder.details
         pose = _pose(course, scan, sensor_height_m)
-        primitives += [
-            p for p in details if math.dist(p.centre[:2], (pose.x_m, pose.y_m)) < _DETAIL_M
-        ]
+        here = (pose.x_m, pose.y_m)
+        primitives += [p for p in details if math.dist(p.centre[:2], here) < _DETAIL_M]
+        around = range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 2)
         return Scene(
             tuple(primitives),
             pose,
@@ -110,33 +104,24 @@ class Street:
             weather,
             tuple(puddles) if weather.water_film_mm > 0 else (),
             recording_car(),
-            _lowest_m(course, own) - _LEVEL_GROUND_M,
+            min(course.section_of(number).z_m for number in around) - _LEVEL_GROUND_M,
             course.road_reflectivity,
         )
 
     def weather_of(self, scan: int) -> Weather:
-        """The weather of one scan.
-
-        Raises:
-            ValueError: If ``scan`` is negative.
-        """
+        """The weather of one scan."""
         if scan < 0:
             raise ValueError(f"scan must be 0 or greater, got {scan}")
         if isinstance(self.weather, Weather):
             return self.weather
         stretch = scan // _SCANS_PER_WEATHER
-        return self.weather.draw(generator_for(self.seed, "weather", self.drive, stretch))
-
-
-class _Block(NamedTuple):
-    primitives: tuple[Primitive, ...]
-    details: tuple[Primitive, ...]
-    puddles: tuple[Puddle, ...]
+        prior = self.weather or WeatherPrior()
+        return prior.draw(generator_for(self.seed, "weather", self.drive, stretch))
 
 
 @lru_cache(maxsize=256)
-def _block(seed: int, drive: int, block: int) -> _Block:
-    """What stands still in one block of 24 m, in world coordinates."""
+def _block(seed: int, drive: int, block: int) -> Builder:
+    """What stands still in one block of 24 m, in world coordinates; not to be changed."""
     course = course_of(seed, drive)
     first_instance = 1 + block % _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
     builder = Builder(course, course.section_of(block), first_instance)
@@ -153,7 +138,7 @@ def _block(seed: int, drive: int, block: int) -> _Block:
         else:
             build_plots(builder, draw, side, district)
     assert builder.num_objects < _MAX_OBJECTS_PER_BLOCK, f"block {block} has too many objects"
-    return _Block(tuple(builder.primitives), tuple(builder.details), tuple(builder.puddles))
+    return builder
 
 
 def _pose(course: Course, scan: int, sensor_height_m: float) -> Pose:
@@ -180,22 +165,13 @@ def _motion(course: Course, scan: int) -> EgoMotion:
     return EgoMotion(speed_m_s, along_m_s * course.smooth(s)[1])
 
 
-def _lowest_m(course: Course, own: int) -> float:
-    numbers = range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 2)
-    return min(course.section_of(number).z_m for number in numbers)
-
-
 class _Stream(NamedTuple):
-    """Actors of one kind in one lane, all of one speed and at uneven distances.
+    """Actors of one kind in one lane, all of one speed and at uneven distances."""
 
-    ``direction``: 1 with the recording car, -1 against it. ``speed_m_s``: None for the speed of
-    the recording car, whose lane it is.
-    """
-
-    kind: Callable[[np.random.Generator], Body]
+    kind: Callable[[Generator], Body]
     lateral_m: float
-    direction: int
-    speed_m_s: float | None
+    direction: int  # 1 with the recording car, -1 against it
+    speed_m_s: float | None  # None in the lane of the recording car: its speed
     gap_m: float
 
 
@@ -224,9 +200,8 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
             for direction in (-1, 1):
                 gap_m = draw.uniform(*character.people_gap_m)
                 speed_m_s = draw.uniform(0.9, 1.7)
-                streams.append(
-                    _Stream(person, lateral - 0.25 * direction, direction, speed_m_s, gap_m)
-                )
+                at = lateral - 0.25 * direction
+                streams.append(_Stream(person, at, direction, speed_m_s, gap_m))
     return tuple(streams)
 
 

@@ -12,14 +12,20 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from r3dpa.simulation.draws import RayIndex
 from r3dpa.simulation.raycast import cast, normals
 from r3dpa.simulation.scene import GROUND_MATERIALS, Material, Scene, Semantic
 from r3dpa.simulation.sensor import SpinningLidar
-from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, level, scene_solids
-from r3dpa.simulation.windows import pieces, windows_of
-
-#: Rays that an effect touches: indices ``(M,)``, or ``slice(None)`` for all.
-RayIndex = NDArray[np.int64] | slice
+from r3dpa.simulation.solids import (
+    GROUND,
+    NO_SURFACE,
+    Floats,
+    Solids,
+    level,
+    pieces,
+    solids_of,
+    windows_of,
+)
 
 #: Whether water can lie on each ``Material``: road, pavement, soil.
 IS_GROUND = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
@@ -52,19 +58,12 @@ IN_THE_AIR = (Origin.FOG, Origin.RAIN, Origin.SNOW, Origin.SPRAY, Origin.BLOOMIN
 
 @dataclass(slots=True)
 class Echoes:
-    """One echo of every shot; all arrays are ``(R,)``.
+    """One echo of every shot; all arrays are ``(R,)``."""
 
-    Args:
-        range_m: Range that is measured: length of the path; infinite without an echo.
-        power: Received over emitted power, m^-2; 0 without an echo.
-        surface: Index of the primitive, ``GROUND``, ``EGO_BODY`` or ``NO_SURFACE``.
-        origin: ``Origin`` of the echo.
-    """
-
-    range_m: Floats
-    power: Floats
-    surface: NDArray[np.int32]
-    origin: NDArray[np.uint8]
+    range_m: Floats  # length of the path; infinite without an echo
+    power: Floats  # received over emitted, m^-2; 0 without an echo
+    surface: NDArray[np.int32]  # index of the primitive, GROUND, EGO_BODY or NO_SURFACE
+    origin: NDArray[np.uint8]  # Origin of the echo
 
     @classmethod
     def none(cls, num: int) -> Echoes:
@@ -84,25 +83,8 @@ class Echoes:
 class Sweep:
     """One turn of the sensor in a scene; effects change it in place.
 
-    Args:
-        scene: What is scanned.
-        sensor: What scans it.
-
-    Attributes:
-        shape: ``(H, W)`` beams and shots.
-        start: ``(3, R)`` where the rays start in the scene frame, metres.
-        direction: ``(3, R)`` unit vectors in the scene frame.
-        time_s: ``(R,)`` when they are fired, seconds from the middle of the sweep.
-        actor_time_s: ``(R,)`` when each ray meets the moving solids, or None: all at time 0.
-        optical_depth: ``(R,)`` how deep each ray gets into foliage, or None: foliage is closed.
-        solids: The primitives as the ray cast wants them.
-        cos_incidence: ``(R,)`` cosine between ray and normal of the surface that was hit.
-        reflectivity: ``(R,)`` of that surface.
-        material: ``(R,)`` of that surface; meaningless where nothing is hit.
-        first: The strongest echo of each shot. It stays the first where the air weakens it below
-            the second: an instrument that records one echo knows of no other.
-        second: The next echo of each shot, or None where it is not recorded.
-        min_power: ``(R,)`` weakest power that is detected, m^-2.
+    ``first`` is the strongest echo of each shot. It stays the first where the air weakens it below
+    the second: an instrument that records one echo knows of no other.
     """
 
     def __init__(self, scene: Scene, sensor: SpinningLidar) -> None:
@@ -111,18 +93,20 @@ class Sweep:
         self.shape = (sensor.num_beams, sensor.shots)
         self.num_rays = sensor.num_beams * sensor.shots
         origin, direction = (level(array, scene.pose).reshape(3, -1) for array in sensor.rays)
-        self.start: Floats = origin
-        self.direction: Floats = direction
-        self.time_s: Floats = sensor.time_s.reshape(-1)
-        self.actor_time_s: Floats | None = None
-        self.optical_depth: Floats | None = None
-        self.solids = scene_solids(scene)
+        zeros = np.zeros(self.num_rays, dtype=np.float32)
+        self.start: Floats = origin  # (3, R) of the rays in the scene frame, metres
+        self.direction: Floats = direction  # (3, R) unit vectors in the scene frame
+        self.time_s: Floats = sensor.time_s.reshape(-1)  # from the middle of the sweep
+        self.actor_time_s: Floats | None = None  # when rays meet moving solids; None: at time 0
+        self.optical_depth: Floats | None = None  # depth of rays in foliage; None: it is closed
+        self.solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
         self.first = Echoes.none(self.num_rays)
-        self.second: Echoes | None = None
-        self.cos_incidence: Floats = np.zeros(self.num_rays, dtype=np.float32)
-        self.reflectivity: Floats = np.zeros(self.num_rays, dtype=np.float32)
-        self.material: NDArray[np.uint8] = np.zeros(self.num_rays, dtype=np.uint8)
-        self.min_power: Floats = np.full(self.num_rays, sensor.min_power, dtype=np.float32)
+        self.second: Echoes | None = None  # the next echo, if it is recorded
+        # Of the surface that was hit:
+        self.cos_incidence: Floats = zeros  # cosine between ray and normal
+        self.reflectivity: Floats = zeros.copy()
+        self.material: NDArray[np.uint8] = zeros.astype(np.uint8)
+        self.min_power: Floats = zeros + np.float32(sensor.min_power)  # weakest detected, m^-2
 
     def grid(self, values: NDArray) -> NDArray:
         """Values ``(..., R)`` as ``(..., H, W)``."""
@@ -134,30 +118,17 @@ class Sweep:
             None if field is None else self.grid(field)
             for field in (self.optical_depth, self.actor_time_s)
         )
-        range_m, surface = cast(
-            self.solids,
-            self.grid(self.start),
-            self.grid(self.direction),
-            self.sensor.max_range_m,
-            actor_time_s,
-            depth,
-        )
+        start, direction = self.grid(self.start), self.grid(self.direction)
+        limit_m = self.sensor.max_range_m
+        range_m, surface = cast(self.solids, start, direction, limit_m, actor_time_s, depth)
         first = self.first
         first.range_m, first.surface = range_m.reshape(-1), surface.reshape(-1)
         first.power = (first.surface != NO_SURFACE).astype(np.float32)
-        self.reflectivity = self.of_surface(
-            [p.reflectivity for p in self.scene.primitives],
-            self.scene.ground_reflectivity,
-            np.float32,
-        )
-        self.material = self.of_surface(
-            [p.material for p in self.scene.primitives], Material.ASPHALT, np.uint8
-        )
+        self.reflectivity, self.material = self.look_of(first.surface)
         self.cos_incidence = self._cos_incidence()
         if depth is not None:
-            inside = np.flatnonzero(
-                self.of_surface([p.extinction_per_m > 0 for p in self.scene.primitives], 0, bool)
-            )
+            is_medium = [p.extinction_per_m > 0 for p in self.scene.primitives]
+            inside = np.flatnonzero(self.of_surface(is_medium, 0, bool))
             first.origin[inside] = Origin.FOLIAGE
             self.cos_incidence[inside] = _FOLIAGE_COS
 
@@ -186,21 +157,14 @@ class Sweep:
     def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
         """For each solid the rays (M,) that can meet it, from its bounding box.
 
-        Args:
-            solids: Solids in the scene frame.
-            actor_time_s: ``(R,)`` when the rays meet those that move; None in the middle of the
-                sweep.
+        ``actor_time_s``: ``(R,)`` when they meet moving ones; None in the middle of the sweep.
         """
         found = [np.empty(0, dtype=np.int64)] * len(solids.shape)
         if not found:
             return found
-        windows = windows_of(
-            solids,
-            self.grid(self.start),
-            self.grid(self.direction),
-            self.sensor.max_range_m,
-            None if actor_time_s is None else self.grid(actor_time_s),
-        )
+        start, direction = self.grid(self.start), self.grid(self.direction)
+        time_s = None if actor_time_s is None else self.grid(actor_time_s)
+        windows = windows_of(solids, start, direction, self.sensor.max_range_m, time_s)
         every_ray = self.grid(np.arange(self.num_rays))
         for index in windows.order:
             parts = pieces(index, windows, self.shape[1])
@@ -215,18 +179,22 @@ class Sweep:
         surface: NDArray[np.int32] | None = None,
         ego: float = 0,
     ) -> NDArray:
-        """What a table of values per primitive says of surfaces, by default those of the cast.
+        """Values ``(M,)`` of surfaces, by default those of the cast, 0 for ``NO_SURFACE``.
 
-        Args:
-            values: One value per primitive of the scene.
-            ground: Value of the ground.
-            dtype: Of the result; 0 stands where there is no surface.
-            surface: ``(M,)`` surfaces.
-            ego: Value of the recording car.
+        ``values``: one per primitive of the scene. ``ego``: of the recording car.
         """
         # EGO_BODY, NO_SURFACE and GROUND are the last entries of the table.
         table: NDArray = np.array([*values, ego, 0, ground], dtype=dtype)
         return table[self.first.surface if surface is None else surface]
+
+    def look_of(self, surface: NDArray[np.int32]) -> tuple[Floats, NDArray[np.uint8]]:
+        """Reflectivity and ``Material`` of surfaces ``(M,)``."""
+        solids, ground = self.scene.primitives, self.scene.ground_reflectivity
+        share, kind = [p.reflectivity for p in solids], [p.material for p in solids]
+        return (
+            self.of_surface(share, ground, np.float32, surface),
+            self.of_surface(kind, Material.ASPHALT, np.uint8, surface),
+        )
 
     def on_ground(self) -> NDArray[np.int64]:
         """Rays that hit ground on which water can lie: road, pavement, soil."""
@@ -256,16 +224,10 @@ class Sweep:
         surface: NDArray[np.int32] | int,
         origin: NDArray[np.uint8] | int,
     ) -> None:
-        """Further echoes of some rays: one that is stronger than the first takes its place.
+        """Further echoes ``(M,)`` of different rays: a stronger one replaces the first.
 
-        Of the echo that is left over and the second one, the stronger is the second.
-
-        Args:
-            rays: ``(M,)`` different rays.
-            range_m: ``(M,)`` ranges of the echoes.
-            power: ``(M,)`` their power; an echo of power 0 is none.
-            surface: ``(M,)`` or one for all.
-            origin: ``(M,)`` or one for all.
+        Of the echo that is left over and the second one, the stronger is the second. An echo of
+        power 0 is none.
         """
         offered = [
             np.broadcast_to(np.asarray(values), rays.shape)
@@ -285,18 +247,11 @@ class Sweep:
             old[rays[stronger]] = values[stronger]
 
     def labels(self, surface: NDArray[np.int32], origin: NDArray[np.uint8]) -> NDArray[np.uint32]:
-        """Label of each point: semantic class in the lower 16 bits, instance in the upper.
+        """Labels ``(M,)``: semantic class in the lower 16 bits, instance in the upper.
 
-        Args:
-            surface: ``(M,)`` surfaces of the points.
-            origin: ``(M,)`` what made them; points in the air are unlabelled.
+        Points whose origin is in the air are unlabelled.
         """
-        coded = self.of_surface(
-            [p.semantic | p.instance << 16 for p in self.scene.primitives],
-            Semantic.ROAD,
-            np.uint32,
-            surface,
-            Semantic.EGO_VEHICLE,
-        )
+        codes = [p.semantic | p.instance << 16 for p in self.scene.primitives]
+        coded = self.of_surface(codes, Semantic.ROAD, np.uint32, surface, Semantic.EGO_VEHICLE)
         coded[np.isin(origin, IN_THE_AIR)] = Semantic.UNLABELED
         return coded

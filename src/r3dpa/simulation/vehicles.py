@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from r3dpa.simulation.scene import Material, Primitive, Semantic, Shape
 
@@ -50,7 +52,15 @@ def _plate(x: float, z: float, semantic: Semantic) -> Part:
     return Part((x, 0, z), _PLATE_M, semantic, Material.RETROREFLECTOR, 0.9, detail=True)
 
 
-def coat(draw: np.random.Generator) -> float:
+def _painted(semantic: Semantic, paint: float) -> Callable[..., Part]:
+    return partial(Part, semantic=semantic, material=Material.PAINT, reflectivity=paint)
+
+
+def _pane(x: float, z: float, size: tuple[float, float, float], semantic: Semantic) -> Part:
+    return Part((x, 0, z), size, semantic, Material.GLASS, DIRT)
+
+
+def coat(draw: Generator) -> float:
     """Reflectivity of a coat of paint.
 
     Under its clear coat a dark car sends hardly anything back to where it came from: at 5 m it
@@ -62,122 +72,88 @@ def coat(draw: np.random.Generator) -> float:
 
 
 def _cabin(
-    draw: np.random.Generator,
-    centre: tuple[float, float, float],
-    size: tuple[float, float, float],
-    roof: Part,
+    draw: Generator, x: float, z: float, size: tuple[float, float, float], roof: Part
 ) -> list[Part]:
     """A band of windows with seats behind it and a roof above.
 
     Hardly anything comes back from inside: panes of vehicles absorb, seats are dark.
     """
     seats_m = (0.9 * size[0], 0.9 * size[1], 0.95 * size[2])
-    seats_at = (centre[0], centre[1], centre[2] - 0.025 * size[2])
     semantic, cloth = roof.semantic, float(np.exp(draw.uniform(*np.log(_SEATS))))
+    seats_at = (x, 0, z - 0.025 * size[2])
     return [
-        Part(centre, size, semantic, Material.GLASS, DIRT),
+        _pane(x, z, size, semantic),
         Part(seats_at, seats_m, semantic, Material.CLOTH, cloth, detail=True),
         roof,
     ]
 
 
-def car(draw: np.random.Generator) -> Body:
+def car(draw: Generator) -> Body:
     """A passenger car: body, cabin of glass with seats in it, roof, two licence plates."""
     length, width = draw.uniform(3.7, 4.9), draw.uniform(1.65, 1.88)
     floor_m, body_m, cabin_m = 0.2, draw.uniform(0.6, 0.72), draw.uniform(0.44, 0.56)
     cabin_long = length * draw.uniform(0.45, 0.68)
     cabin_at = -0.5 * (length - cabin_long) * draw.uniform(0.3, 0.95)
-    top_m, paint = floor_m + body_m, coat(draw)
-    of_car = partial(
-        Part, semantic=Semantic.CAR, material=Material.PAINT, reflectivity=paint, shape=Shape.BOX
-    )
-    roof = of_car(
-        centre=(cabin_at, 0, top_m + cabin_m + 0.03),
-        size=(0.86 * cabin_long, 0.8 * width, 0.06),
-        detail=True,
-    )
+    top_m, painted = floor_m + body_m, _painted(Semantic.CAR, coat(draw))
+    roof_at, roof_m = (cabin_at, 0, top_m + cabin_m + 0.03), (0.86 * cabin_long, 0.8 * width, 0.06)
+    roof, glass_m = painted(roof_at, roof_m, detail=True), (cabin_long, 0.86 * width, cabin_m)
     return (
-        of_car(centre=(0, 0, floor_m + body_m / 2), size=(length, width, body_m)),
-        *_cabin(
-            draw, (cabin_at, 0, top_m + cabin_m / 2), (cabin_long, 0.86 * width, cabin_m), roof
-        ),
+        painted((0, 0, floor_m + body_m / 2), (length, width, body_m)),
+        *_cabin(draw, cabin_at, top_m + cabin_m / 2, glass_m, roof),
         _plate(length / 2, 0.45, Semantic.CAR),
         _plate(-length / 2, draw.uniform(0.45, 0.8), Semantic.CAR),
     )
 
 
-def van(draw: np.random.Generator) -> Body:
+def van(draw: Generator) -> Body:
     """A delivery van: box, bonnet, windscreen and plates."""
     length, width, height = draw.uniform(4.8, 6.4), draw.uniform(1.9, 2.05), draw.uniform(1.8, 2.5)
-    paint, bonnet_m = coat(draw), 0.9
-    side = Part(
-        (-bonnet_m / 2, 0, 0.25 + height / 2),
-        (length - bonnet_m, width, height),
-        Semantic.CAR,
-        Material.PAINT,
-        paint,
-    )
+    painted, bonnet_m = _painted(Semantic.CAR, coat(draw)), 0.9
     front_m = length / 2 - bonnet_m
-    bonnet = Part(
-        (front_m + bonnet_m / 2, 0, 0.7),
-        (bonnet_m, width, 0.9),
-        Semantic.CAR,
-        Material.PAINT,
-        paint,
-    )
-    screen = Part(
-        (front_m + 0.03, 0, 1.6), (0.03, 0.85 * width, 0.8), Semantic.CAR, Material.GLASS, DIRT
-    )
     return (
-        side,
-        bonnet,
-        screen,
+        painted((-bonnet_m / 2, 0, 0.25 + height / 2), (length - bonnet_m, width, height)),
+        painted((front_m + bonnet_m / 2, 0, 0.7), (bonnet_m, width, 0.9)),
+        _pane(front_m + 0.03, 1.6, (0.03, 0.85 * width, 0.8), Semantic.CAR),
         _plate(length / 2, 0.5, Semantic.CAR),
         _plate(-length / 2, 0.6, Semantic.CAR),
     )
 
 
-def truck(draw: np.random.Generator) -> Body:
+def truck(draw: Generator) -> Body:
     """A truck with a box or, sometimes, a polished tank."""
     length, width = draw.uniform(7.0, 10.5), 2.45
     cab_m, load_m = 1.9, draw.uniform(2.3, 2.8)
-    front_m = length / 2
-    cab = Part(
-        (front_m - cab_m / 2, 0, 1.65),
-        (cab_m, width, 2.5),
-        Semantic.TRUCK,
-        Material.PAINT,
-        coat(draw),
-    )
-    screen = Part(
-        (front_m + 0.03, 0, 2.2), (0.03, 0.88 * width, 0.9), Semantic.TRUCK, Material.GLASS, DIRT
-    )
-    chassis = Part(
-        (-cab_m / 2, 0, 0.75), (length - cab_m, 1.9, 0.5), Semantic.TRUCK, Material.PAINT, 0.05
-    )
+    front_m, paint = length / 2, coat(draw)
     load_at = (-cab_m / 2 - 0.1, 0, 1.0 + load_m / 2)
     load_size = (length - cab_m - 0.2, width, load_m)
     if draw.random() < 0.3:
         metal = Material.POLISHED_METAL
         load = Part(load_at, load_size, Semantic.TRUCK, metal, 0.1, Shape.ELLIPSOID)
     else:
-        paint = draw.uniform(0.12, 0.25)
-        load = Part(load_at, load_size, Semantic.TRUCK, Material.PAINT, paint)
-    return cab, screen, chassis, load, _plate(-front_m, 0.8, Semantic.TRUCK)
+        load = _painted(Semantic.TRUCK, draw.uniform(0.12, 0.25))(load_at, load_size)
+    cab_at, cab_size = (front_m - cab_m / 2, 0, 1.65), (cab_m, width, 2.5)
+    return (
+        _painted(Semantic.TRUCK, paint)(cab_at, cab_size),
+        _pane(front_m + 0.03, 2.2, (0.03, 0.88 * width, 0.9), Semantic.TRUCK),
+        _painted(Semantic.TRUCK, 0.05)((-cab_m / 2, 0, 0.75), (length - cab_m, 1.9, 0.5)),
+        load,
+        _plate(-front_m, 0.8, Semantic.TRUCK),
+    )
 
 
-def bus(draw: np.random.Generator) -> Body:
+def bus(draw: Generator) -> Body:
     """A city bus: a band of windows around seats, between a painted body and its roof."""
     length, width, paint = draw.uniform(10.5, 12.5), 2.5, draw.uniform(0.1, 0.25)
-    roof = Part((0, 0, 2.85), (length, width, 0.4), Semantic.BUS, Material.PAINT, paint)
+    painted = _painted(Semantic.BUS, paint)
+    roof = painted((0, 0, 2.85), (length, width, 0.4))
     return (
-        Part((0, 0, 0.8), (length, width, 1.0), Semantic.BUS, Material.PAINT, paint),
-        *_cabin(draw, (0, 0, 1.975), (length - 0.1, width - 0.06, 1.35), roof),
+        painted((0, 0, 0.8), (length, width, 1.0)),
+        *_cabin(draw, 0, 1.975, (length - 0.1, width - 0.06, 1.35), roof),
         _plate(-length / 2, 0.6, Semantic.BUS),
     )
 
 
-def vehicle(draw: np.random.Generator) -> Body:
+def vehicle(draw: Generator) -> Body:
     """Whatever drives in a lane: mostly cars."""
     kind = draw.random()
     if kind < 0.76:
@@ -187,12 +163,12 @@ def vehicle(draw: np.random.Generator) -> Body:
     return truck(draw) if kind < 0.95 else bus(draw)
 
 
-def parked_vehicle(draw: np.random.Generator) -> Body:
+def parked_vehicle(draw: Generator) -> Body:
     """What stands at a kerb: cars, sometimes a van."""
     return van(draw) if draw.random() < 0.08 else car(draw)
 
 
-def bicycle(draw: np.random.Generator) -> Body:
+def bicycle(draw: Generator) -> Body:
     """Two thin wheels."""
     apart_m = draw.uniform(1.0, 1.1)
     return tuple(
@@ -201,43 +177,27 @@ def bicycle(draw: np.random.Generator) -> Body:
     )
 
 
-def cyclist(draw: np.random.Generator) -> Body:
+def cyclist(draw: Generator) -> Body:
     """A rider on a bicycle."""
     tall_m, wide_m = draw.uniform(0.95, 1.15), draw.uniform(0.4, 0.5)
-    rider = partial(Part, semantic=Semantic.RIDER, material=Material.CLOTH, shape=Shape.ELLIPSOID)
+    look, wheels = (Semantic.RIDER, Material.CLOTH), bicycle(draw)
+    torso_at, torso_m = (-0.05, 0, 0.55 + tall_m / 2), (0.55, wide_m, tall_m)
+    cloth = draw.uniform(0.1, 0.3)
     return (
-        *bicycle(draw),
-        rider(
-            centre=(-0.05, 0, 0.55 + tall_m / 2),
-            size=(0.55, wide_m, tall_m),
-            reflectivity=draw.uniform(0.1, 0.3),
-        ),
-        rider(centre=(0.12, 0, 0.62 + tall_m), size=(0.22, 0.18, 0.27), reflectivity=0.2),
+        *wheels,
+        Part(torso_at, torso_m, *look, cloth, Shape.ELLIPSOID),
+        Part((0.12, 0, 0.62 + tall_m), (0.22, 0.18, 0.27), *look, 0.2, Shape.ELLIPSOID),
     )
 
 
-def person(draw: np.random.Generator) -> Body:
+def person(draw: Generator) -> Body:
     """A body and a head."""
     tall_m, wide_m = draw.uniform(1.2, 1.6), draw.uniform(0.32, 0.5)
-    cloth = draw.uniform(0.1, 0.3)
-    skin_at = tall_m + 0.12
+    look, cloth = (Semantic.PERSON, Material.CLOTH), draw.uniform(0.1, 0.3)
+    torso_m = (0.7 * wide_m, wide_m, tall_m)
     return (
-        Part(
-            (0, 0, tall_m / 2),
-            (0.7 * wide_m, wide_m, tall_m),
-            Semantic.PERSON,
-            Material.CLOTH,
-            cloth,
-            Shape.CYLINDER,
-        ),
-        Part(
-            (0, 0, skin_at),
-            (0.2, 0.18, 0.26),
-            Semantic.PERSON,
-            Material.CLOTH,
-            0.2,
-            Shape.ELLIPSOID,
-        ),
+        Part((0, 0, tall_m / 2), torso_m, *look, cloth, Shape.CYLINDER),
+        Part((0, 0, tall_m + 0.12), (0.2, 0.18, 0.26), *look, 0.2, Shape.ELLIPSOID),
     )
 
 
@@ -248,14 +208,9 @@ def recording_car() -> tuple[Primitive, ...]:
     Source: boxes fitted to the shots that never return in scans of KITTI, whatever the scene:
     5 % of all, in the lower 22 beams, mostly behind.
     """
-    return tuple(
-        Primitive(
-            Shape.BOX,
-            (x, y, (top + bottom) / 2),
-            (long / 2, wide / 2, (top - bottom) / 2),
-            Semantic.EGO_VEHICLE,
-            0.1,
-            material=Material.PAINT,
-        )
-        for x, y, long, wide, top, bottom in _RECORDING_CAR
-    )
+    look = (Semantic.EGO_VEHICLE, 0.1)
+    parts = []
+    for x, y, long, wide, top, bottom in _RECORDING_CAR:
+        at, half_size = (x, y, (top + bottom) / 2), (long / 2, wide / 2, (top - bottom) / 2)
+        parts.append(Primitive(Shape.BOX, at, half_size, *look, material=Material.PAINT))
+    return tuple(parts)

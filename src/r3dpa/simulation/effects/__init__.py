@@ -4,10 +4,16 @@ Each effect is a frozen dataclass with its equation in the docstring. A scene is
 each effect reads from it whether it is called for, picks its rays, and changes nothing else.
 """
 
-from r3dpa.simulation.effects.base import Draws, Effect, Stage, Switch
-from r3dpa.simulation.effects.detection import DetectionLimit, SoftRaydrop
+from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.edges import MixedPixels
-from r3dpa.simulation.effects.measurement import DualReturn, LaserCalibration, RangeNoise
+from r3dpa.simulation.effects.glare import Blooming, SunGlare
+from r3dpa.simulation.effects.instrument import (
+    DetectionLimit,
+    DualReturn,
+    LaserCalibration,
+    RangeNoise,
+    SoftRaydrop,
+)
 from r3dpa.simulation.effects.medium import Fog, Spray
 from r3dpa.simulation.effects.motion import (
     EgoOcclusion,
@@ -17,67 +23,30 @@ from r3dpa.simulation.effects.motion import (
 )
 from r3dpa.simulation.effects.optics import Glass, PolishedMetal, WetGround
 from r3dpa.simulation.effects.precipitation import Rain, Snow
-from r3dpa.simulation.effects.retro import Blooming, RetroReflection
-from r3dpa.simulation.effects.sun import SunGlare
 from r3dpa.simulation.effects.surface import (
     DiffuseReflection,
+    RetroReflection,
     SurfaceTexture,
     surface_power,
 )
 
-#: Every effect, in the order in which they are applied.
-EFFECTS: tuple[Effect, ...] = (
+#: Effects on the rays, in the order in which they are applied before the rays are cast.
+RAY_EFFECTS: tuple[Effect, ...] = (
     DualReturn(),
     RollingShutter(),
     MovingActors(),
     FoliageOcclusion(),
-    EgoOcclusion(),
-    DiffuseReflection(),
-    SurfaceTexture(),
-    WetGround(),
-    RetroReflection(),
-    Glass(),
-    PolishedMetal(),
-    MixedPixels(),
-    Fog(),
-    Rain(),
-    Snow(),
-    Spray(),
-    SunGlare(),
-    Blooming(),
-    SoftRaydrop(),
-    DetectionLimit(),
-    RangeNoise(),
-    LaserCalibration(),
 )
 
-__all__ = [
-    "EFFECTS",
-    "Blooming",
-    "DetectionLimit",
-    "DiffuseReflection",
-    "Draws",
-    "DualReturn",
-    "Effect",
-    "EgoOcclusion",
-    "Fog",
-    "FoliageOcclusion",
-    "Glass",
-    "LaserCalibration",
-    "MixedPixels",
-    "MovingActors",
-    "PolishedMetal",
-    "Rain",
-    "RangeNoise",
-    "RetroReflection",
-    "RollingShutter",
-    "Snow",
-    "SoftRaydrop",
-    "Spray",
-    "Stage",
-    "SunGlare",
-    "SurfaceTexture",
-    "Switch",
-    "WetGround",
-    "surface_power",
-]
+#: Effects on the echoes of the cast, in order: surfaces, the optical path, the air, detection, and
+#: measurement.
+ECHO_EFFECTS: tuple[Effect, ...] = (
+    *(EgoOcclusion(), DiffuseReflection(), SurfaceTexture(), WetGround(), RetroReflection()),
+    *(Glass(), PolishedMetal(), MixedPixels()),
+    *(Fog(), Rain(), Snow(), Spray()),
+    *(SunGlare(), Blooming(), SoftRaydrop(), DetectionLimit()),
+    *(RangeNoise(), LaserCalibration()),
+)
+EFFECTS = (*RAY_EFFECTS, *ECHO_EFFECTS)
+
+__all__ = ["ECHO_EFFECTS", "EFFECTS", "RAY_EFFECTS", "surface_power"]

@@ -1,36 +1,37 @@
 """What a beam of finite width sees of an edge.
 
-Letters: M chosen rays, K pairs of a ray and a surface that its rim may meet.
+Six points stand for the rim of the beam's footprint, on a ring of sqrt(2/3) of its radius. Letters:
+M chosen rays, K pairs of a ray and a surface that its rim may meet.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.effects.footprint import (
-    EDGE_M,
-    RING_LEFT,
-    RING_UP,
-    Indices,
-    Surfaces,
-    at_edges,
-    beside_thin_solids,
-    rim_ranges,
-    turned_aside,
-)
+from r3dpa.simulation.draws import Draws, RayIndex
+from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.surface import surface_power
-from r3dpa.simulation.raycast import normals
-from r3dpa.simulation.scene import Material, Scene
+from r3dpa.simulation.raycast import normals, surface_distance
+from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import EGO_BODY, GROUND, Floats
-from r3dpa.simulation.sweep import IS_GROUND, Echoes, Origin, RayIndex, Sweep
+from r3dpa.simulation.sweep import IS_GROUND, Echoes, Origin, Sweep
 
-# Of the power of a beam: its axis, and each point of its rim; see ``footprint``.
+Indices = NDArray[np.int64]
+Surfaces = NDArray[np.int32]
+
+#: Ranges that differ by more make an edge.
+_EDGE_M = 0.3
+# Seven points that integrate polynomials up to the fifth degree over a disk of radius 1 exactly
+# (Radon 1948): the axis, and six on a ring.
+_RING = math.sqrt(2 / 3) * np.exp(1j * np.pi / 3 * np.arange(6))
+#: Where the points of the rim lie, ``(6,)`` in radii of the beam.
+_RING_LEFT, _RING_UP = _RING.real.astype(np.float32), _RING.imag.astype(np.float32)
+# Of the power of a beam: its axis, and each point of its rim.
 _SHARES = np.array([2, 1, 1, 1, 1, 1, 1], dtype=np.float32)[:, None] / 8
 
 
@@ -54,8 +55,7 @@ class _Peak(NamedTuple):
     mixed: NDArray[np.bool_]  # whether others give some
 
 
-@dataclass(frozen=True)
-class MixedPixels:
+class MixedPixels(Effect):
     """A beam that meets an edge with a part of its width sends back an echo of each side.
 
     A ray stands for the axis of a beam whose full angle is ``divergence_rad``. Where its footprint
@@ -82,8 +82,6 @@ class MixedPixels:
     Remote Sensing of Environment 2022).
     """
 
-    stage: ClassVar[Stage] = Stage.OPTICAL_PATH
-
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """A beam that widens, and solids with edges."""
         if not sensor.divergence_rad or not scene.primitives:
@@ -94,8 +92,8 @@ class MixedPixels:
         """Those whose rim reaches over an edge, and those beside a thin solid."""
         chosen = np.zeros(sweep.num_rays, dtype=bool)
         if sweep.sensor.divergence_rad and sweep.scene.primitives:
-            chosen[at_edges(sweep)] = True
-            chosen[beside_thin_solids(sweep)[0]] = True
+            chosen[_at_edges(sweep)] = True
+            chosen[_beside_thin_solids(sweep)[0]] = True
         found = np.flatnonzero(chosen)
         origin, surface = sweep.first.origin[found], sweep.first.surface[found]
         straight = (origin == Origin.SURFACE) | (origin == Origin.FOLIAGE)
@@ -111,7 +109,7 @@ class MixedPixels:
         axis_m = sweep.first.range_m[chosen]
         axis = np.where(np.isfinite(axis_m), np.arange(len(chosen)), -1)
         with np.errstate(invalid="ignore"):
-            edge = (met != axis) & ~(np.abs(rim_m - axis_m) <= EDGE_M)
+            edge = (met != axis) & ~(np.abs(rim_m - axis_m) <= _EDGE_M)
         at = np.flatnonzero(edge.any(axis=0))
         # What the axis meets is measured there: its own slope makes no edge.
         range_m = np.vstack([axis_m, np.where(met == axis, axis_m, rim_m)])[:, at]
@@ -136,14 +134,14 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     own, own_m = first.surface[rays], first.range_m[rays]
     other, other_m = first.surface[beside], first.range_m[beside]
     # Only a solid that ends before something else is missed by the rim of the ray that meets it.
-    ends = (own >= 0) & ((other != own) & (other_m > own_m + EDGE_M)).any(axis=0)
+    ends = (own >= 0) & ((other != own) & (other_m > own_m + _EDGE_M)).any(axis=0)
     ends &= (first.origin[rays] == Origin.SURFACE) & ~IS_GROUND[sweep.material[rays]]
     wanted = (other >= GROUND) & (first.origin[beside] == Origin.SURFACE) & (other != own)
-    wanted &= ends | (other_m < own_m - EDGE_M)
+    wanted &= ends | (other_m < own_m - _EDGE_M)
     for later in range(1, len(beside)):
         wanted[later] &= ~(wanted[:later] & (other[:later] == other[later])).any(axis=0)
 
-    thin_ray, thin = beside_thin_solids(sweep)
+    thin_ray, thin = _beside_thin_solids(sweep)
     row = np.searchsorted(rays, thin_ray).clip(max=len(rays) - 1)
     new = (rays[row] == thin_ray) & (own[row] != thin)
     new &= ~(wanted[:, row] & (other[:, row] == thin)).any(axis=0)
@@ -164,9 +162,9 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     bounds = np.cumsum([0, *(len(layer[0]) for layer in layers)])
     row, surface, seen_by = (np.concatenate(columns) for columns in zip(*layers, strict=True))
     # Whatever has no end fills the beam of the ray whose axis meets it.
-    range_m = np.repeat(own_m[row][None], len(RING_LEFT), axis=0)
+    range_m = np.repeat(own_m[row][None], len(_RING_LEFT), axis=0)
     tested = np.append(np.flatnonzero(ends), np.arange(len(rays), len(row)))
-    range_m[:, tested] = rim_ranges(sweep, rays[row[tested]], surface[tested])
+    range_m[:, tested] = _rim_ranges(sweep, rays[row[tested]], surface[tested])
     seen_m = first.range_m[seen_by]
     brightness = first.power[seen_by] * np.where(np.isfinite(seen_m), seen_m, 0) ** 2
     cosine = sweep.cos_incidence[seen_by]
@@ -186,22 +184,18 @@ def _brightness_of_solids(
     hit = np.flatnonzero(np.isfinite(nearest_m))
     rays, solid, point = rays[hit], solid[hit], point[hit]
     radius = np.float32(sweep.sensor.divergence_rad / 2)
-    direction = turned_aside(sweep, rays, radius * RING_LEFT[point], radius * RING_UP[point])
+    direction = _turned_aside(sweep, rays, radius * _RING_LEFT[point], radius * _RING_UP[point])
     position = sweep.start[:, rays] + nearest_m[hit] * direction
     time_s = None if sweep.actor_time_s is None else sweep.actor_time_s[rays]
     cosine[hit] = np.abs((normals(sweep.solids, solid, position, time_s) * direction).sum(axis=0))
-    primitives = [sweep.scene.primitives[index] for index in solid]
-    reflectivity = np.array([p.reflectivity for p in primitives], dtype=np.float32)
-    material = np.array([p.material for p in primitives], dtype=np.intp)
-    brightness[hit] = surface_power(
-        reflectivity, cosine[hit], material, np.ones(len(hit), dtype=np.float32)
-    )
+    reflectivity, material = sweep.look_of(solid)
+    brightness[hit] = surface_power(reflectivity, cosine[hit], material, np.float32(1))
     return brightness, cosine
 
 
 def _nearest(targets: _Targets, num_rays: int) -> tuple[Indices, Floats]:
     """Pair that each point of the rims meets first, -1 for none, and where; each ``(6, M)``."""
-    met = np.full((len(RING_LEFT), num_rays), -1)
+    met = np.full((len(_RING_LEFT), num_rays), -1)
     nearest_m = np.full(met.shape, np.inf, dtype=np.float32)
     for first, last in zip(targets.bounds[:-1], targets.bounds[1:], strict=True):
         row, there_m = targets.row[first:last], targets.range_m[:, first:last]
@@ -212,13 +206,9 @@ def _nearest(targets: _Targets, num_rays: int) -> tuple[Indices, Floats]:
 
 
 def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> tuple[_Peak, _Peak]:
-    """The two strongest echoes of what the axis and the rim of M rays meet.
+    """The two strongest echoes of M rays; echoes nearer than ``merge_m`` to each other are one.
 
-    Args:
-        targets: The pairs.
-        met: ``(7, M)`` pair that each point of the footprint meets, -1 for none.
-        range_m: ``(7, M)`` where.
-        merge_m: Echoes nearer to each other than this are one.
+    ``met``: ``(7, M)`` pair that each point of the footprint meets, -1 for none; ``range_m`` where.
     """
     # Every surface once, at the first point that meets it: its share and its mean range.
     same = (met[:, None] == met) & (met >= 0)
@@ -253,21 +243,11 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
 
 
 def _either(chosen: NDArray[np.bool_], one: _Peak, other: _Peak) -> _Peak:
-    return _Peak(
-        np.where(chosen, one.range_m, other.range_m),
-        np.where(chosen, one.power, other.power),
-        np.where(chosen, one.target, other.target),
-        np.where(chosen, one.mixed, other.mixed),
-    )
+    return _Peak(*(np.where(chosen, a, b) for a, b in zip(one, other, strict=True)))
 
 
 def _record(
-    sweep: Sweep,
-    rays: Indices,
-    own: Indices,
-    targets: _Targets,
-    strongest: _Peak,
-    next_strongest: _Peak,
+    sweep: Sweep, rays: Indices, own: Indices, targets: _Targets, strongest: _Peak, next_one: _Peak
 ) -> None:
     """Replace the echoes of rays whose own pairs are ``own``."""
     first = sweep.first
@@ -276,12 +256,8 @@ def _record(
     def columns(peak: _Peak, seen: Indices) -> tuple[Floats, Floats, Surfaces, NDArray[np.uint8]]:
         origin = np.where(peak.target == own, own_origin, np.uint8(Origin.SURFACE))
         origin = np.where(peak.mixed, np.uint8(Origin.MIXED), origin)
-        return (
-            peak.range_m[seen],
-            peak.power[seen],
-            targets.surface[peak.target[seen]],
-            origin[seen],
-        )
+        surface = targets.surface[peak.target[seen]]
+        return peak.range_m[seen], peak.power[seen], surface, origin[seen]
 
     seen = np.flatnonzero(strongest.power > 0)
     for old, new in zip(first.columns(), columns(strongest, seen), strict=True):
@@ -289,15 +265,138 @@ def _record(
     if sweep.second is not None:
         for old, none in zip(sweep.second.columns(), Echoes.none(1).columns(), strict=True):
             old[rays[seen]] = none
-    again = np.flatnonzero(next_strongest.power > 0)
-    sweep.offer(rays[again], *columns(next_strongest, again))
+    again = np.flatnonzero(next_one.power > 0)
+    sweep.offer(rays[again], *columns(next_one, again))
     # What is known of the surface goes with it.
-    primitives = sweep.scene.primitives
-    hit, surface = rays[seen], first.surface[rays[seen]]
+    hit = rays[seen]
     sweep.cos_incidence[hit] = targets.cosine[strongest.target[seen]]
-    sweep.reflectivity[hit] = sweep.of_surface(
-        [p.reflectivity for p in primitives], sweep.scene.ground_reflectivity, np.float32, surface
-    )
-    sweep.material[hit] = sweep.of_surface(
-        [p.material for p in primitives], Material.ASPHALT, np.uint8, surface
-    )
+    sweep.reflectivity[hit], sweep.material[hit] = sweep.look_of(first.surface[hit])
+
+
+def _at_edges(sweep: Sweep) -> Indices:
+    """Rays beside a jump whose rim reaches over the edge of the nearer surface."""
+    first = sweep.first
+    near, far, left, up = _jumps(sweep)
+    surface = first.surface[near]
+    edge = (surface >= 0) & (surface != first.surface[far])
+    edge &= (first.origin[near] == Origin.SURFACE) & ~IS_GROUND[sweep.material[near]]
+    near, far, surface = near[edge], far[edge], surface[edge]
+    radius = np.float32(sweep.sensor.divergence_rad / 2)
+    left, up = radius * left[edge], radius * up[edge]
+    both = np.concatenate([near, far])
+    direction = _turned_aside(sweep, both, np.concatenate([left, -left]), np.concatenate([up, -up]))
+    met_m = _range_to(sweep, both, np.tile(surface, 2), direction)
+    missed = np.isinf(met_m[: len(near)])
+    reached = met_m[len(near) :] < first.range_m[far] - _EDGE_M
+    return np.concatenate([near[missed], far[reached]])
+
+
+def _beside_thin_solids(sweep: Sweep) -> tuple[Indices, Indices]:
+    """Rays (K,) and the solids (K,), narrower than the pitch of the shots, that they may touch."""
+    solids, (num_beams, num_shots) = sweep.solids, sweep.shape
+    pitch = 2 * np.pi / num_shots
+    centre_x, centre_y, _ = solids.centre.T
+    half_x, half_y, _ = solids.half_size.T
+    distance = np.hypot(centre_x, centre_y)
+    ahead = centre_x * solids.cos_yaw + centre_y * solids.sin_yaw
+    aside = centre_y * solids.cos_yaw - centre_x * solids.sin_yaw
+    half_length = np.hypot(half_x, half_y)
+    # Half the width seen from here, times the distance.
+    half_width = half_x * np.abs(aside) + half_y * np.abs(ahead)
+    thin = 2 * half_width < pitch * (distance - half_length) * distance
+    if sweep.optical_depth is not None:
+        thin &= solids.extinction == 0
+    thin = np.flatnonzero(thin & (distance - half_length < sweep.sensor.max_range_m))
+
+    # The shot of each beam that passes nearest; it starts where the sensor is when it is fired.
+    beam, solid = (axis.ravel() for axis in np.meshgrid(np.arange(num_beams), thin, indexing="ij"))
+    shot = np.rint(np.arctan2(centre_y, centre_x)[solid] / pitch).astype(np.int64)
+    for _ in range(3):
+        ahead, left = _seen_from(sweep, beam * num_shots + shot % num_shots, solid)
+        shot += np.rint(np.arctan2(left, ahead) / pitch).astype(np.int64)
+    rays = beam * num_shots + shot % num_shots
+    radius = np.float32(sweep.sensor.divergence_rad / 2)
+    x, y, z = sweep.direction[:, rays]
+    slope = z / np.sqrt(x * x + y * y)
+    off = np.abs(sweep.start[2, rays] + slope * ahead - solids.centre[solid, 2])
+    slack = np.abs(slope) + np.abs(solids.grade[solid]).sum(axis=1)
+    level = off <= solids.half_size[solid, 2] + slack * half_length[solid] + radius * ahead
+    beam, shot, solid = beam[level], shot[level], solid[level]
+
+    # Half a pitch to the nearest shot, half for the width, and the rim.
+    around = math.ceil(0.5 + radius / pitch)
+    offsets = np.arange(-around, around + 1)
+    rays = (beam[:, None] * num_shots + (shot[:, None] + offsets) % num_shots).ravel()
+    solid = np.repeat(solid, len(offsets))
+    ahead, left = _seen_from(sweep, rays, solid)
+    touched = np.abs(left) <= half_width[solid] / distance[solid] + radius * ahead
+    return rays[touched & (ahead > 0)], solid[touched & (ahead > 0)]
+
+
+def _rim_ranges(sweep: Sweep, rays: Indices, surface: Surfaces) -> Floats:
+    """Where the points of the rims of rays ``(K,)`` meet their surfaces, ``(6, K)``."""
+    radius = np.float32(sweep.sensor.divergence_rad / 2)
+    six, surfaces = np.tile(rays, len(_RING_LEFT)), np.tile(surface, len(_RING_LEFT))
+    left, up = (np.repeat(radius * side, len(rays)) for side in (_RING_LEFT, _RING_UP))
+    direction = _turned_aside(sweep, six, left, up)
+    return _range_to(sweep, six, surfaces, direction).reshape(len(_RING_LEFT), -1)
+
+
+def _range_to(sweep: Sweep, rays: Indices, surface: Surfaces, direction: Floats) -> Floats:
+    """Where rays ``(M,)`` in other directions meet given surfaces; infinite where they miss."""
+    start = sweep.start[:, rays]
+    solid = np.flatnonzero(surface >= 0)
+    index = surface[solid]
+    seen_from = start[:, solid]
+    if sweep.actor_time_s is not None:
+        seen_from[:2] -= sweep.solids.velocity[index].T * sweep.actor_time_s[rays[solid]]
+    range_m = np.full(len(rays), np.inf, dtype=np.float32)
+    range_m[solid], _ = surface_distance(sweep.solids, index, seen_from, direction[:, solid])
+    ground = np.flatnonzero((surface == GROUND) & (direction[2] < 0))
+    range_m[ground] = (np.float32(sweep.solids.ground_m) - start[2, ground]) / direction[2, ground]
+    return np.where(range_m > 0, range_m, np.float32(np.inf))
+
+
+def _turned_aside(sweep: Sweep, rays: Indices, left: Floats, up: Floats) -> Floats:
+    """Directions ``(3, M)`` at small angles to the left of rays and above them, radians."""
+    x, y, z = sweep.direction[:, rays]
+    level = np.sqrt(x * x + y * y)
+    left, up = left / level, up / level
+    # Their length is 1 to within the square of the angle: less than the step of a float32.
+    return np.stack([x - left * y - up * z * x, y + left * x - up * z * y, z + up * level * level])
+
+
+def _seen_from(sweep: Sweep, rays: Indices, solid: Indices) -> tuple[Floats, Floats]:
+    """How far the centres of solids lie ahead of rays and to their left, seen from above."""
+    x, y = sweep.solids.centre[solid, :2].T - sweep.start[:2, rays]
+    if sweep.actor_time_s is not None:
+        velocity, time_s = sweep.solids.velocity[solid].T, sweep.actor_time_s[rays]
+        x, y = x + velocity[0] * time_s, y + velocity[1] * time_s
+    along, across = sweep.direction[:2, rays]
+    length = np.sqrt(along * along + across * across)
+    return (along * x + across * y) / length, (along * y - across * x) / length
+
+
+def _jumps(sweep: Sweep) -> tuple[Indices, Indices, Floats, Floats]:
+    """Pairs of neighbouring rays that differ in range, the nearer first.
+
+    Also how far the rim of the nearer one reaches towards the farther one, to the left and up, in
+    radii of the beam; each ``(K,)``.
+    """
+    rays = sweep.grid(np.arange(sweep.num_rays))
+    range_m = sweep.grid(sweep.first.range_m)
+    closed_m = np.hstack([range_m, range_m[:, :1]])
+    with np.errstate(invalid="ignore"):
+        sides = (
+            (np.diff(closed_m), rays, np.roll(rays, -1, axis=1), _RING_LEFT.max(), 0),
+            (np.diff(range_m, axis=0), rays[:-1], rays[1:], 0, _RING_UP.min()),
+        )
+    found = []
+    for rise_m, here, there, left, up in sides:
+        jump = np.abs(rise_m) > _EDGE_M
+        rises, here, there = rise_m[jump] > 0, here[jump], there[jump]
+        sign = np.where(rises, np.float32(1), np.float32(-1))
+        near, far = np.where(rises, here, there), np.where(rises, there, here)
+        found.append((near, far, sign * left, sign * up))
+    near, far, left, up = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    return near, far, left, up

@@ -15,21 +15,22 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.draws import Draws, RayIndex
+from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.raycast import surface_distance
 from r3dpa.simulation.scene import Primitive, Scene, Semantic, Shape
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats, Solids, solids_of
-from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+from r3dpa.simulation.sweep import Origin, Sweep
 
 # Backscatter over extinction of clouds of water droplets, see Fog.
 _BACKSCATTER = 0.046 / math.log(20)
 _FOG_STEP_M = 0.05
+_NO_RAYS = np.empty(0, dtype=np.int64)
 _FAST_M_S = 10.0
 _PLUME_S, _PLUME_MAX_M, _PLUME_HEIGHT_M = 0.6, 12.0, 1.8
 # Undersides of vehicles lie about this much above the road.
@@ -64,11 +65,10 @@ def steps_before_target(sweep: Sweep, edges: NDArray[np.float64]) -> Floats:
 
 def all_rays(called: bool) -> RayIndex:
     """All rays, or none."""
-    return slice(None) if called else np.empty(0, dtype=np.int64)
+    return slice(None) if called else _NO_RAYS
 
 
-@dataclass(frozen=True)
-class Fog:
+class Fog(Effect):
     """Droplets too many to tell apart weaken every echo and make a soft one of their own.
 
     With the meteorological optical range MOR, the speed of light c and the pulse length tau::
@@ -87,8 +87,6 @@ class Fog:
 
     Source: Rasshofer et al. 2011 and Hahner et al., ICCV 2021, for both coefficients.
     """
-
-    stage: ClassVar[Stage] = Stage.MEDIUM
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """A finite visibility."""
@@ -121,16 +119,7 @@ class Fog:
 def soft_waveform(
     visibility_m: float, sensor: SpinningLidar
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Echo of fog by range, see :class:`Fog`.
-
-    Args:
-        visibility_m: Meteorological optical range.
-        sensor: Instrument, for its pulse, its overlap and its limits.
-
-    Returns:
-        Ranges ``(K,)`` from the nearest to the farthest that is reported, metres, and the power
-        ``(K,)`` received from there, m^-2.
-    """
+    """Reported ranges ``(K,)`` and the power ``(K,)`` that fog sends back from there, m^-2."""
     extinction, half_pulse_m = math.log(20) / visibility_m, sensor.pulse_depth_m / 2
     edges = range_edges(sensor, _FOG_STEP_M)
     everywhere = np.arange(0.0, sensor.max_range_m + half_pulse_m + _FOG_STEP_M, _FOG_STEP_M)
@@ -142,7 +131,7 @@ def soft_waveform(
 
 
 @dataclass(frozen=True)
-class Spray:
+class Spray(Effect):
     """Fast vehicles on a wet road draw a plume of droplets behind them.
 
     The plume is a box as wide as the vehicle and 1.8 m high from the road on that begins at its
@@ -162,40 +151,25 @@ class Spray:
 
     Args:
         max_extinction_per_m: Extinction behind a vehicle at 20 m/s or more on a flooded road.
-
-    Raises:
-        ValueError: If the extinction is negative or infinite.
     """
 
     max_extinction_per_m: float = 0.2
 
-    stage: ClassVar[Stage] = Stage.MEDIUM
-
-    def __post_init__(self) -> None:
-        """Check the value."""
-        if not 0 <= self.max_extinction_per_m < math.inf:
-            raise ValueError(
-                f"max_extinction_per_m must be 0 or greater, got {self.max_extinction_per_m}"
-            )
-
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """A wet road with a fast vehicle on it."""
         film_mm = scene.weather.water_film_mm
-        if not film_mm or not any(_is_fast(primitive) for primitive in scene.primitives):
-            return None
-        return f"fast vehicles on {film_mm:.2g} mm of water"
+        return f"fast vehicles on {film_mm:.2g} mm of water" if _plumes(scene) else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those whose window meets a plume."""
-        inside = np.zeros(sweep.num_rays, dtype=bool)
-        for window in sweep.rays_near(_plume_solids(sweep.scene), sweep.time_s):
-            inside[window] = True
-        return np.flatnonzero(inside)
+        scene = sweep.scene
+        boxes = solids_of(_plumes(scene), scene.pose, scene.ground_m)
+        return np.unique(np.concatenate([_NO_RAYS, *sweep.rays_near(boxes, sweep.time_s)]))
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Weaken the echoes from behind each plume and offer its own."""
-        sensor, boxes = sweep.sensor, _plumes(sweep.scene)
-        solids = _plume_solids(sweep.scene)
+        sensor, scene, boxes = sweep.sensor, sweep.scene, _plumes(sweep.scene)
+        solids = solids_of(boxes, scene.pose, scene.ground_m)
         drawn = draws.uniform(slice(None))
         for index, window in enumerate(sweep.rays_near(solids, sweep.time_s)):
             chosen, start = _around(solids, index, sweep, window)
@@ -205,7 +179,7 @@ class Spray:
             enter = np.maximum(enter, np.float32(sensor.min_range_m))
             crossed = leave > enter
             chosen, enter, leave = chosen[crossed], enter[crossed], leave[crossed]
-            twice = np.float32(2 * self._extinction_per_m(boxes[index], sweep.scene))
+            twice = np.float32(2 * self._extinction_per_m(boxes[index], scene))
             for echoes in sweep.echoes():
                 path = np.minimum(leave, echoes.range_m[chosen]) - enter
                 echoes.power[chosen] *= np.exp(-twice * path.clip(0))
@@ -223,23 +197,15 @@ class Spray:
         return self.max_extinction_per_m * min(faster, 1.0) * min(flooded, 1.0)
 
 
-def _is_fast(primitive: Primitive) -> bool:
-    return math.hypot(*primitive.velocity_m_s) > _FAST_M_S
-
-
 def _plumes(scene: Scene) -> tuple[Primitive, ...]:
     """One box behind each fast vehicle, in the world frame; none on a dry road."""
     vehicles = defaultdict(list)
     if scene.weather.water_film_mm > 0:
         for index, primitive in enumerate(scene.primitives):
-            if _is_fast(primitive):
+            if math.hypot(*primitive.velocity_m_s) > _FAST_M_S:
                 # Solids that belong to no object are vehicles of their own.
                 vehicles[primitive.instance or -1 - index].append(primitive)
     return tuple(_plume(parts) for parts in vehicles.values())
-
-
-def _plume_solids(scene: Scene) -> Solids:
-    return solids_of(_plumes(scene), scene.pose, scene.ground_m)
 
 
 def _around(
@@ -281,16 +247,10 @@ def _plume(parts: list[Primitive]) -> Primitive:
     length = min(_PLUME_S * speed, _PLUME_MAX_M)
     along, aside = rear - length / 2, (left + right) / 2
     road_m = min(part.centre[2] - part.half_size[2] for part in parts) - _CLEARANCE_M
+    x, y = along * ahead_x - aside * ahead_y, along * ahead_y + aside * ahead_x
+    centre = (x, y, road_m + _PLUME_HEIGHT_M / 2)
+    half_size = (length / 2, (left - right) / 2, _PLUME_HEIGHT_M / 2)
+    velocity = parts[0].velocity_m_s
     return Primitive(
-        Shape.BOX,
-        (
-            along * ahead_x - aside * ahead_y,
-            along * ahead_y + aside * ahead_x,
-            road_m + _PLUME_HEIGHT_M / 2,
-        ),
-        (length / 2, (left - right) / 2, _PLUME_HEIGHT_M / 2),
-        Semantic.UNLABELED,
-        reflectivity=1.0,
-        yaw_rad=heading,
-        velocity_m_s=parts[0].velocity_m_s,
+        Shape.BOX, centre, half_size, Semantic.UNLABELED, 1.0, heading, velocity_m_s=velocity
     )

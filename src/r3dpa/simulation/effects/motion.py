@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.draws import Draws, RayIndex
+from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.raycast import cast, normals
 from r3dpa.simulation.scene import Pose, Primitive, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import EGO_BODY, NO_SURFACE, Floats, level, solids_of, subset
-from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+from r3dpa.simulation.sweep import Origin, Sweep
 
 
-@dataclass(frozen=True)
-class RollingShutter:
+class RollingShutter(Effect):
     """The sensor drives on while it turns, and its points are not corrected for it.
 
     At time t from the middle of the sweep, with speed v and yaw rate w, a shot starts and points::
@@ -31,8 +30,6 @@ class RollingShutter:
     Source: raw scans of KITTI-360 are not motion-compensated; its development kit "curls" them.
     """
 
-    stage: ClassVar[Stage] = Stage.RAYS
-
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """A moving or turning sensor."""
         motion = scene.motion
@@ -40,10 +37,6 @@ class RollingShutter:
             return None
         turn_deg = np.degrees(motion.yaw_rate_rad_s)
         return f"ego moves at {motion.speed_m_s:.1f} m/s, {turn_deg:.1f} deg/s"
-
-    def rays(self, sweep: Sweep) -> RayIndex:
-        """All."""
-        return slice(None)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Turn and shift the rays in the frame of the sensor, then level them."""
@@ -66,8 +59,7 @@ class RollingShutter:
         sweep.direction = level(turned(direction), pose)
 
 
-@dataclass(frozen=True)
-class MovingActors:
+class MovingActors(Effect):
     """A moving solid is met where it is when the shot is fired.
 
     ::
@@ -76,8 +68,6 @@ class MovingActors:
 
     so that an object crossing at v is sheared by ``v * (its width in azimuth) / (2 pi) * 0.1 s``.
     """
-
-    stage: ClassVar[Stage] = Stage.RAYS
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """A solid that moves."""
@@ -94,8 +84,7 @@ class MovingActors:
         sweep.actor_time_s[rays] = sweep.time_s[rays]
 
 
-@dataclass(frozen=True)
-class FoliageOcclusion:
+class FoliageOcclusion(Effect):
     """Crowns, meadows and wire mesh are media: a ray gets into them, and sometimes through them.
 
     With the extinction k per metre, the depth s at which a leaf, a blade or a wire is hit has the
@@ -106,8 +95,6 @@ class FoliageOcclusion:
     and a ray that leaves the solid first goes on. Successive solids are independent, as a process
     without memory asks for.
     """
-
-    stage: ClassVar[Stage] = Stage.RAYS
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Solids with an extinction."""
@@ -123,16 +110,13 @@ class FoliageOcclusion:
         sweep.optical_depth = draws.exponential(slice(None))
 
 
-@dataclass(frozen=True)
-class EgoOcclusion:
+class EgoOcclusion(Effect):
     """The recording car hides what lies behind its roof; the mask is the same in every scan.
 
     ::
 
         range -> min(range, range to the car)
     """
-
-    stage: ClassVar[Stage] = Stage.SURFACE
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Parts of the car in the scene."""
@@ -156,8 +140,7 @@ class EgoOcclusion:
         sweep.material[hit] = mask.material[nearer]
 
 
-@dataclass(frozen=True)
-class _EgoMask:
+class _EgoMask(NamedTuple):
     """The M rays that meet the car, and what they meet; all arrays are ``(M,)``."""
 
     rays: NDArray[np.int64]
@@ -177,14 +160,9 @@ def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMas
     position = origin[:, hit] + range_m[hit] * direction[:, hit]
     normal = normals(body, surface[hit], position, None)
     cosine = np.abs((normal * direction[:, hit]).sum(axis=0))
-    part = surface[hit]
-    return _EgoMask(
-        np.flatnonzero(hit),
-        range_m[hit],
-        cosine,
-        np.array([p.reflectivity for p in ego_body], dtype=np.float32)[part],
-        np.array([p.material for p in ego_body], dtype=np.uint8)[part],
-    )
+    reflectivity = np.array([p.reflectivity for p in ego_body], dtype=np.float32)[surface[hit]]
+    material = np.array([p.material for p in ego_body], dtype=np.uint8)[surface[hit]]
+    return _EgoMask(np.flatnonzero(hit), range_m[hit], cosine, reflectivity, material)
 
 
 def _rays_near(sweep: Sweep, chosen: NDArray, actor_time_s: Floats | None) -> NDArray[np.int64]:

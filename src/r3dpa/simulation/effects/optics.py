@@ -6,18 +6,19 @@ Secondary rays go one step: what they meet counts as matt, be it glass, metal or
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects.base import Draws, Stage
+from r3dpa.simulation.draws import Draws, RayIndex
+from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.surface import surface_power
 from r3dpa.simulation.raycast import cast_single, normals, surface_distance
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
-from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+from r3dpa.simulation.sweep import Origin, Sweep
 
 # A pane belongs to the wall that it is this close to.
 _FASTENED_M = 0.25
@@ -34,10 +35,6 @@ def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
 
     Source: Fresnel's equations. Glass (n = 1.52): 0.043 at 0 and 0.61 at 85 degrees; water
     (n = 1.33): 0.020, 0.35 at 80 and 0.80 at 88 degrees.
-
-    Args:
-        cos_incidence: In [0, 1], any shape.
-        index: Refractive index n of the medium, greater than 1.
     """
     cosine = cos_incidence
     refracted = np.sqrt(1 - (1 - cosine * cosine) / np.float32(index * index))
@@ -47,7 +44,7 @@ def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Glass:
+class Glass(Effect):
     """Of a pane one sees the dirt, what is behind it, or what it mirrors; the strongest wins.
 
     A pane has two surfaces of reflectance F; light that runs to and fro between them included, it
@@ -70,20 +67,10 @@ class Glass:
     Args:
         index: Refractive index of the glass.
         pane_m: Solids of glass that are thinner than this are single panes.
-
-    Raises:
-        ValueError: If the index is not greater than 1 or the thickness is not positive.
     """
 
     index: float = 1.52
     pane_m: float = 0.1
-    stage: ClassVar[Stage] = Stage.OPTICAL_PATH
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_index(self.index)
-        if not self.pane_m > 0:
-            raise ValueError(f"pane_m must be positive, got {self.pane_m}")
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Solids of glass."""
@@ -127,7 +114,7 @@ class Glass:
 
 
 @dataclass(frozen=True)
-class PolishedMetal:
+class PolishedMetal(Effect):
     """Polished metal shows what it mirrors, at the first direction and the length of the path.
 
     With the reflectance q, and ``surface_power`` along the whole path::
@@ -139,18 +126,9 @@ class PolishedMetal:
 
     Args:
         reflectance: Share of the light that is mirrored, 0.9 for steel and aluminium at 905 nm.
-
-    Raises:
-        ValueError: If the reflectance lies outside [0, 1].
     """
 
     reflectance: float = 0.9
-    stage: ClassVar[Stage] = Stage.OPTICAL_PATH
-
-    def __post_init__(self) -> None:
-        """Check the value."""
-        if not 0 <= self.reflectance <= 1:
-            raise ValueError(f"reflectance must lie in [0, 1], got {self.reflectance}")
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Solids of polished metal."""
@@ -169,7 +147,7 @@ class PolishedMetal:
 
 
 @dataclass(frozen=True)
-class WetGround:
+class WetGround(Effect):
     """Water darkens the ground and mirrors the beam away, the more the flatter it comes in.
 
     A film that covers the share f of the ground lets the beam in and its echo out through one
@@ -187,20 +165,10 @@ class WetGround:
     Args:
         index: Refractive index of water.
         full_film_mm: Depth from which on the film covers the ground.
-
-    Raises:
-        ValueError: If the index is not greater than 1 or the depth is not positive.
     """
 
     index: float = 1.33
     full_film_mm: float = 1.2
-    stage: ClassVar[Stage] = Stage.SURFACE
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_index(self.index)
-        if not self.full_film_mm > 0:
-            raise ValueError(f"full_film_mm must be positive, got {self.full_film_mm}")
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Water on the ground."""
@@ -255,15 +223,8 @@ class _Struck(NamedTuple):
 
     def only(self, chosen: NDArray[np.int64]) -> _Struck:
         """Some of them."""
-        return _Struck(
-            self.rays[chosen],
-            self.surface[chosen],
-            self.leg_m[chosen],
-            self.time_s[chosen],
-            self.at[:, chosen],
-            self.direction[:, chosen],
-            self.normal[:, chosen],
-        )
+        columns: list[Any] = [column[..., chosen] for column in self]
+        return _Struck(*columns)
 
 
 def _struck(sweep: Sweep, rays: RayIndex) -> _Struck:
@@ -288,28 +249,16 @@ class _Seen(NamedTuple):
 
 def _look(sweep: Sweep, struck: _Struck, direction: Floats, hollow: NDArray[np.int32]) -> _Seen:
     """Follow the rays on from where they struck, see ``cast_single``."""
+    reach_m, solids = sweep.sensor.max_range_m - struck.leg_m, sweep.solids
     distance_m, surface = cast_single(
-        sweep.solids,
-        struck.at,
-        direction,
-        struck.time_s,
-        sweep.sensor.max_range_m - struck.leg_m,
-        struck.surface,
-        hollow,
+        solids, struck.at, direction, struck.time_s, reach_m, struck.surface, hollow
     )
     onward_m = np.nan_to_num(distance_m, posinf=0.0)
     at = struck.at + onward_m * direction
-    normal = normals(sweep.solids, surface, at, struck.time_s)
+    normal = normals(solids, surface, at, struck.time_s)
     range_m = struck.leg_m + distance_m
-    solids, scene = sweep.scene.primitives, sweep.scene
-    power = surface_power(
-        sweep.of_surface(
-            [p.reflectivity for p in solids], scene.ground_reflectivity, np.float32, surface
-        ),
-        _cosine(direction, normal),
-        sweep.of_surface([p.material for p in solids], Material.ASPHALT, np.uint8, surface),
-        range_m,
-    )
+    reflectivity, material = sweep.look_of(surface)
+    power = surface_power(reflectivity, _cosine(direction, normal), material, range_m)
     return _Seen(distance_m, range_m, power, surface)
 
 
@@ -348,8 +297,3 @@ def _fastened_to(sweep: Sweep, panes: NDArray[np.int32]) -> NDArray[np.int64]:
 
 def _cosine(direction: Floats, normal: Floats) -> Floats:
     return np.abs((direction * normal).sum(axis=0))
-
-
-def _check_index(index: float) -> None:
-    if not index > 1:
-        raise ValueError(f"index must be greater than 1, that of air, got {index}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -11,8 +10,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.effects.base import Draws, Stage
-from r3dpa.simulation.effects.detection import MAX_SPREADS
+from r3dpa.simulation.draws import Draws, RayIndex
+from r3dpa.simulation.effects.base import Effect
+from r3dpa.simulation.effects.instrument import MAX_SPREADS
 from r3dpa.simulation.effects.medium import (
     all_rays,
     attenuate,
@@ -20,10 +20,10 @@ from r3dpa.simulation.effects.medium import (
     range_edges,
     steps_before_target,
 )
-from r3dpa.simulation.scene import Scene, Weather
+from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE
-from r3dpa.simulation.sweep import Origin, RayIndex, Sweep
+from r3dpa.simulation.sweep import Origin, Sweep
 
 _STEP_M = 0.2
 _POWERS = 64
@@ -38,7 +38,7 @@ class DropTable(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Hydrometeors(ABC):
+class _Hydrometeors(Effect):
     """Drops or flakes with an exponential distribution of sizes, each of which may be seen alone.
 
     At the rate R in mm/h there are, per cubic metre and millimetre of diameter D::
@@ -64,35 +64,21 @@ class _Hydrometeors(ABC):
     intercept: tuple[float, float]
     slope: tuple[float, float]
 
-    stage: ClassVar[Stage] = Stage.MEDIUM
     origin: ClassVar[Origin]
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not 0 <= self.reflectivity <= 1:
-            raise ValueError(f"reflectivity must lie in [0, 1], got {self.reflectivity}")
-        if not (self.intercept[0] > 0 and self.slope[0] > 0):
-            raise ValueError(
-                f"intercept and slope of the size distribution must start with a positive factor, "
-                f"got {self.intercept} and {self.slope}"
-            )
-
-    @abstractmethod
-    def rate_mm_h(self, weather: Weather) -> float:
-        """How much of it falls."""
+    field: ClassVar[str]  # of Weather, its rate in mm/h
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         """Some of it falls."""
-        rate = self.rate_mm_h(scene.weather)
+        rate = getattr(scene.weather, self.field)
         return f"{rate:g} mm/h of {self.origin.name.lower()}" if rate > 0 else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """All, while it falls."""
-        return all_rays(self.rate_mm_h(sweep.scene.weather) > 0)
+        return all_rays(getattr(sweep.scene.weather, self.field) > 0)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Weaken the echoes and offer the strongest drop or flake of each ray."""
-        rate = self.rate_mm_h(sweep.scene.weather)
+        rate = getattr(sweep.scene.weather, self.field)
         attenuate(sweep, self.extinction_per_m(rate))
         table = self.drop_table(rate, sweep.sensor)
         if table is None:
@@ -108,11 +94,8 @@ class _Hydrometeors(ABC):
         drawn = draws.exponential(slice(None))
         chosen = np.flatnonzero(_between(expected, row, before) > drawn)
         drawn, row, before = drawn[chosen], row[chosen], before[chosen]
-        row = _last_where(
-            lambda middle: _between(expected, middle, before) > drawn,
-            row,
-            np.full_like(row, _POWERS),
-        )
+        end = np.full_like(row, _POWERS)
+        row = _last_where(lambda middle: _between(expected, middle, before) > drawn, row, end)
         above, beyond = _between(expected, row, before), _between(expected, row + 1, before)
         power = powers[row] * np.exp(log_step * (above - drawn) / (above - beyond))
         stronger = power > weakest[chosen]
@@ -123,24 +106,16 @@ class _Hydrometeors(ABC):
         # Where it is: the drops of this row's powers, up to the target.
         in_row = np.ascontiguousarray(expected[:-1] - expected[1:])
         level = draws.uniform(chosen) * _between(in_row, row, before)
-        step = _last_where(
-            lambda middle: in_row[row, middle] <= level,
-            np.zeros_like(row),
-            before.astype(np.intp) + 1,
-        )
+        end = before.astype(np.intp) + 1
+        step = _last_where(lambda middle: in_row[row, middle] <= level, np.zeros_like(row), end)
         lower, upper = in_row[row, step], in_row[row, (step + 1).clip(max=len(edges) - 1)]
         part = np.divide(
             level - lower, upper - lower, out=np.zeros_like(level), where=upper > lower
         )
         at = np.minimum(step + part, before)
         range_m = edges[0] + (edges[1] - edges[0]) * at
-        sweep.offer(
-            chosen,
-            range_m.astype(np.float32),
-            power.astype(np.float32),
-            NO_SURFACE,
-            self.origin,
-        )
+        range_m, power = range_m.astype(np.float32), power.astype(np.float32)
+        sweep.offer(chosen, range_m, power, NO_SURFACE, self.origin)
 
     def extinction_per_m(self, rate_mm_h: float) -> float:
         """Extinction at a rate, see the class."""
@@ -184,9 +159,6 @@ class Rain(_Hydrometeors):
         reflectivity: Of a drop as wide as the beam, beside a diffuse surface.
         intercept: n per m^3 and mm, and a.
         slope: l per mm, and b.
-
-    Raises:
-        ValueError: If the reflectivity lies outside [0, 1] or n or l is not positive.
     """
 
     reflectivity: float = 0.02
@@ -194,10 +166,7 @@ class Rain(_Hydrometeors):
     slope: tuple[float, float] = (4.1, -0.21)
 
     origin: ClassVar[Origin] = Origin.RAIN
-
-    def rate_mm_h(self, weather: Weather) -> float:
-        """Rain rate."""
-        return weather.rain_mm_h
+    field: ClassVar[str] = "rain_mm_h"
 
 
 @dataclass(frozen=True)
@@ -215,9 +184,6 @@ class Snow(_Hydrometeors):
         reflectivity: Of a flake as wide as the beam, beside a diffuse surface.
         intercept: n per m^3 and mm, and a.
         slope: l per mm, and b.
-
-    Raises:
-        ValueError: If the reflectivity lies outside [0, 1] or n or l is not positive.
     """
 
     reflectivity: float = 0.3
@@ -225,10 +191,7 @@ class Snow(_Hydrometeors):
     slope: tuple[float, float] = (2.55, -0.48)
 
     origin: ClassVar[Origin] = Origin.SNOW
-
-    def rate_mm_h(self, weather: Weather) -> float:
-        """Snow rate."""
-        return weather.snow_mm_h
+    field: ClassVar[str] = "snow_mm_h"
 
 
 def _between(table: NDArray, row: NDArray[np.intp], column: NDArray) -> NDArray:
