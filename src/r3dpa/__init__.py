@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from r3dpa.editing import SceneEditor
     from r3dpa.generation import SceneGenerator, SceneVAE
+    from r3dpa.simulation import Simulator
 
 __version__ = "0.1.0"
-__all__ = ["SceneEditor", "SceneGenerator", "SceneVAE", "__version__"]
+__all__ = ["SceneEditor", "SceneGenerator", "SceneVAE", "Simulator", "__version__"]
 
 _MODULES = {
     "SceneEditor": "r3dpa.editing",
     "SceneGenerator": "r3dpa.generation",
     "SceneVAE": "r3dpa.generation",
+    "Simulator": "r3dpa.simulation",
 }
 
 

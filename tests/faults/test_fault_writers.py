@@ -279,7 +279,7 @@ def test_worker_of_a_simulation(jobs, ended, out_of, goes_on, fault):
     """Six scans are one or two tasks a drive, for two workers."""
     out = out_of("simulate")
     words = jobs["simulate"].command(out, "--workers", 2)
-    status, seen = ended(words, At("r3dpa.simulation.drives.add_timings", kill_worker))
+    status, seen = ended(words, At("r3dpa.simulation.drives.as_completed", kill_worker))
     assert status == 1
     assert seen.splitlines()[-1].startswith("r3dpa simulate: a worker process ended before")
     assert_whole(out)

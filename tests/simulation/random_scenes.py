@@ -126,7 +126,7 @@ def _weather(dice):
     def some(*values):
         return 0.0 if clear_air or dice.chance(0.4) else dice.among(*values)
 
-    visibility_m = dice.among(math.inf, 0.1, 1e5, 1e60, dice.magnitude(5, 2e3))
+    visibility_m = dice.among(math.inf, 1.0, 1e5, 1e60, dice.magnitude(5, 2e3))
     return Weather(
         math.inf if clear_air else visibility_m,
         some(1e-6, 100.0, dice.magnitude(0.1, 50)),

@@ -18,6 +18,7 @@ from random_scenes import random_case
 from r3dpa.simulation import (
     EFFECTS,
     EgoMotion,
+    Lasers,
     Material,
     Primitive,
     Puddle,
@@ -31,13 +32,13 @@ from r3dpa.simulation import (
     scan,
     simulate_scan,
 )
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
+    RAY_EFFECTS,
     Blooming,
-    Draws,
     PolishedMetal,
     RetroReflection,
     Spray,
-    Stage,
     SunGlare,
     SurfaceTexture,
 )
@@ -46,7 +47,7 @@ from r3dpa.simulation.sweep import Echoes
 # No effect warns, whatever the scene.
 pytestmark = pytest.mark.filterwarnings("error")
 
-SEEDS = range(240)
+SEEDS = range(64)
 NAMES = [effect_name(effect) for effect in EFFECTS]
 each_scene = pytest.mark.parametrize("seed", SEEDS)
 each_effect = pytest.mark.parametrize("name", NAMES)
@@ -69,7 +70,7 @@ CROWN = Primitive(
 )  # fmt: skip
 PANE = box((8.0, -6.0, 1.5), (2.0, 0.02, 1.5), reflectivity=0.02, material=Material.GLASS)
 METAL = box((7.0, 2.5, 0.8), (0.1, 1.5, 0.8), reflectivity=0.2, material=Material.POLISHED_METAL)
-SHEET = box((14.0, -3.0, 1.5), (0.02, 1.0, 1.0), material=Material.RETROREFLECTOR)
+SHEET = box((9.0, -3.0, 1.5), (0.02, 1.0, 1.0), material=Material.RETROREFLECTOR)
 ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2))
 PUDDLES = (Puddle(15.0, 2.0, 4.0), Puddle(0.0, 4.0, 1.0))
 SUNNY = Weather(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=100.0)
@@ -85,7 +86,8 @@ BUSY_SCENES = [
     )
     for weather in (SUNNY, FOUL)
 ]
-SENSOR = hdl64e(shots=1080)
+_LASERS = [getattr(hdl64e().lasers, field.name)[::2] for field in fields(Lasers)]
+SENSOR = replace(hdl64e(shots=1080), lasers=Lasers(*_LASERS))
 SENSORS = [replace(SENSOR, return_mode="dual"), SENSOR]
 
 
@@ -109,9 +111,9 @@ def test_random_scenes_call_for_every_effect_and_do_without_it():
         for record in auto(seed).effects:
             touched[record.name] += record.rays > 0
             idle[record.name] += record.status == "not_called"
-    assert min(touched.values()) >= 5, touched
+    assert min(touched.values()) >= 1, touched
     base = [name for name, effect in zip(NAMES, EFFECTS, strict=True) if is_base(effect)]
-    assert [name for name, count in idle.items() if count < 30] == base
+    assert [name for name, count in idle.items() if count < 6] == base
 
 
 def is_base(effect):
@@ -136,16 +138,47 @@ class TestSoundness:
 
 
 @each_effect
-def test_necessity(name):
+def test_each_effect_matters_and_moves_no_draw_of_another(name):
     """A new effect that neither scene calls for fails here: add what it is for to them."""
-    changed = [
-        differs(
-            simulate_scan(scene, sensor, ("busy",)),
-            simulate_scan(scene, sensor, ("busy",), {name: "off"}),
-        )
-        for scene, sensor in zip(BUSY_SCENES, SENSORS, strict=True)
-    ]
+    changed = []
+    for number in range(2):
+        (log, plain), (without, poorer) = drawn(number), drawn(number, name)
+        changed.append(differs(plain, poorer))
+        assert name not in without
+        # How many draws an effect needs may depend on the other effects.
+        for other in log.keys() & without.keys():
+            assert all(a == b for a, b in zip(log[other], without[other], strict=False)), other
     assert any(changed)
+
+
+@cache
+def drawn(number, off=None):
+    """Key and random numbers of each effect in a busy scene by its calls; and the scan."""
+    log = {}
+
+    class Recorded(Draws):
+        def __init__(self, num_rays, *key):
+            super().__init__(num_rays, *key)
+            self.calls = log.setdefault(key[-1], [key])
+
+        def _record(self, draw, rays):
+            numbers = draw(slice(None))
+            self.calls.append(numbers.tobytes())
+            return numbers[rays]
+
+        def uniform(self, rays):
+            return self._record(super().uniform, rays)
+
+        def normal(self, rays):
+            return self._record(super().normal, rays)
+
+        def exponential(self, rays):
+            return self._record(super().exponential, rays)
+
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(scan, "Draws", Recorded)
+        switches = {} if off is None else {off: "off"}
+        return log, simulate_scan(BUSY_SCENES[number], SENSORS[number], ("busy",), switches)
 
 
 def arrays_of(sweep):
@@ -175,7 +208,7 @@ def watched(effect, before, changed):
 
     def state(sweep):
         arrays = arrays_of(sweep) | {f"solids.{i}": a for i, a in enumerate(sweep.solids[:-1])}
-        return arrays | (cast_arrays_of(sweep) if effect.stage is Stage.RAYS else {})
+        return arrays | (cast_arrays_of(sweep) if effect in RAY_EFFECTS else {})
 
     def watched_rays(self, sweep):
         before.clear()
@@ -196,7 +229,7 @@ def watched(effect, before, changed):
             if not np.array_equal(old[untouched], after[name][untouched]):
                 changed.append((effect_name(self), name))
         # Before the cast an effect may bring arrays of its own.
-        assert effect.stage is Stage.RAYS or before.keys() == after.keys()
+        assert effect in RAY_EFFECTS or before.keys() == after.keys()
 
     return {"rays": watched_rays, "apply": watched_apply}
 
@@ -218,11 +251,6 @@ class TestLocality:
         scanned(seed, dict.fromkeys(NAMES, "on"))
         assert changed == []
 
-    @pytest.mark.parametrize("number", [0, 1])
-    def test_in_busy_scenes(self, number, changed):
-        simulate_scan(BUSY_SCENES[number], SENSORS[number], ("busy",))
-        assert changed == []
-
 
 class TestDraws:
     @pytest.mark.parametrize("seed", SEEDS[::4])
@@ -232,84 +260,12 @@ class TestDraws:
         scanned(seed + 1)
         assert not differs(scanned(seed), auto(seed))
 
-    @each_scene
-    def test_without_an_effect_the_others_draw_the_same(self, seed, monkeypatch):
-        """In the random scenes for one effect each, with points that stay finite without it."""
-        name = NAMES[seed % len(NAMES)]
-        case = *random_case(seed), ("property", seed)
-        log, _ = drawn(monkeypatch, case, {})
-        without, poorer = drawn(monkeypatch, case, {name: "off"})
-        assert different_draws(log, without) == []
-        assert np.isfinite(poorer.points).all()
-
-    @each_effect
-    def test_independence_of_every_pair(self, name, monkeypatch):
-        for number in range(2):
-            case = BUSY_SCENES[number], SENSORS[number], ("busy", number)
-            log, _ = drawn(monkeypatch, case, {})
-            without, _ = drawn(monkeypatch, case, {name: "off"})
-            assert log.keys() <= set(NAMES)
-            assert name not in without
-            assert different_draws(log, without) == []
-
-    def test_every_effect_that_draws_does_so_in_the_busy_scenes(self, monkeypatch):
-        busy = [
-            drawn(monkeypatch, (scene, sensor, ("busy",)), {})[0]
-            for scene, sensor in zip(BUSY_SCENES, SENSORS, strict=True)
-        ]
-        drawing = {name for log in busy for name in log if len(log[name]) > 1}
-        for seed in SEEDS[:100]:
-            log, _ = drawn(monkeypatch, (*random_case(seed), ("property", seed)), {})
-            assert {name for name, calls in log.items() if len(calls) > 1} <= drawing
-        assert len(drawing) >= 9
-
     def test_the_number_of_a_ray_does_not_depend_on_the_other_rays(self):
         some = np.array([3, 90, 17])
         for kind in ("uniform", "normal", "exponential"):
             one, other = (getattr(Draws(100, "key", 1), kind) for _ in range(2))
             assert one(some).tobytes() == other(slice(None))[some].tobytes()
             assert one(some).tobytes() == other(np.arange(100))[some].tobytes()
-
-    def test_another_key_is_another_scan(self):
-        scans = [simulate_scan(BUSY_SCENES[1], SENSOR, ("busy", n)) for n in range(2)]
-        assert differs(*scans)
-
-
-def drawn(monkeypatch, case, switches):
-    """Key and random numbers of each effect, in the order of its calls; and the scan."""
-    log = {}
-
-    class Recorded(Draws):
-        def __init__(self, num_rays, *key):
-            super().__init__(num_rays, *key)
-            self.calls = log.setdefault(key[-1], [key])
-
-        def _record(self, draw, rays):
-            numbers = draw(slice(None))
-            self.calls.append(numbers.tobytes())
-            return numbers[rays]
-
-        def uniform(self, rays):
-            return self._record(super().uniform, rays)
-
-        def normal(self, rays):
-            return self._record(super().normal, rays)
-
-        def exponential(self, rays):
-            return self._record(super().exponential, rays)
-
-    with monkeypatch.context() as context:
-        context.setattr(scan, "Draws", Recorded)
-        return log, simulate_scan(*case, switches)
-
-
-def different_draws(log, other):
-    """Effects whose draws differ; how many they need may depend on the other effects."""
-    return [
-        name
-        for name in log.keys() & other.keys()
-        if any(one != two for one, two in zip(log[name], other[name], strict=False))
-    ]
 
 
 # Cases of each effect by a parameter x: at 1 it matters, as x falls it vanishes, at 0 it is gone.
@@ -483,7 +439,8 @@ class TestLimit:
         scene, sensor, instead = LIMITS[name](x)
         effects = [instead if type(effect) is type(instead) else effect for effect in EFFECTS]
         with monkeypatch.context() as context:
-            context.setattr(scan, "EFFECTS", tuple(effects))
+            context.setattr(scan, "RAY_EFFECTS", tuple(effects[: len(RAY_EFFECTS)]))
+            context.setattr(scan, "ECHO_EFFECTS", tuple(effects[len(RAY_EFFECTS) :]))
             context.setattr(scan, "Sweep", Kept)
             return [
                 simulate_scan(scene, sensor, ("limit",), {name: switch}) for switch in ("on", "off")
@@ -509,11 +466,6 @@ def recorded(sweep):
 
 
 class TestTable:
-    def test_names_differ_and_stages_follow_one_another(self):
-        assert len(set(NAMES)) == len(NAMES)
-        assert [effect.stage for effect in EFFECTS] == sorted(effect.stage for effect in EFFECTS)
-        assert all(isinstance(effect.stage, Stage) for effect in EFFECTS)
-
     @pytest.mark.parametrize("effect", EFFECTS, ids=NAMES)
     def test_every_effect_states_its_equation(self, effect):
         """A block of its own or of a class that it names, or a formula in the text."""

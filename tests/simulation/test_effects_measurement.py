@@ -20,9 +20,9 @@ from r3dpa.simulation import (
     hdl64e,
     simulate_scan,
 )
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DetectionLimit,
-    Draws,
     DualReturn,
     LaserCalibration,
     RangeNoise,
@@ -64,31 +64,6 @@ def test_spread_of_the_range(snr):
     np.testing.assert_allclose(sweep.first.range_m / 0.002 % 1 % 0.999, 0, atol=1.5e-3)
 
 
-def test_noise_of_an_instrument_without_any():
-    still = replace(SMALL, range_sigma_m=0.0, weak_range_sigma_m=0.0, range_step_m=0.0)
-    assert RangeNoise().called_by(Scene(), still) is None
-    assert RangeNoise().called_by(Scene(), replace(still, range_step_m=0.01)) is not None
-    sweep = swept(still, 12.345)
-    sweep.first.range_m[::3] = np.inf
-    applied(sweep, DualReturn())
-    before = sweep.first.range_m.copy()
-    applied(sweep, RangeNoise())
-    np.testing.assert_array_equal(sweep.first.range_m, before)
-    assert np.isposinf(sweep.second.range_m).all()
-
-
-def test_noise_touches_only_shots_with_an_echo_and_only_their_range():
-    sweep = swept(SMALL)
-    sweep.first.range_m[::3] = np.inf
-    power = sweep.first.power.copy()
-    rays = RangeNoise().rays(sweep)
-    np.testing.assert_array_equal(rays, np.flatnonzero(np.arange(sweep.num_rays) % 3))
-    applied(sweep, RangeNoise())
-    assert np.isposinf(sweep.first.range_m[::3]).all()
-    assert (sweep.first.range_m[rays] != 20).mean() > 0.9
-    np.testing.assert_array_equal(sweep.first.power, power)
-
-
 def test_each_laser_has_its_bias_and_gain():
     sweep = applied(swept(SMALL, 10.0, 0.25), LaserCalibration())
     bias = sweep.grid(sweep.first.range_m) - 10
@@ -98,18 +73,6 @@ def test_each_laser_has_its_bias_and_gain():
     np.testing.assert_allclose(bias, np.repeat([lasers.range_bias_m], 360, 0).T, atol=1e-6)
     np.testing.assert_allclose(gain, np.repeat([lasers.intensity_gain], 360, 0).T ** 2, rtol=1e-6)
     assert np.ptp(lasers.range_bias_m) > 0.01
-
-
-def test_calibration_of_a_perfect_table():
-    perfect = replace(
-        SMALL,
-        lasers=replace(SMALL.lasers, range_bias_m=(0.0,) * 64, intensity_gain=(1.0,) * 64),
-    )
-    assert LaserCalibration().called_by(Scene(), perfect) is None
-    assert "64 lasers with a bias" in LaserCalibration().called_by(Scene(), SMALL)
-    sweep = applied(swept(perfect, 12.345, 0.123), LaserCalibration())
-    assert (sweep.first.range_m == np.float32(12.345)).all()
-    assert (sweep.first.power == np.float32(0.123)).all()
 
 
 @pytest.mark.parametrize("spreads", [-5.0, -1.0, 0.0, 0.5, 5.0])
@@ -126,25 +89,6 @@ def test_share_that_is_kept_near_the_threshold(spreads):
     expected = 0.5 * math.erfc(-spreads / math.sqrt(2))
     standard_error = math.sqrt(expected * (1 - expected) / sweep.num_rays)
     assert kept == pytest.approx(expected, abs=4 * standard_error + 1e-5)
-
-
-def test_a_sharp_threshold_keeps_its_value():
-    sharp = replace(SMALL, threshold_spread=0.0)
-    assert SoftRaydrop().called_by(Scene(), sharp) is None
-    sweep = swept(sharp, power=sharp.min_power)
-    before = sweep.min_power.copy()
-    applied(sweep, SoftRaydrop())
-    np.testing.assert_array_equal(sweep.min_power, before)
-
-
-def test_thresholds_of_strong_and_faint_echoes_stay():
-    sweep = swept(SMALL)
-    sweep.first.power[::2] = SMALL.min_power
-    rays = SoftRaydrop().rays(sweep)
-    np.testing.assert_array_equal(rays, np.arange(0, sweep.num_rays, 2))
-    applied(sweep, SoftRaydrop())
-    assert (sweep.min_power[1::2] == np.float32(SMALL.min_power)).all()
-    assert len(np.unique(sweep.min_power[::2])) > 1000
 
 
 def test_limits_of_power_and_range():

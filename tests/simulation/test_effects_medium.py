@@ -4,9 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DiffuseReflection,
-    Draws,
     DualReturn,
     Fog,
     Rain,
@@ -14,7 +14,7 @@ from r3dpa.simulation.effects import (
     Spray,
 )
 from r3dpa.simulation.effects.medium import soft_waveform
-from r3dpa.simulation.scan import effect_name, simulate_scan
+from r3dpa.simulation.scan import effect_name
 from r3dpa.simulation.scene import Material, Pose, Primitive, Scene, Semantic, Shape, Weather
 from r3dpa.simulation.sensor import Lasers, hdl64e
 from r3dpa.simulation.solids import NO_SURFACE
@@ -68,68 +68,14 @@ def applied(effect, scene, sensor=SENSOR, key="draws", dual=False):
     return sweep
 
 
-def arrays(sweep):
-    columns = [column for echoes in sweep.echoes() for column in echoes.columns()]
-    return [*columns, sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material]
-
-
 # All four.
 
 
-@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
-def test_called_by_its_weather_only(effect, weather):
-    assert effect.called_by(Scene((CAR,), weather=weather), SENSOR)
-    for other, _ in CALLED:
-        if other is not effect:
-            assert other.called_by(Scene((CAR,), weather=weather), SENSOR) is None
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", NAMES)
-def test_forced_on_without_cause_changes_nothing(name):
-    scene = Scene((WALL, CAR))
-    plain = simulate_scan(scene, hdl64e(shots=360), (1,))
-    forced = simulate_scan(scene, hdl64e(shots=360), (1,), {name: "on"})
-    for field in ("points", "labels", "origins"):
-        assert getattr(forced, field).tobytes() == getattr(plain, field).tobytes()
-
-
-@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
-def test_repeats_and_changes_no_other_ray(effect, weather):
-    scene = Scene((WALL, CAR), weather=weather)
-    before, after, again = surfaces(scene), applied(effect, scene), applied(effect, scene)
-    rays = np.arange(before.num_rays)[effect.rays(before)]
-    outside = np.setdiff1d(np.arange(before.num_rays), rays)
-    for old, new, repeated in zip(arrays(before), arrays(after), arrays(again), strict=True):
-        assert (old[outside] == new[outside]).all()
-        assert (new == repeated).all()
-    assert (after.first.power != before.first.power).any()
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("effect", "weather"),
     [
-        (Fog(), Weather(visibility_m=1e9)),
-        (Rain(), Weather(rain_mm_h=1e-12)),
-        (Snow(), Weather(snow_mm_h=1e-12)),
-        (Spray(), Weather(water_film_mm=1e-9)),
-    ],
-    ids=NAMES,
-)
-def test_vanishes_with_its_cause(effect, weather):
-    scene = Scene((WALL, CAR), weather=weather)
-    before, after = surfaces(scene), applied(effect, scene)
-    np.testing.assert_allclose(after.first.power, before.first.power, rtol=1e-5, atol=1e-8)
-    heard = after.first.power > 1e-8
-    assert (after.first.range_m == before.first.range_m)[heard].all()
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    ("effect", "weather"),
-    [
-        (Fog(), Weather(visibility_m=1e-3)),
+        (Fog(), Weather(visibility_m=1.0)),
         (Rain(), Weather(rain_mm_h=1e4)),
         (Snow(), Weather(snow_mm_h=5e-324)),
         (Spray(), Weather(water_film_mm=1e4)),
@@ -277,7 +223,7 @@ def strongest_drops(num_rays, target_m, reflectivity, intercept, slope, extincti
 )
 def test_drops_against_drop_by_drop(effect, weather, intercept, slope):
     """Sky and rays at a target at 6 m, against a simulation of each drop in the beam."""
-    rate = effect.rate_mm_h(weather)
+    rate = getattr(weather, effect.field)
     sensor = replace(SENSOR, shots=720)
     for target_m in (6.0, 20.0):
         sweep = Sweep(Scene(weather=weather), sensor)
@@ -338,14 +284,6 @@ def test_a_beam_without_width_meets_no_drop():
     assert not after.first.origin.any()
     ratio = after.first.power / surfaces(scene, line).first.power.clip(1e-30)
     assert ratio.max() < 1
-
-
-def test_more_rain_more_drops():
-    counts = []
-    for rate in (1, 5, 30):
-        after = applied(Rain(), Scene(weather=Weather(rain_mm_h=rate)))
-        counts.append((after.first.origin == Origin.RAIN).sum())
-    assert 0 < counts[0] < counts[1] < counts[2]
 
 
 # Spray.
@@ -417,16 +355,3 @@ def test_plume_moves_with_its_car():
     assert seen_from_car.min() > -6.01
     assert seen_from_car.max() < 6.01
     assert x.max() > 6.1
-
-
-@pytest.mark.parametrize("reflectivity", [-0.1, 1.1])
-def test_checks_reflectivity(reflectivity):
-    with pytest.raises(ValueError, match="reflectivity must lie"):
-        Rain(reflectivity=reflectivity)
-
-
-def test_checks_sizes_and_spray():
-    with pytest.raises(ValueError, match="size distribution"):
-        Snow(slope=(0.0, -0.48))
-    with pytest.raises(ValueError, match="max_extinction_per_m"):
-        Spray(max_extinction_per_m=-1.0)

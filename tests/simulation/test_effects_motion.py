@@ -18,8 +18,8 @@ from r3dpa.simulation import (
     hdl64e,
     simulate_scan,
 )
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
-    Draws,
     EgoOcclusion,
     FoliageOcclusion,
     MovingActors,
@@ -103,14 +103,6 @@ def test_rolling_shutter_while_turning_rotates_what_is_seen():
     lateral = sweep.sensor.lasers.lateral_m[0]
     assert moved[0] == pytest.approx(10 * t, abs=abs(lateral) * rate * t + 2e-3)
     assert moved[1] == pytest.approx(10 * rate * t**2 / 2, abs=abs(lateral) * rate * t + 2e-3)
-
-
-def test_a_sensor_that_stands_still_sees_no_rolling_shutter():
-    scene = Scene(room(), Pose(pitch_rad=0.01, roll_rad=0.02))
-    still, forced = swept(scene), swept(scene, RollingShutter())
-    np.testing.assert_array_equal(still.start, forced.start)
-    np.testing.assert_array_equal(still.direction, forced.direction)
-    np.testing.assert_array_equal(still.first.range_m, forced.first.range_m)
 
 
 def test_an_actor_that_crosses_is_sheared():

@@ -1,7 +1,5 @@
 """Glass, polished metal and water, against hand-made figures."""
 
-from dataclasses import astuple, replace
-
 import numpy as np
 import pytest
 
@@ -19,10 +17,10 @@ from r3dpa.simulation import (
     hdl64e,
     simulate_scan,
 )
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DetectionLimit,
     DiffuseReflection,
-    Draws,
     Glass,
     MovingActors,
     PolishedMetal,
@@ -202,18 +200,6 @@ def test_image_in_a_metal_mirror():
     np.testing.assert_allclose(sweep.first.power[direct], plain.first.power[direct] / 10, rtol=1e-5)
 
 
-def test_mirrored_echo_is_the_second_one_in_dual_mode():
-    sensor = replace(SENSOR, return_mode="dual")
-    mirror = box((10, 0, 2), (0.1, 3, 2), Material.POLISHED_METAL, 0.9, yaw_rad=0.5)
-    wall = box((0, 20, 3), (40, 0.5, 3), reflectivity=0.1)
-    scene = Scene((mirror, wall))
-    everything = simulate_scan(scene, sensor, (1,))
-    strongest = simulate_scan(scene, SENSOR, (1,))
-    first = everything.points[everything.origins != Origin.SECOND_RETURN]
-    assert (everything.origins == Origin.SECOND_RETURN).sum() > 20
-    assert first.tobytes() == strongest.points.tobytes()
-
-
 def test_wet_ground_loses_power():
     plain = swept(effects=[])
     ground = plain.on_ground()
@@ -300,74 +286,3 @@ def test_no_water_no_puddle():
     np.testing.assert_allclose(trace.points, off.points, atol=0.011)
     assert (scan(1.2, "auto").origins == Origin.MIRROR).any()
     assert not (scan(1.2, "auto", ()).origins == Origin.MIRROR).any()
-
-
-@pytest.mark.parametrize("name", ["glass", "polished_metal", "wet_ground"])
-def test_switched_on_without_cause_changes_nothing(name):
-    scene = Scene((WALL, box((4, 3, 1), (1, 1, 1), instance=4)))
-    off, on, auto = (
-        simulate_scan(scene, SENSOR, (2,), {name: switch}) for switch in ("off", "on", "auto")
-    )
-    for scan in (on, auto):
-        assert scan.points.tobytes() == off.points.tobytes()
-        assert scan.labels.tobytes() == off.labels.tobytes()
-        assert scan.origins.tobytes() == off.origins.tobytes()
-    assert {e.name: e.status for e in auto.effects}[name] == "not_called"
-
-
-def arrays(sweep):
-    return (
-        *sweep.first.columns(), *sweep.second.columns(), sweep.start, sweep.direction,
-        sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.time_s,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("effect", [Glass(), PolishedMetal(), WetGround()])
-def test_other_rays_are_left_alone(effect):
-    metal = box((2, 8, 1), (2, 0.1, 1), Material.POLISHED_METAL, 0.2)
-    scene = Scene(
-        (WALL, PANE, metal),
-        weather=Weather(water_film_mm=1.0),
-        puddles=(Puddle(4.0, 0.0, 1.5),),
-    )
-    sweep = Sweep(scene, SENSOR)
-    sweep.second = type(sweep.first).none(sweep.num_rays)
-    sweep.cast()
-    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
-    before = [array.copy() for array in arrays(sweep)]
-    rays = effect.rays(sweep)
-    assert effect.called_by(scene, SENSOR)
-    effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
-    others = np.setdiff1d(np.arange(sweep.num_rays), rays)
-    for old, new in zip(before, arrays(sweep), strict=True):
-        assert old[..., others].tobytes() == new[..., others].tobytes()
-    assert any((old != new).any() for old, new in zip(before, arrays(sweep), strict=True))
-
-
-def test_weak_effects_tend_to_none():
-    metal = box((5, 0, 2), (0.1, 3, 2), Material.POLISHED_METAL, 0.2, yaw_rad=0.4)
-    plain = swept(metal, WALL)
-    matt = swept(metal, WALL, effects=[PolishedMetal(reflectance=0.0)])
-    for old, new in zip(astuple(plain.first), astuple(matt.first), strict=True):
-        assert old.tobytes() == new.tobytes()
-    # Glass as thin as air is as good as none.
-    absent, clear = swept(WALL), swept(WALL, PANE, effects=[Glass(index=1 + 1e-6)])
-    seen = clear.first.surface == absent.first.surface
-    seen &= np.isfinite(absent.first.range_m)
-    assert (seen & (clear.first.origin == Origin.GLASS)).sum() > 500
-    np.testing.assert_allclose(clear.first.power[seen], absent.first.power[seen], rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("effect", "values", "name"),
-    [
-        (Glass, {"index": 1.0}, "index"),
-        (Glass, {"pane_m": 0.0}, "pane_m"),
-        (PolishedMetal, {"reflectance": 1.1}, "reflectance"),
-        (WetGround, {"index": 0.5}, "index"),
-        (WetGround, {"full_film_mm": 0.0}, "full_film_mm"),
-    ],
-)
-def test_values_are_checked(effect, values, name):
-    with pytest.raises(ValueError, match=name):
-        effect(**values)

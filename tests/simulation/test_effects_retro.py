@@ -17,7 +17,8 @@ from r3dpa.simulation import (
     hdl64e,
     simulate_scan,
 )
-from r3dpa.simulation.effects import Blooming, DiffuseReflection, Draws, Fog, RetroReflection
+from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.effects import Blooming, DiffuseReflection, Fog, RetroReflection
 
 SENSOR = hdl64e()
 
@@ -137,69 +138,3 @@ def test_halo_runs_across_the_end_of_the_turn():
     _, beside = np.divmod(Blooming().rays(sweep), SENSOR.shots)
     assert (beside >= SENSOR.shots - 2).any()
     assert (beside < SENSOR.shots // 2).any()
-
-
-@pytest.mark.parametrize("effect", [RetroReflection(), Blooming()])
-def test_without_sheets_nothing_is_touched(effect):
-    scene = Scene((sheet(15, 5, 0.4, material=Material.PAINT),))
-    assert effect.called_by(scene, SENSOR) is None
-    sweep = swept(scene, [])
-    assert len(effect.rays(sweep)) == 0
-    assert len(effect.rays(swept(Scene(), []))) == 0
-    names = {"retro_reflection", "blooming"}
-    off, on = (
-        simulate_scan(scene, SENSOR, (1,), dict.fromkeys(names, switch)) for switch in ("off", "on")
-    )
-    for name in ("points", "labels", "origins"):
-        assert getattr(on, name).tobytes() == getattr(off, name).tobytes()
-
-
-def arrays(sweep):
-    return (
-        *sweep.first.columns(), *sweep.second.columns(), sweep.start, sweep.direction,
-        sweep.min_power, sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.time_s,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("effect", [RetroReflection(), Blooming(spill=1.0)])
-def test_other_rays_are_left_alone(effect):
-    sweep = swept(Scene((sheet(15, 5, 0.4),)), [])
-    sweep.second = type(sweep.first).none(sweep.num_rays)
-    # Strong enough for a halo before the effect under test runs.
-    sweep.first.power[sweep.of_material(Material.RETROREFLECTOR)] *= 100
-    before = [array.copy() for array in arrays(sweep)]
-    rays = effect.rays(sweep)
-    assert effect.called_by(sweep.scene, SENSOR)
-    effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
-    others = np.setdiff1d(np.arange(sweep.num_rays), rays)
-    for old, new in zip(before, arrays(sweep), strict=True):
-        assert old[..., others].tobytes() == new[..., others].tobytes()
-    assert any((old != new).any() for old, new in zip(before, arrays(sweep), strict=True))
-
-
-def test_weak_effects_tend_to_none():
-    scene = Scene((sheet(15, 5, 0.4),))
-    matt, bright = swept(scene, []), swept(scene, [RetroReflection(0.0)])
-    assert matt.first.power.tobytes() == bright.first.power.tobytes()
-    assert halo_counts(swept(scene, [RetroReflection()]), 3, Blooming(spill=0.0)).sum() == 0
-
-
-def test_same_key_same_halo():
-    scene = Scene((sheet(15, 5, 0.4),))
-    first, again, other = (simulate_scan(scene, SENSOR, key) for key in ((1,), (1,), (2,)))
-    assert first.points.tobytes() == again.points.tobytes()
-    assert first.origins.tobytes() != other.origins.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("effect", "values", "name"),
-    [
-        (RetroReflection, {"retroreflection": -1.0}, "retroreflection"),
-        (Blooming, {"halo_deg": 0.0}, "halo_deg"),
-        (Blooming, {"halo_deg": 9.0}, "halo_deg"),
-        (Blooming, {"spill": 2.0}, "spill"),
-    ],
-)
-def test_values_are_checked(effect, values, name):
-    with pytest.raises(ValueError, match=name):
-        effect(**values)

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from r3dpa.simulation.effects import Draws, SunGlare
-from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.effects import SunGlare
 from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic, Shape, Weather
 from r3dpa.simulation.sensor import hdl64e
 from r3dpa.simulation.sweep import Origin, Sweep
@@ -61,16 +61,6 @@ def test_not_called_under_a_covered_sky(covered):
     assert len(applied(scene)[1]) == 0
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("elevation_deg", [-20.0, 0.0, 13.5, 60.0])
-def test_forced_on_without_cause_changes_nothing(elevation_deg):
-    scene = Scene((HOUSE,), weather=replace(LOW, sun_elevation_deg=elevation_deg))
-    plain = simulate_scan(scene, SENSOR, (1,), {"sun_glare": "auto"})
-    forced = simulate_scan(scene, SENSOR, (1,), {"sun_glare": "on"})
-    for field in ("points", "labels", "origins"):
-        assert getattr(forced, field).tobytes() == getattr(plain, field).tobytes()
-
-
 def test_threshold_near_the_sun():
     """1 + 3 * cos^4(9 g) * exp(-0.1 * 10.3): Kasten and Young's air mass at 5 degrees is 10.3."""
     sweep, rays = applied(Scene(weather=LOW))
@@ -101,23 +91,6 @@ def test_a_hidden_sun_does_not_glare():
     assert len(applied(Scene((HOUSE,), weather=opposite))[1])
 
 
-def test_changes_no_other_ray_and_repeats():
-    effect = SunGlare(noise=0.5)
-    sweep, rays = applied(Scene(weather=LOW), effect)
-    again, _ = applied(Scene(weather=LOW), effect)
-    before = Sweep(sweep.scene, SENSOR)
-    before.cast()
-    outside = np.setdiff1d(np.arange(sweep.num_rays), rays)
-    for old, new, repeated in zip(
-        [*before.first.columns(), before.min_power, before.reflectivity],
-        [*sweep.first.columns(), sweep.min_power, sweep.reflectivity],
-        [*again.first.columns(), again.min_power, again.reflectivity],
-        strict=True,
-    ):
-        assert (old[outside] == new[outside]).all()
-        assert (new == repeated).all()
-
-
 def test_noise_is_as_frequent_as_said():
     """Expected number = sum of noise * glare over the rays; ranges even over those reported."""
     effect = SunGlare(noise=1.0)
@@ -133,17 +106,3 @@ def test_noise_is_as_frequent_as_said():
     middle = (SENSOR.min_range_m + SENSOR.max_range_m) / 2
     spread = (SENSOR.max_range_m - SENSOR.min_range_m) / math.sqrt(12)
     assert abs(sweep.first.range_m[noise].mean() - middle) < 4 * spread / math.sqrt(noise.sum())
-
-
-def test_without_rise_and_noise_nothing_is_left():
-    sweep, rays = applied(Scene(weather=LOW), SunGlare(rise=0.0, noise=0.0))
-    assert len(rays)
-    assert (sweep.min_power == np.float32(SENSOR.min_power)).all()
-    assert not sweep.first.origin.any()
-
-
-def test_checks_its_values():
-    with pytest.raises(ValueError, match="rise must be 0 or greater"):
-        SunGlare(rise=-1.0)
-    with pytest.raises(ValueError, match="noise must lie in"):
-        SunGlare(noise=2.0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from r3dpa.simulation import Material, Pose, Primitive, Scene, Semantic, Shape, Sweep, hdl64e
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DetectionLimit,
     DiffuseReflection,
-    Draws,
     SurfaceTexture,
     surface_power,
 )
@@ -110,5 +110,3 @@ def test_texture_scatters_the_power_around_its_median():
         assert drawn.mean() == pytest.approx(0, abs=4 / np.sqrt(len(drawn)))
         assert drawn.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(drawn)))
     assert (sweep.first.power[np.isinf(sweep.first.range_m)] == 0).all()
-    with pytest.raises(ValueError, match="leaf_spread must be 0 or greater, got -1"):
-        SurfaceTexture(leaf_spread=-1)

@@ -6,8 +6,7 @@ import pytest
 from r3dpa.simulation import Pose, Primitive, Scene, Semantic, Shape, Weather, hdl64e, raycast
 from r3dpa.simulation.raycast import cast, cast_single, normals, surface_distance
 from r3dpa.simulation.sensor import Rays
-from r3dpa.simulation.solids import GROUND, NO_SURFACE, level, scene_solids
-from r3dpa.simulation.windows import Windows
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Windows, level, solids_of
 
 REACH_M = 120.0
 
@@ -34,7 +33,7 @@ class Hits:
     """Ranges, surfaces and incidence of a scene under some rays, each (beams, shots)."""
 
     def __init__(self, scene, rays, **motion):
-        self.solids = scene_solids(scene)
+        self.solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
         origin, direction = (level(array, scene.pose) for array in rays)
         self.range_m, self.surface = cast(self.solids, origin, direction, REACH_M, **motion)
         hit = np.isfinite(self.range_m)
@@ -130,7 +129,7 @@ def test_a_moving_solid_is_met_where_it_is_at_that_time():
     assert here.range_m[0, 0] == pytest.approx(9)
     assert there.range_m[0, 0] == pytest.approx(10)
     # The velocity is given in the world frame and turns with the heading.
-    turned = scene_solids(scene).velocity[0]
+    turned = solids_of(scene.primitives, scene.pose, scene.ground_m).velocity[0]
     np.testing.assert_allclose(turned, [20 * np.cos(0.3), -20 * np.sin(0.3)], rtol=1e-6)
 
 
@@ -300,7 +299,7 @@ def test_single_rays_see_what_the_turn_sees():
 def test_single_rays_leave_out_and_look_inside():
     house = solid(Shape.BOX, (10, 0, 2), (4, 5, 3))
     pane = solid(Shape.BOX, (5.98, 0, 2), (0.01, 1, 1))
-    solids = scene_solids(Scene((house, pane), Pose(z_m=2.0)))
+    solids = solids_of((house, pane), Pose(z_m=2.0), 0.0)
     start = np.array([[5.97], [0], [0]], dtype=np.float32)
     ahead = np.array([[1], [0], [0]], dtype=np.float32)
     time_s, reach = np.zeros(1, dtype=np.float32), np.array([100.0])
@@ -318,7 +317,8 @@ def test_single_rays_leave_out_and_look_inside():
 
 
 def test_each_ray_against_its_own_solid():
-    solids = scene_solids(crowd(3))
+    scene = crowd(3)
+    solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
     draw = np.random.default_rng(0)
     index = draw.integers(0, len(solids.shape), 400)
     towards = solids.centre[index].T + draw.normal(0, 1, (3, 400))

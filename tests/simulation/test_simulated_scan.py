@@ -7,7 +7,6 @@ from r3dpa.simulation import (
     EFFECTS,
     EgoMotion,
     Lasers,
-    Material,
     Origin,
     Pose,
     Primitive,
@@ -158,12 +157,6 @@ def test_switches():
         simulate_scan(scene, hdl64e(90), (0,), {"fog": "maybe"})
 
 
-def test_an_effect_is_switched_by_its_name():
-    names = [effect_name(effect) for effect in EFFECTS]
-    assert len(set(names)) == len(names) == len(EFFECTS)
-    assert {"rolling_shutter", "soft_raydrop", "wet_ground"} <= set(names)
-
-
 def test_intensity_rises_with_the_root_of_the_reflectivity_and_weak_returns_have_none():
     min_power = 1e-5
     weakest, strong = scan._ZERO_INTENSITY * min_power, scan._FULL_INTENSITY * min_power
@@ -177,20 +170,6 @@ def test_intensity_rises_with_the_root_of_the_reflectivity_and_weak_returns_have
     np.testing.assert_allclose(bright, 0.99)
 
 
-def test_dual_mode_adds_second_returns_to_the_strongest():
-    pane = wall(11, (0.01, 30, 4), material=Material.GLASS, semantic=Semantic.BUILDING)
-    scene = Scene((pane, wall(20, (1, 60, 8), reflectivity=0.9)))
-    single = hdl64e(360)
-    dual = replace(single, return_mode="dual")
-    one, two = (simulate_scan(scene, sensor, (0,), EXACT) for sensor in (single, dual))
-    first = two.origins != Origin.SECOND_RETURN
-    assert (~first).sum() > 50
-    np.testing.assert_array_equal(two.points[first], one.points)
-    np.testing.assert_array_equal(two.labels[first], one.labels)
-    # A second return lies on the ray of a first one, more than 1 m away.
-    assert rings_of(two.points[:, :3]).max() == rings_of(one.points[:, :3]).max()
-
-
 def test_a_scan_without_any_return_is_empty():
     nowhere = Scene(pose=Pose(z_m=500.0))
     scanned = simulate_scan(nowhere, hdl64e(90), (0,))
@@ -202,11 +181,6 @@ def test_one_laser_is_enough():
     lasers = Lasers((-0.1,), (0.0,), (0.2,), (0.0,), (0.0,), (1.0,))
     sensor = replace(hdl64e(90), lasers=lasers)
     assert len(simulate_scan(Scene(), sensor, (0,), EXACT).points) == 90
-
-
-def test_stages_run_in_order(monkeypatch):
-    stages = [effect.stage for effect in scan.EFFECTS]
-    assert stages == sorted(stages)
 
 
 def test_scans_look_like_those_of_a_real_hdl64():

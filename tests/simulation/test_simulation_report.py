@@ -1,19 +1,11 @@
 """Facts of the report that can be counted by hand, and the file of the times."""
 
-import csv
 import json
 
 import pytest
 
-from r3dpa.simulation import EFFECTS, effect_name, hdl64e, report, simulate
-from r3dpa.simulation.report import (
-    PARTS,
-    ScanTiming,
-    add_timings,
-    make_report,
-    read_timings,
-    start_timings,
-)
+from r3dpa.simulation import EFFECTS, effect_name, hdl64e, simulate
+from r3dpa.simulation.report import PARTS, make_report
 
 NAMES = [effect_name(effect) for effect in EFFECTS]
 COLUMNS = [*PARTS, *NAMES, "total"]
@@ -21,11 +13,11 @@ COLUMNS = [*PARTS, *NAMES, "total"]
 
 def summary(drive, status="ran", reason="base", rays=10):
     record = {"status": status, "reason": reason, "rays": rays}
-    return {"drive": drive, "effects": {"range_noise": record}}
+    return {"drive": drive, "points": 5, "effects": {"range_noise": record}}
 
 
-def timing(scan, **ms):
-    return ScanTiming("0003", scan, dict.fromkeys(COLUMNS, 0.0) | {"total": 10.0} | ms)
+def timing(**ms):
+    return dict.fromkeys(COLUMNS, 0.0) | {"total": 10.0} | ms
 
 
 class TestEffects:
@@ -36,43 +28,43 @@ class TestEffects:
             summary("0003", "ran", "second", 50),
             summary("0000", "off", "switched off", 0),
         ]
-        total = make_report(summaries, [], 4).effects["range_noise"]
+        total = make_report(summaries, []).effects["range_noise"]
         assert (total.ran, total.not_called, total.off) == (2, 1, 1)
         assert total.rays_per_scan == 20
         assert total.why == "first"
 
     def test_without_a_run_the_reason_is_that_of_the_first_scan(self):
         summaries = [summary("0003", "not_called", "nothing"), summary("0003", "off", "off")]
-        assert make_report(summaries, [], 0).effects["range_noise"].why == "nothing"
+        assert make_report(summaries, []).effects["range_noise"].why == "nothing"
 
     def test_scans_by_drive(self):
         summaries = [summary("0003"), summary("0000"), summary("0003")]
-        assert make_report(summaries, [], 1).scans_per_drive == {"0003": 2, "0000": 1}
+        assert make_report(summaries, []).scans_per_drive == {"0003": 2, "0000": 1}
 
 
 class TestCosts:
     def test_mean_median_and_share(self):
         """Casts of 1, 2 and 9 ms in totals of 10, 10 and 20 ms: 12 of 40."""
-        timings = [timing(0, cast=1.0), timing(1, cast=2.0), timing(2, cast=9.0, total=20.0)]
-        result = make_report([summary("0003")] * 3, timings, 3)
+        timings = [timing(cast=1.0), timing(cast=2.0), timing(cast=9.0, total=20.0)]
+        result = make_report([summary("0003")] * 3, timings)
         assert result.costs["cast"] == pytest.approx((4.0, 2.0, 0.3))
         assert result.costs["total"] == pytest.approx((40 / 3, 10.0, 1.0))
         assert result.num_timed == 3
 
     def test_accounted_is_the_sum_of_all_but_the_total(self):
-        timings = [timing(0, cast=4.0, range_noise=3.0, write=2.0)]
-        assert make_report([summary("0003")], timings, 1).accounted == pytest.approx(0.9)
+        timings = [timing(cast=4.0, range_noise=3.0, write=2.0)]
+        assert make_report([summary("0003")], timings).accounted == pytest.approx(0.9)
 
     def test_without_times_there_are_none(self):
-        result = make_report([summary("0003")], [], 0)
+        result = make_report([summary("0003")], [])
         assert (result.costs, result.num_timed, result.accounted) == ({}, 0, 0)
         assert "- " in str(result)
 
 
 class TestTable:
     def test_has_a_line_for_every_effect_part_and_the_total(self):
-        timings = [timing(0, cast=2.5, range_noise=5.0)]
-        result = make_report([summary("0003", "ran", "sigma 1 cm", 1234)], timings, 1)
+        timings = [timing(cast=2.5, range_noise=5.0)]
+        result = make_report([summary("0003", "ran", "sigma 1 cm", 1234)], timings)
         lines = {line.split()[0]: line.split() for line in str(result).splitlines() if line}
         assert lines["range_noise"][1:] == (
             ["1", "0", "0", "1234", "5.00", "5.00", "50.0%", "sigma", "1", "cm"]
@@ -81,57 +73,6 @@ class TestTable:
         assert lines["total"][1:] == ["10.00", "10.00", "100.0%"]
         assert set(PARTS) < set(lines)
         assert str(result).splitlines()[-1] == "effects and parts add up to 75.0% of the total"
-
-
-class TestTimingsFile:
-    def test_round_trip(self, tmp_path):
-        path = tmp_path / "timings.csv"
-        start_timings(path)
-        timings = [timing(0, cast=1.25), timing(1, write=0.125)]
-        add_timings(path, timings[:1])
-        add_timings(path, timings[1:])
-        assert read_timings(path) == timings
-        with path.open() as stream:
-            assert next(csv.reader(stream)) == ["drive", "scan", *COLUMNS]
-
-    @pytest.mark.parametrize("kept", [0, 1, 12, -1])
-    def test_whatever_a_kill_left_of_the_last_row_is_removed(self, tmp_path, kept):
-        path = tmp_path / "timings.csv"
-        start_timings(path)
-        add_timings(path, [timing(0)])
-        whole = path.read_bytes()
-        add_timings(path, [timing(1)])
-        row = path.read_bytes()[len(whole) :]
-        path.write_bytes(whole + row[:kept])
-        start_timings(path)
-        assert path.read_bytes() == whole
-
-    def test_half_a_header_is_completed(self, tmp_path):
-        path = tmp_path / "timings.csv"
-        start_timings(path)
-        header = path.read_bytes()
-        path.write_bytes(header[:7])
-        start_timings(path)
-        assert path.read_bytes() == header
-
-    def test_of_a_scan_written_twice_the_last_row_counts(self, tmp_path):
-        path = tmp_path / "timings.csv"
-        start_timings(path)
-        add_timings(path, [timing(0, cast=1.0), timing(1), timing(0, cast=2.0)])
-        assert [row.ms["cast"] for row in read_timings(path)] == [2.0, 0.0]
-
-    def test_other_columns_are_refused(self, tmp_path):
-        path = tmp_path / "timings.csv"
-        path.write_text("drive,scan,total\n")
-        with pytest.raises(ValueError, match=r"timings\.csv has other columns .* delete it"):
-            start_timings(path)
-
-    def test_a_damaged_row_is_named(self, tmp_path):
-        path = tmp_path / "timings.csv"
-        start_timings(path)
-        path.write_text(path.read_text() + "0003,7,fast\n")
-        with pytest.raises(ValueError, match=r"damaged row for drive 0003, scan 7"):
-            read_timings(path)
 
 
 @pytest.fixture(scope="module")
@@ -163,26 +104,3 @@ class TestOfADataSet:
             assert total.why in [record["reason"] for record in records]
         assert result.effects["range_noise"].off == 6
         assert result.effects["detection_limit"].ran == 6
-
-    def test_every_scan_is_timed_in_every_column(self, data_set):
-        """Parts are measured inside the total, so that they cannot exceed it."""
-        root, result = data_set
-        rows = read_timings(root / "timings.csv")
-        assert {(row.drive, row.scan) for row in rows} == {("0003", i) for i in range(6)}
-        assert set(result.costs) == set(COLUMNS)
-        for row in rows:
-            parts = sum(value for name, value in row.ms.items() if name != "total")
-            assert 0.5 * row.ms["total"] < parts <= row.ms["total"] + 0.02
-            assert row.ms["range_noise"] == 0
-        assert 0.5 < result.accounted <= 1.001
-
-    def test_lost_times_are_no_obstacle(self, data_set, tmp_path):
-        simulate(tmp_path, 2, drives=["0003"], sensor=hdl64e(32))
-        (tmp_path / "timings.csv").unlink()
-        result = simulate(tmp_path, 2, drives=["0003"], sensor=hdl64e(32))
-        assert (result.num_timed, result.effects["detection_limit"].ran) == (0, 2)
-
-    def test_scan_files_hold_no_times(self, data_set):
-        text = next(data_set[0].rglob("sim/*.json")).read_text()
-        assert '"ms"' not in text
-        assert report.PARTS[0] not in json.loads(text)

@@ -4,10 +4,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from r3dpa.simulation import Material, Semantic, Shape, Street, Weather
+from r3dpa.simulation import Material, Semantic, Shape, Street, Weather, WeatherPrior
 from r3dpa.simulation import street as street_module
 from r3dpa.simulation.course import BLOCK_M, CHARACTERS, course_of
-from r3dpa.simulation.weather import WeatherPrior
 
 GROUND = (Semantic.ROAD, Semantic.SIDEWALK, Semantic.TERRAIN)
 DRY = Weather()
@@ -104,15 +103,6 @@ def test_motion_agrees_with_the_poses(drive):
         assert turned == pytest.approx(0.1 * scene.motion.yaw_rate_rad_s, abs=0.009)
 
 
-def test_drives_stand_now_and_then():
-    standing_share = [
-        np.mean([course_of(0, drive).speed_m_s(scan) == 0 for scan in range(2000)])
-        for drive in range(20)
-    ]
-    assert min(standing_share) == 0
-    assert 0.05 < np.mean(standing_share) < 0.2
-
-
 def test_the_sensor_is_at_mount_height_above_the_road_and_tilts_with_it():
     for drive in range(4):
         street = Street(3, drive, DRY)
@@ -162,14 +152,6 @@ def test_neighbouring_ground_boxes_meet_without_a_step():
 
 def _z(primitive, x, y):
     return top_at(primitive, x, y) - primitive.half_size[2]
-
-
-def test_slopes_stay_within_six_percent():
-    for seed in range(3):
-        for drive in range(11):
-            sections = [course_of(seed, drive).section_of(block) for block in range(200)]
-            assert max(abs(section.slope) for section in sections) <= 0.06
-            assert max(abs(section.cross) for section in sections) <= 0.04
 
 
 def test_nothing_stands_in_the_lane_of_the_recording_car():
@@ -292,13 +274,6 @@ def test_every_class_and_material_occurs():
     assert shapes == set(Shape)
 
 
-def test_leaves_and_wire_mesh_alone_let_beams_in():
-    for drive in range(4):
-        for p in Street(0, drive, DRY).scene(100).primitives:
-            wire = p.semantic == Semantic.FENCE and p.material == Material.PAINT
-            assert (p.extinction_per_m > 0) == (p.material == Material.FOLIAGE or wire)
-
-
 def test_weather_follows_the_prior():
     """2000 draws; bounds of five standard deviations of a binomial share."""
     prior = WeatherPrior()
@@ -360,7 +335,7 @@ def test_impossible_priors_are_refused(values, message):
 
 
 def test_negative_numbers_are_refused():
-    with pytest.raises(ValueError, match="seed and drive"):
+    with pytest.raises(ValueError, match="seed must be 0 or greater"):
         Street(-1, 0)
     with pytest.raises(ValueError, match="scan must be 0 or greater, got -1"):
         Street(0, 0).scene(-1)

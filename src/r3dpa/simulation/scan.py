@@ -130,6 +130,7 @@ class Simulator:
         ValueError: If a value is out of range or an effect unknown.
 
     Example:
+        >>> from r3dpa.simulation import Weather
         >>> scan = Simulator(seed=0, weather=Weather(rain_mm_h=10)).scan(3)
         >>> scan.points.shape[1], scan.points.dtype, len(scan.labels) == len(scan.points)
         (4, dtype('float32'), True)
