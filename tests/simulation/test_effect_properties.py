@@ -70,7 +70,7 @@ CROWN = Primitive(
 )  # fmt: skip
 PANE = box((8.0, -6.0, 1.5), (2.0, 0.02, 1.5), reflectivity=0.02, material=Material.GLASS)
 METAL = box((7.0, 2.5, 0.8), (0.1, 1.5, 0.8), reflectivity=0.2, material=Material.POLISHED_METAL)
-SHEET = box((9.0, -3.0, 1.5), (0.02, 1.0, 1.0), material=Material.RETROREFLECTOR)
+SHEET = box((9.0, -3.0, 1.5), (0.02, 1.0, 3.0), material=Material.RETROREFLECTOR)
 ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2))
 PUDDLES = (Puddle(15.0, 2.0, 4.0), Puddle(0.0, 4.0, 1.0))
 SUNNY = Weather(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=100.0)

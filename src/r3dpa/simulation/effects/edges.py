@@ -243,7 +243,8 @@ def _peaks(targets: _Targets, met: Indices, range_m: Floats, merge_m: float) -> 
 
 
 def _either(chosen: NDArray[np.bool_], one: _Peak, other: _Peak) -> _Peak:
-    return _Peak(*(np.where(chosen, a, b) for a, b in zip(one, other, strict=True)))
+    pairs = ((np.asarray(a), np.asarray(b)) for a, b in zip(one, other, strict=True))
+    return _Peak(*(np.where(chosen, a, b) for a, b in pairs))
 
 
 def _record(
