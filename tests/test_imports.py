@@ -24,10 +24,9 @@ ALLOWED = {
     "generation": {"geometry", "nn", "flow", "checkpoints"},
     "editing": {"geometry", "nn", "flow", "generation", "checkpoints"},
     "modules": CORE | {"data", "checkpoints", "generation", "editing"},
-    "scoring": {"data", "metrics", "viz"},
     "callbacks": CORE
     | {"data", "checkpoints", "generation", "modules", "metrics", "viz"}
-    | {"scoring", "simulation"},
+    | {"simulation"},
     "ablation": {"metrics", "modules", "checkpoints", "viz"},
     "bench": CORE
     | {"simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
@@ -35,7 +34,7 @@ ALLOWED = {
     "__main__": {"cli"},
     "cli": CORE
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "scoring", "ablation", "editing"},
+    | {"metrics", "ablation", "editing"},
 }
 ANYWHERE = {"io", "unpickling", "__version__"}
 

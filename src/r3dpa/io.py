@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tokenize
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
@@ -225,3 +225,23 @@ def one_line(values: str | dict[str, Any]) -> str:
     if isinstance(values, str):
         return values
     return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def text_table(
+    rows: Iterable[Sequence[str]], heads: Sequence[str], align: str, style: str = "simple"
+) -> str:
+    """A table of texts.
+
+    Args:
+        rows: Cells of each line.
+        heads: Heads of the columns.
+        align: ``l`` or ``r`` for each column.
+        style: Of ``tabulate``: ``simple`` for a terminal, ``pipe`` for Markdown.
+    """
+    from tabulate import tabulate
+
+    sides = ["left" if side == "l" else "right" for side in align]
+    text = tabulate(
+        list(rows), heads, style, disable_numparse=True, colalign=sides, preserve_whitespace=True
+    )
+    return "\n".join(line.rstrip() for line in text.splitlines())

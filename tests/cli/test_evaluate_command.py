@@ -8,11 +8,11 @@ import torch
 import yaml
 
 import r3dpa.cli.evaluate as command
-from r3dpa import scoring
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin, write_npz
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.metrics.distances import Resampling
+from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.official_statistics import compare, reference_spaces
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
@@ -115,7 +115,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
 def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
     undisturbed, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     command.reference(data, undisturbed, ["fgeo"])
-    read, seen = scoring.read_scan, []
+    read, seen = command.read_scan, []
 
     def dying(path, sensor):
         if len(seen) == 10:
@@ -123,7 +123,7 @@ def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
         seen.append(path)
         return read(path, sensor)
 
-    monkeypatch.setattr(scoring, "read_scan", dying)
+    monkeypatch.setattr(command, "read_scan", dying)
     with pytest.raises(KeyboardInterrupt):
         command.reference(data, out, ["fgeo"], every=8)
     partial = tmp_path / "b.partial.safetensors"
@@ -271,8 +271,8 @@ def test_generated_scenes_need_no_files(reference_file, tmp_path):
     made = [EvaluationScene(f"{i}", None, m) for i, m in enumerate(range_images(1, 10))]
     statistics = ReferenceStatistics.load(reference_file)
     options = {"allow_few": True, "resampling": Resampling(0, 40)}
-    spaces = scoring.reference_spaces(statistics, None, None, None, "cpu")
-    found, _ = scoring.compare(made, statistics, spaces, label="memory", **options)
+    spaces = reference_spaces(statistics, None, None, None, "cpu")
+    found, _ = compare(made, statistics, spaces, label="memory", **options)
     rows = {row.name: row.value for row in found.rows}
     write_npz(tmp_path / "made.npz", {str(i): p for i, p in enumerate(clouds(1, 10))})
     path = tmp_path / "made.npz"

@@ -79,7 +79,7 @@ def jobs(scans_folder, tmp_path_factory):
         "reference": Job(
             ["reference", "--data", folder / "data.yaml", "--spaces", "fgeo", "--device", "cpu"],
             "--out",
-            At("r3dpa.scoring.read_scan", None, call=4),
+            At("r3dpa.cli.evaluate.read_scan", None, call=4),
             5000,
             "r3dpa reference: stopped; the same command goes on with {out}\n",
             is_file=True,

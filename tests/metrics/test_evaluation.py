@@ -6,13 +6,10 @@ import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.distances import Resampling
-from r3dpa.metrics.distribution import BEVHistogramDistance, MinimumMatchingDistance
+from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate
-from r3dpa.metrics.frechet import FrechetDistance
-from r3dpa.metrics.functional import fd_infinity
-from r3dpa.metrics.functional_bev import chamfer_squared
-from r3dpa.metrics.functional_manifold import precision_recall
+from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, precision_recall
+from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.result_table import EvaluationTable
@@ -94,7 +91,7 @@ def test_noise_makes_everything_worse(reference):
 
 
 def test_values_are_those_of_the_metrics_one_by_one(reference):
-    """The same numbers from the classes that see all scenes at once."""
+    """The same numbers from the functions that see all scenes at once."""
     rows = rows_of(scenes(1, 30, noise=1.0), reference)
     real, made = (
         [through_sensor(scene, PROTOCOL) for scene in part]
@@ -102,16 +99,14 @@ def test_values_are_those_of_the_metrics_one_by_one(reference):
         for part in (sorted(scenes(), key=lambda scene: scene.name), scenes(1, 30, noise=1.0))
     )
     clouds = [[scene.points for scene in part] for part in (real, made)]
-    bev, matching = BEVHistogramDistance(PROTOCOL.grid), MinimumMatchingDistance(PROTOCOL.grid)
-    frechet = FrechetDistance(3)
-    for metric, parts in ((bev, clouds), (matching, clouds), (frechet, [toy(real), toy(made)])):
-        metric.update(parts[0], real=True)
-        metric.update(parts[1], real=False)
-    assert rows["JSD"].value == pytest.approx(bev.compute()["jsd_distance"], rel=1e-9)
-    assert rows["TV"].value == pytest.approx(bev.compute()["total_variation"], rel=1e-9)
-    mmd = matching.compute()["mmd_squared_normalised"]
+    bev = histogram_distance(*map(PROTOCOL.grid.histogram, clouds))
+    assert rows["JSD"].value == pytest.approx(bev.jsd_distance, rel=1e-9)
+    assert rows["TV"].value == pytest.approx(bev.total_variation, rel=1e-9)
+    cells = [[PROTOCOL.grid.cells(cloud) for cloud in part] for part in clouds]
+    mmd = minimum_matching(*cells, PROTOCOL.grid).mmd_squared_normalised
     assert rows["MMD"].value == pytest.approx(mmd, rel=1e-9)
-    assert rows["TOY"].value == pytest.approx(frechet.compute().item(), rel=1e-6)
+    frechet = frechet_distance_of(toy(real), toy(made))
+    assert rows["TOY"].value == pytest.approx(frechet, rel=1e-6)
     infinite = fd_infinity(toy(real), toy(made), torch.Generator().manual_seed(0))
     assert rows["TOY inf"].value == pytest.approx(infinite.value, rel=1e-6)
     shares = precision_recall(toy(real), toy(made))
@@ -143,12 +138,11 @@ def test_floors_are_between_the_drives(reference):
         [through_sensor(scene, PROTOCOL) for scene in scenes() if scene.name.startswith(drive)]
         for drive in ("drive0", "drive1")
     ]
-    bev, frechet = BEVHistogramDistance(PROTOCOL.grid), FrechetDistance(3)
-    for real, drive in zip((False, True), drives, strict=True):
-        bev.update([scene.points for scene in drive], real=real)
-        frechet.update(toy(drive), real=real)
-    assert rows["JSD"].floor == pytest.approx(bev.compute()["jsd_distance"], rel=1e-9)
-    assert rows["TOY"].floor == pytest.approx(frechet.compute().item(), rel=1e-6)
+    clouds = [[scene.points for scene in drive] for drive in drives]
+    jsd = histogram_distance(*map(PROTOCOL.grid.histogram, clouds)).jsd_distance
+    assert rows["JSD"].floor == pytest.approx(jsd, rel=1e-9)
+    frechet = frechet_distance_of(*map(toy, drives))
+    assert rows["TOY"].floor == pytest.approx(frechet, rel=1e-6)
     assert "floor of 20 and 20 scans" in rows["TOY"].note
     assert rows["TOY precision"].floor is None  # no distance, so nothing ties with it
     assert "real scans reach" in rows["TOY precision"].note
@@ -198,7 +192,7 @@ def test_results_repeat_and_go_through_json(reference, tmp_path):
 def test_only_as_many_scenes_as_the_protocol_counts():
     reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
     comparison = evaluate(scenes(1, 30), reference, [TOY], label="x", resampling=QUICK)
-    assert comparison.samples.count == 20
+    assert len(comparison.names) == 20
     assert comparison.evaluation.about["extra"]["scenes"].startswith("only the first 20 were used")
 
 
@@ -281,7 +275,7 @@ def test_bad_scenes_do_not_use_up_what_the_protocol_counts():
     reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
     mixed = [*(bad for bad, _ in BAD), *scenes(1, 21)]
     comparison = evaluate(mixed, reference, [TOY], label="x", resampling=QUICK, skip_bad=True)
-    assert comparison.samples.count == 20
+    assert len(comparison.names) == 20
 
 
 def test_bad_scenes_alone_are_an_error(reference):
@@ -292,14 +286,15 @@ def test_bad_scenes_alone_are_an_error(reference):
 def test_floors_are_of_as_many_scenes_as_the_values(reference):
     """The nearest of 8 scans is no nearer than that of all 20, of which they are a part."""
     few, many, more = (rows_of(scenes(1, count), reference) for count in (8, 20, 40))
-    for name in ("MMD", "CD 3D", "TOY"):
+    for name in ("MMD", "CD 3D", "TOY", "JSD", "W1 range"):
         assert few[name].note.endswith("floor of 8 and 20 scans"), name
         assert many[name].note.endswith("floor of 20 and 20 scans"), name
         assert more[name].note.endswith(
             "floor of 20 and 20 scans, rather high: the value is of 40 scenes"
         ), name
     assert few["MMD"].floor > many["MMD"].floor == more["MMD"].floor
-    assert few["JSD"].note == ("floor of 20 and 20 scans, rather low: the value is of 8 scenes")
+    assert few["JSD"].note == "floor of 8 and 20 scans"
+    assert few["JSD"].floor > many["JSD"].floor == more["JSD"].floor
     assert more["TOY KID"].note.endswith("floor of 20 and 20 scans")
 
 
@@ -323,3 +318,55 @@ def test_points_beyond_the_grid_are_told(reference):
         scene.range_m[:, 31:33] = 55.0
     note = rows_of(far, reference)["MMD"].note
     assert note.startswith("3.12% of the points, 0.00% of the real ones, lie beyond the grid")
+
+
+def verdict_of(made, reference):
+    return evaluate(made, reference, [TOY], label="x", resampling=QUICK).evaluation
+
+
+def test_the_verdict_is_one_line_above_the_table(reference):
+    fresh = verdict_of(scenes(1), reference)
+    assert fresh.about["extra"]["verdict"].startswith("near the floor in JSD")
+    lost = verdict_of(scenes(1, noise=12.0), reference)
+    line = lost.about["extra"]["verdict"]
+    assert re.match(r"not realistic: TOY precision 0\.\d+ \(real scans 1\), ", line)
+    assert str(lost).splitlines()[1] == f"verdict: {line}"
+    assert "{" not in str(lost)  # JSON is in the file alone
+
+
+def test_scenes_of_another_sensor_are_told(reference):
+    """Every second pixel of both axes is a quarter of the returns."""
+    coarse = list(scenes(1))
+    for scene in coarse:
+        scene.range_m[1::2] = -1
+        scene.range_m[:, 1::2] = -1
+    told = verdict_of(coarse, reference)
+    assert told.about["extra"]["warning"].startswith("256 returns in a scene (median), but 1,024")
+    assert "warning: 256 returns" in str(told)
+    assert "warning" not in str(verdict_of(scenes(1), reference))
+
+
+def corrupted(scene, ladder, amount):
+    """The scan with noise on its ranges, or without a share of them; smaller amounts nest."""
+    generator = torch.Generator().manual_seed(int(scene.name.rpartition("/")[2]))
+    if ladder == "noise":
+        noise = amount * torch.randn(16, 64, generator=generator).abs()
+        return scene._replace(range_m=scene.range_m + noise)
+    dropped = torch.rand(16, 64, generator=generator) < amount
+    return scene._replace(range_m=torch.where(dropped, -1.0, scene.range_m))
+
+
+@pytest.mark.parametrize(
+    ("ladder", "amounts", "blind"),
+    [("noise", (0.0, 1.5, 4.0, 12.0), ()), ("drop", (0.0, 0.3, 0.6, 0.9), ("W1 range",))],
+)
+def test_every_distance_worsens_with_each_corruption(reference, ladder, amounts, blind):
+    """What is dropped at random leaves the distribution of ranges as it is."""
+    steps = [
+        rows_of([corrupted(s, ladder, amount) for s in scenes(1, 20)], reference)
+        for amount in amounts
+    ]
+    for name in DISTANCES - set(blind):
+        values = [rows[name].value for rows in steps]
+        assert values == sorted(values), (name, values)
+        assert values[0] < values[-1], name

@@ -19,18 +19,16 @@ from r3dpa.metrics.functional import (
     frechet_distance_of,
     merge_packed,
     polynomial_mmd,
+    precision_recall,
     squared_mmd,
     wasserstein_1_of_values,
 )
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
-    chamfer_cells,
     chamfer_squared,
     histogram_distance,
     minimum_matching,
-    timing_against_brute_force,
 )
-from r3dpa.metrics.functional_manifold import precision_recall
 
 
 def draw(*shape, seed=0):
@@ -232,9 +230,7 @@ def prdc_by_loops(real, generated, k):
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])
 def test_prdc_against_loops(monkeypatch, offset):
-    monkeypatch.setattr(
-        "r3dpa.metrics.functional_manifold._BLOCK", 7
-    )  # several blocks, the last one short
+    monkeypatch.setattr("r3dpa.metrics.functional._BLOCK", 7)  # several blocks, the last one short
     real, generated = draw(30, 3) + offset, 1.2 * draw(24, 3, seed=1) + 0.5 + offset
     result = vars(precision_recall(real, generated, num_neighbors=3))
     assert result == pytest.approx(prdc_by_loops(real, generated, 3))
@@ -350,6 +346,14 @@ def test_chamfer_by_hand():
         chamfer_squared(a, torch.zeros(0, 3))
 
 
+def chamfer_cells(cells_a, cells_b, grid):
+    """Chamfer distance of :func:`minimum_matching` for one pair, all cells against all."""
+    side = grid.shape[0]
+    a, b = (torch.stack([c // side, c % side], dim=1).double() for c in (cells_a, cells_b))
+    squared = torch.cdist(a, b).square().round()
+    return (squared.amin(1).mean() + squared.amin(0).mean()).item() / (2 * side**2)
+
+
 def test_matching_by_hand():
     """On 8 x 8 cells: 3 and 4 cells apart are 25 / 64; the nearer sample is 1 / 64 away."""
     reference = GRID.cells(cloud((0.5, 0.5)))
@@ -394,16 +398,6 @@ def test_matching_refuses():
         minimum_matching([cells], [], GRID)
     with pytest.raises(ValueError, match=r"square grid .* got 8 x 3"):
         minimum_matching([cells], [cells], BEVGrid((-4.0, 4.0), (0.0, 3.0), 1.0))
-
-
-def test_timing_compares_both_ways():
-    grid = BEVGrid((-50.0, 50.0), (-50.0, 50.0), 1.0)
-    clouds = list(random_cells(grid, 4, 0))
-    timing = timing_against_brute_force(clouds[:2], clouds[2:], grid)
-    assert timing.largest_difference < 1e-12
-    ours, brute_force = timing.extrapolate(10, 20)
-    assert ours == pytest.approx(30 * timing.table_s + 400 * timing.lookup_s)
-    assert brute_force == pytest.approx(200 * timing.brute_force_s)
 
 
 # How sure a number is

@@ -9,11 +9,19 @@ import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.feature_distances import (
+    metrics_of,
+    scene_metrics,
+    update_with,
+    with_features,
+)
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
     frechet_distance_of,
     polynomial_mmd,
+    precision_recall,
+    shared_balls,
     squared_mmd,
     wasserstein_1_of_values,
 )
@@ -23,11 +31,9 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.functional_manifold import precision_recall, shared_balls
 from r3dpa.metrics.protocol import DEFAULT
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import EvaluationScene, usable_scenes
 from r3dpa.metrics.scene_features import scene_features
-from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
 from r3dpa.nn.backbones.sparse_features import pool_voxels
 
 SEEDS = range(4)
@@ -195,19 +201,25 @@ def test_batches_change_nothing():
     space = scene_features("fgeo", None, protocol)
     sets = []
     for batch_size in (1, 3, 7):
-        found = SceneSet(protocol, {"fgeo": space.dim}, 5, 4, num_groups=2)
-        for batch, features in add_scenes(usable_scenes(scenes, protocol), [space], batch_size):
-            found.add(batch, features)
-        sets.append(found)
+        metrics = scene_metrics(
+            protocol, {"fgeo": ("FGEO", space.dim)}, 2, max_rows=(None, 5), max_images=(None, 4)
+        )
+        for batch, features in with_features(usable_scenes(scenes, protocol), [space], batch_size):
+            update_with(metrics, batch, features, real=False)
+        sets.append(metrics_of(metrics))
     for one, other in pairwise(sets):
-        assert torch.equal(one.cells, other.cells)
-        assert torch.equal(one.ranges, other.ranges)
-        assert [item[:2] for item in one.images.items()] == [
-            item[:2] for item in other.images.items()
-        ]
-        torch.testing.assert_close(one.features("fgeo"), other.features("fgeo"))
+        for name in ("cells", "ranges"):
+            assert torch.equal(one[name].generated_bins, other[name].generated_bins)
+        for a, b in zip(
+            *(part["matching"].kept("generated") for part in (one, other)), strict=True
+        ):
+            assert torch.equal(a, b)
+        rows = [part["fgeo_kid"].rows("generated") for part in (one, other)]
+        torch.testing.assert_close(*rows, rtol=1.3e-6, atol=1e-5)
         for key in ("count", "mean", "scatter"):
-            values = [getattr(part.moments["fgeo"], key) for part in (one, other)]
+            values = [
+                getattr(part["fgeo_frechet"].moments("generated"), key) for part in (one, other)
+            ]
             torch.testing.assert_close(*values, rtol=1e-6, atol=1e-9)
 
 

@@ -9,9 +9,9 @@ import torch
 
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin
-from r3dpa.metrics.distances import Resampling
-from r3dpa.metrics.distribution import BEVHistogramDistance, MinimumMatchingDistance
-from r3dpa.metrics.frechet import FrechetDistance
+from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.functional import frechet_distance_of
+from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching
 from r3dpa.metrics.official_statistics import (
     OfficialStatistics,
     evaluate_official,
@@ -85,19 +85,15 @@ def file(tmp_path):
 class TestEvaluateOfficial:
     def test_rows_are_those_against_the_scans_themselves(self, file):
         """From the file alone, the numbers that the metrics give from all scans."""
-        bev, matching = BEVHistogramDistance(), MinimumMatchingDistance()
-        frechet = FrechetDistance(3)
-        for real, part in ((True, REAL), (False, scenes(1, 5))):
-            seen = [through_sensor(scene, PUBLISHED) for scene in part]
-            bev.update([scene.points for scene in seen], real=real)
-            matching.update([scene.points for scene in seen], real=real)
-            frechet.update(features(seen), real=real)
-        distances = bev.compute()
+        seen = [[through_sensor(s, PUBLISHED) for s in part] for part in (REAL, scenes(1, 5))]
+        clouds, grid = [[scene.points for scene in part] for part in seen], PUBLISHED.grid
+        distances = histogram_distance(*map(grid.histogram, clouds))
+        cells = [[grid.cells(cloud) for cloud in part] for part in clouds]
         expected = {
-            "JSD": distances["jsd_distance"],
-            "TV": distances["total_variation"],
-            "MMD": matching.compute()["mmd_squared_normalised"],
-            "FRID": frechet.compute().item(),
+            "JSD": distances.jsd_distance,
+            "TV": distances.total_variation,
+            "MMD": minimum_matching(*cells, grid).mmd_squared_normalised,
+            "FRID": frechet_distance_of(*map(features, seen)),
         }
         found = evaluate_official(
             scenes(1, 5), OfficialStatistics.load(file), [FRID], label="made", resampling=WITHOUT

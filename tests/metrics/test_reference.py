@@ -7,6 +7,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.feature_distances import metrics_of
 from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.reference import (
     ReferenceStatistics,
@@ -16,7 +17,6 @@ from r3dpa.metrics.reference import (
 )
 from r3dpa.metrics.scene import EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.metrics.scene_set import Chosen
 
 SENSOR = LidarSensor(beams=16, columns=64)
 PROTOCOL = replace(
@@ -52,36 +52,45 @@ def filled():
     return reference
 
 
+def whole(reference):
+    metrics = reference.metrics()
+    reference.fill(metrics)
+    return metrics_of(metrics)
+
+
 def test_moments_and_histograms_are_those_of_all_scans():
     reference = filled()
-    whole = reference.whole
+    metrics = whole(reference)
     features = toy([*scenes()]).double().numpy()
-    moments = whole.moments["toy"]
+    moments = metrics["toy_frechet"].moments("real")
     assert moments.mean.numpy() == pytest.approx(features.mean(axis=0), rel=1e-9)
     assert moments.covariance().numpy() == pytest.approx(np.cov(features.T), rel=1e-9)
-    assert whole.count == moments.count == 11
-    ranges = torch.cat([scene.range_m.flatten() for scene in scenes()])
-    counts, _ = np.histogram(ranges.numpy(), bins=560, range=(0, 56))
-    assert whole.ranges.sum() == len(ranges)
+    assert reference.count() == moments.count == metrics["matching"].count("real") == 11
+    values = torch.cat([scene.range_m.flatten() for scene in scenes()])
+    counts, _ = np.histogram(values.numpy(), bins=560, range=(0, 56))
+    ranges = metrics["ranges"].real_bins
+    assert ranges.sum() == len(values)
     # Float32 may put a range beside the border of its bin; the CDF then differs by that return.
-    assert np.abs(np.cumsum(counts) - np.cumsum(whole.ranges[0].numpy())).max() <= 5
+    assert np.abs(np.cumsum(counts) - np.cumsum(ranges.numpy())).max() <= 5
     clouds = [through_sensor(scene, PROTOCOL).points for scene in scenes()]
     expected = PROTOCOL.grid.histogram(clouds)
-    assert torch.equal(whole.cells.view(100, 100).long(), expected)
+    assert torch.equal(metrics["cells"].real_bins.view(100, 100).long(), expected)
 
 
 def test_kept_scans_are_few_and_the_halves_have_different_drives():
     reference = filled()
-    drives = []
-    for half in reference.halves:
-        assert (len(half.rows), len(half.images)) == (4, 2)
-        drives.append({name.split("/")[0] for name, *_ in half.rows.items()})
+    drives = [{n.split("/")[0] for n in reference.names_of_half(half)} for half in (0, 1)]
     assert drives[0].isdisjoint(drives[1])
-    assert [half.count for half in reference.halves] == [7, 4]
+    assert [reference.count(half) for half in (0, 1)] == [7, 4]
+    for half in reference.halves:
+        metrics = metrics_of(half)
+        assert metrics["toy_frechet"].rows("real").shape == (4, 2)
+        assert len(metrics["matching"].kept("real")[0]) == 2
     images = {scene.name: scene.range_m for scene in scenes()}
-    for name, _, image in reference.whole.images.items():
+    _, kept = whole(reference)["matching"].kept("real")
+    for name, image in zip(reference.kept_images, kept, strict=True):
         assert torch.equal(image, images[name])
-    assert reference.whole.features("toy").shape == (8, 2)
+    assert whole(reference)["toy_kid"].rows("real").shape == (8, 2)
 
 
 def test_halves_are_whole_drives_or_ends_of_one():
@@ -120,22 +129,10 @@ def test_as_many_scans_are_kept_as_the_protocol_asks_for(sizes, limit, kept):
     protocol = replace(PROTOCOL, num_samples=limit, num_mmd_references=limit)
     reference = ReferenceStatistics.prepare([TOY], protocol, names, {})
     reference.update((EvaluationScene(n, None, torch.full((16, 64), 9.0)) for n in names), [TOY])
-    assert tuple(len(half.rows) for half in reference.halves) == kept
-    assert tuple(len(half.images) for half in reference.halves) == kept
-    assert len(reference.whole.rows) == sum(kept)
-
-
-def test_the_choice_does_not_depend_on_the_order():
-    names = [f"scan {i}" for i in range(50)]
-    choices = []
-    for order in (names, names[::-1]):
-        chosen = Chosen(7)
-        for place, name in enumerate(order):
-            chosen.offer(name, place, None)
-        choices.append({name for name, *_ in chosen.items()})
-    assert choices[0] == choices[1]
-    assert len(choices[0]) == 7
-    assert choices[0] != set(names[:7])
+    metrics = [*map(metrics_of, reference.halves), whole(reference)]
+    wanted = (*kept, sum(kept))
+    assert tuple(len(part["toy_frechet"].rows("real")) for part in metrics) == wanted
+    assert tuple(len(part["matching"].kept("real")[0]) for part in metrics) == wanted
 
 
 def test_a_reference_comes_back_from_its_file(tmp_path):

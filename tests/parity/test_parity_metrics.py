@@ -8,7 +8,6 @@ import torch
 from r3dpa.metrics.functional import frechet_distance, frechet_distance_of
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
-    chamfer_cells,
     chamfer_squared,
     histogram_distance,
     minimum_matching,
@@ -96,7 +95,10 @@ def test_occupied_cells(name, case):
 def test_matching(name, case, close):
     grid = grid_of(case)
     references, samples = ([grid.cells(c) for c in clouds(case, w)] for w in ("ref", "smp"))
-    pairs = [[chamfer_cells(x, y, grid) for y in samples] for x in references]
+    pairs = [
+        [minimum_matching([x], [y], grid).mmd_squared_normalised for y in samples]
+        for x in references
+    ]
     close(torch.tensor(pairs), case["out/chamfer_ref_x_smp"], atol=0, rtol=1e-5)
     matching = minimum_matching(references, samples, grid)
     close(matching.mmd_squared_normalised, case["out/mmd"], atol=0, rtol=1e-5)

@@ -19,26 +19,25 @@ from tqdm import tqdm
 from r3dpa.callbacks.pictures import averaged_generator
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.scans import read_scan
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit
-from r3dpa.metrics.evaluation import TooFewScenesError, check_counts
+from r3dpa.metrics.evaluation import TooFewScenesError, check_counts, feature_spaces
+from r3dpa.metrics.official_statistics import (
+    AnyReference,
+    compare,
+    load_reference,
+    reference_spaces,
+)
 from r3dpa.metrics.protocol import PROTOCOLS
-from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.reference import ReferenceStatistics, cached_reference
+from r3dpa.metrics.result_table import report, save_reports
 from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
-from r3dpa.scoring import (
-    AnyReference,
-    cached_reference,
-    compare,
-    feature_spaces,
-    load_reference,
-    reference_spaces,
-    report,
-    save_reports,
-)
+from r3dpa.viz.evaluation import save_figures
 
 __all__ = ["SceneScorer"]
 
@@ -162,7 +161,13 @@ class SceneScorer(L.Callback):
         made_with = self._made_with(trainer, pl_module, folder)
         if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
             path = folder / "reference.safetensors"
-            statistics = cached_reference(statistics, scans, spaces, path)
+            sensor = statistics.protocol.sensor
+
+            def scans_from(start: int) -> Iterator[EvaluationScene]:
+                for scan in scans[start:]:
+                    yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
+
+            statistics = cached_reference(statistics, scans_from, spaces, path)
         try:
             evaluation, comparison = compare(
                 self._sampled(pl_module, folder, statistics),
@@ -180,8 +185,10 @@ class SceneScorer(L.Callback):
             trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
             return
         shutil.rmtree(_parts(folder))
-        save_reports(evaluation, comparison, statistics, folder)
-        trainer.print(report(evaluation, statistics))
+        save_reports(evaluation, statistics.about.get("split"), folder)
+        if comparison is not None:
+            save_figures(folder, **comparison.figure_data())
+        trainer.print(report(evaluation, statistics.about.get("split")))
         _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
 
     def _loaded(self) -> AnyReference | None:

@@ -8,29 +8,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
 from r3dpa.data.samples import SampleError, Samples, read_samples
-from r3dpa.data.scans import Scan, evenly
+from r3dpa.data.scans import Scan, evenly, read_scan
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import source_commit
-from r3dpa.metrics.official_statistics import OfficialSplit
-from r3dpa.metrics.protocol import PROTOCOLS
-from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import FREE_SPACES
-from r3dpa.scoring import (
+from r3dpa.metrics.evaluation import feature_spaces
+from r3dpa.metrics.official_statistics import (
+    OfficialSplit,
     compare,
-    complete_reference,
-    feature_spaces,
     load_reference,
     reference_spaces,
-    report,
-    save_reports,
 )
+from r3dpa.metrics.protocol import PROTOCOLS
+from r3dpa.metrics.reference import ReferenceStatistics, complete_reference
+from r3dpa.metrics.result_table import report, save_reports
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import FREE_SPACES
+from r3dpa.viz.evaluation import save_figures
 
 __all__ = ["evaluate", "reference"]
 
@@ -61,7 +61,7 @@ def reference(
         limit: Use this many at most, spread evenly.
         protocol: ``default`` or ``published``.
         device: Where the networks compute.
-        every: Scans after which the unfinished file is saved.
+        every: Scans after which the unfinished file is saved; it also is on an interrupt.
 
     Returns:
         What was written, in a line.
@@ -78,7 +78,12 @@ def reference(
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
     names = [scan.name for scan in scans]
     job = ReferenceStatistics.prepare(found, setting, names, about)
-    statistics = complete_reference(job, scans, found, out, every)
+
+    def scans_from(start: int) -> Iterator[EvaluationScene]:
+        for scan in scans[start:]:
+            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
+
+    statistics = complete_reference(job, scans_from, found, out, every)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
@@ -141,8 +146,10 @@ def evaluate(
         about: Any = {**evaluation.about, "extra": {**evaluation.about["extra"], **bad}}
         evaluation = replace(evaluation, about=about)
     if out is not None:
-        save_reports(evaluation, comparison, statistics, out)
-    return report(evaluation, statistics)
+        save_reports(evaluation, statistics.about.get("split"), out)
+        if comparison is not None:
+            save_figures(out, **comparison.figure_data())
+    return report(evaluation, statistics.about.get("split"))
 
 
 def _scenes(samples: Samples) -> Iterator[EvaluationScene]:

@@ -1,22 +1,31 @@
-"""How realistic scans are, how near generated scenes are to real ones, what features know."""
+"""How realistic scans are, and how near generated scenes are to real ones."""
 
-from r3dpa.metrics.bootstrap import Interval, bootstrap_interval
-from r3dpa.metrics.distribution import (
+from r3dpa.metrics.bootstrap import Interval, Resampling, bootstrap_interval
+from r3dpa.metrics.distances import (
     BEVHistogramDistance,
     MinimumMatchingDistance,
+    RangeHistogramDistance,
+)
+from r3dpa.metrics.evaluation import Comparison, evaluate, feature_spaces
+from r3dpa.metrics.feature_distances import (
+    FrechetDistance,
+    FrechetInfinity,
     PolynomialMMD,
     PrecisionRecall,
+    scene_metrics,
 )
-from r3dpa.metrics.evaluation import Comparison, evaluate
 from r3dpa.metrics.features import curves
-from r3dpa.metrics.frechet import FrechetDistance
 from r3dpa.metrics.functional import (
     Moments,
+    curve_rmse,
     fd_infinity,
     frechet_distance,
     frechet_distance_of,
+    jensen_shannon,
     polynomial_mmd,
+    precision_recall,
     squared_mmd,
+    wasserstein_1,
     wasserstein_1_of_values,
 )
 from r3dpa.metrics.functional_bev import (
@@ -25,15 +34,7 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.functional_manifold import precision_recall
-from r3dpa.metrics.measures import (
-    MEASURES,
-    Measure,
-    curve_rmse,
-    jensen_shannon,
-    known,
-    wasserstein_1,
-)
+from r3dpa.metrics.measures import MEASURES, Measure, known
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED, Protocol
 from r3dpa.metrics.realism import RealismRow, RealismTable, realism_table
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -54,6 +55,7 @@ __all__ = [
     "EvaluationScene",
     "EvaluationTable",
     "FrechetDistance",
+    "FrechetInfinity",
     "Interval",
     "Measure",
     "MetricResult",
@@ -62,9 +64,11 @@ __all__ = [
     "PolynomialMMD",
     "PrecisionRecall",
     "Protocol",
+    "RangeHistogramDistance",
     "RealismRow",
     "RealismTable",
     "ReferenceStatistics",
+    "Resampling",
     "ScanStatistics",
     "SceneFeatures",
     "bootstrap_interval",
@@ -73,6 +77,7 @@ __all__ = [
     "curves",
     "evaluate",
     "fd_infinity",
+    "feature_spaces",
     "frechet_distance",
     "frechet_distance_of",
     "histogram_distance",
@@ -85,6 +90,7 @@ __all__ = [
     "realism_table",
     "scan_statistics",
     "scene_features",
+    "scene_metrics",
     "squared_mmd",
     "wasserstein_1",
     "wasserstein_1_of_values",

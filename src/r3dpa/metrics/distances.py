@@ -1,14 +1,25 @@
-"""Distances between two sets of scenes that need no network, as rows of a table."""
+"""Distances of two sets of scenes that need no network, as torchmetrics metrics.
+
+Every metric is updated with real and with generated scenes, synchronises under DDP, and gives its
+numbers by ``compute()`` or, with bootstrap intervals, by ``results()``.
+Letters: B scenes, H x W range image, G groups of a bootstrap, n scenes that are kept.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
-from r3dpa.metrics.bootstrap import bootstrap_interval
+from r3dpa.geometry import points_of
+from r3dpa.metrics.bootstrap import Ends, Resampling
+from r3dpa.metrics.functional import wasserstein_1
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
     Matching,
@@ -16,11 +27,12 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.measures import wasserstein_1
+from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.results import MetricResult
-from r3dpa.metrics.scene_set import RANGE_BIN_M, SceneSet
 
-Ends = tuple[float, float]
+#: Width of the bins of ranges, metres.
+RANGE_BIN_M = 0.1
+SIDES = ("real", "generated")
 #: Generated scenes and real scans; None where their number is not known.
 Counts = tuple[int, int | None]
 
@@ -29,135 +41,317 @@ _SCALES = {"FLD": -1, "JSD": -2, "MMD": -5}
 _CHAMFER_PAIRS = 200
 
 
-@dataclass(frozen=True)
-class Resampling:
-    """Where randomness comes from, and how much work the intervals may cost.
+class SceneMetric(Metric):
+    """Distance between generated scenes and real scans; the base of all metrics of scenes.
 
-    Args:
-        seed: Of every metric alone, so that one more metric changes no other.
-        num_resamples: Of each 95 % bootstrap interval, at least 40; 0 for none.
+    States come in pairs, ``real_<name>`` and ``generated_<name>``. Those that grow with the scenes
+    hold at most ``limits[side]`` of them: the ones whose names have the lowest hashes, a choice
+    that is as good as a random one but does not depend on order, batches or interruptions.
     """
 
-    seed: int = 0
-    num_resamples: int = 100
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+    #: Names and empty values of the states that are lists of tensors.
+    _lists: ClassVar[dict[str, Tensor]]
+    real_count: Tensor
+    generated_count: Tensor
 
-    def generator(self) -> torch.Generator:
-        """Fresh source of randomness."""
-        return torch.Generator().manual_seed(self.seed)
+    def __init__(self, max_real: int | None = None, max_generated: int | None = None) -> None:
+        super().__init__()
+        self.limits = {"real": max_real, "generated": max_generated}
+        self._empty: dict[str, Tensor] = {}
+        self._add_states("count", torch.zeros((), dtype=torch.int64))
 
-    def interval(self, statistic: Callable[[Tensor], float], size: int) -> Ends | None:
-        """Bootstrap interval over one set of samples; None where it has fewer than two."""
-        if size < 2 or not self.num_resamples:
-            return None
-        found = bootstrap_interval(
-            statistic, (size,), self.generator(), num_resamples=self.num_resamples
-        )
-        return found.low, found.high
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """The distances as rows of a table, with intervals; of this process alone."""
+        raise NotImplementedError
+
+    def count(self, side: str) -> int:
+        """Scenes seen."""
+        return int(getattr(self, f"{side}_count"))
+
+    def adopt_real(self, *others: SceneMetric) -> None:
+        """Takes over the real scans of other metrics of this kind, one after the other."""
+        for name in self._defaults:
+            if not name.startswith("real_"):
+                continue
+            if name in self._empty:
+                for other in others:
+                    other._prune("real")
+                setattr(self, name, [other._joined(name) for other in others])
+            else:
+                reduction = cast(Callable[[Tensor], Tensor], self._reductions[name])
+                parts = torch.stack([getattr(other, name) for other in others])
+                setattr(self, name, reduction(parts))
+        self.limits["real"] = None  # each of the others kept as many as it should
+
+    def kept(self, side: str) -> tuple[Tensor, Tensor]:
+        """Places ``(n,)`` among all scenes, and values ``(n, ...)``, of those that are kept."""
+        self._prune(side)
+        return self._joined(f"{side}_order")[:, 1], self._joined(f"{side}_values")
+
+    def lowest(self, side: str, limit: int) -> Tensor:
+        """Indices of up to ``limit`` kept scenes: those whose names have the lowest hashes."""
+        return self._joined(f"{side}_order")[:, 0].argsort(stable=True)[:limit].sort().values
+
+    def _add_states(self, name: str, default: Tensor, reduction: Any = "sum") -> None:
+        for side in SIDES:
+            self.add_state(f"{side}_{name}", default.clone(), dist_reduce_fx=reduction)
+
+    def _add_kept(self, empty: Tensor) -> None:
+        """Adds the states of scenes that are kept: their values, ranks and places."""
+        for name, default in (("values", empty), ("order", torch.zeros(0, 2, dtype=torch.int64))):
+            for side in SIDES:
+                self.add_state(f"{side}_{name}", [], dist_reduce_fx="cat")
+                self._empty[f"{side}_{name}"] = default
+
+    def _joined(self, name: str) -> Tensor:
+        parts = getattr(self, name)
+        return dim_zero_cat(parts) if len(parts) else self._empty[name].to(self.device)
+
+    def _sync_dist(self, *args: Any, **kwargs: Any) -> None:
+        for name in self._empty:  # a process without scenes must take part with the right shape
+            setattr(self, name, [self._joined(name)])
+        super()._sync_dist(*args, **kwargs)
+
+    def _keep(self, side: str, values: Tensor, names: Sequence[str] | None) -> None:
+        """Counts ``(B, ...)`` values in."""
+        ranks = [0] * len(values) if names is None else [_rank(scene) for scene in names]
+        count = getattr(self, f"{side}_count")
+        places = count + torch.arange(len(values), device=self.device)
+        order = torch.stack([torch.tensor(ranks).to(self.device), places], dim=1)
+        getattr(self, f"{side}_order").append(order)
+        getattr(self, f"{side}_values").append(values)
+        count += len(values)
+        limit = self.limits[side]
+        if limit is not None and sum(map(len, getattr(self, f"{side}_order"))) > 2 * limit + 64:
+            self._prune(side)
+
+    def _prune(self, side: str) -> None:
+        """Drops the scenes beyond the limit."""
+        limit, order = self.limits[side], self._joined(f"{side}_order")
+        if limit is None or len(order) <= limit:
+            return
+        values, kept = self._joined(f"{side}_values"), self.lowest(side, limit)
+        setattr(self, f"{side}_order", [order.index_select(0, kept)])
+        setattr(self, f"{side}_values", [values.index_select(0, kept)])
+
+    def load_kept(self, side: str, chosen: Sequence[tuple[str, int]], values: Tensor) -> None:
+        """Sets the scenes that are kept from their names, places and values in a file."""
+        order = [(_rank(scene), place) for scene, place in chosen]
+        setattr(self, f"{side}_order", [torch.tensor(order, dtype=torch.int64).view(-1, 2)])
+        setattr(self, f"{side}_values", [values])
+
+    def _need_both(self) -> None:
+        for side in SIDES:
+            if not self.count(side):
+                raise ValueError(
+                    f"no {side} scenes given yet; call update(..., real=...) with them"
+                )
 
 
-def histogram_rows(
-    real: SceneSet, generated: SceneSet, resampling: Resampling
-) -> list[MetricResult]:
-    """JSD and TV of occupied cells seen from above, and W1 of ranges.
+class _Histograms(SceneMetric):
+    """Sums of histograms of scenes; the generated ones in groups, which a bootstrap resamples."""
 
-    The bootstrap resamples the groups that the histograms of the generated scenes are counted in.
-    """
-    counts = (generated.count, real.count)
-    real_ranges, ranges = real.ranges.sum(dim=0).double(), generated.ranges.double()
+    real_bins: Tensor
+    generated_bins: Tensor
 
-    def range_distance(counted: Tensor) -> float:
-        return wasserstein_1(real_ranges.numpy(), counted.numpy(), RANGE_BIN_M)
+    def __init__(self, num_bins: int, num_groups: int, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.add_state("real_bins", torch.zeros(num_bins, dtype=dtype), dist_reduce_fx="sum")
+        groups = torch.zeros(num_groups, num_bins, dtype=dtype)
+        self.add_state("generated_bins", groups, dist_reduce_fx="sum")
 
-    return [
-        *cell_rows(real.cells.sum(dim=0), generated, counts, resampling),
-        _histogram_row("W1 range", range_distance, ranges, counts, resampling, "m"),
-    ]
+    def _groups(self, real: bool, num: int) -> tuple[Tensor, Tensor]:
+        """Histograms ``(groups, bins)`` of a side, and the group ``(num,)`` of each new scene."""
+        bins = self.real_bins[None] if real else self.generated_bins
+        count = self.real_count if real else self.generated_count
+        groups = (count + torch.arange(num, device=self.device)) % len(bins)
+        count += num
+        return bins, groups
 
+    def _row(
+        self,
+        name: str,
+        distance: Callable[[Tensor], float],
+        resampling: Resampling,
+        groups: Tensor,
+        unit: str = "",
+        note: str = "",
+    ) -> MetricResult:
+        """Distance of the sum of the groups ``(G, bins)``."""
 
-def cell_rows(
-    real_cells: Tensor, generated: SceneSet, counts: Counts, resampling: Resampling
-) -> list[MetricResult]:
-    """JSD and TV of occupied cells alone, as :func:`histogram_rows` has them.
+        def resampled(drawn: Tensor) -> float:
+            weights = torch.bincount(drawn, minlength=len(groups)).to(groups)
+            return distance(weights @ groups)
 
-    Args:
-        real_cells: ``(cells,)``, real scans that occupy each cell.
-        generated: Generated scenes.
-        counts: Generated scenes and, where it is known, real scans.
-        resampling: Of the intervals.
-    """
-    occupied = (real_cells > 0) | (generated.cells > 0).any(dim=0)
-    real_cells, cells = real_cells[occupied].double(), generated.cells[:, occupied].float()
-
-    def jsd(counted: Tensor) -> float:
-        return histogram_distance(real_cells, counted).jsd_distance
-
-    def total_variation(counted: Tensor) -> float:
-        return histogram_distance(real_cells, counted).total_variation
-
-    half = "half of what the official code calls TV"
-    return [
-        _histogram_row("JSD", jsd, cells, counts, resampling),
-        _histogram_row("TV", total_variation, cells, counts, resampling, note=half),
-    ]
-
-
-def _histogram_row(
-    name: str,
-    distance: Callable[[Tensor], float],
-    table: Tensor,
-    counts: Counts,
-    resampling: Resampling,
-    unit: str = "",
-    note: str = "",
-) -> MetricResult:
-    """Distance of the sum of the groups ``(G, bins)`` of generated scenes."""
-
-    def resampled(drawn: Tensor) -> float:
-        weights = torch.bincount(drawn, minlength=len(table)).to(table)
-        return distance(weights @ table)
-
-    ends = resampling.interval(resampled, min(counts[0], len(table)))
-    value = distance(table.sum(dim=0))
-    return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
-
-
-def matching_rows(
-    real: SceneSet, generated: SceneSet, resampling: Resampling
-) -> tuple[list[MetricResult], Matching]:
-    """MMD of occupied cells, and the 3D Chamfer distance of the scenes it matches.
-
-    The 3D distance is the mean over up to 200 real scans, each with the generated scene that is
-    nearest to it by its cells. Intervals are over the real scans. Points beyond the grid do not
-    count in MMD, by its definition; its note tells their share.
-    """
-    grid = real.protocol.grid
-    (references, real_beyond), (samples, beyond) = (
-        _cells_and_share_beyond(scenes, grid) for scenes in (real, generated)
-    )
-    note = f"{beyond:.2%} of the points, {real_beyond:.2%} of the real ones, lie beyond the grid"
-    matching = minimum_matching(references, samples, grid)
-    nearest = matching.nearest[:_CHAMFER_PAIRS].tolist()
-    pairs = zip(real.clouds(range(len(nearest))), generated.clouds(nearest), strict=True)
-    chamfer = torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)
-
-    def row(name: str, values: Tensor, unit: str = "", note: str = "") -> MetricResult:
-        ends = resampling.interval(lambda drawn: values[drawn].mean().item(), len(values))
-        counts = (len(samples), len(values))
-        value = values.mean().item()
+        counts = (self.count("generated"), self.count("real") or None)
+        ends = resampling.interval(resampled, min(counts[0], len(groups)))
+        value = distance(groups.sum(dim=0))
         return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
 
-    mmd = row("MMD", matching.squared_normalised, note=note if beyond or real_beyond else "")
-    return [mmd, row("CD 3D", chamfer, "m2")], matching
+
+class BEVHistogramDistance(_Histograms):
+    """JSD, TV and their relatives of how many clouds occupy each cell seen from above.
+
+    Args:
+        grid: Cells; the default is that of the published numbers.
+        num_groups: Groups of generated scenes that the bootstrap resamples.
+    """
+
+    def __init__(self, grid: BEVGrid | None = None, num_groups: int = 1) -> None:
+        grid = BEVGrid() if grid is None else grid
+        super().__init__(math.prod(grid.shape), num_groups, torch.int32)
+        self.grid = grid
+
+    def update(self, clouds: Sequence[Tensor], real: bool) -> None:
+        """Add clouds ``(P, 3 or more)``; NaN, or no point on the grid, is a ``ValueError``."""
+        side = SIDES[not real]
+        cells = [self.grid.cells(cloud, f"{side} cloud {i}") for i, cloud in enumerate(clouds)]
+        bins, groups = self._groups(real, len(cells))
+        for group, occupied in zip(groups, cells, strict=True):
+            bins[group, occupied.to(bins.device)] += 1
+
+    def compute(self) -> dict[str, float]:
+        """Fields of :class:`HistogramDistance`; the published "JSD" is ``jsd_distance``."""
+        self._need_both()
+        return dict(vars(histogram_distance(self.real_bins, self.generated_bins.sum(dim=0))))
+
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """JSD and TV."""
+        occupied = (self.real_bins > 0) | (self.generated_bins > 0).any(dim=0)
+        real, groups = self.real_bins[occupied].double(), self.generated_bins[:, occupied].float()
+
+        def jsd(counted: Tensor) -> float:
+            return histogram_distance(real, counted).jsd_distance
+
+        def total_variation(counted: Tensor) -> float:
+            return histogram_distance(real, counted).total_variation
+
+        half = "half of what the official code calls TV"
+        return [
+            self._row("JSD", jsd, resampling, groups),
+            self._row("TV", total_variation, resampling, groups, note=half),
+        ]
 
 
-def _cells_and_share_beyond(scenes: SceneSet, grid: BEVGrid) -> tuple[list[Tensor], float]:
-    """Occupied cells of the kept scenes, and the share of their points that are not on the grid."""
-    cells, points, beyond = [], 0, 0
-    for cloud in scenes.clouds(range(len(scenes.images))):
-        cells.append(grid.cells(cloud))
-        points += len(cloud)
-        beyond += int((~grid.inside(cloud)).sum())
-    return cells, beyond / max(points, 1)
+class RangeHistogramDistance(_Histograms):
+    """Earth mover's distance (W1) of the ranges of all returns, metres, in bins of 0.1 m.
+
+    Args:
+        range_max_m: Largest range.
+        num_groups: Groups of generated scenes that the bootstrap resamples.
+    """
+
+    def __init__(self, range_max_m: float, num_groups: int = 1) -> None:
+        super().__init__(math.ceil(range_max_m / RANGE_BIN_M), num_groups, torch.int64)
+
+    def update(self, range_m: Tensor, real: bool) -> None:
+        """Add range images ``(B, H, W)`` in metres, not above 0 without a return."""
+        bins, groups = self._groups(real, len(range_m))
+        width = bins.shape[1]
+        index = (range_m.flatten(1) / RANGE_BIN_M).long().clamp(0, width - 1)
+        index = index + width * groups[:, None].to(index.device)
+        returns = (range_m > 0).flatten()
+        bins.view(-1).index_add_(0, index.flatten().to(bins.device), returns.to(bins))
+
+    def compute(self) -> dict[str, float]:
+        """``w1_m``."""
+        self._need_both()
+        return {"w1_m": self._distance(self.generated_bins.sum(dim=0))}
+
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """W1."""
+        groups = self.generated_bins.double()
+        return [self._row("W1 range", self._distance, resampling, groups, "m")]
+
+    def _distance(self, counted: Tensor) -> float:
+        real = self.real_bins.double().cpu().numpy()
+        return wasserstein_1(real, counted.double().cpu().numpy(), RANGE_BIN_M)
+
+
+class MinimumMatchingDistance(SceneMetric):
+    """Published "MMD" on occupied cells seen from above, and 3D Chamfer distance of its matches.
+
+    Points beyond the grid do not count in MMD, by its definition. The 3D distance is the mean over
+    up to 200 real scans, each with the generated scene that is nearest to it by its cells.
+
+    Args:
+        protocol: Cells, sensor, and which point of a pixel stands for it.
+        max_real: Real scans that are kept; all where None.
+        max_generated: Generated scenes that are kept.
+    """
+
+    def __init__(
+        self, protocol: Protocol, max_real: int | None = None, max_generated: int | None = None
+    ) -> None:
+        super().__init__(max_real, max_generated)
+        self.protocol = protocol
+        self._add_kept(torch.zeros(0, protocol.sensor.beams, protocol.sensor.columns))
+
+    def update(self, range_m: Tensor, real: bool, names: Sequence[str] | None = None) -> None:
+        """Add range images ``(B, H, W)``; of the named ones those with the lowest hashes stay."""
+        self._keep(SIDES[not real], range_m.detach(), names)
+
+    def clouds(self, images: Tensor) -> list[Tensor]:
+        """Points ``(P, 3)`` of each range image."""
+        projection, corner = self.protocol.projection, self.protocol.corner
+        return [points_of(image, projection, corner) for image in images]
+
+    def cells(self, side: str) -> tuple[list[Tensor], float]:
+        """Occupied cells of the kept scenes, and the share of their points beyond the grid."""
+        grid, clouds = self.protocol.grid, self.clouds(self.kept(side)[1])
+        beyond = sum(int((~grid.inside(cloud)).sum()) for cloud in clouds)
+        return [grid.cells(c) for c in clouds], beyond / max(sum(map(len, clouds)), 1)
+
+    def matching(self) -> tuple[Matching, dict[str, float]]:
+        """Nearest generated scene of each real one, and the shares of points beyond the grid."""
+        self._need_both()
+        (references, beyond_real), (samples, beyond) = map(self.cells, SIDES)
+        shares = {"real": beyond_real, "generated": beyond}
+        return minimum_matching(references, samples, self.protocol.grid), shares
+
+    def compute(self) -> dict[str, float]:
+        """The published number, in square metres too, and ``*_outside_share`` of the points."""
+        matching, shares = self.matching()
+        grid, value = self.protocol.grid, matching.mmd_squared_normalised
+        return {
+            "mmd_squared_normalised": value,
+            "mmd_m2": value * (grid.shape[0] * grid.cell_m) ** 2,
+            "chamfer_m2": self._chamfer(matching).mean().item(),
+            **{f"{side}_outside_share": share for side, share in shares.items()},
+        }
+
+    def results(
+        self, resampling: Resampling, known: tuple[Matching, dict[str, float]] | None = None
+    ) -> list[MetricResult]:
+        """MMD and CD; intervals are over the real scans. ``known`` is of :meth:`matching`."""
+        matching, shares = known or self.matching()
+        real, made = (f"{shares[side]:.2%}" for side in SIDES)
+        note = f"{made} of the points, {real} of the real ones, lie beyond the grid"
+        kept = len(self.kept("generated")[0])
+
+        def row(name: str, values: Tensor, unit: str = "", note: str = "") -> MetricResult:
+            ends, value = resampling.of_mean(values), values.mean().item()
+            counts = (kept, len(values))
+            return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
+
+        told = note if any(shares.values()) else ""
+        return [
+            row("MMD", matching.squared_normalised, note=told),
+            row("CD 3D", self._chamfer(matching), "m2"),
+        ]
+
+    def _chamfer(self, matching: Matching) -> Tensor:
+        nearest = matching.nearest[:_CHAMFER_PAIRS]
+        real, made = (self.kept(side)[1] for side in SIDES)
+        pairs = zip(
+            self.clouds(real[: len(nearest)]),
+            self.clouds(made[nearest.to(made.device)]),
+            strict=True,
+        )
+        return torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)
 
 
 def distance_row(
@@ -181,3 +375,8 @@ def distance_row(
         num_references=counts[1],
         note=note,
     )
+
+
+def _rank(name: str) -> int:
+    """Hash of a name as a signed number of 64 bits."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") - 2**63

@@ -1,48 +1,91 @@
-"""How near generated scenes are to real ones: all metrics with intervals and floors."""
+"""How near generated scenes are to real ones: all metrics with intervals, floors and a verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any, cast
 
-from r3dpa.metrics.distances import Resampling, histogram_rows, matching_rows
-from r3dpa.metrics.feature_distances import FeatureSample, feature_rows
+import torch
+from torchmetrics import MetricCollection
+
+from r3dpa.io import usable_device
+from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
+from r3dpa.metrics.feature_distances import (
+    FeatureMetric,
+    metrics_of,
+    scene_metrics,
+    update_with,
+    with_features,
+)
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
 from r3dpa.metrics.results import About, Evaluation, MetricResult
-from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
+from r3dpa.metrics.scene import EvaluationScene, usable_scenes
+from r3dpa.metrics.scene_features import SceneFeatures, scene_features
 
 _GROUPS = 16  # of the bootstrap of histograms
 _BATCH = 8
 _UNBIASED = (" inf", " KID")  # distances whose mean does not depend on how many scenes there are
-_RESAMPLING = Resampling()
+_SHOWN_MATCHES = 3
+_SHARES = ("precision", "recall")
+_NEAR, _POOR = 1.5, 0.5  # times the floor; times the share that real scans reach
+_ALIKE = 0.6  # ratio of the numbers of returns below which scenes are of another sensor
 #: How a caller in Python sets an option that allows something.
 PYTHON_OPTION = "{}=True"
 
 
 class TooFewScenesError(ValueError):
-    """Not two scenes are left that can be compared."""
+    """Fewer than two scenes are left that can be compared."""
 
 
-class Comparison(NamedTuple):
-    """An evaluation, and what its figures are drawn from.
+@dataclass(frozen=True)
+class Comparison:
+    """An evaluation, and the data that its figures are drawn from.
 
-    Attributes:
+    Args:
         evaluation: All numbers.
-        samples: Generated scenes.
-        references: Real scans.
+        metrics: Of :func:`scene_metrics`, with the real and the generated scenes.
+        reference: Real scans.
         matching: Of the real scans whose images are kept to the generated scenes.
+        names: Of all generated scenes.
     """
 
     evaluation: Evaluation
-    samples: SceneSet
-    references: SceneSet
+    metrics: MetricCollection
+    reference: ReferenceStatistics
     matching: Matching
+    names: list[str]
+
+    def figure_data(self) -> dict[str, Any]:
+        """Arguments of :func:`r3dpa.viz.evaluation.save_figures`."""
+        metrics: dict[str, Any] = metrics_of(self.metrics)
+        protocol, ranges = self.reference.protocol, metrics["ranges"]
+        cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
+        halves: list[Any] = [metrics_of(half)["ranges"] for half in self.reference.halves]
+        order = self.matching.squared_normalised.argsort().tolist()
+        return {
+            "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
+            "limits_m": (protocol.grid.x_m, protocol.grid.y_m),
+            "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
+            "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
+            "halves": torch.stack([h.real_bins for h in halves if h.count("real")]).numpy(),
+            "best": [self._pair(index) for index in order[:_SHOWN_MATCHES]],
+            "worst": [self._pair(index) for index in order[::-1][:_SHOWN_MATCHES]],
+            "sensor": protocol.sensor,
+        }
+
+    def _pair(self, index: int) -> tuple[str, Any, Any]:
+        """Title and range images of a real scan and the sample that is nearest to it."""
+        metric = cast(MinimumMatchingDistance, metrics_of(self.metrics)["matching"])
+        (places, samples), (_, scans) = metric.kept("generated"), metric.kept("real")
+        nearest = int(self.matching.nearest[index])
+        pair = f"{self.names[places[nearest]]} and {self.reference.kept_images[index]}"
+        title = f"{pair}: {self.matching.squared_normalised[index]:.3g}"
+        return title, samples[nearest].numpy(), scans[index].numpy()
 
 
 def evaluate(
@@ -58,7 +101,7 @@ def evaluate(
     skip_bad: bool = False,
     option: str = PYTHON_OPTION,
     batch_size: int = _BATCH,
-    resampling: Resampling = _RESAMPLING,
+    resampling: Resampling | None = None,
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
 
@@ -66,10 +109,9 @@ def evaluate(
     scenes in the same order give the same numbers.
 
     The floor of a distance is that between the halves of the reference: other drives where there
-    are several. It is taken at as many scenes as are evaluated, or at as many as a half keeps; but
-    JSD, TV and W1, of which only sums are kept, over all scans of both halves. Fewer scenes than
-    are evaluated raise a floor and more lower it, and the note of the row then says so.
-    Precision and its relatives are no distances: what the halves reach is in their notes.
+    are several. It is taken at as many scenes as are evaluated, or at as many as a half keeps; the
+    note of the row says so where these are fewer. Precision and its relatives are no distances:
+    what the halves reach is in their notes.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
@@ -93,91 +135,76 @@ def evaluate(
             ``allow_few``, not more scenes than features; without ``skip_bad``, if a scene is empty,
             holds NaN or has another size: it is named.
     """
+    resampling = resampling or Resampling()
     reference.check_complete()
     check_spaces(reference.spaces, spaces)
     protocol = reference.protocol
+    metrics = empty_metrics(protocol, spaces)
     bad: list[str] | None = [] if skip_bad else None
-    samples, more = gather(scenes, spaces, protocol, batch_size, bad, option)
-    references = reference.whole
-    counts = {"generated scenes": samples.count, "real scans": references.count}
+    names, more = gather(metrics, scenes, spaces, protocol, batch_size, bad, option)
+    counts = {"generated scenes": len(names), "real scans": reference.count()}
     check_counts(counts, spaces, allow_few, option, bad or ())
+    reference.fill(metrics)
 
-    rows = histogram_rows(references, samples, resampling)
-    matched, matching = matching_rows(references, samples, resampling)
-    rows += matched
-    for space in spaces:
-        real, generated = (FeatureSample.of(part, space.name) for part in (references, samples))
-        rows += feature_rows(space.label, real, generated, resampling)
-    floors = _floors(reference, spaces, samples, resampling)
-    about = about_generated(samples.count, more, spaces, reference, made_with, commit, source)
-    about["extra"] |= {"bootstrap": vars(resampling)} | ({"bad_samples": bad} if bad else {})
+    by_name = metrics_of(metrics)
+    match = cast(MinimumMatchingDistance, by_name["matching"])
+    known = match.matching()
+    rows: list[MetricResult] = []
+    for metric in by_name.values():
+        rows += match.results(resampling, known) if metric is match else metric.results(resampling)
+    floors = floors_of(reference, spaces, len(names), len(match.kept("generated")[0]), resampling)
+    about = about_generated(len(names), more, spaces, reference, made_with, commit, source)
+    extra = about["extra"] | {"verdict": verdict(rows, floors), "bootstrap": vars(resampling)}
+    if warning := _other_sensor(match):
+        extra["warning"] = warning
+    if bad:
+        extra["bad_samples"] = bad
+    about["extra"] = extra
     evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    return Comparison(evaluation, samples, references, matching)
+    return Comparison(evaluation, metrics, reference, known[0], names)
 
 
-def about_generated(
-    count: int,
-    more: bool,
-    spaces: Sequence[SceneFeatures],
-    reference: Any,
-    made_with: Mapping[str, Any] | None,
-    commit: str | None,
-    source: str,
-) -> About:
-    """Where the numbers come from.
-
-    Args:
-        count: Scenes compared.
-        more: Whether there were more of them than the protocol counts.
-        spaces: Feature spaces.
-        reference: What has their ``protocol`` and can ``describe`` itself.
-        made_with: As for :func:`evaluate`.
-        commit: As for :func:`evaluate`.
-        source: As for :func:`evaluate`.
-    """
-    told, protocol = dict(made_with or {}), reference.protocol
-    return {
-        "backbones": {space.label: dict(space.card) for space in spaces},
-        "protocol": protocol.to_dict(),
-        "reference": reference.describe(),
-        "solver": told.pop("solver", None),
-        "steps": told.pop("steps", None),
-        "seed": told.pop("seed", None),
-        "precision": told.pop("precision", None),
-        "feature_source": told.pop("feature_source", None),
-        "commit": commit,
-        "published": False,
-        "source": source,
-        "extra": told | _counted(count, more, protocol),
-    }
+def empty_metrics(protocol: Protocol, spaces: Sequence[SceneFeatures]) -> MetricCollection:
+    """Metrics of an evaluation under a protocol."""
+    return scene_metrics(
+        protocol,
+        {space.name: (space.label, space.dim) for space in spaces},
+        num_groups=_GROUPS,
+        max_rows=(None, protocol.num_samples),
+        max_images=(None, protocol.num_mmd_samples),
+    )
 
 
 def gather(
+    metrics: MetricCollection,
     scenes: Iterable[EvaluationScene],
     spaces: Sequence[SceneFeatures],
     protocol: Protocol,
     batch_size: int = _BATCH,
     bad: list[str] | None = None,
     option: str = PYTHON_OPTION,
-) -> tuple[SceneSet, bool]:
-    """Statistics of generated scenes, and whether there were more than the protocol counts.
+) -> tuple[list[str], bool]:
+    """Updates metrics with generated scenes.
 
     Args:
+        metrics: Of :func:`scene_metrics`.
         scenes: Read once; the first usable ones count, as many as the protocol says.
         spaces: Feature spaces.
         protocol: How scenes are prepared.
         batch_size: Scenes per pass of a network.
         bad: Takes the messages of scenes that cannot be used. Where None, the first one stops.
         option: How the caller sets ``skip_bad``, for that message.
+
+    Returns:
+        Names of the scenes, and whether there were more than the protocol counts.
     """
-    widths = {space.name: space.dim for space in spaces}
-    samples = SceneSet(protocol, widths, protocol.num_samples, protocol.num_mmd_samples, _GROUPS)
-    stream = iter(scenes)
+    stream, names = iter(scenes), []
     advice = f". {option.format('skip_bad')} leaves such scenes out, and lists them"
     counted = islice(usable_scenes(stream, protocol, bad, advice), protocol.num_samples)
-    for batch, features in add_scenes(counted, spaces, batch_size):
-        samples.add(batch, features)
-    return samples, next(stream, None) is not None
+    for batch, features in with_features(counted, spaces, batch_size):
+        update_with(metrics, batch, features, real=False)
+        names += [scene.name for scene in batch]
+    return names, next(stream, None) is not None
 
 
 def check_counts(
@@ -220,28 +247,128 @@ def check_counts(
         )
 
 
-def _floors(
+def about_generated(
+    count: int,
+    more: bool,
+    spaces: Sequence[SceneFeatures],
+    reference: Any,
+    made_with: Mapping[str, Any] | None,
+    commit: str | None,
+    source: str,
+) -> About:
+    """Where the numbers of an evaluation come from.
+
+    Args:
+        count: Scenes compared.
+        more: Whether there were more of them than the protocol counts.
+        spaces: Feature spaces.
+        reference: What has their ``protocol`` and can ``describe`` itself.
+        made_with: As for :func:`evaluate`.
+        commit: As for :func:`evaluate`.
+        source: As for :func:`evaluate`.
+    """
+    extra, protocol = dict(made_with or {}), reference.protocol
+    known = {
+        key: extra.pop(key, None)
+        for key in ("solver", "steps", "seed", "precision", "feature_source")
+    }
+    if more:
+        extra["scenes"] = f"only the first {count} were used, as many as the protocol counts"
+    elif count < protocol.num_samples:
+        extra["scenes"] = f"{count}, where the protocol asks for {protocol.num_samples}"
+    about: Any = {
+        "backbones": {space.label: dict(space.card) for space in spaces},
+        "protocol": protocol.to_dict(),
+        "reference": reference.describe(),
+        **known,
+        "commit": commit,
+        "published": False,
+        "source": source,
+        "extra": extra,
+    }
+    return cast(About, about)
+
+
+def floors_of(
     reference: ReferenceStatistics,
     spaces: Sequence[SceneFeatures],
-    samples: SceneSet,
+    num_samples: int,
+    num_images: int,
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
     """Rows of the first half of the reference as if it were generated, against the second.
 
-    Of it, as many scans as there are samples are used where it keeps so many.
+    Args:
+        reference: Complete statistics.
+        spaces: Feature spaces.
+        num_samples: Scans of the first half that are used, or all that it keeps.
+        num_images: The same for MMD.
+        resampling: Gives the seed.
     """
-    first, second = reference.halves
-    if min(first.count, second.count) < 2:
+    if min(reference.count(0), reference.count(1)) < 2:
         return {}
     without = replace(resampling, num_resamples=0)
-    rows = histogram_rows(second, first, without)
-    # The nearest of more samples is nearer, so that MMD falls with their number.
-    rows += matching_rows(second, first.with_images(len(samples.images)), without)[0]
-    for space in spaces:
-        real, held_out = (FeatureSample.of(part, space.name) for part in (second, first))
-        same_size = held_out.subset(samples.count, resampling.generator())
-        rows += feature_rows(space.label, real, same_size, without)
-    return {row.name: row for row in rows}
+    held: dict[str, Any] = metrics_of(reference.halves[0])
+    names = [space.name for space in spaces]
+    metrics = reference.metrics(names, max_images=(None, num_images))
+    reference.fill(metrics, 1)
+    own: dict[str, Any] = metrics_of(metrics)
+    places, images = held["matching"].kept("real")
+    of_first = [reference.names_of_half(0)[place] for place in places]
+    own["matching"].update(images, real=False, names=of_first)
+    if num_samples <= len(images):
+        chosen = images[held["matching"].lowest("real", num_samples)]
+        own["cells"].update(own["matching"].clouds(chosen), real=False)
+        own["ranges"].update(chosen, real=False)
+    else:  # only sums are left of the others
+        for name in ("cells", "ranges"):
+            own[name].generated_bins[0] = held[name].real_bins
+            own[name].generated_count = held[name].real_count.clone()
+    for name in names:
+        rows = cast(FeatureMetric, held[f"{name}_frechet"]).rows("real")
+        chosen = torch.randperm(len(rows), generator=resampling.generator())[:num_samples]
+        own[f"{name}_frechet"].update(rows[chosen], real=False)
+    rows_by_name: dict[str, MetricResult] = {}
+    for metric in metrics_of(metrics).values():
+        rows_by_name |= {row.name: row for row in metric.results(without)}
+    return rows_by_name
+
+
+def verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) -> str:
+    """One line: which distances are near their floor, and whether the scenes are realistic."""
+    near, far, poor = [], [], []
+    for row in rows:
+        floor = floors.get(row.name)
+        if floor is None or floor.value is None or row.value is None:
+            continue
+        if row.direction == "lower":
+            if row.value <= _NEAR * max(floor.value, 0.0) + row.half_width:
+                near.append(row.name)
+            elif floor.value > 0:
+                far.append((row.value / floor.value, row.name))
+        elif row.name.endswith(_SHARES) and row.value < _POOR * floor.value:
+            poor.append(f"{row.name} {row.value:.2g} (real scans {floor.value:.2g})")
+    worst = ", ".join(f"{name} ({ratio:.3g} x)" for ratio, name in sorted(far, reverse=True)[:3])
+    parts = [f"near the floor in {', '.join(near)}"] if near else []
+    parts += [f"above it in {len(far)} distances, most in {worst}"] if far else []
+    if not parts:
+        return "no floors to compare with"
+    if poor:
+        return f"not realistic: {', '.join(poor)}" + (f", though {parts[0]}" if near else "")
+    return "; ".join(parts)
+
+
+def _other_sensor(match: MinimumMatchingDistance) -> str:
+    """A warning where scenes and real scans differ in their number of returns by much."""
+    made, real = (
+        int((match.kept(side)[1] > 0).sum(dim=(1, 2)).median()) for side in ("generated", "real")
+    )
+    if _ALIKE <= made / max(real, 1) <= 1 / _ALIKE:
+        return ""
+    return (
+        f"{made:,} returns in a scene (median), but {real:,} in a real scan: scenes of another "
+        "sensor need a reference for it, `r3dpa reference --data` with a YAML of that sensor"
+    )
 
 
 def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> MetricResult:
@@ -260,10 +387,31 @@ def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> Metric
     return replace(row, floor=max(floor.value, 0.0), note=note)
 
 
-def _counted(count: int, more: bool, protocol: Protocol) -> dict[str, Any]:
-    """What differs from the number of scenes that the protocol asks for."""
-    if more:
-        return {"scenes": f"only the first {count} were used, as many as the protocol counts"}
-    if count < protocol.num_samples:
-        return {"scenes": f"{count}, where the protocol asks for {protocol.num_samples}"}
-    return {}
+def feature_spaces(
+    names: Sequence[str],
+    ckpt: Mapping[str, Any] | None,
+    protocol: Protocol,
+    device: str,
+) -> list[SceneFeatures]:
+    """Feature spaces by name.
+
+    Args:
+        names: Of :data:`r3dpa.metrics.scene_features.SPACES`.
+        ckpt: Weight files by name.
+        protocol: How scenes are prepared.
+        device: Where the networks compute; ``auto`` is the GPU where there is one.
+
+    Raises:
+        ValueError: If a name occurs twice, a file belongs to none of them, or as
+            :func:`scene_features`.
+    """
+    if len(set(names)) < len(names):
+        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
+    unused = [name for name in ckpt or {} if name not in names]
+    if unused:
+        raise ValueError(
+            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
+            f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
+        )
+    device = usable_device(device)
+    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]

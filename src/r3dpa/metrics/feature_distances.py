@@ -1,169 +1,374 @@
-"""Distances between two sets of scenes in one feature space, as rows of a table."""
+"""Distances of two sets of scenes in one feature space, as torchmetrics metrics.
+
+The metrics of a space hold the same states; in the collection of :func:`scene_metrics` they are
+computed once. Letters: N scenes, F feature width.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
 
 import torch
 from torch import Tensor
+from torchmetrics import MetricCollection
 
-from r3dpa.metrics.distances import Counts, Ends, Resampling, distance_row
+from r3dpa.metrics.bootstrap import Ends, Resampling
+from r3dpa.metrics.distances import (
+    SIDES,
+    BEVHistogramDistance,
+    MinimumMatchingDistance,
+    RangeHistogramDistance,
+    SceneMetric,
+    distance_row,
+)
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
     frechet_distance,
+    merge_packed,
     polynomial_mmd,
+    precision_recall,
+    shared_balls,
 )
-from r3dpa.metrics.functional_manifold import shared_balls
+from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.results import MetricResult
-from r3dpa.metrics.scene_set import SceneSet
+from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene_features import SceneFeatures
 
-_NUM_NEIGHBORS = 5
 _KID_SUBSETS, _KID_SUBSET_SIZE = 100, 1000
 _NORMAL_95 = 1.96  # deviations of a normal distribution that hold 95 % of it, to each side
+_BATCH = 8
 
 
-class FeatureSample(NamedTuple):
-    """A set of scenes in one feature space.
-
-    Attributes:
-        moments: Of all scenes.
-        rows: ``(n, F)`` features of those that are kept.
-    """
-
-    moments: Moments
-    rows: Tensor
-
-    @classmethod
-    def of(cls, scenes: SceneSet, space: str) -> FeatureSample:
-        """Features of one space."""
-        return cls(scenes.moments[space], scenes.features(space).double())
-
-    def subset(self, size: int, generator: torch.Generator) -> FeatureSample:
-        """Up to ``size`` scenes, of the kept ones, and their moments alone."""
-        rows = self.rows[torch.randperm(len(self.rows), generator=generator)[:size]]
-        return FeatureSample(Moments.of(rows), rows)
-
-
-def feature_rows(
-    label: str, real: FeatureSample, generated: FeatureSample, resampling: Resampling
-) -> list[MetricResult]:
-    """Fréchet distance, FD-infinity, polynomial MMD (KID), precision, recall, density and coverage.
-
-    The intervals are over the generated scenes: bootstrap for the Fréchet distance, the error of
-    the line for FD-infinity, the spread of subsets for the polynomial MMD (wider than needed), and
-    of the shares the bootstrap of the scenes that they are means over (real ones for recall and
-    coverage), with the balls left as they are.
+class FeatureMetric(SceneMetric):
+    """Moments of all features in float64, and the features of the scenes that are kept.
 
     Args:
-        label: Of the space.
-        real: At least two scenes.
-        generated: At least two scenes.
-        resampling: Of the intervals.
+        num_features: Feature width F.
+        label: Of the feature space, in results.
+        space: Which features are taken where ``update`` gets those of several spaces.
+        max_real: Real scans whose features are kept; all where None.
+        max_generated: Generated scenes whose features are kept.
     """
-    counts = (int(generated.moments.count), int(real.moments.count))
-    kept = (len(generated.rows), len(real.rows))
-    mean, covariance = real.moments.mean, real.moments.covariance()
-    return [
-        frechet_row(label, mean, covariance, generated, resampling, counts),
-        _infinity(label, real.rows, generated.rows, resampling, kept),
-        _polynomial(label, real.rows, generated.rows, resampling, kept),
-        *_shares(label, real.rows, generated.rows, resampling, kept),
-    ]
+
+    real_moments: Tensor
+    generated_moments: Tensor
+
+    def __init__(
+        self,
+        num_features: int,
+        label: str = "",
+        space: str = "",
+        max_real: int | None = None,
+        max_generated: int | None = None,
+    ) -> None:
+        super().__init__(max_real, max_generated)
+        self.num_features, self.label, self.space = num_features, label, space
+        empty = torch.zeros(1 + num_features + num_features**2, dtype=torch.float64)
+        self._add_states("moments", empty, merge_packed)
+        self._add_kept(torch.zeros(0, num_features))
+
+    def update(
+        self,
+        features: Tensor | Mapping[str, Tensor],
+        real: bool,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        """Add ``(N, F)`` features, or such by space; NaN or another width is a ``ValueError``."""
+        side = SIDES[not real]
+        values = (features if isinstance(features, Tensor) else features[self.space]).detach()
+        if values.ndim != 2 or values.shape[1] != self.num_features:
+            raise ValueError(
+                f"{side} features: expected (N, {self.num_features}), got {tuple(values.shape)}; "
+                "num_features must be the width of the extractor"
+            )
+        added = Moments.of(values, f"{side} features")
+        merged = Moments.unpack(getattr(self, f"{side}_moments")).merge(added)
+        setattr(self, f"{side}_moments", merged.pack())
+        self._keep(side, values, names)
+
+    def moments(self, side: str) -> Moments:
+        """Of all scenes."""
+        return Moments.unpack(getattr(self, f"{side}_moments"))
+
+    def rows(self, side: str) -> Tensor:
+        """Features ``(n, F)`` of the kept scenes."""
+        return self.kept(side)[1].double()
+
+    def _rows(self) -> tuple[Tensor, Tensor]:
+        self._need_both()
+        return self.rows("real"), self.rows("generated")
 
 
-def frechet_row(
-    label: str,
-    mean: Tensor,
-    covariance: Tensor,
-    generated: FeatureSample,
-    resampling: Resampling,
-    counts: Counts,
-) -> MetricResult:
-    """Fréchet distance to real scans of which only moments are known.
+class FrechetDistance(FeatureMetric):
+    """Fréchet distance between real and generated features: FRID, FLD, FSVD, FPVD.
+
+    The metric knows no network: give it the features of one extractor. Processes with unequal
+    batches give what one process would.
 
     Args:
-        label: Of the space.
-        mean: ``(F,)`` of the real scans.
-        covariance: ``(F, F)`` of the real scans.
-        generated: At least two scenes.
-        resampling: Of the interval.
-        counts: Generated scenes and, where it is known, real scans.
+        num_features: Feature width F.
+        label: Of the feature space, in results.
+        space: See :class:`FeatureMetric`.
+        max_real: See :class:`FeatureMetric`.
+        max_generated: See :class:`FeatureMetric`.
+        allow_few_samples: Accept fewer than F + 1 samples, where the covariance is singular and
+            the distance mostly tells how many samples there were.
+        reference: Mean ``(F,)`` and covariance ``(F, F)`` of the real features, where only these
+            are known, as in the official statistics file; real features are then refused.
+
+    Raises:
+        ValueError: By ``compute``, if there are fewer than F + 1 samples.
+
+    Example:
+        >>> metric = FrechetDistance(num_features=2)
+        >>> square = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+        >>> metric.update(square, real=True)
+        >>> metric.update(square + 3, real=False)
+        >>> round(metric.compute().item(), 6)
+        18.0
     """
 
-    def distance(moments: Moments) -> float:
-        return frechet_distance(mean, covariance, moments.mean, moments.covariance()).item()
+    reference_mean: Tensor | None
+    reference_covariance: Tensor | None
 
-    width, fewest = len(mean), min(count for count in counts if count is not None)
-    few = f"{fewest} scenes for {width} features: tells mostly how few they are"
-    ends = resampling.interval(
-        lambda drawn: distance(Moments.of(generated.rows[drawn])), len(generated.rows)
-    )
-    return distance_row(
-        label,
-        label,
-        distance(generated.moments),
-        counts,
-        interval=ends,
-        note=few if fewest <= width else "",
-    )
+    def __init__(
+        self,
+        num_features: int,
+        label: str = "",
+        space: str = "",
+        max_real: int | None = None,
+        max_generated: int | None = None,
+        allow_few_samples: bool = False,
+        reference: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        super().__init__(num_features, label, space, max_real, max_generated)
+        self.allow_few_samples = allow_few_samples
+        mean, covariance = reference if reference is not None else (None, None)
+        self.register_buffer("reference_mean", mean, persistent=False)
+        self.register_buffer("reference_covariance", covariance, persistent=False)
 
+    def update(
+        self,
+        features: Tensor | Mapping[str, Tensor],
+        real: bool,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        """Add features, see :class:`FeatureMetric`."""
+        if real and self.reference_mean is not None:
+            raise ValueError("real features given beside a reference; build the metric without it")
+        super().update(features, real, names)
 
-def _infinity(
-    label: str, real: Tensor, generated: Tensor, resampling: Resampling, counts: tuple[int, int]
-) -> MetricResult:
-    needed = 4 * (real.shape[1] + 1)
-    name = f"{label} inf"
-    if min(counts) < needed:
-        return distance_row(name, label, None, counts, note=f"needs {needed} scenes of both kinds")
-    found = fd_infinity(real, generated, resampling.generator())
-    error = _NORMAL_95 * found.standard_error
-    return distance_row(
-        name, label, found.value, counts, interval=(found.value - error, found.value + error)
-    )
+    def compute(self) -> Tensor:
+        """Distance ``()`` float64 of everything seen so far, by all processes."""
+        for side in SIDES:
+            count, needed = self.moments(side).count, self.num_features + 1
+            needed = 2 if self.allow_few_samples else needed
+            if count < needed and (side == "generated" or self.reference_mean is None):
+                raise ValueError(
+                    f"{side}: {int(count)} samples for {self.num_features} features, at least "
+                    f"{needed} are needed; give more, or allow_few_samples=True for a smoke test"
+                )
+        return self._distance(self.moments("generated"))
 
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """The distance, with a bootstrap interval over the generated scenes that are kept."""
+        rows = self.rows("generated")
+        counts = (int(self.moments("generated").count), int(self.moments("real").count) or None)
+        width, fewest = self.num_features, min(count for count in counts if count is not None)
+        few = f"{fewest} scenes for {width} features: tells mostly how few they are"
+        ends = resampling.interval(
+            lambda drawn: self._distance(Moments.of(rows[drawn])).item(), len(rows)
+        )
+        value = self._distance(self.moments("generated")).item()
+        note = few if fewest <= width else ""
+        return [distance_row(self.label, self.label, value, counts, interval=ends, note=note)]
 
-def _polynomial(
-    label: str, real: Tensor, generated: Tensor, resampling: Resampling, counts: tuple[int, int]
-) -> MetricResult:
-    name = f"{label} KID"
-    # Subsets as large as a set would all be one.
-    size = min(_KID_SUBSET_SIZE, min(counts) // 2)
-    if size < 2:
-        return distance_row(name, "", None, counts, note="needs 4 scenes of both kinds")
-    mean, std = polynomial_mmd(real, generated, resampling.generator(), _KID_SUBSETS, size)
-    ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
-    return distance_row(name, "", mean, counts, interval=ends)
-
-
-def _shares(
-    label: str, real: Tensor, generated: Tensor, resampling: Resampling, counts: tuple[int, int]
-) -> list[MetricResult]:
-    def row(name: str, value: float | None, ends: Ends | None, note: str = "") -> MetricResult:
-        return MetricResult(
-            f"{label} {name}",
-            value,
-            interval=ends,
-            direction="higher",
-            num_samples=counts[0],
-            num_references=counts[1],
-            note=note,
+    def _distance(self, generated: Moments) -> Tensor:
+        if self.reference_mean is not None and self.reference_covariance is not None:
+            mean, covariance = self.reference_mean, self.reference_covariance
+        else:
+            real = self.moments("real")
+            mean, covariance = real.mean, real.covariance("real features")
+        return frechet_distance(
+            mean, covariance, generated.mean, generated.covariance("generated features")
         )
 
-    if min(counts) <= _NUM_NEIGHBORS:
-        note = f"needs {_NUM_NEIGHBORS + 1} scenes of both kinds"
-        names = ("precision", "recall", "density", "coverage")
-        return [row(name, None, None, note) for name in names]
 
-    def mean(name: str, by_scene: Tensor) -> MetricResult:
-        values = by_scene.double()
-        ends = resampling.interval(lambda drawn: values[drawn].mean().item(), len(values))
-        return row(name, values.mean().item(), ends)
+class FrechetInfinity(FeatureMetric):
+    """Fréchet distance extrapolated to infinitely many samples, see :func:`fd_infinity`."""
 
-    balls = shared_balls(real, generated, _NUM_NEIGHBORS)
-    return [
-        mean("precision", balls.precise),
-        mean("recall", balls.recalled),
-        mean("density", balls.density),
-        mean("coverage", balls.covered),
-    ]
+    def compute(self) -> dict[str, float]:
+        """``fd_infinity`` and the standard error of the line."""
+        found = fd_infinity(*self._rows(), torch.Generator().manual_seed(0))
+        return {"fd_infinity": found.value, "standard_error": found.standard_error}
+
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """The extrapolated distance with the error of the line."""
+        real, generated = self._rows()
+        counts = (len(generated), len(real))
+        name, needed = f"{self.label} inf", 4 * (self.num_features + 1)
+        if min(counts) < needed:
+            note = f"needs {needed} scenes of both kinds"
+            return [distance_row(name, self.label, None, counts, note=note)]
+        found = fd_infinity(real, generated, resampling.generator())
+        error = _NORMAL_95 * found.standard_error
+        ends = (found.value - error, found.value + error)
+        return [distance_row(name, self.label, found.value, counts, interval=ends)]
+
+
+class PolynomialMMD(FeatureMetric):
+    """Kernel distance (KID) of features: unbiased at any number of samples.
+
+    Subsets have at most ``subset_size`` scenes and half of the smaller set.
+    """
+
+    num_subsets, subset_size, seed = _KID_SUBSETS, _KID_SUBSET_SIZE, 0
+
+    def compute(self) -> dict[str, float]:
+        """``kid_mean`` and ``kid_std`` over the subsets."""
+        mean, std = self._kid(torch.Generator().manual_seed(self.seed))
+        return {"kid_mean": mean, "kid_std": std}
+
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """The mean with the spread of the subsets, which is wider than needed."""
+        counts, name = (len(self.rows("generated")), len(self.rows("real"))), f"{self.label} KID"
+        if min(counts) < 4:
+            return [distance_row(name, "", None, counts, note="needs 4 scenes of both kinds")]
+        mean, std = self._kid(resampling.generator())
+        ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
+        return [distance_row(name, "", mean, counts, interval=ends)]
+
+    def _kid(self, generator: torch.Generator) -> tuple[float, float]:
+        real, generated = self._rows()
+        # Subsets as large as a set would all be one.
+        size = min(self.subset_size, min(len(real), len(generated)) // 2)
+        return polynomial_mmd(real, generated, generator, self.num_subsets, size)
+
+
+class PrecisionRecall(FeatureMetric):
+    """Precision, recall, density and coverage, see :func:`precision_recall`.
+
+    ``results`` has bootstrap intervals over the scenes that a share is the mean of (real ones for
+    recall and coverage), with the balls left as they are.
+    """
+
+    higher_is_better = True
+    num_neighbors = 5
+
+    def compute(self) -> dict[str, float]:
+        """``precision``, ``recall``, ``density`` and ``coverage``."""
+        return dict(vars(precision_recall(*self._rows(), self.num_neighbors)))
+
+    def results(self, resampling: Resampling) -> list[MetricResult]:
+        """The four shares."""
+        real, generated = self._rows()
+        few = min(len(real), len(generated)) <= self.num_neighbors
+        values: dict[str, Tensor | None] = dict.fromkeys(
+            ("precision", "recall", "density", "coverage")
+        )
+        if not few:
+            balls = shared_balls(real, generated, self.num_neighbors)
+            shares = (balls.precise, balls.recalled, balls.density, balls.covered)
+            values = {k: v.double() for k, v in zip(values, shares, strict=True)}
+
+        def row(name: str, by_scene: Tensor | None) -> MetricResult:
+            ends: Ends | None = None if by_scene is None else resampling.of_mean(by_scene)
+            return MetricResult(
+                f"{self.label} {name}",
+                None if by_scene is None else by_scene.mean().item(),
+                interval=ends,
+                direction="higher",
+                num_samples=len(generated),
+                num_references=len(real),
+                note=f"needs {self.num_neighbors + 1} scenes of both kinds" if few else "",
+            )
+
+        return [row(name, by_scene) for name, by_scene in values.items()]
+
+
+_OF_SPACE = {
+    "frechet": FrechetDistance,
+    "inf": FrechetInfinity,
+    "kid": PolynomialMMD,
+    "shares": PrecisionRecall,
+}
+
+
+def scene_metrics(
+    protocol: Protocol,
+    spaces: Mapping[str, tuple[str, int]],
+    num_groups: int = 1,
+    max_rows: tuple[int | None, int | None] = (None, None),
+    max_images: tuple[int | None, int | None] = (None, None),
+) -> MetricCollection:
+    """All metrics of scenes: ``cells``, ``ranges``, ``matching`` and four for each feature space.
+
+    ``update`` takes ``clouds``, ``range_m``, ``features`` by space, ``names`` and ``real``; see
+    :func:`update_with`.
+
+    Args:
+        protocol: How scenes are prepared.
+        spaces: Label and feature width by name.
+        num_groups: Groups of generated scenes that the bootstrap of histograms resamples.
+        max_rows: Real and generated scenes whose features are kept.
+        max_images: Real and generated scenes whose range images are kept.
+    """
+    metrics: dict[str, SceneMetric] = {
+        "cells": BEVHistogramDistance(protocol.grid, num_groups),
+        "ranges": RangeHistogramDistance(protocol.sensor.range_max_m, num_groups),
+        "matching": MinimumMatchingDistance(protocol, *max_images),
+    }
+    groups = [[name] for name in metrics]
+    for name, (label, width) in spaces.items():
+        own = {
+            f"{name}_{kind}": metric(width, label, name, *max_rows)
+            for kind, metric in _OF_SPACE.items()
+        }
+        metrics |= own
+        groups.append(list(own))
+    return MetricCollection(dict(metrics), compute_groups=groups)
+
+
+def metrics_of(metrics: MetricCollection) -> dict[str, SceneMetric]:
+    """The metrics by name in their order, those of a feature space with the states they share."""
+    found: dict[str, Any] = dict(metrics.items(keep_base=True, copy_state=False))
+    return {name: found[name] for group in metrics.compute_groups.values() for name in group}
+
+
+def update_with(
+    metrics: MetricCollection,
+    scenes: Sequence[EvaluationScene],
+    features: Mapping[str, Tensor],
+    real: bool,
+) -> None:
+    """Counts scenes in.
+
+    Args:
+        metrics: Of :func:`scene_metrics`.
+        scenes: As :func:`through_sensor` makes them; may be empty.
+        features: ``(B, F)`` by space.
+        real: Whether they are real scans.
+
+    Raises:
+        ValueError: If no point of a scene lies on the grid seen from above.
+    """
+    if scenes:
+        metrics.update(
+            clouds=[scene.points for scene in scenes],
+            range_m=torch.stack([s.range_m for s in scenes if s.range_m is not None]),
+            features=features,
+            names=[scene.name for scene in scenes],
+            real=real,
+        )
+
+
+def with_features(
+    scenes: Iterable[EvaluationScene], spaces: Sequence[SceneFeatures], batch_size: int = _BATCH
+) -> Iterator[tuple[list[EvaluationScene], dict[str, Tensor]]]:
+    """Batches of scenes and their features by space: what :func:`update_with` takes."""
+    stream = iter(scenes)
+    while batch := list(islice(stream, batch_size)):
+        yield batch, {space.name: space(batch) for space in spaces}

@@ -7,13 +7,9 @@ Letters: P points, R references, S samples.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import product
-from statistics import median
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -22,10 +18,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from r3dpa.metrics.measures import jensen_shannon
+from r3dpa.metrics.functional import jensen_shannon
 
 Cells = NDArray[np.int64]
-Result = TypeVar("Result")
 
 #: Cells along a side of a grid that clouds can be matched on.
 MAX_SIDE = 2048
@@ -93,10 +88,9 @@ class BEVGrid:
         """
         inside = self.kept(points, name)[:, :2]
         # A tensor, not a number: division by a number may become a product with its inverse.
-        indices = torch.floor(inside / inside.new_tensor(self.cell_m)).long()
-        indices -= indices.new_tensor(
-            [math.ceil(side[0] / self.cell_m) for side in (self.x_m, self.y_m)]
-        )
+        indices = torch.floor(inside / inside.new_full((), self.cell_m)).long()
+        first = [math.ceil(side[0] / self.cell_m) for side in (self.x_m, self.y_m)]
+        indices -= torch.tensor(first).to(indices.device)
         rows, columns = self.shape
         row, column = indices[:, 0].clamp(0, rows - 1), indices[:, 1].clamp(0, columns - 1)
         return (row * columns + column).unique()
@@ -264,25 +258,6 @@ def minimum_matching(
     )
 
 
-def chamfer_cells(cells_a: Tensor, cells_b: Tensor, grid: BEVGrid) -> float:
-    """Chamfer distance of :func:`minimum_matching` for one pair, all cells against all."""
-    side = _side(grid)
-    a, b = (
-        torch.stack([cells // side, cells % side], dim=1).float() for cells in (cells_a, cells_b)
-    )
-
-    def mean_nearest(x: Tensor, y: Tensor) -> float:
-        # Indices are below 2^11, so every number here is an integer up to 2^24: exact in float32.
-        norms = y.square().sum(dim=1)
-        nearest = [
-            torch.addmm(norms, part, y.T, alpha=-2).amin(dim=1) + part.square().sum(dim=1)
-            for part in x.split(max(1, 2**20 // len(y)))
-        ]
-        return torch.cat(nearest).double().mean().item()
-
-    return (mean_nearest(a, b) + mean_nearest(b, a)) / (2 * side**2)
-
-
 def _side(grid: BEVGrid) -> int:
     rows, columns = grid.shape
     if rows != columns or rows > MAX_SIDE:
@@ -309,68 +284,3 @@ def _distance_table(cells: Cells, side: int) -> NDArray[np.int32]:
 
 def _mean_lookup(table: NDArray[np.int32], cells: Cells) -> float:
     return int(table.take(cells).sum(dtype=np.int64)) / len(cells)
-
-
-@dataclass(frozen=True)
-class MatchingTiming:
-    """Measured costs of :func:`minimum_matching`, and of comparing all cells with all.
-
-    Args:
-        table_s: Seconds of one core to transform one cloud.
-        lookup_s: Seconds to look up one cloud in the table of another.
-        brute_force_s: Seconds of :func:`chamfer_cells` for one pair.
-        largest_difference: Between both, relative; 0 is expected up to rounding.
-    """
-
-    table_s: float
-    lookup_s: float
-    brute_force_s: float
-    largest_difference: float
-
-    def extrapolate(self, num_references: int, num_samples: int) -> tuple[float, float]:
-        """Core-seconds of both ways for so many clouds; the first without any early end."""
-        pairs = num_references * num_samples
-        tables = num_references + num_samples
-        return tables * self.table_s + 2 * pairs * self.lookup_s, pairs * self.brute_force_s
-
-
-def timing_against_brute_force(
-    references: Sequence[Tensor], samples: Sequence[Tensor], grid: BEVGrid
-) -> MatchingTiming:
-    """Time both ways on every pair of a few clouds; extrapolate from there.
-
-    Args:
-        references: Vectors of :meth:`BEVGrid.cells`; two or three are enough.
-        samples: Likewise.
-        grid: Theirs.
-    """
-    side = _side(grid)
-    clouds = [[cells.cpu().numpy() for cells in part] for part in (references, samples)]
-    table_s, tables = _timed(lambda: [[_distance_table(c, side) for c in part] for part in clouds])
-    pairs = list(product(range(len(references)), range(len(samples))))
-    lookup_s, sums = _timed(
-        lambda: [
-            _mean_lookup(tables[1][s], clouds[0][r]) + _mean_lookup(tables[0][r], clouds[1][s])
-            for r, s in pairs
-        ]
-    )
-    brute_s, brute = _timed(
-        lambda: [chamfer_cells(references[r], samples[s], grid) for r, s in pairs]
-    )
-    ours = np.array(sums) / (2 * side**2)
-    return MatchingTiming(
-        table_s / (len(references) + len(samples)),
-        lookup_s / (2 * len(pairs)),
-        brute_s / len(pairs),
-        float((np.abs(ours - brute) / np.maximum(brute, np.finfo(float).tiny)).max()),
-    )
-
-
-def _timed(work: Callable[[], Result]) -> tuple[float, Result]:
-    """Median of three runs after one that does not count, and the last result."""
-    seconds = []
-    for _ in range(4):
-        start = time.process_time()  # of all threads: other load on the machine does not count
-        result = work()
-        seconds.append(time.process_time() - start)
-    return median(seconds[1:]), result

@@ -21,6 +21,7 @@ from r3dpa.metrics.features import (
     median_intensity,
     overall_keep_rate,
 )
+from r3dpa.metrics.functional import curve_rmse, jensen_shannon, wasserstein_1
 from r3dpa.metrics.scan_statistics import (
     GROUND_REACH_BIN_M,
     GROUND_RESIDUAL_BIN_M,
@@ -34,57 +35,6 @@ from r3dpa.metrics.scan_statistics import (
 )
 
 Floats = NDArray[np.float64]
-
-
-def wasserstein_1(counts_a: Floats, counts_b: Floats, bin_width: float) -> float:
-    """Earth mover's distance of two normalised histograms: the area between their CDFs.
-
-    Args:
-        counts_a: ``(N,)`` counts in bins of equal width.
-        counts_b: ``(N,)`` counts in the same bins.
-        bin_width: In the unit of the result.
-
-    Returns:
-        The distance; NaN where a histogram is empty.
-    """
-    if counts_a.sum() == 0 or counts_b.sum() == 0:
-        return float("nan")
-    cdf_a, cdf_b = counts_a.cumsum() / counts_a.sum(), counts_b.cumsum() / counts_b.sum()
-    return float(np.abs(cdf_a - cdf_b).sum() * bin_width)
-
-
-def jensen_shannon(counts_a: Floats, counts_b: Floats) -> float:
-    """Jensen-Shannon divergence of two normalised histograms, in nats.
-
-    ``(KL(a | m) + KL(b | m)) / 2`` with ``m = (a + b) / 2`` and natural logarithms: 0 for equal
-    histograms, ln 2 = 0.693 for disjoint ones. Not its square root.
-
-    Args:
-        counts_a: Counts of any shape.
-        counts_b: Counts of the same shape.
-
-    Returns:
-        The divergence; NaN where a histogram is empty.
-    """
-    if counts_a.sum() == 0 or counts_b.sum() == 0:
-        return float("nan")
-    shares = (counts_a / counts_a.sum(), counts_b / counts_b.sum())
-    middle = (shares[0] + shares[1]) / 2
-    return float(sum((p[p > 0] * np.log(p[p > 0] / middle[p > 0])).sum() / 2 for p in shares))
-
-
-def curve_rmse(curve_a: Floats, curve_b: Floats) -> float:
-    """Root mean square difference of two curves over the bins that both know.
-
-    Args:
-        curve_a: Values of any shape, NaN where unknown.
-        curve_b: Values of the same shape.
-
-    Returns:
-        The difference in the unit of the curves; NaN where no bin is known in both.
-    """
-    both = np.isfinite(curve_a) & np.isfinite(curve_b)
-    return float(np.sqrt(np.mean((curve_a[both] - curve_b[both]) ** 2))) if both.any() else np.nan
 
 
 def known(number: float) -> float | None:

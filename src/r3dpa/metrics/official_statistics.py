@@ -10,27 +10,36 @@ Letters: F feature width, n occupied cells of one scan.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from r3dpa.io import UNPICKLING_ERRORS
-from r3dpa.metrics.distances import Resampling, cell_rows, distance_row
-from r3dpa.metrics.evaluation import PYTHON_OPTION, about_generated, check_counts, gather
-from r3dpa.metrics.feature_distances import FeatureSample, frechet_row
+from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.distances import BEVHistogramDistance, MinimumMatchingDistance, distance_row
+from r3dpa.metrics.evaluation import (
+    PYTHON_OPTION,
+    Comparison,
+    about_generated,
+    check_counts,
+    empty_metrics,
+    evaluate,
+    feature_spaces,
+    gather,
+)
+from r3dpa.metrics.feature_distances import FrechetDistance, metrics_of
 from r3dpa.metrics.functional_bev import minimum_matching
 from r3dpa.metrics.protocol import PUBLISHED
+from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.unpickling import ArraysOnly, array_header
-
-__all__ = ["OfficialSplit", "OfficialStatistics", "evaluate_official", "is_official"]
+from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 
 OfficialSplit = Literal["val", "all"]
 #: Official names of the feature spaces; FRID also reads the intensity with other weights.
@@ -163,67 +172,69 @@ def evaluate_official(
 
     The rows are the Fréchet distances, and JSD, TV and MMD where the file has what they need. All
     other rows of :func:`r3dpa.metrics.evaluation.evaluate` and every floor need real scans;
-    ``left_out`` of the result's ``extra`` names them.
-
-    Args:
-        scenes: Read once; the first ``num_samples`` of the protocol count.
-        statistics: Reference.
-        spaces: Feature spaces, each one of the file. It does not say which weights it was made
-            with: that they are those is for the caller to know.
-        label: Of the generator or run.
-        source: Where the scenes come from.
-        made_with: What is known of their making, as for ``evaluate``.
-        commit: Version of the code.
-        allow_few: Accept fewer scenes than features.
-        skip_bad: As for ``evaluate``.
-        option: As for ``evaluate``.
-        batch_size: Scenes per pass of a network.
-        resampling: Seed, and cost of the intervals.
-
-    Raises:
-        ValueError: If the file lacks a space, or as ``evaluate``.
+    ``left_out`` of the result's ``extra`` names them. The file does not say which weights it was
+    made with: that those of ``spaces`` are the same is for the caller to know. The other arguments
+    and errors are those of ``evaluate``.
     """
     resampling = resampling or Resampling()
     moments = [statistics.of_space(space) for space in spaces]  # before the long way
     protocol = statistics.protocol
+    metrics = empty_metrics(protocol, spaces)
     bad: list[str] | None = [] if skip_bad else None
-    samples, more = gather(scenes, spaces, protocol, batch_size, bad, option)
-    check_counts({"generated scenes": samples.count}, spaces, allow_few, option, bad or ())
+    names, more = gather(metrics, scenes, spaces, protocol, batch_size, bad, option)
+    count, by_name = len(names), metrics_of(metrics)
+    check_counts({"generated scenes": count}, spaces, allow_few, option, bad or ())
     rows: list[MetricResult] = []
     absent = ["floors", "W1 range", "CD 3D", "FD-infinity, KID, precision and its relatives"]
     if statistics.cells is None:
         absent += ["JSD", "TV"]
     else:
-        rows += cell_rows(statistics.cells, samples, (samples.count, None), resampling)
+        cells = cast(BEVHistogramDistance, by_name["cells"])
+        cells.real_bins = statistics.cells
+        rows += cells.results(resampling)
     if statistics.clouds:
         references = statistics.clouds[: protocol.num_mmd_references]
-        own = [protocol.grid.cells(cloud) for cloud in samples.clouds(range(len(samples.images)))]
+        own, _ = cast(MinimumMatchingDistance, by_name["matching"]).cells("generated")
         values = minimum_matching(references, own, protocol.grid).squared_normalised
-        ends = resampling.interval(lambda drawn: values[drawn].mean().item(), len(values))
-        counts = (len(own), len(references))
-        rows.append(distance_row("MMD", "MMD", values.mean().item(), counts, interval=ends))
+        ends = resampling.of_mean(values)
+        sizes = (len(own), len(references))
+        rows.append(distance_row("MMD", "MMD", values.mean().item(), sizes, interval=ends))
     else:
         absent.append("MMD")
     for space, (mean, covariance) in zip(spaces, moments, strict=True):
-        made, counts_known = FeatureSample.of(samples, space.name), (samples.count, None)
-        rows.append(frechet_row(space.label, mean, covariance, made, resampling, counts_known))
+        frechet = cast(FrechetDistance, by_name[f"{space.name}_frechet"])
+        frechet.reference_mean, frechet.reference_covariance = mean, covariance
+        rows += frechet.results(resampling)
     if not rows:
         raise ValueError(f"{statistics.path}: nothing to compare; choose spaces that it holds")
     note = f"the official file does not hold what these need: {', '.join(absent)}"
-    about = about_generated(samples.count, more, spaces, statistics, made_with, commit, source)
+    about = about_generated(count, more, spaces, statistics, made_with, commit, source)
     about["extra"] |= {"left_out": note, "bootstrap": vars(resampling)}
     about["extra"] |= {"bad_samples": bad} if bad else {}
     return Evaluation(label, tuple(rows), about)
 
 
+class _ArraysOnly(pickle.Unpickler):
+    """Unpickler of NumPy arrays and plain containers; refuses everything else by name."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        parts = module.replace("numpy._core", "numpy.core").split(".")
+        if (parts[0], name) in {("numpy", "ndarray"), ("numpy", "dtype")}:
+            return super().find_class("numpy", name)
+        if parts == ["numpy", "core", "multiarray"] and name in ("_reconstruct", "scalar"):
+            return super().find_class("numpy._core.multiarray", name)
+        raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
+
+
 def _read(path: Path) -> dict[Any, Any]:
-    """The dictionary of the file."""
+    """The dictionary of the file; nothing in it is executed."""
     try:
         with path.open("rb") as stream:
-            shape, _, dtype = array_header(stream)
-            if shape != () or not dtype.hasobject:
-                raise ValueError(f"an array {shape} of {dtype} instead of one dictionary")
-            content = ArraysOnly(stream).load()
+            version = np.lib.format.read_magic(stream)
+            head = getattr(np.lib.format, f"read_array_header_{version[0]}_0")(stream)
+            if head[0] != () or not head[2].hasobject:
+                raise ValueError(f"an array {head[0]} of {head[2]} instead of one dictionary")
+            content = _ArraysOnly(stream).load()
         content = content.item() if isinstance(content, np.ndarray) else content
         if not isinstance(content, dict):
             raise ValueError(f"holds a {type(content).__name__} instead of a dictionary")
@@ -291,3 +302,91 @@ def _clouds(value: Any, where: str) -> list[Tensor]:
         index_of = torch.from_numpy(cells).long()
         clouds.append((index_of[:, 0] * side + index_of[:, 1]).unique())
     return clouds
+
+
+AnyReference = ReferenceStatistics | OfficialStatistics
+
+
+def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
+    """Reference of either kind, ready to compare with.
+
+    Args:
+        path: File of ``r3dpa reference``, or the official statistics file.
+        split: Part of the official file, see :meth:`OfficialStatistics.load`.
+
+    Raises:
+        ValueError: If the file is missing, damaged, of something else or not complete, or a split
+            is asked of a file that has none.
+    """
+    if is_official(path):
+        return OfficialStatistics.load(path, split)
+    if split is not None:
+        raise ValueError(
+            f"{path}: is no official statistics file, so the split {split} does not apply to it; "
+            "leave it out"
+        )
+    statistics = ReferenceStatistics.load(path)
+    statistics.check_complete()
+    return statistics
+
+
+def reference_spaces(
+    statistics: AnyReference,
+    names: Sequence[str] | None,
+    ckpt: Mapping[str, Any] | None,
+    protocol: str | None,
+    device: str,
+) -> list[SceneFeatures]:
+    """Feature spaces of a comparison with a reference.
+
+    Args:
+        statistics: The reference.
+        names: Feature spaces; where None, those of the reference that need no file or that
+            ``ckpt`` has one for.
+        ckpt: Weight files by name.
+        protocol: Must be that of the reference; not compared where None.
+        device: As for :func:`feature_spaces`.
+
+    Raises:
+        ValueError: If the reference is of another protocol or lacks a space, or as
+            :func:`feature_spaces`.
+    """
+    setting = statistics.protocol
+    if protocol is not None and protocol != setting.name:
+        raise ValueError(
+            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
+            f"with `r3dpa reference --protocol {protocol}`, or ask for no protocol"
+        )
+    if names is None:
+        names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
+    spaces = feature_spaces(names, ckpt, setting, device)
+    if isinstance(statistics, OfficialStatistics):
+        for space in spaces:
+            statistics.of_space(space)
+    else:
+        check_spaces(statistics.spaces, spaces)
+    return spaces
+
+
+def compare(
+    scenes: Iterable[EvaluationScene],
+    statistics: AnyReference,
+    spaces: Sequence[SceneFeatures],
+    **options: Any,
+) -> tuple[Evaluation, Comparison | None]:
+    """Generated scenes beside a reference of either kind.
+
+    Args:
+        scenes: Read once; a generated one is ``EvaluationScene(name, None, range_m)``.
+        statistics: Reference.
+        spaces: Of :func:`reference_spaces`.
+        options: Those that :func:`r3dpa.metrics.evaluation.evaluate` and ``evaluate_official``
+            share.
+
+    Returns:
+        All numbers, and the data of figures; None for the official file, which holds no scans.
+    """
+    if isinstance(statistics, OfficialStatistics):
+        return evaluate_official(scenes, statistics, spaces, **options), None
+    comparison = evaluate(scenes, statistics, spaces, **options)
+    return comparison.evaluation, comparison

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from r3dpa.io import text_table
 from r3dpa.metrics.features import curves
 from r3dpa.metrics.measures import MEASURES, Measure, known
 from r3dpa.metrics.scan_statistics import ScanStatistics
@@ -85,21 +86,13 @@ class RealismTable:
 
     def __str__(self) -> str:
         """Aligned table, the measures that miss, and the notes."""
-        table = [_COLUMNS, *map(_cells, self.rows)]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  ".join(
-                [cell.ljust(width) for cell, width in zip(cells[:2], widths[:2], strict=True)]
-                + [cell.rjust(width) for cell, width in zip(cells[2:], widths[2:], strict=True)]
-            )
-            for cells in table
-        ]
+        table = text_table(map(_cells, self.rows), _COLUMNS, align="ll" + "r" * 8)
         missed = ", ".join(f"{row.name} ({row.ratio:.1f}x)" for row in self.misses)
         num_judged = sum(row.ratio is not None for row in self.rows)
         verdict = f"{num_judged - len(self.misses)} of {num_judged} measures within 3 x the floor"
         unknown = [f"n/a: {row.name}: {row.reason}" for row in self.rows if row.reason]
         missing = [f"beyond 3 x the floor: {missed}"] if missed else []
-        return "\n".join([*lines, "", verdict, *missing, *unknown, *self.notes])
+        return "\n".join([table, "", verdict, *missing, *unknown, *self.notes])
 
     def to_dict(self) -> dict[str, Any]:
         """Rows, notes and the curves behind them, as JSON can hold them (None where unknown)."""

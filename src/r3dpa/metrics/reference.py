@@ -1,28 +1,42 @@
-"""What samples are compared with: statistics of real scans, computed once and kept in one file."""
+"""Reference of an evaluation: statistics of real scans, computed once and kept in one file."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from glob import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+from torchmetrics import MetricCollection
+from tqdm import tqdm
 
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, refuse_name
-from r3dpa.metrics.functional import Moments
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
+from r3dpa.metrics.distances import BEVHistogramDistance, MinimumMatchingDistance
+from r3dpa.metrics.feature_distances import (
+    FeatureMetric,
+    metrics_of,
+    scene_metrics,
+    update_with,
+    with_features,
+)
 from r3dpa.metrics.protocol import Protocol
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import EvaluationScene, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
-from r3dpa.metrics.scene_set import SceneSet, add_scenes, usable_scenes
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 2
+_EVERY = 2000  # scans between two savings of an unfinished reference
+_BATCH = 8
+
+_log = logging.getLogger(__name__)
 
 
 class ReferenceStatistics:
@@ -35,12 +49,12 @@ class ReferenceStatistics:
         protocol: How scans are prepared.
         spaces: Cards of the feature spaces by name; each also holds ``dim`` and ``label``.
         names: Names of all scans, in their order.
-        about: What a reader must know, such as ``data``, ``split`` and ``commit``.
+        about: Further facts, such as ``data``, ``split`` and ``commit``.
 
     Attributes:
-        halves: The two sets; features of up to ``num_samples`` scans and images of up to
-            ``num_mmd_references`` are kept, half of them in each, or more in one where the other
-            has fewer scans.
+        halves: Metrics of :func:`scene_metrics` that hold the real scans of a half. Features of up
+            to ``num_samples`` scans and images of up to ``num_mmd_references`` are kept, half of
+            them in each, or more in one where the other has fewer scans.
         num_done: Scans counted in so far; all of them once complete.
 
     Raises:
@@ -63,15 +77,14 @@ class ReferenceStatistics:
         self.protocol, self.spaces, self.about = protocol, spaces, about
         self.names, self._half_of = tuple(names), split_halves(names)
         self.num_done = 0
-        widths = {name: card["dim"] for name, card in spaces.items()}
         in_first = sum(half == 0 for half in self._half_of.values())
         sizes = (in_first, len(names) - in_first)
-        limits = [
+        rows, images = (
             _kept_of_halves(limit, sizes)
             for limit in (protocol.num_samples, protocol.num_mmd_references)
-        ]
+        )
         self.halves = tuple(
-            SceneSet(protocol, widths, *of_half) for of_half in zip(*limits, strict=True)
+            self.metrics(max_rows=(rows[i], None), max_images=(images[i], None)) for i in (0, 1)
         )
 
     @classmethod
@@ -85,27 +98,48 @@ class ReferenceStatistics:
         """Empty statistics of these scans; the arguments are those of the class."""
         return cls(protocol, {space.name: space_card(space) for space in spaces}, names, about)
 
+    def metrics(self, spaces: Iterable[str] | None = None, **options: Any) -> MetricCollection:
+        """Empty metrics of the protocol and of some or all feature spaces."""
+        chosen = self.spaces if spaces is None else {name: self.spaces[name] for name in spaces}
+        cards = {name: (card["label"], card["dim"]) for name, card in chosen.items()}
+        return scene_metrics(self.protocol, cards, **options)
+
+    def fill(self, metrics: MetricCollection, *halves: int) -> None:
+        """Gives metrics the real scans of both halves, or of one."""
+        parts = [metrics_of(self.halves[i]) for i in halves or (0, 1)]
+        for name, metric in metrics_of(metrics).items():
+            metric.adopt_real(*(part[name] for part in parts))
+
+    def count(self, *halves: int) -> int:
+        """Scans of both halves, or of one."""
+        parts = [metrics_of(self.halves[i])["cells"] for i in halves or (0, 1)]
+        return sum(part.count("real") for part in parts)
+
+    def names_of_half(self, index: int) -> list[str]:
+        """Names of the scans of a half, in their order."""
+        return [name for name in self.names if self._half_of[name] == index]
+
+    @property
+    def kept_images(self) -> list[str]:
+        """Names of the scans whose range images are kept, first half first."""
+        return [
+            self.names_of_half(index)[place]
+            for index, half in enumerate(self.halves)
+            for place in cast(Any, metrics_of(half)["matching"]).kept("real")[0]
+        ]
+
     @property
     def complete(self) -> bool:
         """Whether every scan was counted in."""
         return self.num_done == len(self.names)
 
     def check_complete(self) -> None:
-        """Refuses statistics that lack scans.
-
-        Raises:
-            ValueError: Telling how many are there.
-        """
+        """Raises a ``ValueError`` where scans are missing."""
         if not self.complete:
             raise ValueError(
                 f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
                 "command to complete it"
             )
-
-    @property
-    def whole(self) -> SceneSet:
-        """Both halves together."""
-        return self.halves[0].merge(self.halves[1])
 
     def describe(self) -> str:
         """Split, count and hash of the names, in one line."""
@@ -118,17 +152,19 @@ class ReferenceStatistics:
         scenes: Iterable[EvaluationScene],
         spaces: Sequence[SceneFeatures],
         partial: Path | None = None,
-        every: int = 2000,
-        batch_size: int = 8,
+        every: int = _EVERY,
+        batch_size: int = _BATCH,
     ) -> None:
         """Count in all scans that are missing.
+
+        Interrupted and resumed, the statistics are the same to the last bit.
 
         Args:
             scenes: The scans ``names[num_done:]``, in that order.
             spaces: Those that the statistics were prepared for.
-            partial: File to save to after every ``every`` scans, so that the work can be resumed.
-            every: Rounded up to whole batches. Interrupted and resumed at such a point, the
-                statistics are the same to the last bit.
+            partial: File to save to after every ``every`` scans and on a ``KeyboardInterrupt``, so
+                that the work can be resumed.
+            every: Rounded up to whole batches.
             batch_size: Scans per pass of a network.
 
         Raises:
@@ -137,44 +173,57 @@ class ReferenceStatistics:
         """
         check_spaces(self.spaces, spaces)
         every = -(-every // batch_size) * batch_size
-        seen = usable_scenes(scenes, self.protocol)
-        for batch, features in add_scenes(seen, spaces, batch_size):
-            expected = self.names[self.num_done : self.num_done + len(batch)]
-            if tuple(scene.name for scene in batch) != expected:
-                raise ValueError(
-                    f"the scans from number {self.num_done} on are {[s.name for s in batch]}, but "
-                    f"{list(expected)} were announced: give them in the order of their names"
-                )
-            for index, part in enumerate(self.halves):
-                own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
-                part.add(
-                    [batch[i] for i in own],
-                    {name: values[own] for name, values in features.items()},
-                )
-            self.num_done += len(batch)
-            if partial is not None and self.num_done % every == 0 and not self.complete:
+        whole = True  # no batch is counted in by a part
+        try:
+            batches = with_features(usable_scenes(scenes, self.protocol), spaces, batch_size)
+            for batch, features in batches:
+                whole = False
+                self._add(batch, features)
+                whole = True
+                if partial is not None and self.num_done % every == 0 and not self.complete:
+                    self.save(partial)
+        except KeyboardInterrupt:
+            if whole and partial is not None and self.num_done:
                 self.save(partial)
+            raise
         if not self.complete:
             raise ValueError(f"got {self.num_done} of {len(self.names)} scans; give all of them")
+
+    def _add(self, batch: Sequence[EvaluationScene], features: dict[str, Tensor]) -> None:
+        expected = self.names[self.num_done : self.num_done + len(batch)]
+        if tuple(scene.name for scene in batch) != expected:
+            raise ValueError(
+                f"the scans from number {self.num_done} on are {[s.name for s in batch]}, but "
+                f"{list(expected)} were announced: give them in the order of their names"
+            )
+        for index, part in enumerate(self.halves):
+            own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
+            of_half = {name: values[own] for name, values in features.items()}
+            update_with(part, [batch[i] for i in own], of_half, real=True)
+        self.num_done += len(batch)
 
     def save(self, path: str | Path) -> None:
         """Writes everything to one ``.safetensors`` file, its card in the metadata."""
         tensors: dict[str, Tensor] = {}
         chosen = []
         for index, part in enumerate(self.halves):
-            rows, images = part.rows.items(), part.images.items()
-            chosen.append({"rows": [r[:2] for r in rows], "images": [i[:2] for i in images]})
-            tensors |= {f"{index}.moments.{s}": m.pack() for s, m in part.moments.items()}
-            tensors |= {f"{index}.features.{s}": part.features(s) for s in part.widths}
-            sensor = self.protocol.sensor
-            stack = torch.zeros(len(images), sensor.beams, sensor.columns)
-            for place, (_, _, image) in enumerate(images):
-                stack[place] = image
-            tensors[f"{index}.images"] = stack
-            occupied = part.cells[0].nonzero()[:, 0]
+            names = self.names_of_half(index)
+            metrics = metrics_of(part)
+            places: dict[str, list[int]] = {"rows": [], "images": []}
+            for space in self.spaces:
+                metric = cast(FeatureMetric, metrics[f"{space}_frechet"])
+                kept, rows = metric.kept("real")
+                places["rows"] = kept.tolist()
+                tensors[f"{index}.moments.{space}"] = metric.real_moments
+                tensors[f"{index}.features.{space}"] = rows
+            kept, images = cast(MinimumMatchingDistance, metrics["matching"]).kept("real")
+            places["images"], tensors[f"{index}.images"] = kept.tolist(), images
+            cells = cast(BEVHistogramDistance, metrics["cells"]).real_bins
+            occupied = cells.nonzero()[:, 0]
             tensors[f"{index}.cells"] = occupied.int()
-            tensors[f"{index}.cell_counts"] = part.cells[0, occupied]
-            tensors[f"{index}.ranges"] = part.ranges
+            tensors[f"{index}.cell_counts"] = cells[occupied]
+            tensors[f"{index}.ranges"] = cast(Any, metrics["ranges"]).real_bins[None]
+            chosen.append({key: [(names[i], i) for i in of] for key, of in places.items()})
         card = {
             "version": _VERSION,
             "protocol": self.protocol.to_dict(),
@@ -182,7 +231,7 @@ class ReferenceStatistics:
             "names": self.names,
             "about": self.about,
             "num_done": self.num_done,
-            "counts": [part.count for part in self.halves],
+            "counts": [self.count(index) for index in (0, 1)],
             "chosen": chosen,
         }
         with atomic_path(path) as temporary:
@@ -210,8 +259,8 @@ class ReferenceStatistics:
                 raise ValueError(f"name of a scan {refused[0]}")
             reference = cls(protocol, card["spaces"], card["names"], card["about"])
             reference.num_done = card["num_done"]
-            for index, part in enumerate(reference.halves):
-                _fill(part, tensors, index, card)
+            for index in (0, 1):
+                reference._load_half(tensors, index, card)
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
                 f"{path} holds no reference statistics ({first_line(error)}): give the "
@@ -219,41 +268,89 @@ class ReferenceStatistics:
             ) from error
         return reference
 
+    def _load_half(self, tensors: dict[str, Tensor], index: int, card: dict[str, Any]) -> None:
+        def tensor(key: str, *shape: int) -> Tensor:
+            found = tensors.get(f"{index}.{key}")
+            if found is None or found.shape != shape:
+                given = "is missing" if found is None else f"has shape {tuple(found.shape)}"
+                raise ValueError(f"tensor {index}.{key} {given}, expected {shape}")
+            return found
 
-def _fill(part: SceneSet, tensors: dict[str, Tensor], index: int, card: dict[str, Any]) -> None:
-    """Statistics of one half from a file."""
+        metrics: dict[str, Any] = metrics_of(self.halves[index])
+        chosen, sensor = card["chosen"][index], self.protocol.sensor
+        rows, images = chosen["rows"], chosen["images"]
+        for metric in metrics.values():
+            metric.real_count = torch.tensor(card["counts"][index])
+        for space, about in self.spaces.items():
+            metric, width = metrics[f"{space}_frechet"], about["dim"]
+            metric.real_moments = tensor(f"moments.{space}", 1 + width + width**2)
+            values = tensor(f"features.{space}", len(rows), width)
+            metric.load_kept("real", rows, values)
+        stack = tensor("images", len(images), sensor.beams, sensor.columns)
+        metrics["matching"].load_kept("real", images, stack)
+        occupied = len(tensors.get(f"{index}.cells", ()))
+        cells = tensor("cells", occupied).long()
+        metrics["cells"].real_bins[cells] = tensor("cell_counts", occupied)
+        bins = metrics["ranges"].real_bins
+        metrics["ranges"].real_bins = tensor("ranges", 1, len(bins))[0]
 
-    def tensor(key: str, *shape: int) -> Tensor:
-        found = tensors.get(f"{index}.{key}")
-        if found is None or found.shape != shape:
-            given = "is missing" if found is None else f"has shape {tuple(found.shape)}"
-            raise ValueError(f"tensor {index}.{key} {given}, expected {shape}")
-        return found
 
-    chosen, sensor = card["chosen"][index], part.protocol.sensor
-    rows, images = chosen["rows"], chosen["images"]
-    part.count = card["counts"][index]
-    part.moments = {
-        space: Moments.unpack(tensor(f"moments.{space}", 1 + width + width**2))
-        for space, width in part.widths.items()
-    }
-    features = {s: tensor(f"features.{s}", len(rows), width) for s, width in part.widths.items()}
-    for row, (name, place) in enumerate(rows):
-        part.rows.offer(name, place, {space: values[row] for space, values in features.items()})
-    stack = tensor("images", len(images), sensor.beams, sensor.columns)
-    for row, (name, place) in enumerate(images):
-        part.images.offer(name, place, stack[row])
-    occupied = len(tensors.get(f"{index}.cells", ()))
-    part.cells[0, tensor("cells", occupied).long()] = tensor("cell_counts", occupied)
-    part.ranges = tensor("ranges", *part.ranges.shape)
+def complete_reference(
+    job: ReferenceStatistics,
+    scans_from: Callable[[int], Iterable[EvaluationScene]],
+    spaces: Sequence[SceneFeatures],
+    out: Path,
+    every: int = _EVERY,
+) -> ReferenceStatistics:
+    """Statistics of scans as a file; goes on where an interrupted call has stopped.
+
+    Args:
+        job: Empty statistics that were prepared for these scans and spaces.
+        scans_from: The scans from a number on, in the order of their names in ``job``.
+        spaces: Those of ``job``.
+        out: File to write; beside it lies ``<name>.partial.safetensors`` until it is complete.
+        every: Scans after which the unfinished file is saved; it also is on an interrupt.
+
+    Raises:
+        ValueError: If the unfinished file is of another job, another process computes ``out``, or
+            a scan cannot be used.
+    """
+    with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
+        partial = _partial(out)
+        for path in out.parent.glob(f".{escape(partial.stem)}.*.partial.*"):
+            path.unlink(missing_ok=True)  # of a killed call
+        statistics = resume_or_start(job, partial)
+        start, total = statistics.num_done, len(statistics.names)
+        scenes = tqdm(
+            scans_from(start), "reference", total, initial=start, unit="scan", disable=None
+        )
+        statistics.update(scenes, spaces, partial, every)
+        statistics.save(partial)
+        partial.replace(out)
+        return statistics
+
+
+def cached_reference(
+    job: ReferenceStatistics,
+    scans_from: Callable[[int], Iterable[EvaluationScene]],
+    spaces: Sequence[SceneFeatures],
+    out: Path,
+) -> ReferenceStatistics:
+    """The same, but read from ``out`` where that file is of the same job; replaced where not."""
+    for path in (out, _partial(out)):
+        try:
+            found = resume_or_start(job, path)
+        except ValueError as error:  # of other scans, spaces or settings, or damaged
+            _log.warning("made anew: %s", error)
+            path.unlink()
+        else:
+            if found.complete:
+                return found
+    return complete_reference(job, scans_from, spaces, out)
 
 
 def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
     """What an interrupted job has saved, or the empty statistics where there is nothing.
-
-    Args:
-        reference: Empty statistics of the job.
-        partial: Its file for partial results.
 
     Raises:
         ValueError: If the file is of another job.
@@ -303,9 +400,6 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
     The drive of a scan is what its name has before the last ``/``. Drives go to the smaller half,
     the largest first. A single drive, or one with over two thirds of all scans, is divided: its
     start makes one half, and its end goes to the other, so that both have equally many.
-
-    Args:
-        names: ``drive/frame`` of each scan.
     """
     drives: dict[str, list[str]] = {}
     for name in sorted(names):
@@ -325,3 +419,7 @@ def _kept_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
     """Scans that each half of so many keeps: half the limit, and what the other half lacks."""
     first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
     return first, min(sizes[1], limit - first)
+
+
+def _partial(out: Path) -> Path:
+    return out.with_name(f"{out.stem}.partial{out.suffix}")

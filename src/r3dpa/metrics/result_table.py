@@ -1,7 +1,7 @@
 """Several evaluations side by side, as text, Markdown, LaTeX and CSV.
 
 Evaluations are lines and metrics are columns. In every column the best value and the second best
-are marked; values that cannot be told apart share their mark (``MetricResult.ties_with``).
+are marked where they can be told from the others (``MetricResult.ties_with``).
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from r3dpa.io import atomic_path
-from r3dpa.metrics.results import Evaluation, MetricResult, printed
+from r3dpa.io import atomic_path, text_table
+from r3dpa.metrics.results import Evaluation, MetricResult, printed, published_evaluations
+from r3dpa.metrics.scene_features import SPACES
 
 _COMPARABLE = ("protocol", "reference", "backbones")
 _PAPER_ORDER = ("FRID", "FLD", "FSVD", "FPVD", "JSD", "MMD")
@@ -38,7 +39,7 @@ class Mark(NamedTuple):
 
     Args:
         place: 1 best, 2 second, 0 neither or not ranked.
-        tied: Whether other values that it cannot be told from have the same place.
+        tied: Whether it cannot be told from others that would have the same place.
     """
 
     place: int = 0
@@ -49,10 +50,10 @@ class Mark(NamedTuple):
 class EvaluationTable:
     """Evaluations beside each other; ``str`` gives the table for a terminal.
 
-    The best place goes to the best value and to all that tie with it, the second place to the best
-    of the others and to all others that tie with that one. A column with fewer than two ranked
-    values has no marks. Published numbers, which stand apart and have no intervals of their own,
-    are ranked only if asked for.
+    The best value and the second best are marked only where their intervals and floors tell them
+    from all that follow; values that tie for a place have an equals sign instead. A column with
+    fewer than two ranked values has no marks. Published numbers, which stand apart and have no
+    intervals of their own, are ranked only if asked for.
 
     Args:
         evaluations: At least one; labels differ, except that a published one may repeat a label.
@@ -107,11 +108,14 @@ class EvaluationTable:
         if len(left) < 2:
             return marks
         for place in (1, 2):
-            if left:
-                anchor = min(left.values(), key=_badness)
-                group = [name for name, result in left.items() if result.ties_with(anchor)]
-                marks |= dict.fromkeys(group, Mark(place, len(group) > 1))
-                left = {name: result for name, result in left.items() if name not in group}
+            anchor = min(left.values(), key=_badness)
+            group = [name for name, result in left.items() if result.ties_with(anchor)]
+            if len(group) > 1:
+                return marks | dict.fromkeys(group, Mark(0, True))
+            marks[group[0]] = Mark(place)
+            left.pop(group[0])
+            if not left:
+                break
         return marks
 
     def __str__(self) -> str:
@@ -120,19 +124,10 @@ class EvaluationTable:
         def cell(result: MetricResult, mark: Mark) -> str:
             return f"{' *+'[mark.place]}{'=' * mark.tied} {_value(result)}".strip()
 
-        heads = [result.name for result in self._heads]
         below = [f"{f'x1e{r.scale} ' * bool(r.scale)}{_kind(r)}" for r in self._heads]
-        groups = [[["", *heads], ["", *below]], *self._groups(cell)]
-        widths = [max(map(len, c)) for c in zip(*(row for g in groups for row in g), strict=True)]
-        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        lines = []
-        for group in groups:
-            for first, *cells in group:
-                aligned = [f"{c:>{width}}" for c, width in zip(cells, widths[1:], strict=True)]
-                lines.append("  ".join([f"{first:<{widths[0]}}", *aligned]).rstrip())
-            lines.append(rule)
-        legend = self._legend("* best, + second")
-        return "\n".join([*lines[:-1], "", *legend, *self.notes]) + "\n"
+        heads = ["", *(f"{r.name}\n{kind}" for r, kind in zip(self._heads, below, strict=True))]
+        table = text_table(self._lines(cell), heads, align="l" + "r" * len(below))
+        return "\n".join([table, "", *self._legend("* best, + second"), *self.notes]) + "\n"
 
     def markdown(self) -> str:
         """The table in Markdown: best bold, second underlined, ``=`` where tied."""
@@ -142,27 +137,20 @@ class EvaluationTable:
             value, _, interval = _value(result).partition(" ")
             return f"{wrap.format(value)}{'<sup>=</sup>' * mark.tied} {interval}".strip()
 
-        def line(cells: Iterable[str]) -> str:
-            return f"| {' | '.join(cells)} |"
-
         heads = [
             f"{_markdown(r.name)}{f' &times;10<sup>{r.scale}</sup>' * bool(r.scale)} ({_kind(r)})"
             for r in self._heads
         ]
-        rows = [
-            line([_markdown(first), *cells])
-            for group in self._groups(cell)
-            for first, *cells in group
-        ]
-        lines = [line(["", *heads]), line([":--", *["--:"] * len(heads)]), *rows, ""]
+        rows = [[_markdown(first), *cells] for first, *cells in self._lines(cell)]
+        table = text_table(rows, ["", *heads], "l" + "r" * len(heads), "pipe")
         below = [*self._legend("**best**, <u>second</u>"), *map(_markdown, self.notes)]
-        return "\n".join([*lines, *(f"- {text}" for text in below)]) + "\n"
+        return "\n".join([table, "", *(f"- {text}" for text in below)]) + "\n"
 
     def latex(self) -> str:
         r"""The table as a ``tabular`` of the package booktabs: best bold, second underlined.
 
-        Values that are tied have a small equals sign. Intervals are left out, as they make the
-        columns too wide for a page; they are in the other formats. Legend and notes are comments.
+        Intervals are left out, as they make the columns too wide for a page; they are in the other
+        formats. Legend and notes are comments.
         """
 
         def cell(result: MetricResult, mark: Mark) -> str:
@@ -180,8 +168,7 @@ class EvaluationTable:
             + f" {latex_text(r.unit)}" * bool(r.unit)
             for r in self._heads
         ]
-        groups = self._groups(cell)
-        body = [[line([latex_text(first), *cells]) for first, *cells in group] for group in groups]
+        body = [line([latex_text(first), *cells]) for first, *cells in self._lines(cell)]
         comments = [
             "needs the package booktabs",
             *self._legend("bold best, underlined second", False),
@@ -193,7 +180,8 @@ class EvaluationTable:
                 r"\toprule",
                 line(["Method", *names]),
                 line(["", *below]),
-                *(text for rows in body for text in (r"\midrule", *rows)),
+                r"\midrule",
+                *body,
                 r"\bottomrule",
                 r"\end{tabular}",
                 "",
@@ -279,28 +267,19 @@ class EvaluationTable:
             cells.append(" to ".join(texts))
         return cells
 
-    def _groups(self, cell: Callable[[MetricResult, Mark], str]) -> list[list[list[str]]]:
-        """Lines of cells: the published evaluations, the others, the floors; none is empty."""
+    def _lines(self, cell: Callable[[MetricResult, Mark], str]) -> list[list[str]]:
+        """Lines of cells: the published evaluations, the others, the floors."""
         marks = {metric: self.marks(metric) for metric in self.metrics}
-        groups = [
-            [
-                [
-                    _name(e),
-                    *(
-                        cell(result, marks[metric].get(_name(e), Mark()))
-                        if (result := e.row(metric))
-                        else "-"
-                        for metric in self.metrics
-                    ),
-                ]
-                for e in self.evaluations
-                if e.published is published
-            ]
-            for published in (True, False)
-        ]
+        lines = []
+        for e in sorted(self.evaluations, key=lambda e: not e.published):
+            cells = [_name(e)]
+            for metric in self.metrics:
+                result = e.row(metric)
+                mark = marks[metric].get(_name(e), Mark())
+                cells.append("-" if result is None else cell(result, mark))
+            lines.append(cells)
         floors = self._floors
-        last = [[_FLOOR, *(floor or "-" for floor in floors)]] if any(floors) else []
-        return [group for group in (*groups, last) if group]
+        return [*lines, [_FLOOR, *(floor or "-" for floor in floors)]] if any(floors) else lines
 
     def _legend(self, marks: str, intervals: bool = True) -> list[str]:
         """What the marks and brackets of this table mean."""
@@ -308,7 +287,9 @@ class EvaluationTable:
         results = [result for column in self._columns.values() for result in column.values()]
         lines = [f"{marks}, in each column"] if any(mark.place for mark in some) else []
         if any(mark.tied for mark in some):
-            lines.append("= tie: the values differ by no more than the floor or their intervals")
+            lines.append(
+                "= tie for the next place: they differ by no more than the floor or their intervals"
+            )
         if intervals and any(result.interval for result in results):
             lines.append("[low, high]: 95 % interval of the value at this number of scenes")
         published = {e.about["reference"]: None for e in self.evaluations if e.published}
@@ -346,3 +327,45 @@ def _kind(result: MetricResult) -> str:
 def _markdown(text: str) -> str:
     """A text on one line, without what Markdown would take for the end of a cell or for markup."""
     return "".join(f"\\{c}" if c in "\\|*_<>`" else c for c in " ".join(text.split()))
+
+
+def report(evaluation: Evaluation, split: str | None) -> str:
+    """All numbers of an evaluation, and below those that the paper has, beside the published.
+
+    Args:
+        evaluation: All numbers.
+        split: Of the reference, ``val`` for the published numbers of the validation drives.
+    """
+    text, table = str(evaluation), _beside_published(evaluation, split)
+    return text if table is None else f"{text}\n\n{table}"
+
+
+def save_reports(evaluation: Evaluation, split: str | None, out: Path) -> None:
+    """Writes the tables of an evaluation to a folder; files of these names are replaced.
+
+    ``evaluation.json`` and ``metrics.csv`` hold all rows; ``table.md`` and ``table.tex`` the
+    distances beside the published ones.
+
+    Args:
+        evaluation: All numbers.
+        split: As for :func:`report`.
+        out: Folder.
+    """
+    evaluation.save(out / "evaluation.json")
+    EvaluationTable((evaluation,)).save(out / "metrics.csv")
+    table = _beside_published(evaluation, split) or EvaluationTable((evaluation,))
+    table.save(out / "table.md")
+    table.save(out / "table.tex")
+
+
+def _beside_published(evaluation: Evaluation, split: str | None) -> EvaluationTable | None:
+    """Distances without relatives of theirs, below the published rows that have some of them."""
+    heads = {space.upper() for space in SPACES} | {"JSD", "MMD"}
+    own = replace(evaluation, rows=tuple(r for r in evaluation.rows if r.name in heads))
+    names = {row.name for row in own.rows}
+    others = [
+        replace(other, rows=tuple(row for row in other.rows if row.name in names))
+        for other in published_evaluations("val-only" if split == "val" else "train-val")
+    ]
+    others = [other for other in others if other.rows]
+    return EvaluationTable((*others, own)) if others else None

@@ -1,4 +1,4 @@
-"""What an evaluation found: numbers with how sure they are, and what one must know to repeat them.
+"""Results of an evaluation: numbers with intervals and floors, and where they come from.
 
 A value is kept as it was computed; a power of ten belongs to the printed column only, so that
 JSD = 0.0567 is stored and 5.67 is printed below 10^-2.
@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self, TypedDict, get_args
 
-from r3dpa.io import atomic_path
+from r3dpa.io import atomic_path, text_table
 
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
@@ -200,35 +200,36 @@ class Evaluation:
         return next((r for r in self.rows if r.name == name and r.value is not None), None)
 
     def __str__(self) -> str:
-        """The rows with interval, floor, counts and notes, and below what they are about.
+        """Verdict, rows with interval, floor, counts and notes, and where the numbers come from.
 
         Of many samples that were left out, the first are listed; the stored file has all.
         """
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
-        table = [heads, *map(_cells, self.rows)]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  ".join(
-                f"{cell:<{width}}" if left else f"{cell:>{width}}"
-                for cell, width, left in zip(cells, widths, (1, 0, 0, 0, 1, 0, 0, 1), strict=True)
-            ).rstrip()
-            for cells in table
+        table = text_table(map(_cells, self.rows), heads, align="lrrrlrrl")
+        extra = {**self.about["extra"]}
+        bad, head = (
+            extra.pop("bad_samples", []),
+            [extra.pop("verdict", ""), extra.pop("warning", "")],
+        )
+        head = [
+            f"{name}: {text}"
+            for name, text in zip(("verdict", "warning"), head, strict=True)
+            if text
         ]
-        bad = self.bad_samples
-        extra = {key: value for key, value in self.about["extra"].items() if key != "bad_samples"}
-        about = [
-            f"{key}: {value if isinstance(value, str) else json.dumps(value)}"
-            for key, value in {**self.about, "extra": extra}.items()
-            if value is not None and value != {}
+        about = {**self.about, "protocol": self.about["protocol"].get("name"), **extra}
+        lines = [
+            f"{key}: {value}"
+            for key, value in about.items()
+            if isinstance(value, str | int | float) and not isinstance(value, bool)
         ]
         if bad:
-            about += [
+            lines += [
                 f"samples that cannot be used and are left out: {len(bad)}",
                 *bad[:_SHOWN_BAD],
             ]
         if len(bad) > _SHOWN_BAD:
-            about.append(f"and {len(bad) - _SHOWN_BAD} more")
-        return "\n".join([self.label, "", *lines, "", *about])
+            lines.append(f"and {len(bad) - _SHOWN_BAD} more")
+        return "\n".join([self.label, *head, "", table, "", *lines])
 
     def save(self, path: str | Path) -> None:
         """Writes the evaluation as JSON."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -96,6 +97,36 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
         )
     points = points_of(range_m, projection, protocol.corner)
     return EvaluationScene(scene.name, points, range_m, intensity)
+
+
+def usable_scenes(
+    scenes: Iterable[EvaluationScene],
+    protocol: Protocol,
+    bad: list[str] | None = None,
+    advice: str = "",
+) -> Iterator[EvaluationScene]:
+    """Scenes through the sensor, as long as every metric can use them.
+
+    Args:
+        scenes: As files or a generator give them.
+        protocol: How they are prepared.
+        bad: Takes the messages of the scenes that are left out. Where None, the first one stops.
+        advice: Added to the message that stops.
+
+    Raises:
+        ValueError: As :func:`through_sensor`, or if nothing lies on the grid seen from above.
+    """
+    for scene in scenes:
+        try:
+            seen = through_sensor(scene, protocol)
+            assert seen.points is not None
+            protocol.grid.kept(seen.points, seen.name)
+        except ValueError as error:
+            if bad is None:
+                raise ValueError(f"{error}{advice}") from error
+            bad.append(str(error))
+        else:
+            yield seen
 
 
 def _finite(name: str, what: str, values: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part
+from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part, save
 from r3dpa.viz.scans import RANGE_MAP, range_image_picture, range_scale
 from r3dpa.viz.sheets import range_ticks
 
@@ -235,6 +236,37 @@ def matches_figure(
             aspect=12,
         )
     return figure
+
+
+def save_figures(
+    folder: Path,
+    *,
+    cells: tuple[Array, Array],
+    limits_m: tuple[tuple[float, float], tuple[float, float]],
+    edges_m: Array,
+    ranges: tuple[Array, Array],
+    halves: Array,
+    best: Sequence[tuple[str, Array, Array]],
+    worst: Sequence[tuple[str, Array, Array]],
+    sensor: LidarSensor,
+) -> None:
+    """Writes ``birds_eye.png``, ``ranges.png`` and ``matches.png`` of an evaluation.
+
+    Args:
+        folder: Where to.
+        cells: ``(X, Y)`` occupied cells of samples and of references.
+        limits_m: Of x and of y.
+        edges_m: Borders of the bins of ranges.
+        ranges: Returns by range of samples and of references.
+        halves: The same of parts of the references.
+        best: Fields of :class:`MatchedPair`, the best matches first.
+        worst: The same, the worst first.
+        sensor: Of the range images.
+    """
+    save(bev_histograms(*cells, *limits_m), folder / "birds_eye.png")
+    save(range_histogram(edges_m, *ranges, halves), folder / "ranges.png")
+    near, far = ([MatchedPair(*pair) for pair in part] for part in (best, worst))
+    save(matches_figure(near, far, sensor), folder / "matches.png")
 
 
 def _shares(counts: Array, name: str, axes: tuple[str, ...]) -> NDArray[np.float64]:

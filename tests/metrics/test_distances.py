@@ -1,0 +1,329 @@
+"""Metrics are what their functions are, in batches, merged, or in two uneven processes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.distributed as dist
+
+from r3dpa.geometry import LidarSensor, points_of
+from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.distances import (
+    BEVHistogramDistance,
+    MinimumMatchingDistance,
+    RangeHistogramDistance,
+)
+from r3dpa.metrics.feature_distances import (
+    FrechetDistance,
+    FrechetInfinity,
+    PolynomialMMD,
+    PrecisionRecall,
+    metrics_of,
+    scene_metrics,
+)
+from r3dpa.metrics.functional import (
+    Moments,
+    fd_infinity,
+    frechet_distance_of,
+    polynomial_mmd,
+    precision_recall,
+    wasserstein_1_of_values,
+)
+from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
+from r3dpa.metrics.protocol import DEFAULT
+
+PROTOCOL = replace(DEFAULT, sensor=LidarSensor(beams=8, columns=32), voxel_m=1.0)
+GRID = PROTOCOL.grid
+NAMES = ["bev", "ranges", "mmd", "frechet", "inf", "kid", "prdc"]
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def metric_of(name, **options):
+    if name == "bev":
+        return BEVHistogramDistance(GRID, **options)
+    if name == "ranges":
+        return RangeHistogramDistance(56.0, **options)
+    if name == "mmd":
+        return MinimumMatchingDistance(PROTOCOL, **options)
+    kinds = {
+        "frechet": FrechetDistance,
+        "inf": FrechetInfinity,
+        "kid": PolynomialMMD,
+        "prdc": PrecisionRecall,
+    }
+    return kinds[name](4, "X", **options)
+
+
+def images(real):
+    """Range images on whole and half decimetres, so that bins and values have one distance."""
+    count, seed = (7, 1) if real else (5, 2)
+    decimetres = torch.randint(
+        20, 480, (count, 8, 32), generator=torch.Generator().manual_seed(seed)
+    )
+    range_m = (decimetres + 0.5) / 10
+    range_m[:, 5, ::3] = -1
+    range_m[:, 0, 0] = 55.0  # straight back and up: beyond the grid
+    return range_m
+
+
+def clouds(real):
+    return [points_of(image, PROTOCOL.projection) for image in images(real)]
+
+
+def data(name, real):
+    if name in ("ranges", "mmd"):
+        return images(real)
+    if name == "bev":
+        return clouds(real)
+    return draw(23, 4) if real else draw(21, 4, seed=1) + 0.5
+
+
+def expected(name):
+    real, made = data(name, True), data(name, False)
+    generator = torch.Generator().manual_seed(0)
+    if name == "frechet":
+        return frechet_distance_of(real, made)
+    if name == "inf":
+        found = fd_infinity(real, made, generator)
+        return {"fd_infinity": found.value, "standard_error": found.standard_error}
+    if name == "kid":
+        mean, std = polynomial_mmd(real, made, generator, 100, 10)
+        return {"kid_mean": mean, "kid_std": std}
+    if name == "prdc":
+        return vars(precision_recall(real, made))
+    if name == "ranges":
+        return {"w1_m": wasserstein_1_of_values(real[real > 0], made[made > 0])}
+    if name == "bev":
+        return vars(histogram_distance(GRID.histogram(real), GRID.histogram(made)))
+    parts = [clouds(real) for real in (True, False)]
+    found = minimum_matching(*([GRID.cells(c) for c in part] for part in parts), GRID)
+    pairs = zip(parts[0], found.nearest, strict=True)
+    chamfer = torch.tensor([chamfer_squared(c, parts[1][i]) for c, i in pairs])
+    outside = [
+        sum(int((~GRID.inside(c)).sum()) for c in part) / sum(map(len, part)) for part in parts
+    ]
+    value = found.mmd_squared_normalised
+    return {
+        "mmd_squared_normalised": value,
+        "mmd_m2": value * 100**2,
+        "chamfer_m2": chamfer.double().mean().item(),
+        "real_outside_share": outside[0],
+        "generated_outside_share": outside[1],
+    }
+
+
+def computed(metric):
+    result = metric.compute()
+    return result.item() if isinstance(result, torch.Tensor) else result
+
+
+def updated(metric, name, part=slice(None), sides=(True, False)):
+    for real in sides:
+        metric.update(data(name, real)[part], real=real)
+    return metric
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_batches_give_what_the_function_gives(name):
+    metric = updated(updated(metric_of(name), name, slice(3)), name, slice(3, None))
+    assert computed(metric) == pytest.approx(expected(name), rel=1e-6)
+    metric.reset()
+    assert computed(updated(metric, name)) == pytest.approx(expected(name), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_merged_states_give_what_one_gives(name):
+    parts = [updated(metric_of(name), name, part) for part in (slice(2), slice(2, None))]
+    parts[1].merge_state(parts[0])  # torchmetrics puts what comes in first
+    assert computed(parts[1]) == pytest.approx(expected(name), rel=1e-6)
+    adopting = updated(metric_of(name), name, sides=(False,))
+    halves = [updated(metric_of(name), name, part, (True,)) for part in (slice(2), slice(2, None))]
+    adopting.adopt_real(*halves)
+    assert computed(adopting) == pytest.approx(expected(name), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_set_alone_is_refused(name):
+    metric = updated(metric_of(name), name, sides=(True,))
+    with pytest.raises(ValueError, match="generated"):
+        metric.compute()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_results_have_intervals_around_the_value(name):
+    options = {"num_groups": 5} if name in ("bev", "ranges") else {}
+    rows = updated(metric_of(name, **options), name).results(Resampling(num_resamples=60))
+    values = expected(name)
+    first = values if name == "frechet" else next(iter(values.values()))
+    assert rows[0].value == pytest.approx(first, rel=1e-6)
+    assert rows[0].interval[0] < rows[0].interval[1]
+    for row in rows:
+        assert row.interval[0] <= row.interval[1], row.name
+        assert (row.num_samples, row.num_references) == tuple(
+            len(data(name, real)) for real in (False, True)
+        )
+
+
+@pytest.mark.parametrize("name", ["mmd", "kid"])
+def test_kept_scenes_depend_on_names_alone(name):
+    """Those with the lowest hashes stay, whatever the order and the batches; values in order."""
+    values = images(True) if name == "mmd" else draw(7, 4)
+    values = values.repeat(30, *([1] * (values.ndim - 1))) + torch.arange(210.0).view(
+        -1, *([1] * (values.ndim - 1))
+    )
+    names = [f"drive/{i:03d}" for i in range(210)]
+    kept = []
+    for order in (torch.arange(210), torch.randperm(210, generator=torch.Generator())):
+        metric = metric_of(name, max_real=9)
+        for part in order.split(4):
+            metric.update(values[part], real=True, names=[names[i] for i in part])
+        places, stored = metric.kept("real")
+        assert len(places) == 9
+        assert (places.diff() > 0).all()
+        assert torch.equal(stored, values[order[places]])
+        assert metric.count("real") == 210
+        kept.append(set(order[places].tolist()))
+    assert kept[0] == kept[1]
+    assert kept[0] != set(range(9))
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (torch.zeros(0, 3), "real cloud 1 has no point"),
+        (torch.full((2, 3), torch.nan), "real cloud 1: 2 of 2 points"),
+        (torch.full((2, 3), 60.0), "real cloud 1: none of 2 points"),
+    ],
+)
+def test_a_refused_cloud_leaves_the_state(cloud, message):
+    metric = metric_of("bev")
+    with pytest.raises(ValueError, match=message):
+        metric.update([clouds(True)[0], cloud], real=True)
+    assert computed(updated(metric, "bev")) == pytest.approx(expected("bev"))
+
+
+def test_refused_features_leave_the_state():
+    metric, broken = FrechetDistance(3), draw(5, 3)
+    broken[4, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"generated features: 1 of 5 rows .* row 4"):
+        metric.update(broken, real=False)
+    with pytest.raises(ValueError, match=r"real features: expected \(N, 3\), got \(5, 4\)"):
+        metric.update(draw(5, 4), real=True)
+    assert not metric.generated_moments.any()
+    assert metric.count("generated") == len(metric.generated_values) == 0
+
+
+def test_reference_in_place_of_real_features():
+    real, generated = draw(50, 4), draw(40, 4, seed=1)
+    moments = Moments.of(real)
+    metric = FrechetDistance(4, reference=(moments.mean, moments.covariance()))
+    metric.update(generated, real=False)
+    expected = frechet_distance_of(real, generated)
+    assert metric.compute().item() == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(ValueError, match="beside a reference"):
+        metric.update(real, real=True)
+
+
+def frechet(num, real, generated, **options):
+    metric = FrechetDistance(num, **options)
+    metric.update(real, real=True)
+    metric.update(generated, real=False)
+    return metric
+
+
+def test_few_samples():
+    with pytest.raises(ValueError, match="generated: 6 samples for 6 features, at least 7"):
+        frechet(6, draw(20, 6), draw(6, 6)).compute()
+    few = {"allow_few_samples": True}
+    assert frechet(6, draw(3, 6), draw(6, 6, seed=1), **few).compute().isfinite()
+    with pytest.raises(ValueError, match=r"real: 1 samples .* at least 2"):
+        frechet(6, draw(1, 6), draw(6, 6), **few).compute()
+
+
+def stream_against_float64(num_samples, num_features):
+    """Mean 5 and deviation 0.02 break sums of squares in float32 (numerics: 53 % off)."""
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(num_features, generator=generator).abs() + 0.1
+    features = 5 + 0.02 * factor * torch.randn(num_samples, num_features, generator=generator)
+    metric = FrechetDistance(num_features)
+    for part in features.split(1000):
+        metric.update(part, real=True)
+        metric.update(part + 0.25, real=False)  # 0.25: sums with it are exact in float32
+    exact = features.double()
+    exact -= exact.mean(dim=0)
+    covariance = Moments.unpack(metric.real_moments).covariance()
+    expected = exact.T @ exact / (num_samples - 1)
+    assert (covariance - expected).abs().max() < 1e-6 * expected.abs().max()
+    return metric.compute().item()
+
+
+@pytest.mark.numerics
+def test_stream_of_float32():
+    assert stream_against_float64(4000, 48) == pytest.approx(48 * 0.25**2, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.numerics
+def test_stream_of_float32_full_size():
+    assert stream_against_float64(80_000, 768) == pytest.approx(768 * 0.25**2, rel=1e-6)
+
+
+def run_process(rank, folder):
+    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    results = {}
+    for name in NAMES:
+        part = slice(2) if rank == 0 else slice(2, None)
+        metric = updated(metric_of(name), name, part)
+        results[name] = computed(metric)
+        # After compute, its own part again.
+        assert metric.count("real") == len(data(name, True)[part])
+        alone = metric_of(name) if rank == 0 else updated(metric_of(name), name)
+        results[f"{name}, one without scenes"] = computed(alone)
+    torch.save(results, f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
+
+
+@pytest.mark.ddp
+@pytest.mark.filterwarnings("ignore:The ``compute`` method")
+def test_two_processes_are_one(tmp_path):
+    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
+    for rank in range(2):
+        results = torch.load(tmp_path / f"{rank}.pt")
+        assert len(results) == 2 * len(NAMES)
+        for name, result in results.items():
+            wanted = expected(name.partition(",")[0])
+            assert result == pytest.approx(wanted, rel=1e-6), name
+
+
+def test_metrics_of_a_space_share_one_state():
+    metrics = scene_metrics(PROTOCOL, {"x": ("X", 4)})
+    for real in (True, False):
+        metrics.update(
+            clouds=clouds(real),
+            range_m=images(real),
+            features={"x": data("kid", real)[: len(images(real))]},
+            names=[str(i) for i in range(len(images(real)))],
+            real=real,
+        )
+    found = metrics_of(metrics)
+    assert list(found) == ["cells", "ranges", "matching", "x_frechet", "x_inf", "x_kid", "x_shares"]
+    assert found["x_kid"].real_moments is found["x_frechet"].real_moments
+    assert found["x_shares"].count("real") == 7
+    assert computed(found["cells"]) == pytest.approx(expected("bev"))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("name", NAMES)
+def test_on_a_gpu(name):
+    metric = metric_of(name).cuda()
+    for real in (True, False):
+        samples = data(name, real)
+        on_gpu = [s.cuda() for s in samples] if isinstance(samples, list) else samples.cuda()
+        metric.update(on_gpu, real=real)
+    assert computed(metric) == pytest.approx(expected(name), rel=1e-6)
