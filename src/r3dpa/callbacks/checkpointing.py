@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_info
 
 from r3dpa.io import atomic_path
-from r3dpa.modules.guards import StepGuard
+from r3dpa.callbacks.step_guard import StepGuard
 
 __all__ = ["AtomicCheckpointIO", "RunCheckpoint"]
 
@@ -100,12 +100,10 @@ class RunCheckpoint(ModelCheckpoint):
 
                 signal.signal(number, stop)
 
-    def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
-    ) -> None:
-        """Has the guard of the step tell the other processes who asked to stop: no talk more."""
-        guard = getattr(pl_module, "guard", None)
-        if isinstance(guard, StepGuard):
+    def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Sends the stop signal with the guard's all-reduce."""
+        guard = _guard(trainer)
+        if guard is not None:
             guard.stop = self._signal
 
     def on_train_batch_end(
@@ -140,10 +138,10 @@ class RunCheckpoint(ModelCheckpoint):
 
     def _asked(self, trainer: L.Trainer) -> int:
         """Signal that asked any process to stop, 0 for none; the same answer in all of them."""
-        guard = getattr(trainer.lightning_module, "guard", None)
+        guard = _guard(trainer)
         if trainer.world_size == 1:
             return self._signal
-        if isinstance(guard, StepGuard):
+        if guard is not None:
             return guard.stop
         asked = torch.tensor(self._signal, device=trainer.strategy.root_device)
         return int(trainer.strategy.reduce(asked, reduce_op="max"))
@@ -180,3 +178,8 @@ class RunCheckpoint(ModelCheckpoint):
             self._should_skip_saving_checkpoint(trainer)
         ):
             self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
+
+
+def _guard(trainer: L.Trainer) -> StepGuard | None:
+    callbacks = cast(Any, trainer).callbacks
+    return next((one for one in callbacks if isinstance(one, StepGuard)), None)

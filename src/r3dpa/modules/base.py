@@ -1,8 +1,7 @@
-"""What the three training modules share: settings, start of a stage, checkpoints."""
+"""Base of the three training modules: start of a stage, optimisation, evaluation, checkpoints."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Literal, cast
@@ -10,36 +9,38 @@ from typing import Any, Literal, cast
 import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info
+from torch import Tensor, nn
 
-from r3dpa.checkpoints import (
-    load_into,
-    read_checkpoint,
-    transfer_rgb,
-)
+from r3dpa import losses
+from r3dpa.checkpoints import load_into, read_checkpoint, transfer_rgb
 from r3dpa.data.augmentation import Augmentation
-from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
 from r3dpa.geometry import ScanGeometry
-from r3dpa.modules.evaluation import Evaluation
-from r3dpa.modules.guards import StepGuard
-from r3dpa.modules.optimisation import GuardedOptimisation
-from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig, PathName, TimeSampling
-from r3dpa.modules.step_losses import PathDraws, frozen
-from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, SiT, VelocityNetwork
+from r3dpa.modules import steps
+from r3dpa.modules.checks import (
+    check_features,
+    check_geometry,
+    check_sizes,
+    check_trainer,
+    geometry_of,
+)
+from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
+from r3dpa.modules.steps import PathDraws, frozen
+from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
 
 __all__ = ["GenerativeModule", "PathDraws", "frozen"]
 
-_GUARDS = GuardConfig()
 
-
-class GenerativeModule(Evaluation, GuardedOptimisation):
+class GenerativeModule(L.LightningModule):
     """Base of the training modules.
 
-    A subclass names its stage, lists its networks in :meth:`trainable` and adds up the losses of a
-    step in :meth:`step_losses`. All losses of a step come from the same forward values, so one
-    optimiser with a parameter group per network and one backward pass equal the official three
-    optimisers stepped in turn; ``accumulate_grad_batches``, ``gradient_clip_val`` (per network),
-    plain ``ddp`` and ``global_step`` keep their usual meaning.
+    A subclass names its stage, lists its networks in :meth:`trainable` and has its own
+    ``training_step``. All losses of a step come from the same forward values, so one optimiser with
+    a parameter group per network and one backward pass equal the official three optimisers stepped
+    in turn; ``accumulate_grad_batches``, ``gradient_clip_val`` (per network), plain ``ddp`` and
+    ``global_step`` keep their usual meaning. Steps that are not finite are skipped by the callback
+    :class:`r3dpa.callbacks.StepGuard`.
 
     Random numbers of a step are a function of ``(seed, batch, sample)`` alone: they do not depend
     on the number of processes and need no state for an exact resume.
@@ -61,8 +62,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             random values.
         keep_projector: Keep the RGB model's projection head where its shape fits.
         seed: Key of the training draws.
-        guards: When a step is dropped, and when training stops; None trains without: the first
-            non-finite gradient then breaks the weights.
+        guards: Ignored; given by configurations and checkpoints of earlier versions.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
         compile: Compile the networks for training with ``torch.compile``: VAE, discriminator and
@@ -70,10 +70,9 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             names.
     """
 
-    replayed = True
+    stage: str
     default_init: tuple[str, ...] = ()
     trains_velocity: bool = True
-    data_class: type[L.LightningDataModule] = LidarDataModule  # that it works with, see StageCLI
 
     def __init__(
         self,
@@ -92,17 +91,12 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         rgb_weights: str | None = None,
         keep_projector: bool = False,
         seed: int = 0,
-        guards: GuardConfig | None = _GUARDS,
+        guards: Any = None,
         channels_last: bool = False,
         compile: bool = False,
     ) -> None:
         super().__init__()
-        with warnings.catch_warnings():
-            # Lightning advises to leave networks out. Kept, they are class paths in a checkpoint of
-            # the CLI, from which the networks are rebuilt.
-            warnings.filterwarnings(
-                "ignore", message="Attribute '.*' is an instance of `nn.Module`"
-            )
+        with steps.networks_as_settings():
             self.save_hyperparameters()
         self.vae = vae
         self.sit = sit
@@ -117,7 +111,6 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.rgb_weights = rgb_weights
         self.keep_projector = keep_projector
         self.seed = seed
-        self.guard = None if guards is None else StepGuard(guards)
         self.channels_last = channels_last
         self.compiles = compile
         self.ema: EMA | None = None
@@ -127,6 +120,8 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         self.augmentation: Augmentation | None = None
         self.loaded_step = 0
         self.feature_source: str | None = None
+        self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
+        self.step_skipped = False  # set by StepGuard
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
 
@@ -150,25 +145,33 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
                 cast(Any, network).to(memory_format=format_)  # not in torch's own stubs
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks."""
+        """Checks trainer and data against the networks.
+
+        The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches and has a
+        ``geometry`` after its own setup; of other attributes of
+        :class:`r3dpa.data.LidarDataModule` those that it has are used.
+
+        Raises:
+            ValueError: If they do not fit, saying what to change.
+        """
+        check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
-        if not isinstance(datamodule, LidarDataModule):
-            raise ValueError(
-                f"{type(self).__name__} needs a LidarDataModule, got {type(datamodule).__name__}"
-            )
-        self.geometry, self.augmentation = datamodule.geometry, datamodule.augmentation
-        self._check_sizes(self.geometry)
+        geometry = geometry_of(datamodule, self)
+        self.geometry = geometry
+        self.augmentation = getattr(datamodule, "augmentation", None)
+        check_sizes(self.vae, self.sit, geometry)
         if stage != "predict":
-            self.feature_source = datamodule.feature_source
-        if self.needs_features() and stage != "predict":
-            self._check_features(self.geometry, datamodule)
+            self.feature_source = getattr(datamodule, "feature_source", None)
+            if self.needs_features():
+                check_features(self.sit, geometry, datamodule, self.stage)
 
     def on_fit_start(self) -> None:
         """Loads the stage before, unless this run goes on from a checkpoint of its own."""
         if not self._has_weights:
             self.load_previous_stage()
         if self._previous_geometry is not None:
-            self._check_geometry(self._previous_geometry, str(self.init_from))
+            there = ScanGeometry.from_dict(dict(self._previous_geometry))
+            check_geometry(there, self.scan_geometry, str(self.init_from))
 
     def load_previous_stage(self) -> None:
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
@@ -201,55 +204,209 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
             self.ema.reset(self.sit, self.latent_norm)
         self._has_weights = True
 
-    def _check_geometry(self, stored: Mapping[str, Any], source: str) -> None:
-        """Refuses weights that were trained on other range images than this run's."""
-        there, here = ScanGeometry.from_dict(dict(stored)), self.scan_geometry
-        parts = {
-            "projection": (there.projection, here.projection),
-            "codec": (there.codec, here.codec),
-        }
-        different = [
-            f"{name} {theirs} there, {ours} here"
-            for name, (theirs, ours) in parts.items()
-            if theirs != ours
-        ]
-        if different:
-            raise ValueError(
-                f"{source} was trained on other range images: {'; '.join(different)}. Set sensor, "
-                "projection and codec of the data module to those of the checkpoint"
-            )
+    # Training
 
-    def _check_sizes(self, geometry: ScanGeometry) -> None:
-        if self.sit.in_channels != self.vae.latent_channels:
-            raise ValueError(
-                f"sit.in_channels is {self.sit.in_channels}, but the VAE has "
-                f"{self.vae.latent_channels} latent channels; give both the same number"
-            )
-        sensor = geometry.projection.sensor
-        image_size = (sensor.beams, sensor.columns)
-        latent_size = self.vae.latent_size(image_size)
-        if tuple(latent_size) != tuple(self.sit.input_size):
-            raise ValueError(
-                f"a {image_size} range image gives {latent_size} latents, but sit.input_size is "
-                f"{tuple(self.sit.input_size)}; set sit.input_size to {latent_size}"
-            )
+    def trainable(self) -> dict[str, nn.Module]:
+        """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
+        raise NotImplementedError
 
-    def _check_features(self, geometry: ScanGeometry, datamodule: LidarDataModule) -> None:
-        if datamodule.features_dir is None:
+    def needs_features(self) -> bool:
+        """Whether a training batch must hold feature grids."""
+        return self.weights.vae_alignment != 0 or self.weights.sit_alignment != 0
+
+    def draw_path(
+        self, num_scans: int, batch_number: int | None = None, stream: int = 0
+    ) -> PathDraws:
+        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`.
+
+        Args:
+            num_scans: Scans B of the batch on this process.
+            batch_number: Number of the batch; None is the training batch at hand.
+            stream: Separates training (0) from evaluation draws.
+        """
+        number = steps.batch_number(self) if batch_number is None else batch_number
+        shape = (self.vae.latent_channels, *self.sit.input_size)
+        return steps.draw_path(
+            self, num_scans, shape, self.seed, number, self.time_sampling, stream
+        )
+
+    def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
+        """Sum of weighted losses, logged as ``train/loss``; see :func:`steps.weigh_and_log`."""
+        return steps.weigh_and_log(self, parts, self.weights)
+
+    def vae_losses(
+        self, image: Tensor, posterior: Posterior, reconstruction: Tensor
+    ) -> dict[str, Tensor]:
+        """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
+        weights, parts = self.weights, {}
+        if weights.reconstruction != 0:
+            error = losses.reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
+            parts["reconstruction"] = weights.reconstruction * error
+        if weights.kl != 0:
+            parts["kl"] = weights.kl * posterior.kl().mean()
+        if self.discriminator is not None and weights.adversarial != 0 and self._adversarial:
+            with frozen(self.discriminator):
+                logits = self.discriminator(reconstruction)
+            parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
+        if not parts.keys() & {"reconstruction", "adversarial"}:
+            parts["reconstruction"] = steps.zero_loss(self.vae)
+        return parts
+
+    @property
+    def _adversarial(self) -> bool:
+        """Whether the adversarial losses count yet."""
+        return self.global_step >= self.weights.adversarial_start
+
+    def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
+        """Hinge loss on scans and detached reconstructions; a plain 0 before its start."""
+        if self.discriminator is None:
+            return {}
+        if self.weights.discriminator == 0 or not self._adversarial:
+            return {"discriminator": steps.zero_loss(self.discriminator)}
+        real = self.discriminator(image)
+        fake = self.discriminator(reconstruction.detach())
+        loss = losses.discriminator_loss(real, fake)
+        return {"discriminator": self.weights.discriminator * loss}
+
+    def vae_alignment_losses(
+        self, latents: Tensor, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        """lambda1 L_align with running latent statistics: the gradient reaches the encoder."""
+        if self.weights.vae_alignment == 0:
+            return {}
+        normalised = self.latent_norm.normalise(latents)
+        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
+        projected = self.sit.project_features(noisy, draws.time)
+        return {"vae_alignment": self.weights.vae_alignment * self.align(projected, features)}
+
+    def flow_losses(
+        self, normalised: Tensor, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        """L_denoise + lambda2 L_align on normalised latents without gradient."""
+        weights = self.weights
+        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
+        velocity, projected = steps.predict(
+            self.sit, noisy, draws.time, weights.denoising != 0, weights.sit_alignment != 0
+        )
+        parts = {}
+        if velocity is None:
+            parts["denoising"] = steps.zero_loss(self.sit)
+        else:
+            target = self.interpolant.target(normalised, draws.noise, draws.time)
+            error = losses.flow_matching_loss(velocity, target).mean()
+            parts["denoising"] = weights.denoising * error
+        if projected is not None:
+            parts["sit_alignment"] = weights.sit_alignment * self.align(projected, features)
+        return parts
+
+    def align(self, projected: Tensor, features: Tensor | None) -> Tensor:
+        """L_align of projected tokens and feature grids, both ``(B, N, D)``."""
+        if features is None:
             raise ValueError(
-                f"stage {self.stage} aligns with 3D features, but the data module has none; give "
-                "it an extractor or features_dir, or set the alignment weights to 0"
+                f"stage {self.stage} aligns with 3D features, but the batch holds no feature_grid"
             )
-        if tuple(geometry.grid_size) != tuple(self.sit.grid_size):
-            raise ValueError(
-                f"feature grids are {geometry.grid_size}, but the {type(self.sit).__name__} has "
-                f"{tuple(self.sit.grid_size)} tokens; set data.grid_size to the latter"
-            )
-        if datamodule.feature_dim != self.sit.feature_dim:
-            raise ValueError(
-                f"features have width {datamodule.feature_dim}, but sit.feature_dim is "
-                f"{self.sit.feature_dim}; set it to the former"
-            )
+        return losses.alignment_loss(
+            projected, features, skip_empty_cells=self.weights.skip_empty_cells
+        ).mean()
+
+    # Optimisation
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One AdamW with a parameter group per trained network."""
+        return steps.adamw(self, self.trainable(), self.optimizer_config)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``."""
+        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Steps the optimiser, then the averages, unless the step was skipped."""
+        super().optimizer_step(*args, **kwargs)
+        if self.ema is not None and not self.step_skipped:
+            self.ema.update(self.sit, self.latent_norm)
+
+    def on_train_start(self) -> None:
+        """Fits the state of a resumed optimiser to this run."""
+        steps.fit_optimizer(self)
+
+    # Evaluation
+
+    @property
+    def scan_geometry(self) -> ScanGeometry:
+        """Geometry of the scans it trains on, known from setup or from a checkpoint."""
+        if self.geometry is None:
+            raise RuntimeError("the module has no scan geometry yet: set it up with a data module")
+        return self.geometry
+
+    def reconstruct(self, image: Tensor) -> Tensor:
+        """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
+        return self.vae.decode(self.vae.encode(image).mean)
+
+    def evaluate(self, batch: LidarBatch, batch_idx: int, prefix: str) -> None:
+        """Logs the losses on held-out scans, and the reconstruction error in metres.
+
+        The error is the mean over all pixels with a return, the losses are means over the scans.
+        The SiT is the averaged one where the stage has an average.
+        """
+        image, mask = batch["range_image"], batch["valid_mask"]
+        codec = self.scan_geometry.codec
+        draws = self.draw_path(len(image), batch_idx, stream=1)
+        posterior = self.vae.encode(image)
+        reconstruction = self.vae.decode(posterior.mean)
+        error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
+        norm = self.weights.reconstruction_norm
+        values = {"reconstruction": losses.reconstruction_loss(reconstruction, image, norm)}
+        if self.trains_velocity or self.needs_features():
+            values |= self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
+        self.log_dict(
+            {f"{prefix}/{name}": value for name, value in values.items()},
+            batch_size=len(image),
+            sync_dist=True,
+        )
+        # Weighted by pixels: the mean must not depend on how scans were put into batches.
+        num_returns = int(mask.sum())
+        self.log(
+            f"{prefix}/range_error_m",
+            error_m[mask].sum() / max(1, num_returns),
+            batch_size=num_returns,
+            sync_dist=True,
+        )
+
+    def _evaluate_flow(
+        self, posterior: Posterior, features: Tensor | None, draws: PathDraws
+    ) -> dict[str, Tensor]:
+        networks = self if self.ema is None else self.ema
+        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
+        velocity, projected = steps.predict(
+            networks.sit, noisy, draws.time, self.trains_velocity, self.needs_features()
+        )
+        values = {}
+        if velocity is not None:
+            target = self.interpolant.target(latents, draws.noise, draws.time)
+            values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
+        if projected is not None:
+            values["alignment"] = self.align(projected, features)
+        return values
+
+    def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
+        """Evaluates a batch of the validation split under ``val/``."""
+        self.evaluate(batch, batch_idx, "val")
+
+    def test_step(self, batch: LidarBatch, batch_idx: int) -> None:
+        """Evaluates a batch of the test split under ``test/``."""
+        self.evaluate(batch, batch_idx, "test")
+
+    def predict_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""
+        geometry = self.scan_geometry
+        image = self.reconstruct(batch["range_image"])
+        return geometry.codec.decode(image[:, 0], geometry.projection.sensor)
 
     # Checkpoints
 
@@ -260,7 +417,7 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         """
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
-        super().on_save_checkpoint(checkpoint)
+        steps.describe_stage(checkpoint, self.stage, self.interpolant.path)
         checkpoint["r3dpa"] |= {
             "geometry": self.scan_geometry.to_dict(),
             "augmentation": None if self.augmentation is None else asdict(self.augmentation),
@@ -275,9 +432,9 @@ class GenerativeModule(Evaluation, GuardedOptimisation):
         """
         self.loaded_step = checkpoint.get("global_step", 0)
         self._has_weights = True
-        super().on_load_checkpoint(checkpoint)
-        stored = checkpoint["r3dpa"]["geometry"]
+        steps.check_stage(checkpoint, self.stage, self.optimizer_config)
+        there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
         if self.geometry is None:
-            self.geometry = ScanGeometry.from_dict(stored)
+            self.geometry = there
         else:
-            self._check_geometry(stored, "the checkpoint")
+            check_geometry(there, self.geometry, "the checkpoint")

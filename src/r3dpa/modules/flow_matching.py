@@ -15,7 +15,6 @@ from r3dpa.data.store import CachedTensors
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
-from r3dpa.modules.step_losses import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
 __all__ = ["FlowMatching"]
@@ -76,9 +75,20 @@ class FlowMatching(GenerativeModule):
             )
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks, and cached latents against the augmentation."""
+        """Checks data against networks, and cached latents against the data module.
+
+        Raises:
+            ValueError: If the posteriors of its scans cannot be cached.
+        """
         super().setup(stage)
-        if self.cache_latents and stage == "fit" and self.augmentation is not None:
+        if not self.cache_latents or stage != "fit":
+            return
+        if not isinstance(self._datamodule, LidarDataModule):
+            raise ValueError(
+                "model.init_args.cache_latents needs a r3dpa.data.LidarDataModule, got "
+                f"{type(self._datamodule).__name__}; set it to false"
+            )
+        if self.augmentation is not None:
             self.augmentation.check_latents(self.sit.input_size[1], self._datamodule.grid_size[1])
 
     def on_fit_start(self) -> None:
@@ -128,13 +138,15 @@ class FlowMatching(GenerativeModule):
         """The SiT alone."""
         return {"sit": self.sit}
 
-    def step_losses(self, batch: LidarBatch | LatentBatch, draws: PathDraws) -> dict[str, Tensor]:
-        """Losses of range images or posteriors, and feature grids ``(B, N, D)``."""
+    def training_step(self, batch: LidarBatch | LatentBatch, batch_idx: int) -> Tensor:
+        """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
         with torch.no_grad():
             if "posterior_moments" in batch:
                 posterior = Posterior(cast(LatentBatch, batch)["posterior_moments"])
             else:
                 posterior = self.vae.encode(cast(LidarBatch, batch)["range_image"])
+            draws = self.draw_path(len(posterior.mean))
             latents = posterior.sample(draws.posterior_noise)
             normalised = self.latent_norm.normalise(latents)
-        return self.flow_losses(normalised, batch.get("feature_grid"), draws)
+
+        return self.weigh_and_log(self.flow_losses(normalised, batch.get("feature_grid"), draws))

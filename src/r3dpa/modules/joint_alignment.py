@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.step_losses import PathDraws, frozen
+from r3dpa.modules.steps import frozen
 from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 
 __all__ = ["JointAlignment"]
@@ -47,15 +47,18 @@ class JointAlignment(GenerativeModule):
             "sit": self.sit,
         }
 
-    def step_losses(self, batch: LidarBatch, draws: PathDraws) -> dict[str, Tensor]:
-        """Losses of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """One step on range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
+        draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
         reconstruction = self.vae.decode(latents)
+
         losses = self.vae_losses(image, posterior, reconstruction)
         with frozen(self.sit):
             losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, reconstruction)
         normalised = self.latent_norm.update(latents.detach())
-        return losses | self.flow_losses(normalised, features, draws)
+        losses |= self.flow_losses(normalised, features, draws)
+        return self.weigh_and_log(losses)

@@ -5,22 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
+import lightning as L
 import torch
 from torch import Tensor, nn
 
-from r3dpa import losses
 from r3dpa.checkpoints import load_into, read_checkpoint
+from r3dpa.data import ImageDataModule
 from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry, latent_statistics
 from r3dpa.data.store import CachedTensors
+from r3dpa.flow import Interpolant
+from r3dpa.losses import alignment_loss, flow_matching_loss
+from r3dpa.modules import steps
+from r3dpa.modules.checks import check_trainer, image_datamodule
 from r3dpa.modules.encoding import encoded_once
-from r3dpa.modules.image_stage import ImageStage
-from r3dpa.modules.settings import GuardConfig, LossWeights, OptimizerConfig, TimeSampling
-from r3dpa.modules.step_losses import PathDraws
+from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
 
 __all__ = ["ImageTeacher", "RGBPretraining"]
-
-_GUARDS = GuardConfig()
 
 
 class ImageTeacher(Protocol):
@@ -44,7 +45,7 @@ class ImageTeacher(Protocol):
         ...
 
 
-class RGBPretraining(ImageStage):
+class RGBPretraining(L.LightningModule):
     """Stage 0: unconditional SiT on image latents, by L_denoise (+ lambda L_align).
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
@@ -71,14 +72,14 @@ class RGBPretraining(ImageStage):
         latents_dir: Folder of the encoded images, which runs may share: 33 kB each at 4 x 32 x 32;
             ``<run_dir>/latents`` where None.
         seed: Key of the training draws.
-        guards: When a step is dropped, and when training stops; None trains without.
+        guards: Ignored; given by configurations and checkpoints of earlier versions.
 
     Raises:
         ValueError: If networks, teacher and weights do not belong together.
     """
 
     stage = "rgb_pretraining"
-    ema: EMA
+    data_class = ImageDataModule
 
     def __init__(
         self,
@@ -93,9 +94,11 @@ class RGBPretraining(ImageStage):
         ema_buffers: Literal["copy", "decay"] = "copy",
         latents_dir: str | None = None,
         seed: int = 0,
-        guards: GuardConfig | None = _GUARDS,
+        guards: Any = None,
     ) -> None:
-        super().__init__(vae, weights, optimizer, time_sampling, seed, guards)
+        super().__init__()
+        with steps.networks_as_settings():
+            self.save_hyperparameters()
         if (teacher is None) != (weights.sit_alignment == 0):
             raise ValueError(
                 "teacher and weights.sit_alignment go together: give a teacher and a weight above "
@@ -112,7 +115,10 @@ class RGBPretraining(ImageStage):
                 f"sit.feature_dim is {sit.feature_dim}, but the teacher's features have width "
                 f"{cast(ImageTeacher, teacher).dim}; set the former to the latter"
             )
-        self.sit = sit
+        self.vae, self.sit = vae, sit
+        self.weights, self.optimizer_config = weights, optimizer
+        self.time_sampling, self.seed = time_sampling, seed
+        self.interpolant = Interpolant("linear")
         self.latent_norm = LatentNorm(vae.latent_channels)
         self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.vae.requires_grad_(False)
@@ -120,24 +126,32 @@ class RGBPretraining(ImageStage):
         # In a tuple, so that checkpoints do not hold weights that never change.
         self._teacher = () if teacher is None else (teacher.eval().requires_grad_(False),)
         self.init_from, self.latents_dir = init_from, latents_dir
+        self.step_skipped = False  # set by StepGuard
+        self._resumed = False
+
+    @property
+    def _datamodule(self) -> ImageDataModule:
+        return image_datamodule(self, self.vae)
 
     def setup(self, stage: str) -> None:
         """Checks data against networks.
 
         Raises:
-            ValueError: As :class:`ImageStage`, if the latents have another size than the SiT's, or
-                if the teacher of a fit has random weights.
+            ValueError: If there are no images, their latents have another size than the SiT's, or
+                the teacher of a fit has random weights.
         """
-        super().setup(stage)
+        check_trainer(self.trainer)
+        size = self._datamodule.image_size
+        latent_size = self.vae.latent_size((size, size))
         if stage == "fit" and not all(cast(ImageTeacher, one).trained for one in self._teacher):
             raise ValueError(
                 "the teacher has random weights: give model.init_args.teacher.init_args.weights "
                 "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "
                 "(model.init_args.teacher null, model.init_args.weights.sit_alignment 0)"
             )
-        if self.latent_size != tuple(self.sit.input_size):
+        if latent_size != tuple(self.sit.input_size):
             raise ValueError(
-                f"images of {self.datamodule.image_size} pixels give {self.latent_size} latents, "
+                f"images of {size} pixels give {latent_size} latents, "
                 f"but sit.input_size is {tuple(self.sit.input_size)}; set it to the former"
             )
 
@@ -147,7 +161,7 @@ class RGBPretraining(ImageStage):
         Raises:
             ValueError: If there is no trained VAE.
         """
-        if not self.resumed:
+        if not self._resumed:
             if self.init_from is None:
                 raise ValueError(
                     "stage rgb_pretraining trains on the latents of a trained image VAE: give "
@@ -156,8 +170,8 @@ class RGBPretraining(ImageStage):
                 )
             load_into({"vae": self.vae}, read_checkpoint(self.init_from), stage=self.stage)
         posteriors = self._encoded()
-        self.datamodule.use_posteriors(posteriors, with_images=bool(self._teacher))
-        if not self.resumed:
+        self._datamodule.use_posteriors(posteriors, with_images=bool(self._teacher))
+        if not self._resumed:
             mean, variance = latent_statistics(posteriors)
             self.latent_norm.running_mean.copy_(mean)
             self.latent_norm.running_var.copy_(variance)
@@ -169,7 +183,7 @@ class RGBPretraining(ImageStage):
 
         A ``fast_dev_run`` makes those of its batches alone.
         """
-        trainer, datamodule = self.trainer, self.datamodule
+        trainer, datamodule = self.trainer, self._datamodule
         entries = cast(ImageDataset, datamodule.train_set).entries
         if cast(Any, trainer).fast_dev_run:
             batches = int(trainer.limit_train_batches)
@@ -179,22 +193,29 @@ class RGBPretraining(ImageStage):
             self.vae,
             Path(self.latents_dir or Path(trainer.default_root_dir) / "latents"),
             {"images": datamodule.settings},
-            (2 * self.vae.latent_channels, *self.latent_size),
+            (2 * self.vae.latent_channels, *self.sit.input_size),
             entries,
             lambda some: ImageDataset(datamodule.source, some, datamodule.image_size),
             "image",
             shared=True,
         )
 
-    def trainable(self) -> dict[str, nn.Module]:
-        """The SiT alone."""
-        return {"sit": self.sit}
-
-    def step_losses(self, batch: ImageBatch, draws: PathDraws) -> dict[str, Tensor]:
-        """Losses of posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
-        posterior = Posterior(batch["posterior_moments"])
+    def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
+        """One step on posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
+        posterior, weights = Posterior(batch["posterior_moments"]), self.weights
+        draws = self._draws(len(posterior.mean), steps.batch_number(self))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        return self.flow_losses(normalised, self._features(batch), draws)
+        denoising, alignment = self._losses(self.sit, normalised, draws, self._features(batch))
+        losses = {"denoising": weights.denoising * denoising}
+        if alignment is not None:
+            losses["sit_alignment"] = weights.sit_alignment * alignment
+        return steps.weigh_and_log(self, losses, weights)
+
+    def _draws(self, num_images: int, batch_number: int, stream: int = 0) -> steps.PathDraws:
+        shape = (self.vae.latent_channels, *self.sit.input_size)
+        return steps.draw_path(
+            self, num_images, shape, self.seed, batch_number, self.time_sampling, stream
+        )
 
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:
@@ -204,19 +225,68 @@ class RGBPretraining(ImageStage):
             return teacher.to(image.device)(image, self.sit.grid_size)
         return None
 
-    def evaluate(self, batch: ImageBatch, batch_idx: int) -> dict[str, Tensor]:
-        """Losses of the averaged SiT on held-out images."""
-        draws = self.draw_path(len(batch["index"]), batch_idx, stream=1)
+    def _losses(
+        self, sit: SiT, normalised: Tensor, draws: steps.PathDraws, features: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """L_denoise and, with features, L_align."""
+        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
+        velocity, projected = steps.predict(sit, noisy, draws.time, True, features is not None)
+        target = self.interpolant.target(normalised, draws.noise, draws.time)
+        denoising = flow_matching_loss(cast(Tensor, velocity), target).mean()
+        if projected is None or features is None:
+            return denoising, None
+        skip = self.weights.skip_empty_cells
+        return denoising, alignment_loss(projected, features, skip_empty_cells=skip).mean()
+
+    def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
+        """Evaluates held-out images under ``val/``."""
+        self._evaluate(batch, batch_idx, "val")
+
+    def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
+        """Evaluates held-out images under ``test/``."""
+        self._evaluate(batch, batch_idx, "test")
+
+    def _evaluate(self, batch: ImageBatch, batch_idx: int, prefix: str) -> None:
+        """Logs the losses of the averaged SiT."""
+        sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
-        latents = self.ema.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
-        features = self._features(batch)
-        velocity, projected = self._predict(
-            self.ema.sit, noisy, draws.time, velocity=True, features=features is not None
-        )
-        assert velocity is not None
-        target = self.interpolant.target(latents, draws.noise, draws.time)
-        values = {"denoising": losses.flow_matching_loss(velocity, target).mean()}
-        if projected is not None:
-            values["alignment"] = self._aligned(projected, features)
-        return values
+        draws = self._draws(len(posterior.mean), batch_idx, stream=1)
+        normalised = norm.normalise(posterior.sample(draws.posterior_noise))
+        denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
+        values = {f"{prefix}/denoising": denoising}
+        if alignment is not None:
+            values[f"{prefix}/alignment"] = alignment
+        self.log_dict(values, batch_size=len(batch["image"]), sync_dist=True)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """AdamW of the SiT."""
+        return steps.adamw(self, {"sit": self.sit}, self.optimizer_config)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips the gradient norm and logs it."""
+        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Steps the optimiser, then the averages, unless the step was skipped."""
+        super().optimizer_step(*args, **kwargs)
+        if not self.step_skipped:
+            self.ema.update(self.sit, self.latent_norm)
+
+    def on_train_start(self) -> None:
+        """Fits the state of a resumed optimiser to this run."""
+        steps.fit_optimizer(self)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Adds the stage and the images that it was trained with."""
+        steps.describe_stage(checkpoint, self.stage, self.interpolant.path)
+        checkpoint["r3dpa"]["images"] = self._datamodule.settings
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses the checkpoint of another stage."""
+        steps.check_stage(checkpoint, self.stage, self.optimizer_config)
+        self._resumed = True

@@ -1,11 +1,11 @@
-"""Loss weights, optimiser and guards of a stage, as its YAML gives them."""
+"""Loss weights and optimiser of a stage, as its YAML gives them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["GuardConfig", "LossWeights", "OptimizerConfig", "PathName", "TimeSampling"]
+__all__ = ["LossWeights", "OptimizerConfig", "PathName", "TimeSampling"]
 
 PathName = Literal["linear", "cosine"]
 TimeSampling = Literal["uniform", "lognormal"]
@@ -57,34 +57,3 @@ class OptimizerConfig:
     betas: tuple[float, float] = (0.9, 0.999)
     weight_decay: float = 0.03
     eps: float = 1e-8
-
-
-@dataclass(frozen=True)
-class GuardConfig:
-    """When a training step is dropped, and when training stops.
-
-    Args:
-        max_skipped_steps: Steps in a row with a non-finite loss or gradient before training stops.
-        collapse_norm: A network whose gradient norm is smaller learns nothing.
-        collapse_steps: Steps in a row in which that holds for all networks before training stops.
-        saved_batches: Batches of dropped steps that each process keeps in
-            ``<run_dir>/bad_batches``, for ``r3dpa replay``.
-
-    Raises:
-        ValueError: If a number is out of its range.
-    """
-
-    max_skipped_steps: int = 10
-    collapse_norm: float = 1e-8
-    collapse_steps: int = 100
-    saved_batches: int = 3
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name, least in (("max_skipped_steps", 1), ("collapse_steps", 1), ("saved_batches", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(
-                    f"guards.{name} must be at least {least}, got {getattr(self, name)}"
-                )
-        if not self.collapse_norm >= 0:
-            raise ValueError(f"guards.collapse_norm must be at least 0, got {self.collapse_norm}")

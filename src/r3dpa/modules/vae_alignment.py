@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.step_losses import PathDraws
 from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
 
 __all__ = ["VAEAlignment"]
@@ -65,14 +64,16 @@ class VAEAlignment(GenerativeModule):
         }
         return networks | ({"sit": self.sit} if self.needs_features() else {})
 
-    def step_losses(self, batch: LidarBatch, draws: PathDraws) -> dict[str, Tensor]:
-        """Losses of range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """One step on range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
+        draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
         reconstruction = self.vae.decode(latents)
+
         losses = self.vae_losses(image, posterior, reconstruction)
         losses |= self.vae_alignment_losses(latents, features, draws)
         losses |= self.discriminator_losses(image, reconstruction)
         self.latent_norm.update(latents.detach())
-        return losses
+        return self.weigh_and_log(losses)

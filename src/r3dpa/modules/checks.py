@@ -1,0 +1,108 @@
+"""Checks of trainer, data and earlier stages against the networks; each error says the remedy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import StochasticWeightAveraging
+
+from r3dpa.data.image_datamodule import ImageDataModule
+from r3dpa.geometry import ScanGeometry
+from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
+
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+
+
+def check_trainer(trainer: Any) -> None:
+    """Refuses precisions and callbacks that the stages cannot train with."""
+    if trainer.precision not in _PRECISIONS:
+        raise ValueError(
+            f"trainer.precision {trainer.precision} is not supported, as weights, averages and "
+            f"latent statistics are float32: give one of {', '.join(_PRECISIONS)}"
+        )
+    if any(isinstance(callback, StochasticWeightAveraging) for callback in trainer.callbacks):
+        raise ValueError(
+            "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
+            "a SiT keep an average of their own, see model.ema_decay"
+        )
+
+
+def geometry_of(datamodule: object, module: object) -> ScanGeometry:
+    """Geometry of any data module whose batches are those of :class:`r3dpa.data.LidarBatch`."""
+    geometry = getattr(datamodule, "geometry", None)
+    if not isinstance(geometry, ScanGeometry):
+        raise ValueError(
+            f"data.class_path: {type(module).__name__} needs a data module that gives "
+            "r3dpa.data.LidarBatch batches and has a geometry (r3dpa.geometry.ScanGeometry), such "
+            f"as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
+        )
+    return geometry
+
+
+def check_sizes(vae: VAE, sit: VelocityNetwork, geometry: ScanGeometry) -> None:
+    """Refuses a velocity network of other latents than those of the range images."""
+    if sit.in_channels != vae.latent_channels:
+        raise ValueError(
+            f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "
+            "channels; give both the same number"
+        )
+    sensor = geometry.projection.sensor
+    image_size = (sensor.beams, sensor.columns)
+    latent_size = vae.latent_size(image_size)
+    if tuple(latent_size) != tuple(sit.input_size):
+        raise ValueError(
+            f"a {image_size} range image gives {latent_size} latents, but sit.input_size is "
+            f"{tuple(sit.input_size)}; set sit.input_size to {latent_size}"
+        )
+
+
+def check_features(
+    sit: VelocityNetwork, geometry: ScanGeometry, datamodule: Any, stage: str
+) -> None:
+    """Refuses data without feature grids, or with grids of another size than the network's."""
+    if getattr(datamodule, "features_dir", "") is None:
+        raise ValueError(
+            f"stage {stage} aligns with 3D features, but the data module has none; give it an "
+            "extractor or features_dir, or set the alignment weights to 0"
+        )
+    if tuple(geometry.grid_size) != tuple(sit.grid_size):
+        raise ValueError(
+            f"feature grids are {geometry.grid_size}, but the {type(sit).__name__} has "
+            f"{tuple(sit.grid_size)} tokens; set data.grid_size to the latter"
+        )
+    feature_dim = getattr(datamodule, "feature_dim", sit.feature_dim)
+    if feature_dim != sit.feature_dim:
+        raise ValueError(
+            f"features have width {feature_dim}, but sit.feature_dim is {sit.feature_dim}; set it "
+            "to the former"
+        )
+
+
+def check_geometry(there: ScanGeometry, here: ScanGeometry, source: str) -> None:
+    """Refuses weights that were trained on other range images than this run's."""
+    parts = {
+        "projection": (there.projection, here.projection),
+        "codec": (there.codec, here.codec),
+    }
+    different = [
+        f"{name} {theirs} there, {ours} here"
+        for name, (theirs, ours) in parts.items()
+        if theirs != ours
+    ]
+    if different:
+        raise ValueError(
+            f"{source} was trained on other range images: {'; '.join(different)}. Set sensor, "
+            "projection and codec of the data module to those of the checkpoint"
+        )
+
+
+def image_datamodule(module: L.LightningModule, vae: ImageVAE) -> ImageDataModule:
+    """Data module of a stage on images, whose size the VAE can encode."""
+    found = getattr(module.trainer, "datamodule", None)
+    if not isinstance(found, ImageDataModule):
+        raise ValueError(
+            f"{type(module).__name__} needs an ImageDataModule, got {type(found).__name__}"
+        )
+    vae.latent_size((found.image_size, found.image_size))
+    return found

@@ -1,0 +1,113 @@
+"""Training of a small image VAE, where Stable Diffusion's is not at hand or too large."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from r3dpa.data.image_datamodule import ImageDataModule
+from r3dpa.data.images import ImageBatch
+from r3dpa.losses import reconstruction_loss
+from r3dpa.modules import steps
+from r3dpa.modules.checks import check_trainer, image_datamodule
+from r3dpa.modules.settings import LossWeights, OptimizerConfig
+from r3dpa.nn import ImageVAE
+
+__all__ = ["ImageVAETraining"]
+
+
+class ImageVAETraining(L.LightningModule):
+    """An image VAE by reconstruction and KL alone.
+
+    No discriminator and no perceptual loss: good enough a latent space for stage 0, not for fine
+    pictures.
+
+    Args:
+        vae: Image autoencoder.
+        weights: Loss weights; those of reconstruction and KL count.
+        optimizer: Optimiser settings.
+        seed: Key of the training draws.
+        guards: Ignored; given by configurations and checkpoints of earlier versions.
+    """
+
+    stage = "image_vae"
+    data_class = ImageDataModule
+
+    def __init__(
+        self,
+        vae: ImageVAE,
+        weights: LossWeights = LossWeights(),
+        optimizer: OptimizerConfig = OptimizerConfig(),
+        seed: int = 0,
+        guards: Any = None,
+    ) -> None:
+        super().__init__()
+        with steps.networks_as_settings():
+            self.save_hyperparameters()
+        self.vae = vae
+        self.weights, self.optimizer_config, self.seed = weights, optimizer, seed
+
+    def setup(self, stage: str) -> None:
+        """Checks trainer and data against the VAE."""
+        check_trainer(self.trainer)
+        image_datamodule(self, self.vae)
+
+    def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
+        """One step on images ``(B, 3, S, S)``."""
+        image, weights = batch["image"], self.weights
+        posterior = self.vae.encode(image)
+        shape = (*posterior.mean.shape[1:],)
+        draws = steps.draw_path(self, len(image), shape, self.seed, steps.batch_number(self))
+        reconstruction = self.vae.decode(posterior.sample(draws.posterior_noise))
+        error = reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
+        losses = {
+            "reconstruction": weights.reconstruction * error,
+            "kl": weights.kl * posterior.kl().mean(),
+        }
+        return steps.weigh_and_log(self, losses, weights)
+
+    def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
+        """Evaluates held-out images under ``val/``."""
+        self._evaluate(batch, "val")
+
+    def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
+        """Evaluates held-out images under ``test/``."""
+        self._evaluate(batch, "test")
+
+    def _evaluate(self, batch: ImageBatch, prefix: str) -> None:
+        """Logs the reconstruction error of the posterior mean, and the KL."""
+        image = batch["image"]
+        posterior = self.vae.encode(image)
+        reconstruction = self.vae.decode(posterior.mean)
+        error = reconstruction_loss(reconstruction, image, self.weights.reconstruction_norm)
+        values = {f"{prefix}/reconstruction": error, f"{prefix}/kl": posterior.kl().mean()}
+        self.log_dict(values, batch_size=len(image), sync_dist=True)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """AdamW of the VAE."""
+        return steps.adamw(self, {"vae": self.vae}, self.optimizer_config)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips the gradient norm and logs it."""
+        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
+
+    def on_train_start(self) -> None:
+        """Fits the state of a resumed optimiser to this run."""
+        steps.fit_optimizer(self)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Adds the stage and the images that it was trained with."""
+        steps.describe_stage(checkpoint, self.stage, "linear")
+        checkpoint["r3dpa"]["images"] = image_datamodule(self, self.vae).settings
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses the checkpoint of another stage."""
+        steps.check_stage(checkpoint, self.stage, self.optimizer_config)

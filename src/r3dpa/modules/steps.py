@@ -1,0 +1,250 @@
+"""Parts of a training step that all modules share: random draws, frozen passes, AdamW, clipping."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any, NamedTuple, cast
+
+import lightning as L
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from r3dpa import __version__
+from r3dpa.flow import sample_time
+from r3dpa.io import source_commit
+from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
+from r3dpa.nn import VelocityNetwork
+
+
+class PathDraws(NamedTuple):
+    """Random numbers of one training step.
+
+    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``.
+    """
+
+    posterior_noise: Tensor
+    time: Tensor
+    noise: Tensor
+
+
+def draw_path(
+    module: L.LightningModule,
+    num_samples: int,
+    latent_shape: tuple[int, int, int],
+    seed: int,
+    batch_number: int,
+    time_sampling: TimeSampling = "uniform",
+    stream: int = 0,
+) -> PathDraws:
+    """Posterior noise, times and path noise for this process's part of a global batch.
+
+    They are a function of ``(seed, stream, batch, sample)`` alone, whatever the number of
+    processes.
+
+    Args:
+        module: Attached to a trainer, on its device.
+        num_samples: Samples B of the batch on this process.
+        latent_shape: ``(C, h, w)``.
+        seed: Key of the draws.
+        batch_number: Number of the batch since the start of training, or of the split.
+        time_sampling: Density of the times.
+        stream: Separates training (0) from evaluation draws.
+    """
+    world, rank = module.trainer.world_size, module.trainer.global_rank
+    key = np.random.SeedSequence([seed, stream, batch_number]).generate_state(1)
+    generator = torch.Generator(module.device).manual_seed(int(key[0]))
+    total = num_samples * world
+    shape = (total, *latent_shape)
+    drawn = PathDraws(
+        torch.randn(shape, generator=generator, device=module.device),
+        sample_time(total, time_sampling, generator=generator),
+        torch.randn(shape, generator=generator, device=module.device),
+    )
+    return PathDraws(*(values[rank::world] for values in drawn))
+
+
+def batch_number(module: L.LightningModule) -> int:
+    """Training batches before this one, over all epochs and resumed runs."""
+    return module.trainer.fit_loop.epoch_loop.total_batch_idx
+
+
+@contextmanager
+def networks_as_settings() -> Iterator[None]:
+    """For ``save_hyperparameters()``, without Lightning's advice to leave networks out.
+
+    Kept, they are class paths in a checkpoint of the CLI, from which the networks are rebuilt.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Attribute '.*' is an instance of `nn.Module`")
+        yield
+
+
+@contextmanager
+def frozen(*networks: nn.Module) -> Iterator[None]:
+    """Records the forward pass inside without gradients to the networks' own parameters.
+
+    Gradients still flow through the networks to their inputs.
+    """
+    parameters = [p for network in networks for p in network.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+
+
+def zero_loss(network: nn.Module) -> Tensor:
+    """A loss of exactly 0 that gives each trained parameter a gradient of 0, at no cost.
+
+    Under DDP each trained network must take part in each step.
+    """
+    empty = [p.flatten()[:0].sum() for p in network.parameters() if p.requires_grad]
+    return torch.stack(empty).sum()
+
+
+def weigh_and_log(
+    module: L.LightningModule, parts: Mapping[str, Tensor], weights: LossWeights
+) -> Tensor:
+    """Sum of weighted losses; logs it as ``train/loss``, and each loss without its weight.
+
+    Args:
+        module: Gets the logged values, detached, as ``module.logged_losses``.
+        parts: Weighted losses under the names of their weights.
+        weights: Losses of weight 0 are not logged.
+    """
+    total = torch.stack(list(parts.values())).sum()
+    factors = {name: getattr(weights, name) for name in parts}
+    values = {n: value.detach() / factors[n] for n, value in parts.items() if factors[n] != 0}
+    values["loss"] = total.detach()
+    module.logged_losses = values  # type: ignore[assignment]
+    module.log_dict({f"train/{name}": value for name, value in values.items()})
+    return total
+
+
+def adamw(
+    module: L.LightningModule, networks: Mapping[str, nn.Module], config: OptimizerConfig
+) -> torch.optim.AdamW:
+    """One AdamW with a parameter group per network, fused where the device has it."""
+    groups = [
+        {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
+        for name, network in networks.items()
+    ]
+    return torch.optim.AdamW(groups, **asdict(config), fused=uses_fused(module))
+
+
+def uses_fused(module: L.LightningModule) -> bool:
+    """Whether one kernel moves all weights.
+
+    In float16 it would also undo the scale of the gradients, after they were clipped.
+    """
+    supported = module.device.type in ("cpu", "cuda", "mps", "xpu")
+    return supported and module.trainer.precision != "16-mixed"
+
+
+def arrange_optimizer(optimizer: torch.optim.Optimizer, fused: bool) -> None:
+    """Puts the state of an AdamW where it has to be, in the memory format of the weights.
+
+    A fused optimiser walks through the memory of weights and moments alike, unchecked.
+
+    Args:
+        optimizer: It may hold the state of a run with other settings.
+        fused: Whether one kernel moves all weights.
+    """
+    for group in optimizer.param_groups:
+        group["fused"] = fused
+    for parameter, state in optimizer.state.items():
+        state["step"] = state["step"].to(parameter.device if fused else "cpu")
+        for name in ("exp_avg", "exp_avg_sq"):
+            if state[name].stride() != parameter.stride():
+                state[name] = torch.empty_like(parameter).copy_(state[name])
+
+
+def fit_optimizer(module: L.LightningModule) -> None:
+    """Fits the state of a resumed optimiser to this run."""
+    optimizer = cast(torch.optim.Optimizer, module.optimizers(use_pl_optimizer=False))
+    arrange_optimizer(optimizer, uses_fused(module))
+
+
+def gradient_norms(
+    module: L.LightningModule, optimizer: torch.optim.Optimizer
+) -> dict[str, Tensor]:
+    """Gradient norm of each parameter group by its name."""
+    return {
+        group.get("name", str(index)): nn.utils.get_total_norm(
+            [p.grad for p in group["params"] if p.grad is not None]
+        ).to(module.device)  # without any gradient it is made on the host
+        for index, group in enumerate(optimizer.param_groups)
+    }
+
+
+def clip_per_network(
+    module: L.LightningModule,
+    optimizer: torch.optim.Optimizer,
+    limit: int | float | None,
+    algorithm: str | None,
+) -> None:
+    """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``.
+
+    Args:
+        module: ``module.grad_norms`` are taken for the norms where a callback has computed them.
+        optimizer: Of :func:`adamw`.
+        limit: Largest norm; None clips nothing.
+        algorithm: As Lightning gives it; ``norm`` or None.
+
+    Raises:
+        ValueError: If the gradients are to be clipped by value.
+    """
+    if algorithm not in (None, "norm"):
+        raise ValueError(
+            "gradients are clipped by norm per network; leave gradient_clip_algorithm out, got "
+            f"{getattr(algorithm, 'value', algorithm)!r}"
+        )
+    norms = module.__dict__.pop("grad_norms", None) or gradient_norms(module, optimizer)
+    module.log_dict({f"grad_norm/{name}": norm for name, norm in norms.items()})
+    limit = float("inf") if limit is None else float(limit)
+    for group in optimizer.param_groups:
+        nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
+
+
+def describe_stage(checkpoint: dict[str, Any], stage: str, path: str) -> None:
+    """Adds stage, interpolant and version to a checkpoint."""
+    checkpoint["r3dpa"] = {
+        "stage": stage,
+        "interpolant": path,
+        "version": __version__,
+        "commit": source_commit(),
+    }
+
+
+def check_stage(checkpoint: dict[str, Any], stage: str, config: OptimizerConfig) -> None:
+    """Refuses the checkpoint of another stage; optimiser settings stay those of this run.
+
+    Raises:
+        ValueError: Naming both stages.
+    """
+    found = checkpoint.get("r3dpa", {}).get("stage")
+    if found != stage:
+        raise ValueError(
+            f"the checkpoint is of stage {found!r}, this is {stage!r}; to start a stage from "
+            "another one, give model.init_from instead of ckpt_path"
+        )
+    for state in checkpoint.get("optimizer_states", []):
+        for group in state["param_groups"]:
+            group.update(asdict(config))
+
+
+def predict(
+    sit: VelocityNetwork, noisy: Tensor, time: Tensor, velocity: bool, features: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """Velocity and projected features; what is not asked for is None and not computed."""
+    if velocity and features:
+        return sit(noisy, time)
+    if velocity:
+        return sit.velocity(noisy, time), None
+    return None, sit.project_features(noisy, time) if features else None
