@@ -223,9 +223,9 @@ class TestCheckpoints:
         """The command line decides, not the checkpoint, and config.yaml says what ran."""
         more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
         more += ["--ckpt_path", str(vae_checkpoint), "--trainer.max_steps=4"]
-        more += ["--model.init_args.guards.max_skipped_steps=7"]
+        more += ["--model.init_args.ema_decay=0.7"]
         main(smoke_args("vae_alignment", tmp_path, *more))
-        assert "max_skipped_steps: 7" in (tmp_path / "config.yaml").read_text()
+        assert "ema_decay: 0.7" in (tmp_path / "config.yaml").read_text()
 
     def test_missing_file_is_named(self, refused, tmp_path):
         path = tmp_path / "nothing.ckpt"

@@ -29,6 +29,7 @@ ALLOWED = {
     | {"simulation"},
     "ablation": {"metrics", "modules", "checkpoints", "viz"},
     "bench": CORE
+    | {"callbacks"}
     | {"simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
     | {"editing"},
     "__main__": {"cli"},

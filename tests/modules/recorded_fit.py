@@ -5,19 +5,19 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from r3dpa.callbacks import StepGuard
 from r3dpa.cli import main
-from r3dpa.modules import GenerativeModule
 
-begin = GenerativeModule.on_train_batch_start
+begin = StepGuard.on_train_batch_start
 
 
-def begin_and_note(self, batch, batch_idx):
-    path = Path(self.trainer.default_root_dir) / f"seen_{self.global_rank}.txt"
+def begin_and_note(self, trainer, module, batch, batch_idx):
+    path = Path(trainer.default_root_dir) / f"seen_{trainer.global_rank}.txt"
     with path.open("a") as file:
         file.writelines(f"{name}\n" for name in batch["name"])
-    begin(self, batch, batch_idx)
+    begin(self, trainer, module, batch, batch_idx)
 
 
 if __name__ == "__main__":
-    GenerativeModule.on_train_batch_start = begin_and_note
+    StepGuard.on_train_batch_start = begin_and_note
     main(sys.argv[1:])

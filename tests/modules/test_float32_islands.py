@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_gradients import stage_module, train
-from test_guards import NamedData
+from tiny_stages import QUIET, NamedData, stage_module, train
 
 from r3dpa import losses
 from r3dpa.flow import Interpolant
-from r3dpa.modules import step_losses
+from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm, Posterior
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-]
+pytestmark = QUIET
 LAYERS = {
     "vae.decoder.conv_out",  # the range image: 0.1 m at 50 m would be lost
     "sit.t_embedder.mlp.0",  # the time, and what all blocks are modulated by
@@ -39,7 +34,7 @@ FUNCTIONS = [
     (losses, "discriminator_loss"),
     (losses, "flow_matching_loss"),
     (losses, "alignment_loss"),
-    (step_losses.StepLosses, "weigh_and_log"),
+    (GenerativeModule, "weigh_and_log"),
 ]
 
 

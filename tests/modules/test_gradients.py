@@ -2,178 +2,21 @@
 
 from __future__ import annotations
 
-import tempfile
-
-import lightning as L
 import pytest
 import torch
+from tiny_stages import QUIET, TinyData, group_of, stage_module, train
 from torch import nn
-from torch.utils.data import DataLoader
 
-from r3dpa.data import LidarDataModule
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.modules import FlowMatching, GuardConfig, JointAlignment, LossWeights, VAEAlignment
+from r3dpa.callbacks import StepGuard
+from r3dpa.modules import LossWeights
 from r3dpa.modules.base import frozen
-from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
-pytestmark = [
-    # Only `r3dpa fit` saves plain arguments in place of networks; nothing is saved here.
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-    pytest.mark.filterwarnings("ignore:step . was skipped"),
-]
-SENSOR = LidarSensor(beams=8, columns=16)
-FEATURE_DIM = 6
-
-
-class TinyData(LidarDataModule):
-    """One random batch per step; where ``bad`` says so with a NaN in its features."""
-
-    feature_source = "random"
-
-    def __init__(self, bad=(False,)):
-        L.LightningDataModule.__init__(self)
-        self.features_dir = "random"
-        generator = torch.Generator().manual_seed(0)
-        self.batches = [
-            {
-                "range_image": 2 * torch.rand(2, 1, 8, 16, generator=generator) - 1,
-                "feature_grid": torch.randn(2, 8, FEATURE_DIM, generator=generator),
-            }
-            for _ in bad
-        ]
-        for batch, is_bad in zip(self.batches, bad, strict=True):
-            if is_bad:
-                batch["feature_grid"][0, 0, 0] = torch.nan
-
-    feature_dim = FEATURE_DIM
-    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 4))
-
-    def prepare_data(self):
-        pass
-
-    def setup(self, stage):
-        pass
-
-    def train_dataloader(self):
-        return DataLoader(self.batches, batch_size=None)
-
-    def state_dict(self):
-        return {}
-
-
-class Observed:
-    """Keeps the losses of each step, the gradients around clipping, and the state after it.
-
-    With ``separates_losses`` also the gradient of every single loss, in ``reached``.
-    """
-
-    separates_losses = False
-
-    def on_fit_start(self):
-        self.parts, self.reached, self.grads, self.clipped, self.states = [], [], [], [], []
-
-    def load_previous_stage(self):
-        """Keeps the weights made here."""
-
-    def weigh_and_log(self, parts):
-        self.parts.append({name: part.detach() for name, part in parts.items()})
-        if self.separates_losses:
-            named = [(name, p) for name, p in self.named_parameters() if p.requires_grad]
-            self.reached.append({name: gradients(part, named) for name, part in parts.items()})
-        return super().weigh_and_log(parts)
-
-    def configure_gradient_clipping(self, optimizer, **kwargs):
-        self.grads.append(self.present_gradients())
-        super().configure_gradient_clipping(optimizer, **kwargs)
-        self.clipped.append(self.present_gradients())
-
-    def present_gradients(self):
-        return {n: p.grad.clone() for n, p in self.named_parameters() if p.grad is not None}
-
-    def on_train_batch_end(self, outputs, batch, batch_idx):
-        weights = {k: v.clone() for k, v in self.state_dict().items()}
-        moments = [
-            {k: torch.as_tensor(v).clone() for k, v in state.items()}
-            for state in self.optimizers().state.values()
-        ]
-        self.states.append((weights, moments))
-
-
-def gradients(loss, named):
-    """Gradient of a loss by parameter name, where it is not zero."""
-    parameters = [parameter for _, parameter in named]
-    found = torch.autograd.grad(loss, parameters, allow_unused=True, retain_graph=True)
-    return {
-        name: gradient
-        for (name, _), gradient in zip(named, found, strict=True)
-        if gradient is not None and gradient.count_nonzero()
-    }
-
-
-STAGES = {
-    "vae_alignment": type("ObservedVAEAlignment", (Observed, VAEAlignment), {}),
-    "joint": type("ObservedJoint", (Observed, JointAlignment), {}),
-    "flow_matching": type("ObservedFlowMatching", (Observed, FlowMatching), {}),
-}
-
-
-def stage_module(stage, **kwargs):
-    torch.manual_seed(0)
-    networks = {
-        "vae": VAE(
-            latent_channels=4,
-            channels=32,
-            channel_multipliers=(1, 1),
-            strides=((2, 2),),
-            num_res_blocks=1,
-        ),
-        "sit": SiT(
-            input_size=(4, 8),
-            in_channels=4,
-            hidden_size=8,
-            depth=2,
-            num_heads=2,
-            alignment_depth=1,
-            feature_dim=FEATURE_DIM,
-            projector_dim=8,
-        ),
-    }
-    if stage != "flow_matching":
-        networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)
-    # A fresh SiT has zero gates and output: no gradient would get past them.
-    for parameter in networks["sit"].parameters():
-        nn.init.normal_(parameter, std=0.3)
-    return STAGES[stage](**networks, **kwargs)
-
-
-def train(module, data=None, **kwargs):
-    data = data or TinyData()
-    with tempfile.TemporaryDirectory() as folder:
-        settings = {"max_steps": len(data.batches), "default_root_dir": folder, "devices": 1}
-        trainer = L.Trainer(
-            accelerator="cpu",
-            limit_val_batches=0,
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            **settings | kwargs,
-        )
-        trainer.fit(module, datamodule=data)
-    return module
-
-
+pytestmark = QUIET
 ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}
 DISCRIMINATOR = {"discriminator.main"}
 ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
 REST = {"sit.blocks.1", "sit.final_layer"}
 PROJECTOR = {"sit.projector"}
-
-
-def group_of(name):
-    return ".".join(name.split(".")[: 3 if name.startswith("sit.blocks") else 2])
 
 
 REACH = {
@@ -387,14 +230,14 @@ class TestNonFiniteGradients:
 
     def test_too_many_in_a_row_stop_the_training(self):
         """Of max_skipped_steps = 2: bad, good, bad goes on, a second bad one in a row stops."""
-        module = stage_module("joint", guards=GuardConfig(max_skipped_steps=2))
+        module = stage_module("joint")
         message = r"2 steps in a row had a non-finite loss.*vae nan.*replay.*learning rate"
         with pytest.raises(RuntimeError, match=message):
-            train(module, TinyData([True, False, True, True, False]))
+            train(module, TinyData([True, False, True, True, False]), StepGuard(2))
         assert len(module.states) == 3
         assert all(value.isfinite().all() for value in module.state_dict().values())
 
     def test_bad_steps_with_good_ones_between_do_not_add_up(self):
-        module = stage_module("joint", guards=GuardConfig(max_skipped_steps=2))
-        train(module, TinyData([True, False] * 3))
+        module = stage_module("joint")
+        train(module, TinyData([True, False] * 3), StepGuard(2))
         assert len(module.states) == 6

@@ -5,12 +5,11 @@ from __future__ import annotations
 import lightning as L
 import pytest
 import torch
-from test_gradients import TinyData, stage_module
+from tiny_stages import QUIET, TinyData, stage_module
 from torch.utils.data import DataLoader
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
+    *QUIET,
     pytest.mark.filterwarnings("ignore:The 'val_dataloader' does not have many workers"),
 ]
 

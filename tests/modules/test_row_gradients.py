@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_gradients import FEATURE_DIM, STAGES, group_of, stage_module, train
+from tiny_stages import FEATURE_DIM, STAGES, group_of, stage_module, train
 from torch import nn
 
 from r3dpa.ablation import make_plan, read_scale

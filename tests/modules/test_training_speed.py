@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_gradients import TinyData, stage_module, train
+from tiny_stages import QUIET, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from r3dpa.cli import main
-from r3dpa.modules import JointAlignment, LossWeights, flow_matching
+from r3dpa.modules import LossWeights, flow_matching
+from r3dpa.modules.steps import arrange_optimizer
 from r3dpa.nn import Posterior
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-]
+pytestmark = QUIET
 CHANNELS_LAST = {"memory_format": torch.channels_last}
 
 
@@ -128,7 +125,7 @@ class TestLayout:
         state = optimizer.state[weight]
         state["exp_avg"] = state["exp_avg"].contiguous()
         before = state["exp_avg"].clone()
-        JointAlignment.arrange_optimizer(optimizer, fused)
+        arrange_optimizer(optimizer, fused)
         assert state["exp_avg"].stride() == weight.stride()
         assert torch.equal(state["exp_avg"], before)
         assert optimizer.param_groups[0]["fused"] == fused

@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 import torch
 import yaml
-from test_gradients import FEATURE_DIM, STAGES, TinyData, train
+from tiny_stages import FEATURE_DIM, QUIET, STAGES, TinyData, train
 from torch import nn
 
 from r3dpa.checkpoints import read_checkpoint
@@ -16,11 +16,7 @@ from r3dpa.generation import SamplerConfig, SceneGenerator, Solver
 from r3dpa.modules import LossWeights
 from r3dpa.nn import VAE, PatchDiscriminator, UNet
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-]
+pytestmark = QUIET
 # In place of the SiT of conf/smoke.yaml: the same latents, grid and features.
 SMOKE = {
     "input_size": [4, 16],

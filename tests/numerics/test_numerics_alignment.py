@@ -8,8 +8,6 @@ import torch.nn.functional as F
 from torch import nn
 
 from r3dpa.losses import alignment_loss
-from r3dpa.modules.guards import StepGuard
-from r3dpa.modules.settings import GuardConfig
 
 HALF = [torch.bfloat16, torch.float16]
 
@@ -110,10 +108,10 @@ def test_large_and_small_features_have_the_cosine_of_their_directions(dtype, nai
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.numerics(section=6, case="collapse of the gradients")
-def test_a_zeroed_network_is_counted_as_still(dtype, naive):
+def test_a_zeroed_network_has_no_gradient(dtype, naive):
     """All weights are zero: the loss is 0, finite, and no layer before the last learns anything.
 
-    That training ends after as many steps as are allowed is tested with the guards.
+    The logged ``grad_norm/<network>`` shows it.
     """
     network = nn.Sequential(nn.Linear(6, 16), nn.SiLU(), nn.Linear(16, 16), nn.Linear(16, 8))
     grid = torch.randn(2, 4, 8, generator=torch.Generator().manual_seed(0))
@@ -127,17 +125,12 @@ def test_a_zeroed_network_is_counted_as_still(dtype, naive):
         loss.backward()
         return loss, nn.utils.get_total_norm([w.grad for w in network[:3].parameters()])
 
-    guard = StepGuard(GuardConfig(collapse_steps=100))
-    assert guard.judge(step()[1][None]).good
-    assert guard.still == 0
+    assert step()[1] > 1e-8
     with torch.no_grad():
         for weight in network.parameters():
             weight.zero_()
-    for number in range(1, 101):
-        loss, norm = step()
-        assert guard.judge(norm[None]).good
-        assert guard.still == number
-    assert guard.still >= guard.config.collapse_steps
+    loss, norm = step()
+    assert norm == 0
     assert loss.isfinite()
     assert norm.isfinite()
-    naive("loss and gradient norms are finite in all 100 steps: a check of isfinite sees nothing")
+    naive("loss and gradient norms are finite: a check of isfinite sees nothing")

@@ -14,7 +14,7 @@ from r3dpa import losses
 from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import JointAlignment, LossWeights, OptimizerConfig
-from r3dpa.modules.base import PathDraws
+from r3dpa.modules.steps import PathDraws, batch_number
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator
 
 
@@ -69,9 +69,9 @@ class Recording(JointAlignment):
     def load_previous_stage(self):
         """Keeps the recorded average, which differs from the weights."""
 
-    def draw_path(self, image, batch_number, stream=0):
+    def draw_path(self, num_scans, number=None, stream=0):
         self.steps.append({})
-        values = f"in/step{batch_number}"
+        values = f"in/step{batch_number(self)}"
         return PathDraws(
             self.case[f"{values}/posterior_noise"],
             self.case[f"{values}/time_input"].flatten(),

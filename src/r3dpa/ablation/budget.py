@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from r3dpa.ablation.configs import with_value
 from r3dpa.ablation.plan import Plan, Stage
 from r3dpa.modules import FlowMatching, GenerativeModule, RGBPretraining
-from r3dpa.modules.step_losses import PathDraws
+from r3dpa.modules.steps import PathDraws
 
 __all__ = ["Budget", "StageBudget", "budget_of"]
 
@@ -143,9 +143,9 @@ def _flop_per_sample(module: Any, image_size: int | None) -> float:
         )
     module.train()
     batch, draws = _batch(module, image_size)
+    module.draw_path, module.log_dict = lambda *_: draws, lambda *_: None
     with FlopCounterMode(display=False) as counter:
-        losses = module.step_losses(batch, draws)
-        torch.stack(list(losses.values())).sum().backward()
+        module.training_step(batch, 0).backward()
     return counter.get_total_flops()
 
 

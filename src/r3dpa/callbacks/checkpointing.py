@@ -14,8 +14,8 @@ from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_info
 
-from r3dpa.io import atomic_path
 from r3dpa.callbacks.step_guard import StepGuard
+from r3dpa.io import atomic_path
 
 __all__ = ["AtomicCheckpointIO", "RunCheckpoint"]
 

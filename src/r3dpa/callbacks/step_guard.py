@@ -19,8 +19,8 @@ class StepGuard(L.Callback):
     """Skips a step with a loss, gradient norm or buffer that is not finite, on any process.
 
     A skipped step moves no weight, moment or average, and batch norm and latent statistics are put
-    back; ``global_step`` and ``train/skipped_steps`` count it, its samples are named and its batches
-    kept for ``r3dpa replay``. Gradients that overflow through the loss scale of float16 are counted
+    back; ``global_step`` and ``train/skipped_steps`` count it, and its batches are named and kept
+    for ``r3dpa replay``. Gradients that overflow through the loss scale of float16 are counted
     only. A step, of one or more batches, costs one read of the device and one all-reduce.
 
     Args:
@@ -91,12 +91,12 @@ class StepGuard(L.Callback):
         if own_bad or not losses_bad:
             report_skipped(pl_module, batches, found, self.saved_batches)
         if self.in_a_row >= self.max_skipped_steps:
+            folder = f"{trainer.default_root_dir}/bad_batches"
             raise RuntimeError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last one "
-                f"at step {trainer.global_step} (gradient norms: {listed(found)}). Look at the named "
-                f"samples, or at one of {trainer.default_root_dir}/bad_batches with `r3dpa replay "
-                "FILE CHECKPOINT`; if they are sound, lower the learning rate, or train in bf16 or "
-                "fp32 instead of fp16"
+                f"at step {trainer.global_step} (gradient norms: {listed(found)}). Look at the "
+                f"named samples, or at a file of {folder} with `r3dpa replay`; if they are sound, "
+                "lower the learning rate, or train in bf16 or fp32 instead of fp16"
             )
 
     def _faults(self, norms: Tensor) -> list[bool]:

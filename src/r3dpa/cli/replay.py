@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -96,7 +96,9 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         lines.append(f"{saved.precision} is not repeated: run in float32, which may not break")
     tensors = {f"input {name}": value for name, value in saved.tensors.items()}
     tensors |= {f"input {name}": value for name, value in saved.draws._asdict().items()}
-    for name, value in (tensors | {f"weight {name}": value for name, value in state.items()}).items():
+    for name, value in (
+        tensors | {f"weight {name}": value for name, value in state.items()}
+    ).items():
         num_bad = int((~value.isfinite()).sum())
         if num_bad:
             lines.append(f"{name}: {num_bad} of {value.numel()} values are not finite")
@@ -135,7 +137,7 @@ def _losses(
     dtype = _AUTOCAST.get(saved.precision)
     with torch.set_grad_enabled(backward):
         with torch.autocast(module.device.type, dtype or torch.bfloat16, enabled=dtype is not None):
-            total = module.training_step(batch, 0)
+            total = cast(Tensor, module.training_step(batch, 0))
         if backward:
             total.backward()
     return {name: float(value) for name, value in module.logged_losses.items()}

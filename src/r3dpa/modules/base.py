@@ -224,10 +224,9 @@ class GenerativeModule(L.LightningModule):
             batch_number: Number of the batch; None is the training batch at hand.
             stream: Separates training (0) from evaluation draws.
         """
-        number = steps.batch_number(self) if batch_number is None else batch_number
         shape = (self.vae.latent_channels, *self.sit.input_size)
         return steps.draw_path(
-            self, num_scans, shape, self.seed, number, self.time_sampling, stream
+            self, num_scans, shape, self.seed, batch_number, self.time_sampling, stream
         )
 
     def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:

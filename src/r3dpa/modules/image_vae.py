@@ -55,13 +55,18 @@ class ImageVAETraining(L.LightningModule):
         check_trainer(self.trainer)
         image_datamodule(self, self.vae)
 
+    def draw_path(self, num_images: int) -> steps.PathDraws:
+        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
+        size = image_datamodule(self, self.vae).image_size
+        shape = (self.vae.latent_channels, *self.vae.latent_size((size, size)))
+        return steps.draw_path(self, num_images, shape, self.seed)
+
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, 3, S, S)``."""
         image, weights = batch["image"], self.weights
         posterior = self.vae.encode(image)
-        shape = (*posterior.mean.shape[1:],)
-        draws = steps.draw_path(self, len(image), shape, self.seed, steps.batch_number(self))
-        reconstruction = self.vae.decode(posterior.sample(draws.posterior_noise))
+        latents = posterior.sample(self.draw_path(len(image)).posterior_noise)
+        reconstruction = self.vae.decode(latents)
         error = reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
         losses = {
             "reconstruction": weights.reconstruction * error,

@@ -203,7 +203,7 @@ class RGBPretraining(L.LightningModule):
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
         posterior, weights = Posterior(batch["posterior_moments"]), self.weights
-        draws = self._draws(len(posterior.mean), steps.batch_number(self))
+        draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(self.sit, normalised, draws, self._features(batch))
         losses = {"denoising": weights.denoising * denoising}
@@ -211,7 +211,10 @@ class RGBPretraining(L.LightningModule):
             losses["sit_alignment"] = weights.sit_alignment * alignment
         return steps.weigh_and_log(self, losses, weights)
 
-    def _draws(self, num_images: int, batch_number: int, stream: int = 0) -> steps.PathDraws:
+    def draw_path(
+        self, num_images: int, batch_number: int | None = None, stream: int = 0
+    ) -> steps.PathDraws:
+        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
         shape = (self.vae.latent_channels, *self.sit.input_size)
         return steps.draw_path(
             self, num_images, shape, self.seed, batch_number, self.time_sampling, stream
@@ -250,7 +253,7 @@ class RGBPretraining(L.LightningModule):
         """Logs the losses of the averaged SiT."""
         sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
-        draws = self._draws(len(posterior.mean), batch_idx, stream=1)
+        draws = self.draw_path(len(posterior.mean), batch_idx, stream=1)
         normalised = norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
         values = {f"{prefix}/denoising": denoising}

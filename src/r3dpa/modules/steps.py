@@ -36,7 +36,7 @@ def draw_path(
     num_samples: int,
     latent_shape: tuple[int, int, int],
     seed: int,
-    batch_number: int,
+    number: int | None = None,
     time_sampling: TimeSampling = "uniform",
     stream: int = 0,
 ) -> PathDraws:
@@ -50,12 +50,14 @@ def draw_path(
         num_samples: Samples B of the batch on this process.
         latent_shape: ``(C, h, w)``.
         seed: Key of the draws.
-        batch_number: Number of the batch since the start of training, or of the split.
+        number: Number of the batch since the start of training, or of the split; None is that of
+            the training batch at hand.
         time_sampling: Density of the times.
         stream: Separates training (0) from evaluation draws.
     """
     world, rank = module.trainer.world_size, module.trainer.global_rank
-    key = np.random.SeedSequence([seed, stream, batch_number]).generate_state(1)
+    number = batch_number(module) if number is None else number
+    key = np.random.SeedSequence([seed, stream, number]).generate_state(1)
     generator = torch.Generator(module.device).manual_seed(int(key[0]))
     total = num_samples * world
     shape = (total, *latent_shape)

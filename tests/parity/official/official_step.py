@@ -28,7 +28,9 @@ class _GivenDraws(JointAlignment):
     def setup(self, stage: str) -> None:
         """Needs no scans: the batch is given."""
 
-    def draw_path(self, num_scans: int, batch_number: int, stream: int = 0) -> PathDraws:
+    def draw_path(
+        self, num_scans: int, batch_number: int | None = None, stream: int = 0
+    ) -> PathDraws:
         """The given draws."""
         return self.draws
 

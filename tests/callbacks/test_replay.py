@@ -6,19 +6,22 @@ import dataclasses
 
 import pytest
 import torch
-from test_gradients import SENSOR, stage_module, train
-from test_guards import NamedData, constant_loss, guarded, infinite_image
+from tiny_stages import (
+    QUIET,
+    SENSOR,
+    NamedData,
+    constant_loss,
+    guarded,
+    infinite_image,
+    stage_module,
+    train,
+)
 
+from r3dpa.callbacks.bad_batches import BadBatch
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli.replay import replay
-from r3dpa.modules.bad_batches import BadBatch
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-    pytest.mark.filterwarnings("ignore:step .* was skipped"),
-]
+pytestmark = QUIET
 ARGUMENTS = {
     "vae": {
         "latent_channels": 4,
@@ -107,7 +110,7 @@ def test_networks_of_another_size_are_refused(tmp_path):
     (file,) = (tmp_path / "bad_batches").iterdir()
     kept = BadBatch.read(file)
     wide = {**kept.tensors, "feature_grid": torch.zeros(2, 8, 7)}
-    other = dataclasses.replace(kept, tensors=wide, step=1).save(tmp_path / "other", 1)
+    other = dataclasses.replace(kept, tensors=wide, step=1).save(tmp_path / "other")
     ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
     with pytest.raises(ValueError, match=r"step_0000001.*cannot be run with the networks of"):
         replay(other, ckpt)
@@ -121,7 +124,7 @@ def test_a_precision_that_is_not_repeated_is_said(precision, said, tmp_path):
     (file,) = (tmp_path / "bad_batches").iterdir()
     kept = dataclasses.replace(BadBatch.read(file), precision=precision, step=1)
     text = replay(
-        kept.save(tmp_path / "other", 1),
+        kept.save(tmp_path / "other"),
         save(stage_module("joint"), tmp_path / "before.safetensors"),
     )
     assert (f"{precision} is not repeated: run in float32" in text) == said

@@ -4,73 +4,32 @@ from __future__ import annotations
 
 import re
 import signal
+from types import SimpleNamespace
 
 import lightning as L
 import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
-from test_gradients import STAGES, TinyData, stage_module, train
+from tiny_stages import (
+    QUIET,
+    STAGES,
+    NamedData,
+    constant_loss,
+    guarded,
+    huge_latents,
+    infinite_image,
+    stage_module,
+    train,
+)
 
-from r3dpa.modules import GuardConfig
-from r3dpa.modules.bad_batches import BadBatch
-from r3dpa.modules.guards import StepGuard
+from r3dpa.callbacks import StepGuard
+from r3dpa.callbacks.bad_batches import BadBatch
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`"),
-    pytest.mark.filterwarnings("ignore:Found .* module.* in eval mode"),
-    pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
-    pytest.mark.filterwarnings("ignore:step .* was skipped"),
+    *QUIET,
     pytest.mark.filterwarnings("ignore:.*barrier.. using the device"),
     pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork"),
 ]
-
-
-class NamedData(TinyData):
-    """Batches whose scans have names; ``left_out`` are not handed out, the others keep theirs."""
-
-    def __init__(self, num, left_out=()):
-        super().__init__([False] * num)
-        for number, batch in enumerate(self.batches):
-            batch["name"] = [f"drive/{number}a", f"drive/{number}b"]
-        self.numbers = [number for number in range(num) if number not in left_out]
-        self.batches = [self.batches[number] for number in self.numbers]
-
-
-def infinite_image(module, batch):
-    batch["range_image"][0, 0, 0, 0] = torch.inf
-
-
-def huge_latents(module, batch):
-    """Finite, as are the batch statistics: only what is computed from them overflows."""
-    hook = module.vae.quant_conv.register_forward_hook(
-        lambda *_: (hook.remove(), torch.full((2, 8, 4, 8), 1e38))[1]
-    )
-
-
-def constant_loss(module, batch):
-    """A loss without a finite value, but with gradients that are."""
-    module.added = torch.inf
-
-
-def guarded(stage, bad=(), fault=infinite_image, numbers=None, **kwargs):
-    """A stage whose batches of these numbers are broken before the step sees them."""
-
-    class Module(STAGES[stage]):
-        added = 0.0
-        batch_number = property(
-            lambda self: (numbers or range(99))[self.trainer.fit_loop.epoch_loop.total_batch_idx]
-        )
-
-        def step_losses(self, batch, draws):
-            if self.batch_number in bad:
-                fault(self, batch)
-            parts = super().step_losses(batch, draws)
-            added, self.added = self.added, 0.0
-            return {name: part + added for name, part in parts.items()}
-
-    module = stage_module(stage, **kwargs)
-    module.__class__ = Module
-    return module
 
 
 FAULTS = [
@@ -115,8 +74,9 @@ class TestABadStep:
 
     def test_breaks_weights_or_statistics_without_guards(self, stage, fault, accumulate):
         """The naive way; an infinite loss with finite gradients only moves them on."""
-        module = guarded(stage, [accumulate], fault, guards=None)
-        train(module, NamedData(2 * accumulate), max_steps=2, accumulate_grad_batches=accumulate)
+        module = guarded(stage, [accumulate], fault)
+        data = NamedData(2 * accumulate)
+        train(module, data, None, max_steps=2, accumulate_grad_batches=accumulate)
         sound = all(value.isfinite().all() for value in module.state_dict().values())
         assert sound == (fault is constant_loss)
 
@@ -153,13 +113,13 @@ class TestTheReport:
         assert file.name == "step_0000000_batch_0000001_rank_0.safetensors"
 
     def test_keeps_a_few_batches_at_most(self, tmp_path):
-        module = guarded("joint", range(4), guards=GuardConfig(saved_batches=2))
-        train(module, NamedData(5), default_root_dir=tmp_path)
+        module = guarded("joint", range(4))
+        train(module, NamedData(5), StepGuard(saved_batches=2), default_root_dir=tmp_path)
         assert module.guard.skipped == 4
         assert len(list((tmp_path / "bad_batches").iterdir())) == 2
 
     def test_a_full_disk_does_not_end_the_training(self, tmp_path, monkeypatch):
-        def full(self, folder, most):
+        def full(self, folder):
             raise OSError(28, "No space left on device")
 
         monkeypatch.setattr(BadBatch, "save", full)
@@ -174,43 +134,61 @@ class TestTheReport:
             BadBatch.read(path)
 
 
-def test_statistics_that_overflow_are_put_back_though_the_gradients_are_finite():
-    guard, running, count = StepGuard(GuardConfig()), torch.ones(3), torch.tensor(4)
-    guard.begin({}, 0, [running, count])
-    running[1], count[...] = torch.inf, 5
-    assert not guard.judge(torch.ones(2)).good
-    assert running.tolist() == [1.0, 1.0, 1.0]
-    assert count == 4
-    guard.begin({}, 1, [running, count])
-    running[1] = 1e38
-    assert guard.judge(torch.ones(2)).good
-    assert running[1] == 1e38
+def checked(norms, loss=1.0, buffer=1.0, scaler=None, guard=None):
+    """A guard after one step of a module with one buffer, which the forward pass moved."""
+    guard, kept, logged = guard or StepGuard(), torch.ones(3), {}
+    weights = [torch.nn.Parameter(torch.ones(1)) for _ in norms]
+    for weight, norm in zip(weights, norms, strict=True):
+        weight.grad = torch.tensor([norm])
+    optimizer = torch.optim.SGD([{"params": [w], "name": str(i)} for i, w in enumerate(weights)])
+    loop = SimpleNamespace(epoch_loop=SimpleNamespace(total_batch_idx=0))
+    trainer = SimpleNamespace(
+        precision_plugin=SimpleNamespace(scaler=scaler),
+        global_step=0,
+        default_root_dir="run",
+        fit_loop=loop,
+    )
+    module = SimpleNamespace(
+        buffers=lambda: [kept],
+        device="cpu",
+        logged_losses={"loss": torch.tensor(loss)},
+        log=logged.__setitem__,
+        trainer=trainer,
+        global_step=0,
+        global_rank=0,
+    )
+    guard.on_train_batch_start(trainer, module, {}, 0)
+    kept[1] = buffer
+    guard.on_after_backward(trainer, module)
+    guard.on_before_optimizer_step(trainer, module, optimizer)
+    assert logged == {"train/skipped_steps": guard.skipped}
+    assert all((weight.grad is None) == module.step_skipped for weight in weights)
+    return guard, module.step_skipped, kept.tolist()
+
+
+@pytest.mark.parametrize(("value", "after"), [(torch.inf, 1.0), (1e38, 1e38)])
+def test_statistics_that_overflow_are_put_back_though_the_gradients_are_finite(value, after):
+    _, skipped, kept = checked([1.0, 1.0], buffer=value)
+    assert skipped == (after == 1.0)
+    assert kept == pytest.approx([1.0, after, 1.0])
 
 
 class TestScaledLosses:
     """Float16 scales the losses up and looks for a scale at which no gradient overflows."""
 
-    @staticmethod
-    def judged(norms, scale, loss=1.0, buffer=1.0):
-        guard, kept = StepGuard(GuardConfig()), torch.ones(1)
-        guard.begin({}, 0, [kept])
-        guard.saw({"loss": torch.tensor(loss)})
-        kept.fill_(buffer)
-        return guard, guard.judge(torch.tensor(norms), lambda: scale)
-
     @pytest.mark.parametrize("norms", [[1.0, torch.inf], [torch.nan, 1.0]])
     def test_gradients_that_overflow_are_the_business_of_the_scale(self, norms):
-        guard, verdict = self.judged(norms, 65536.0)
-        assert (verdict.good, verdict.overflow, guard.dropped) == (False, True, True)
-        assert (guard.skipped, guard.in_a_row) == (1, 0)
+        guard, skipped, _ = checked(norms, scaler=SimpleNamespace(get_scale=lambda: 65536.0))
+        assert (skipped, guard.skipped, guard.in_a_row) == (True, 1, 0)
 
     @pytest.mark.parametrize(
         "fault", [{"scale": 1.0}, {"loss": torch.nan}, {"buffer": torch.inf}, {"loss": torch.inf}]
     )
     def test_another_fault_is_not(self, fault):
-        guard, verdict = self.judged(**{"norms": [torch.inf], "scale": 65536.0, **fault})
-        assert (verdict.good, verdict.overflow) == (False, False)
-        assert (guard.skipped, guard.in_a_row) == (1, 1)
+        scale = fault.pop("scale", 65536.0)
+        scaler = SimpleNamespace(get_scale=lambda: scale)
+        guard, skipped, _ = checked([torch.inf], scaler=scaler, **fault)
+        assert (skipped, guard.skipped, guard.in_a_row) == (True, 1, 1)
 
     @staticmethod
     def fit(num, scale, **kwargs):
@@ -224,9 +202,9 @@ class TestScaledLosses:
     def test_a_fit_finds_its_scale_beyond_the_most_bad_steps_in_a_row(self, recwarn):
         """2^60 is far above what 16 bits hold; it is halved in each step until it fits."""
         module, scale = self.fit(60, 2.0**60)
-        assert module.guard.skipped > module.guard.config.max_skipped_steps
+        assert module.guard.skipped > module.guard.max_skipped_steps
         assert scale == 2.0 ** (60 - module.guard.skipped)
-        assert not module.guard.dropped
+        assert not module.step_skipped
         assert not [w for w in recwarn if "was skipped" in str(w.message)]
 
     def test_gradients_that_no_scale_mends_stop_it(self):
@@ -240,54 +218,18 @@ class TestScaledLosses:
 
 
 def test_a_step_passes_on_who_asks_to_stop():
-    guard = StepGuard(GuardConfig())
+    guard = StepGuard()
     for norm in (1.0, torch.nan):
         guard.stop = 15
-        guard.judge(torch.tensor([norm]))
-        assert guard.stop == 15
+        assert checked([norm], guard=guard)[0].stop == 15
     guard.stop = 0
-    guard.judge(torch.ones(1))
-    assert guard.stop == 0
+    assert checked([1.0], guard=guard)[0].stop == 0
 
 
-class TestCollapse:
-    @staticmethod
-    def collapsed(still, config):
-        """Gradients are exactly zero in the steps of these numbers."""
-        module = guarded("joint", guards=config)
-        losses = type(module).step_losses
-
-        def step_losses(self, batch, draws):
-            factor = 0 if self.batch_number in still else 1
-            return {n: factor * part for n, part in losses(self, batch, draws).items()}
-
-        type(module).step_losses = step_losses
-        return module
-
-    def test_stops_after_enough_steps_without_gradients(self):
-        module = self.collapsed({1, 2, 3}, GuardConfig(collapse_steps=3))
-        with pytest.raises(RuntimeError, match=r"below 1e-08 for 3 steps, until step 3.*learning"):
-            train(module, NamedData(5))
-        assert len(module.states) == 3
-
-    def test_a_gradient_in_between_starts_the_count_again(self):
-        module = self.collapsed({0, 1, 3, 4}, GuardConfig(collapse_steps=3))
-        assert len(train(module, NamedData(5)).states) == 5
-
-    @pytest.mark.parametrize(("norms", "still"), [([0.0, 1e-9], 1), ([0.0, 1e-7], 0)])
-    def test_all_networks_must_be_still(self, norms, still):
-        guard = StepGuard(GuardConfig())
-        assert guard.judge(torch.tensor(norms)).good
-        assert guard.still == still
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("max_skipped_steps", 0), ("collapse_steps", 0), ("saved_batches", -1), ("collapse_norm", -1)],
-)
-def test_settings_out_of_range_are_refused(name, value):
-    with pytest.raises(ValueError, match=rf"guards\.{name} must be at least .*got {value}"):
-        GuardConfig(**{name: value})
+@pytest.mark.parametrize(("most", "saved"), [(0, 3), (10, -1)])
+def test_settings_out_of_range_are_refused(most, saved):
+    with pytest.raises(ValueError, match=f"at least 1 .* got {most} and {saved}"):
+        StepGuard(most, saved)
 
 
 @pytest.mark.ddp
@@ -315,7 +257,7 @@ def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_t
         use_distributed_sampler=False,
     )
     first, second = (torch.load(tmp_path / f"rank_{rank}.pt") for rank in (0, 1))
-    assert first["guard"] == second["guard"] == {"skipped": 1, "in_a_row": 0, "still": 0}
+    assert first["guard"] == second["guard"] == {"skipped": 1, "in_a_row": 0}
     for key, value in first["weights"].items():
         assert value.isfinite().all(), key
         assert torch.equal(value, second["weights"][key]), key
@@ -332,7 +274,7 @@ def test_a_process_that_is_asked_to_stop_tells_the_other_in_its_step(tmp_path, o
         def __init__(self):
             self.seen = []
 
-        def on_before_optimizer_step(self, trainer, module, optimizer):
+        def on_after_backward(self, trainer, module):
             asked = trainer.global_rank == 1 and trainer.global_step == 1
             module.guard.stop = int(signal.SIGTERM) if asked else 0
 
