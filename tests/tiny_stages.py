@@ -152,24 +152,25 @@ def stage_module(stage, **kwargs):
     return STAGES[stage](**networks, **kwargs)
 
 
-def train(module, data=None, guard=True, callbacks=(), **kwargs):
+def train(module, data=None, guard=True, callbacks=(), ckpt_path=None, **kwargs):
     """Trains with a step guard, kept as ``module.guard``; None trains without."""
     data = data or TinyData()
     module.guard = StepGuard() if guard is True else guard
     callbacks = [*callbacks, *([module.guard] if module.guard else [])]
     with tempfile.TemporaryDirectory() as folder:
-        settings = {"max_steps": len(data.batches), "default_root_dir": folder, "devices": 1}
-        trainer = L.Trainer(
-            accelerator="cpu",
-            limit_val_batches=0,
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            callbacks=callbacks,
-            **settings | kwargs,
-        )
-        trainer.fit(module, datamodule=data)
+        settings = {
+            "max_steps": len(data.batches),
+            "default_root_dir": folder,
+            "accelerator": "cpu",
+            "devices": 1,
+            "limit_val_batches": 0,
+            "logger": False,
+            "enable_checkpointing": False,
+            "enable_progress_bar": False,
+            "enable_model_summary": False,
+        }
+        trainer = L.Trainer(callbacks=callbacks, **settings | kwargs)
+        trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=False)
     return module
 
 

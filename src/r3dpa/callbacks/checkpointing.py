@@ -88,6 +88,7 @@ class RunCheckpoint(ModelCheckpoint):
                 f"{trainer.ckpt_path}, the first one from step {first}: give all processes the "
                 "same checkpoint, on a disk that all see, by its full name"
             )
+        _start_next_epoch(trainer)
         self._step = trainer.global_step
         self._signal = signal.SIGTERM if trainer.received_sigterm else 0
         if threading.current_thread() is threading.main_thread():
@@ -183,3 +184,13 @@ class RunCheckpoint(ModelCheckpoint):
 def _guard(trainer: L.Trainer) -> StepGuard | None:
     callbacks = cast(Any, trainer).callbacks
     return next((one for one in callbacks if isinstance(one, StepGuard)), None)
+
+
+def _start_next_epoch(trainer: L.Trainer) -> None:
+    """Starts an epoch anew where the checkpoint was written after the last batch of one.
+
+    Lightning would go on within that epoch, train a batch of the next one there and drop the rest.
+    """
+    loop = trainer.fit_loop.epoch_loop
+    if loop.restarting and loop.batch_progress.current.completed >= trainer.num_training_batches:
+        loop.restarting = False

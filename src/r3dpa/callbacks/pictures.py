@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import lightning as L
 import torch
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from r3dpa import viz
 from r3dpa.data import write_bin
-from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import points_of
 from r3dpa.modules import GenerativeModule
@@ -73,14 +72,10 @@ class PictureLogger(L.Callback):
             return
         if not isinstance(module, GenerativeModule):
             raise TypeError(f"PictureLogger draws GenerativeModules, got {type(module).__name__}")
-        datamodule = getattr(trainer, "datamodule", None)
-        if not isinstance(datamodule, LidarDataModule):
-            raise TypeError(
-                f"PictureLogger needs a LidarDataModule, got {type(datamodule).__name__}"
-            )
         pictures = {}
-        if datamodule.val_set:
-            image = datamodule.val_set[len(datamodule.val_set) // 2]["range_image"]
+        val_set = getattr(cast(Any, trainer).datamodule, "val_set", None)
+        if val_set:
+            image = val_set[len(val_set) // 2]["range_image"]
             pictures["reconstruction"] = self._reconstruction(module, image)
         if self.num_scenes and module.ema is not None:
             pictures["samples"] = self._samples(module, module.ema)
