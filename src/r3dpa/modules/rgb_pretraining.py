@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.data import ImageDataModule
+from r3dpa.data.image_datamodule import ImageDataModule
 from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry, latent_statistics
 from r3dpa.data.store import CachedTensors
 from r3dpa.flow import Interpolant
