@@ -208,18 +208,6 @@ def command() -> str:
     return re.sub(r"(?<![^\s='\"])[^\s='\"]*/(?=[^\s/'\"])", "", typed)
 
 
-def provenance(scan: Path | None, num_points: int, *packages: ModuleType) -> dict[str, Any]:
-    """Command, scan (simulated where None), machine and versions of a benchmark on one scan."""
-    import torch
-
-    return {
-        "command": command(),
-        "scan": {"file": "simulated" if scan is None else scan.name, "points": num_points},
-        "machine": machine() | {"threads": torch.get_num_threads()},
-        "versions": versions(torch, *packages),
-    }
-
-
 def one_line(values: str | dict[str, Any]) -> str:
     """A text as it is, or names and values in one line."""
     if isinstance(values, str):

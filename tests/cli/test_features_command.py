@@ -20,7 +20,8 @@ import torch
 import yaml
 
 from r3dpa.cli import main
-from r3dpa.data import FeatureGrids, features_lock, find_scans, stored_source
+from r3dpa.data import FeatureGrids, features_lock, find_scans
+from r3dpa.data.feature_grids import any_settings
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import WaffleIron
 from r3dpa.nn.backbones.point_features import official_name
@@ -148,7 +149,7 @@ class TestForms:
             words += ["--extractor", "geometric", "--data.init_args.num_workers", 0]
             features("--data", *words)
             grids = tmp_path / folder / "feature_grids" / "geometric"
-            assert stored_source(grids) == "geometric"
+            assert any_settings(grids).extractor["name"] == "geometric"
             assert num_written(grids / "8x64") == 2
             assert capsys.readouterr().out.endswith(f" per second, in {grids / '8x64'}\n")
 
@@ -182,7 +183,7 @@ class TestForms:
         words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
         words += ["--data.init_args.limit", 1, "--out", tmp_path / "grids"]
         features("--data", data, *words)
-        assert stored_source(tmp_path / "grids") == "scalr"
+        assert any_settings(tmp_path / "grids").extractor["name"] == "scalr"
         assert num_written(tmp_path / "grids") == 2
 
 

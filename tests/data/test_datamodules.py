@@ -6,7 +6,6 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from r3dpa.data import (
-    FeatureGridWriter,
     KITTI360DataModule,
     LidarDataModule,
     PointDataset,
@@ -197,7 +196,7 @@ def test_stored_grids_need_not_be_made_as_they_would_be_here(tmp_path, data, sca
     todo = plan(*arguments)
     samples = PointDataset(todo.missing, module.sensor, extractor.prepare)
     grids = pooled_grids(extractor, [*samples], projection, [(2, 4)])
-    with FeatureGridWriter(module.features_dir, todo.settings[2, 4]) as writer:
+    with todo.settings[2, 4].writer(module.features_dir) as writer:
         writer.add([sample.key for sample in samples], grids[2, 4])
     module.prepare_data()
     module.setup("fit")

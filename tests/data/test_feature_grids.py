@@ -15,7 +15,6 @@ import torch
 
 from r3dpa.data import (
     FeatureGrids,
-    FeatureGridWriter,
     GridSettings,
     PointDataset,
     StoreError,
@@ -23,11 +22,9 @@ from r3dpa.data import (
     find_scans,
     pooled_grids,
     read_scan,
-    stored_feature_dim,
-    stored_source,
     write_feature_grids,
 )
-from r3dpa.data.feature_grids import plan
+from r3dpa.data.feature_grids import any_settings, plan
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
@@ -453,13 +450,11 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
         (settings((4, 4), gain=3.0), r"'gain': 1\.0.*, but .*'gain': 3\.0"),
     ):
         with pytest.raises(StoreError, match=f"{words}.*features_dir .*r3dpa features"):
-            FeatureGridWriter(root, other)
-    FeatureGridWriter(root, settings((4, 4), dtype="int8"))  # another size may be stored otherwise
-    assert stored_feature_dim(root) == 4
-    assert stored_source(root) == "scaled"
-    for function in (stored_feature_dim, stored_source):
-        with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
-            function(root / "nothing")
+            other.writer(root)
+    settings((4, 4), dtype="int8").writer(root)  # another size may be stored otherwise
+    assert any_settings(root).extractor["name"] == "scaled"
+    with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
+        any_settings(root / "nothing")
     with pytest.raises(ValueError, match="dtype must be float16 or int8, got 'int4'"):
         settings(dtype="int4")
 
@@ -477,7 +472,7 @@ def test_a_disk_that_fills_up(made, projection, scaled_points):
     settings = GridSettings.of(scaled_points(), projection, GRID)
     keys = [("new/1", 1, 1), ("new/2", 1, 1)]
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    writer = FeatureGridWriter(root, settings)
+    writer = settings.writer(root)
     resource.setrlimit(resource.RLIMIT_FSIZE, (64 + 32, hard))
     try:
         with pytest.raises(StoreError, match=r"cannot be written to .*2x4 \(.*\): give a folder"):

@@ -29,7 +29,7 @@ import yaml
 from PIL import Image
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
-from r3dpa.data import FeatureGrids, FeatureGridWriter, GridSettings, Scan, read_samples
+from r3dpa.data import FeatureGrids, GridSettings, Scan, read_samples
 from r3dpa.data.images import read_mask
 from r3dpa.data.labels import read_labels
 from r3dpa.data.objects import ObjectClass, ObjectLibrary
@@ -162,7 +162,7 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
     scans = [Scan("drive", f"{n}", folder / f"{n}.bin") for n in range(3)]
     for scan in scans:
         scan.path.write_bytes(bytes(160))
-    with FeatureGridWriter(store, settings) as writer:
+    with settings.writer(store) as writer:
         writer.add([scan.cache_key for scan in scans], torch.randn(3, 8, 3))
 
     def read() -> None:

@@ -11,10 +11,8 @@ from r3dpa.data.checks import CheckReport, check
 from r3dpa.data.datasets import (
     LatentBatch,
     LatentDataset,
-    LatentSample,
     LidarBatch,
     LidarDataset,
-    LidarSample,
     PointDataset,
     PointSample,
     list_collate,
@@ -25,14 +23,11 @@ from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
-    FeatureGridWriter,
     GridPlan,
     GridSettings,
     default_features_dir,
     features_lock,
     pooled_grids,
-    stored_feature_dim,
-    stored_source,
     write_feature_grids,
 )
 from r3dpa.data.images import ImageFolder, ImageSource, TarImages
@@ -73,7 +68,6 @@ __all__ = [
     "CheckReport",
     "DeadLeaves",
     "Extractor",
-    "FeatureGridWriter",
     "FeatureGrids",
     "GridPlan",
     "GridSettings",
@@ -83,11 +77,9 @@ __all__ = [
     "KITTI360DataModule",
     "LatentBatch",
     "LatentDataset",
-    "LatentSample",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",
-    "LidarSample",
     "PointDataModule",
     "PointDataset",
     "PointSample",
@@ -115,8 +107,6 @@ __all__ = [
     "read_ply",
     "read_samples",
     "read_scan",
-    "stored_feature_dim",
-    "stored_source",
     "write_bin",
     "write_feature_grids",
     "write_npz",
@@ -126,7 +116,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Load the data modules on first use."""
     if name in _ON_FIRST_USE:
         return getattr(import_module(f"r3dpa.data.{_ON_FIRST_USE[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r3dpa.data.datasets import LatentDataset, LatentSample, LidarDataset, LidarSample
+from r3dpa.data.datasets import LatentDataset, LidarDataset
 
 _STREAM = 1  # separates these draws from those of the order, which have the same seed
 
@@ -38,16 +38,10 @@ class View:
     grid_columns: int
 
     def points(self, points: Tensor) -> Tensor:
-        """Points seen this way, computed in float64.
+        """Points ``(P, 3 or more)`` seen this way, computed in float64; other columns stay.
 
         :meth:`image` equals projecting these, but for points at the border of two pixels: a pixel
         holds its left border only, which mirroring makes the right one.
-
-        Args:
-            points: ``(P, F)`` x, y, z in metres and anything else, which stays.
-
-        Returns:
-            ``(P, F)``, a copy, in the same order and dtype.
         """
         angle = -2 * math.pi * self.columns / self.grid_columns
         x, y = points[:, 0].double(), points[:, 1].double()
@@ -63,25 +57,18 @@ class View:
         return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
 
     def grid(self, grid: Tensor) -> Tensor:
-        """Feature grid ``(h * w, D)`` seen this way.
-
-        As exact as the features: see :meth:`Augmentation.check_extractor`.
-        """
+        """Feature grid ``(h * w, D)`` seen this way, see :meth:`Augmentation.check_extractor`."""
         return self._reordered(grid.unflatten(0, (-1, self.grid_columns)), 1, 1).flatten(0, 1)
 
-    def sample(self, sample: LidarSample | LatentSample) -> LidarSample | LatentSample:
-        """Training sample seen this way; index and name stay.
-
-        Posteriors are images, too: the encoder commutes with rotation by its column stride. With
-        mirroring it does not, see :meth:`Augmentation.check_latents`.
-        """
-        seen: dict[str, Any] = dict(sample)
+    def sample(self, sample: dict[str, Any]) -> dict[str, Any]:
+        """Training sample seen this way; index and name stay."""
+        seen = dict(sample)
         for name in ("range_image", "valid_mask", "posterior_moments"):
             if name in seen:
                 seen[name] = self.image(seen[name])
         if "feature_grid" in seen:
             seen["feature_grid"] = self.grid(seen["feature_grid"])
-        return cast(LidarSample, seen)
+        return seen
 
     def _reordered(self, values: Tensor, axis: int, cell_columns: int) -> Tensor:
         if self.mirrored:
@@ -111,31 +98,17 @@ class Augmentation:
         return self.rotate or self.flip
 
     def draw(self, seed: int, epoch: int, index: int, grid_columns: int) -> View:
-        """View of one scan in one epoch: a function of the arguments alone.
-
-        Args:
-            seed: Seed of the data module, not negative.
-            epoch: Passes over the data before this one.
-            index: Place of the scan in the training set.
-            grid_columns: Columns w of the feature grid.
-        """
+        """View of one scan in one epoch: a function of the arguments alone."""
         generator = np.random.default_rng((seed, epoch, index, _STREAM))
         columns = int(generator.integers(grid_columns))
         mirrored = bool(generator.random() < 0.5)
         return View(columns if self.rotate else 0, self.flip and mirrored, grid_columns)
 
     def check_extractor(self, extractor: Any, grid_columns: int) -> None:
-        """Refuse stored grids that are not those of the scan seen otherwise.
+        """Raise ``ValueError`` where stored grids, reordered, may not be those of the view.
 
         An extractor says by ``num_headings`` and ``mirror_invariant`` how its features follow the
-        scan, see :class:`r3dpa.data.Extractor`.
-
-        Args:
-            extractor: What made the grids, None if unknown.
-            grid_columns: Columns w of the feature grid.
-
-        Raises:
-            ValueError: If a stored grid, reordered, may differ from that of the reordered scan.
+        scan, see :class:`r3dpa.data.Extractor`; unknown if None.
         """
         if self.approximate_grids:
             return
@@ -156,14 +129,9 @@ class Augmentation:
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:
-        """Refuse cached posteriors that are not those of the scan seen otherwise.
+        """Raise ``ValueError`` where cached posteriors are not those of the view.
 
-        Args:
-            latent_columns: Columns w of the latents.
-            grid_columns: Columns of the feature grid, by which scans are rotated.
-
-        Raises:
-            ValueError: If scans are mirrored, or rotated by parts of a latent column.
+        The encoder commutes with rotation by its column stride only, and not with mirroring.
         """
         if self.flip:
             reason = "flip: the encoder of the VAE does not commute with mirroring"
@@ -180,7 +148,7 @@ class Augmentation:
         )
 
 
-class AugmentedDataset(Dataset[LidarSample | LatentSample]):
+class AugmentedDataset(Dataset[dict[str, Any]]):
     """Training samples seen otherwise in each epoch.
 
     Args:
@@ -201,14 +169,9 @@ class AugmentedDataset(Dataset[LidarSample | LatentSample]):
         self.seed, self.grid_columns = seed, grid_columns
 
     def __len__(self) -> int:
-        """Number of scans."""
         return len(self.dataset)
 
-    def __getitem__(self, key: tuple[int, int]) -> LidarSample | LatentSample:
-        """Sample of ``(epoch, index)``.
-
-        Loader processes live longer than an epoch, so that each sample asked for names its own.
-        """
+    def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
         epoch, index = key
         view = self.augmentation.draw(self.seed, epoch, index, self.grid_columns)
         return view.sample(self.dataset[index])

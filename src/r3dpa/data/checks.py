@@ -47,7 +47,6 @@ class CheckReport:
         return not self.bad and not self.missing
 
     def __str__(self) -> str:
-        """Report for the terminal."""
         lines = [f"{drive}: {count} scans" for drive, count in self.num_scans.items()]
         lines += [f"missing: {folder}" for folder in self.missing]
         lines += [f"bad: {file}: {reason}" for file, reason in self.bad]

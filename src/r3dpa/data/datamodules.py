@@ -27,7 +27,7 @@ from r3dpa.data.feature_grids import (
     default_features_dir,
     write_feature_grids,
 )
-from r3dpa.data.loaders import module_loader
+from r3dpa.data.loaders import at_least, module_loader
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
@@ -55,8 +55,8 @@ class LidarDataModule(LightningDataModule):
     """Scans of a folder, file, glob, or list of these.
 
     Validation and test use the held-out scans, prediction all scans in order. Training scans alone
-    are augmented, where asked for, and not under ``overfit_batches``. Their order and augmentation
-    depend on ``seed`` and the epoch alone; a resumed run goes on with the very next batch.
+    are augmented, and not under ``overfit_batches``. Their order and augmentation depend on
+    ``seed`` and the epoch alone; a resumed run goes on with the very next batch.
 
     Args:
         scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
@@ -74,7 +74,7 @@ class LidarDataModule(LightningDataModule):
             Without either, no grids.
         batch_size: Scans per batch **per process**; an optimiser step sees ``batch_size`` x
             processes x ``accumulate_grad_batches`` scans.
-        num_workers: Loader processes per training process; also prepare scans for the extractor.
+        num_workers: Loader processes per training process.
         seed: Seed of the order of training scans and of their augmentation.
         val_every: Every this many scans, one is held out; None for none. Neighbours in a recording
             look alike: hold out whole recordings by ``val_drives`` for an honest score.
@@ -84,12 +84,7 @@ class LidarDataModule(LightningDataModule):
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
         images_dir: Folder that keeps the range images, which are then projected once, before
-            training: 262 kB a scan of 64 x 1024 pixels, the very same numbers. None projects each
-            scan each time it is read.
-
-    Attributes:
-        feature_dim: Width D of the feature grids; 768, that of ScaLR, where none are used.
-        projection_kind: The argument ``projection``.
+            training: 262 kB a scan of 64 x 1024 pixels, the very same numbers.
 
     Raises:
         ValueError: If an argument is out of its range, or the features do not follow the
@@ -122,15 +117,11 @@ class LidarDataModule(LightningDataModule):
         self.prepare_data_per_node = prepare_data_per_node
         if projection not in ("spherical", "rings"):
             raise ValueError(f"projection must be 'spherical' or 'rings', got {projection!r}.")
-        for name, value, least in (
-            ("batch_size", batch_size, 1),
-            ("num_workers", num_workers, 0),
-            ("seed", seed, 0),
-            ("val_every", val_every, 2),
-            ("limit", limit, 1),
-        ):
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}.")
+        at_least("batch_size", batch_size, 1)
+        at_least("num_workers", num_workers, 0)
+        at_least("seed", seed, 0)
+        at_least("val_every", val_every, 2)
+        at_least("limit", limit, 1)
         self.scans = scans
         self.sensor = sensor
         self.projection_kind = projection
@@ -156,22 +147,14 @@ class LidarDataModule(LightningDataModule):
 
     @property
     def feature_dim(self) -> int:
-        """Width D of the feature grids; 768, that of ScaLR, where none are used.
-
-        Raises:
-            StoreError: If ``features_dir`` is given, is empty and there is no extractor.
-        """
+        """Width D of the feature grids; 768, that of ScaLR, where none are used."""
         if self.extractor is not None:
             return cast(Extractor, self.extractor).dim
         return _SCALR_DIM if self.features_dir is None else any_settings(self.features_dir).dim
 
     @property
     def feature_source(self) -> str | None:
-        """Name of the extractor of the feature grids; None where none are used.
-
-        Raises:
-            StoreError: If ``features_dir`` is given, is empty and there is no extractor.
-        """
+        """Name of the extractor of the feature grids; None where none are used."""
         if self.extractor is not None:
             return cast(Extractor, self.extractor).name
         if self.features_dir is None:
@@ -184,11 +167,7 @@ class LidarDataModule(LightningDataModule):
         return ScanGeometry(self.projection, self.codec, self.grid_size)
 
     def split(self) -> tuple[list[Scan], list[Scan]]:
-        """Training scans and held-out scans, each sorted, before ``limit``; not both empty.
-
-        Raises:
-            ValueError: If there are no scans, or a name in ``val_drives`` is none of theirs.
-        """
+        """Training and held-out scans, each sorted, before ``limit``; ``ValueError`` if none."""
         scans = find_scans(self.scans)
         if self.val_drives:
             drives = {scan.drive for scan in scans}
@@ -207,10 +186,7 @@ class LidarDataModule(LightningDataModule):
         return evenly(train, self.limit), evenly(val, self.limit)
 
     def prepare_data(self) -> None:
-        """Make the range images and feature grids that are missing; no grids to predict.
-
-        Range images where there is an ``images_dir``, grids where there is an extractor.
-        """
+        """Make the range images and, but to predict, the feature grids that are missing."""
         predicting = self.trainer is not None and self.trainer.predicting
         if self.images_dir is not None:
             train, val, projection = self._scans_and_projection()
@@ -243,11 +219,7 @@ class LidarDataModule(LightningDataModule):
         rank_zero_info(f"feature grids: {num_made} made, {num_kept} kept, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
-        """Index the scans and open the feature grids.
-
-        Args:
-            stage: ``"fit"``, ``"validate"``, ``"test"``, or ``"predict"``, which needs no grids.
-        """
+        """Index the scans and open the feature grids, which ``"predict"`` needs not."""
         self._posteriors = None  # of another fit, maybe with another VAE
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
@@ -266,10 +238,7 @@ class LidarDataModule(LightningDataModule):
         )
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
-        """Train on cached posteriors of a frozen VAE: :class:`LatentBatch` in place of images.
-
-        Args:
-            posteriors: Moments ``(2C, h, w)`` of all training scans.
+        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE: :class:`LatentBatch`.
 
         Raises:
             ValueError: If they do not follow the augmentation.

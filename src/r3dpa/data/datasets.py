@@ -18,16 +18,6 @@ from r3dpa.data.store import CachedTensors, ItemKey, TensorCache
 from r3dpa.geometry import LidarSensor, Projection, RangeCodec, projection_to_dict, range_image
 
 
-class LidarSample(TypedDict):
-    """One scan: the shapes of :class:`LidarBatch` without B, ``index`` and ``name`` single."""
-
-    range_image: Tensor
-    valid_mask: Tensor
-    feature_grid: NotRequired[Tensor]
-    index: int
-    name: str
-
-
 class LidarBatch(TypedDict):
     """Batch of the training modules.
 
@@ -44,15 +34,6 @@ class LidarBatch(TypedDict):
     name: list[str]
 
 
-class LatentSample(TypedDict):
-    """One encoded scan: the shapes of :class:`LatentBatch` without B."""
-
-    posterior_moments: Tensor
-    feature_grid: NotRequired[Tensor]
-    index: int
-    name: str
-
-
 class LatentBatch(TypedDict):
     """Replaces a :class:`LidarBatch` where the posteriors of the VAE are cached.
 
@@ -66,7 +47,7 @@ class LatentBatch(TypedDict):
     name: list[str]
 
 
-class LidarDataset(Dataset[LidarSample]):
+class LidarDataset(Dataset[dict[str, Any]]):
     """Range image, mask and feature grid of each scan as it is; nothing random.
 
     Args:
@@ -93,23 +74,17 @@ class LidarDataset(Dataset[LidarSample]):
         self.images = images
 
     def __len__(self) -> int:
-        """Number of scans."""
         return len(self.scans)
 
-    def __getitem__(self, index: int) -> LidarSample:
-        """Sample of one scan.
-
-        Raises:
-            ScanError: If the scan cannot be used; the message names the file.
-        """
+    def __getitem__(self, index: int) -> dict[str, Any]:
         scan = self.scans[index]
         image = self._project(scan) if self.images is None else self.images.read(scan)
-        sample = LidarSample(
-            range_image=image,
-            valid_mask=self.codec.valid_mask(image),
-            index=index,
-            name=scan.name,
-        )
+        sample = {
+            "range_image": image,
+            "valid_mask": self.codec.valid_mask(image),
+            "index": index,
+            "name": scan.name,
+        }
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
@@ -125,7 +100,7 @@ class LidarDataset(Dataset[LidarSample]):
         return self.codec.encode(range_m)[None]
 
 
-class LatentDataset(Dataset[LatentSample]):
+class LatentDataset(Dataset[dict[str, Any]]):
     """Posterior of a frozen VAE and feature grid of each scan; range images are not read.
 
     Args:
@@ -143,14 +118,15 @@ class LatentDataset(Dataset[LatentSample]):
         self.scans, self.posteriors, self.grids = list(scans), posteriors, grids
 
     def __len__(self) -> int:
-        """Number of scans."""
         return len(self.scans)
 
-    def __getitem__(self, index: int) -> LatentSample:
-        """Sample of one scan."""
+    def __getitem__(self, index: int) -> dict[str, Any]:
         scan = self.scans[index]
-        moments = self.posteriors.read(scan)
-        sample = LatentSample(posterior_moments=moments, index=index, name=scan.name)
+        sample: dict[str, Any] = {
+            "posterior_moments": self.posteriors.read(scan),
+            "index": index,
+            "name": scan.name,
+        }
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
@@ -187,11 +163,9 @@ class PointDataset(Dataset[PointSample]):
         self.scans, self.sensor, self.prepare = list(scans), sensor, prepare
 
     def __len__(self) -> int:
-        """Number of scans."""
         return len(self.scans)
 
     def __getitem__(self, index: int) -> PointSample:
-        """One scan; ``ScanError`` if it cannot be used."""
         scan = self.scans[index]
         key = scan.cache_key
         points = torch.from_numpy(read_scan(scan.path, self.sensor))
@@ -218,11 +192,9 @@ class DrawnPoints(Dataset[Any]):
         self.scans, self.sensor, self.prepare, self.seed = list(scans), sensor, prepare, seed
 
     def __len__(self) -> int:
-        """Number of scans."""
         return len(self.scans)
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
-        """Preparation of ``(epoch, index)``; of epoch 0 where only an index is given."""
         epoch, index = key if isinstance(key, tuple) else (0, key)
         points = torch.from_numpy(read_scan(self.scans[index].path, self.sensor))
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
@@ -260,11 +232,7 @@ def write_range_images(
         workers: Processes that project; 0 for none.
 
     Returns:
-        Number of range images made.
-
-    Raises:
-        StoreError: If the cache cannot be written or is damaged.
-        ScanError: If a scan cannot be used; the message names the file.
+        Number of range images made. ``StoreError`` or ``ScanError`` names what cannot be used.
     """
     cache = range_image_cache(root, projection, codec)
     if not cache.missing(scans):

@@ -54,7 +54,6 @@ class DeadLeaves(ImageSource):
     largest: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         if self.num_images < 1 or self.seed < 0:
             raise ValueError(
                 f"num_images >= 1 and seed >= 0 are needed, got {self.num_images} and {self.seed}"
@@ -86,18 +85,9 @@ class DeadLeaves(ImageSource):
 def dead_leaves(
     generator: np.random.Generator, size: int, smallest: float = 0.06, largest: float = 0.5
 ) -> NDArray[np.uint8]:
-    """One image of the model that :class:`DeadLeaves` describes.
+    """One image ``(S, S, 3)`` uint8 of the model that :class:`DeadLeaves` describes.
 
     Shapes are drawn from the front to the back, each where nothing is drawn yet.
-
-    Args:
-        generator: All randomness.
-        size: Side S of the image, pixels.
-        smallest: Smallest radius in sides of the image.
-        largest: Largest radius in sides of the image.
-
-    Returns:
-        ``(S, S, 3)`` uint8.
     """
     side = size * _OVERSAMPLING
     palette = _colours(generator, _PALETTE)

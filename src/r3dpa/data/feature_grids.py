@@ -30,22 +30,19 @@ _SETTINGS = "settings.json"
 
 
 class Extractor(Protocol):
-    """Frozen network that describes every point of a scan.
+    """Frozen network whose features of a scan are ``lift(point_features([prepare(points)])[0])``.
 
-    Its features are ``lift(point_features([prepare(points)])[0])``. A last step that is linear
-    belongs into ``lift((N, K)) -> (N, dim)``, which may be absent: it commutes with the mean of a
-    cell, so that cells are lifted instead of points.
-
-    It may also say which augmentation its features follow: ``num_headings``, if rotating a scan by
-    any multiple of ``2 * pi / num_headings`` about the vertical axis leaves the features of its
-    points alone, and ``mirror_invariant``, if swapping left and right does.
+    A last step that is linear belongs into ``lift((N, K)) -> (N, dim)``, which may be absent: it
+    commutes with the mean of a cell, so that cells are lifted instead of points. For augmentation,
+    ``num_headings`` may say that rotating a scan by multiples of ``2 * pi / num_headings`` leaves
+    the features of its points alone, and ``mirror_invariant`` that swapping left and right does.
 
     Attributes:
         name: Short name, that of the default folder.
         dim: Width D of the features.
         settings: Whatever else determines the features, as JSON values; compared on opening.
-        prepare: Work on the CPU for the points ``(P, 4)`` x, y, z (metres), intensity of one scan.
-            Loader processes do it: a function that can be pickled and holds no weights.
+        prepare: Work on the CPU for the points ``(P, 4)`` x, y, z (metres), intensity of one scan,
+            done in loader processes: can be pickled and holds no weights.
     """
 
     name: str
@@ -87,7 +84,6 @@ class GridSettings:
     precision: str
 
     def __post_init__(self) -> None:
-        """Refuse an unknown ``dtype``."""
         if self.dtype not in ("float16", "int8"):
             raise ValueError(f"dtype must be float16 or int8, got {self.dtype!r}")
 
@@ -100,11 +96,7 @@ class GridSettings:
         dtype: Literal["float16", "int8"] = "float16",
         precision: str = "32-true",
     ) -> Self:
-        """Settings of the grids that an extractor would make.
-
-        Raises:
-            ValueError: If the grid does not divide the range image, or ``dtype`` is unknown.
-        """
+        """Settings of the grids that an extractor would make; refuses a grid that does not fit."""
         projection.sensor.cell_size(grid_size)
         wanted = _wanted(projection, extractor)
         size = (grid_size[0], grid_size[1])
@@ -121,12 +113,13 @@ class GridSettings:
             remedy=f"{REMEDY}, or give the data module an extractor",
         )
 
-    def check(self, features_dir: str | Path) -> None:
-        """Refuse to add grids to those of other settings, or to a folder of another extractor.
+    def writer(self, features_dir: str | Path, shard: int = 0) -> StoreWriter:
+        """Writer of such grids; ``StoreError`` if the folder was made with other settings."""
+        self.check(features_dir)
+        return self.store(features_dir).writer(shard)
 
-        Raises:
-            StoreError: Names both values.
-        """
+    def check(self, features_dir: str | Path) -> None:
+        """Raise :class:`StoreError` where a folder holds grids of other settings or extractors."""
         for size, stored in stored_settings(features_dir).items():
             same_size = size == self.grid_size
             stored.compare(
@@ -135,11 +128,7 @@ class GridSettings:
             )
 
     def compare(self, wanted: Mapping[str, Any], folder: Path) -> None:
-        """Refuse these stored grids where other settings are wanted.
-
-        Raises:
-            StoreError: Names both values.
-        """
+        """Raise :class:`StoreError`, with both values, where these stored grids are not those."""
         for key, value in wanted.items():
             if getattr(self, key) != value:
                 raise _made_otherwise(key, getattr(self, key), value, folder)
@@ -162,11 +151,7 @@ def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreEr
 
 
 def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSettings]:
-    """Settings of the stores of a folder by grid size; empty if there are none.
-
-    Raises:
-        StoreError: If a file of settings is damaged.
-    """
+    """Settings of the stores of a folder by grid size; ``StoreError`` for a damaged file."""
     found = {}
     for path in sorted(Path(features_dir).glob(f"*/{_SETTINGS}")):
         try:
@@ -186,27 +171,13 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
 
 
 def any_settings(features_dir: str | Path) -> GridSettings:
-    """Settings of some grids of a folder; extractor and width are the same for all sizes.
-
-    Raises:
-        StoreError: If there are none.
-    """
+    """Settings of the first grids of a folder, all of one extractor; ``StoreError`` if none."""
     stored = stored_settings(features_dir)
     if not stored:
         raise StoreError(
             f"No feature grids in {features_dir}: make them {REMEDY}, or give an extractor."
         )
     return next(iter(stored.values()))
-
-
-def stored_feature_dim(features_dir: str | Path) -> int:
-    """Width D of the grids of a folder; ``StoreError`` if there are none."""
-    return any_settings(features_dir).dim
-
-
-def stored_source(features_dir: str | Path) -> str:
-    """Name of the extractor that made the grids of a folder; ``StoreError`` if there are none."""
-    return str(any_settings(features_dir).extractor["name"])
 
 
 class FeatureGrids(CachedTensors[Scan]):
@@ -246,23 +217,6 @@ class FeatureGrids(CachedTensors[Scan]):
         self.dim = settings.dim
 
 
-class FeatureGridWriter(StoreWriter):
-    """Appends grids of given settings to a shard of its own, see :class:`StoreWriter`.
-
-    Args:
-        features_dir: Folder of one extractor.
-        settings: How the grids are made; must be those of the store, if there is one.
-        shard: The first free shard from this number on is taken.
-
-    Raises:
-        StoreError: If the store was made with other settings, is damaged, or cannot be written.
-    """
-
-    def __init__(self, features_dir: str | Path, settings: GridSettings, shard: int = 0) -> None:
-        settings.check(features_dir)
-        super().__init__(settings.store(features_dir), shard)
-
-
 @dataclass(frozen=True)
 class GridPlan:
     """Grids that are to be made.
@@ -300,20 +254,12 @@ def plan(
 ) -> GridPlan:
     """Find the grids that are missing, and refuse what cannot work before anything is written.
 
-    ``dtype`` and ``precision`` need to be those of the store only where grids are missing.
-
-    Args:
-        scans: Scans, of any number of drives.
-        extractor: What would make them.
-        projection: That of the range images.
-        grid_sizes: Rows and columns (h, w) of each grid.
-        features_dir: Folder of the extractor.
-        dtype: How grids are stored, see :class:`GridSettings`.
-        precision: Arithmetic of the extractor, as Lightning names it.
+    ``dtype`` and ``precision`` (as Lightning names it) need to be those of the store only where
+    grids are missing. Arguments: see :func:`write_feature_grids`.
 
     Raises:
-        StoreError: If there are grids that were made with other settings, or the disk has
-            not enough space left.
+        StoreError: If there are grids that were made with other settings, or the disk has not
+            enough space left.
         ValueError: If there are no grid sizes, or one does not divide the range image.
     """
     if not grid_sizes:
@@ -363,10 +309,8 @@ def pooled_grids(
         grid_sizes: Rows and columns (h, w) of each grid.
 
     Returns:
-        ``(B, N, D)`` float32 on the CPU for each grid size; empty cells are zero.
-
-    Raises:
-        StoreError: If a feature is NaN or infinite; names the file of the scan.
+        ``(B, N, D)`` float32 on the CPU for each grid size; empty cells are zero. ``StoreError``
+        names the scan whose features are not finite.
     """
     features = extractor.point_features([sample.prepared for sample in samples])
     lift = getattr(extractor, "lift", torch.nn.Identity())
@@ -399,8 +343,8 @@ def write_feature_grids(
 ) -> int:
     """Make the grids that are missing for ``scans`` in this process; those that exist are kept.
 
-    Another process that makes grids in the folder is waited for, and then what is still missing is
-    made. After an error or a kill, all but the grids of the last batch are kept.
+    Another process that makes grids in the folder is waited for. After an error or a kill, all but
+    the grids of the last batch are kept.
 
     Args:
         scans: Scans, of any number of drives.
@@ -410,17 +354,15 @@ def write_feature_grids(
         features_dir: Folder of the extractor.
         workers: Processes that read and prepare the scans; 0 for none.
         batch_size: Scans that the extractor is given at once.
-        dtype: How grids are stored, see :class:`GridSettings`.
+        dtype: How grids are stored, see :class:`r3dpa.data.store.Store`.
         progress: Called after each scan with the number of scans done and the number to do.
 
     Returns:
         Number of scans whose grids were made.
 
     Raises:
-        StoreError: If ``features_dir`` has grids that were made with other settings, cannot
-            be written, or has not enough space left.
+        StoreError: As :func:`plan`, or if ``features_dir`` cannot be written.
         ScanError: If a scan cannot be used; the message names the file.
-        ValueError: If there are no grid sizes, or one does not divide the range image.
     """
     arguments = scans, extractor, projection, grid_sizes, features_dir, dtype
     if not plan(*arguments).missing:
@@ -437,7 +379,7 @@ def write_feature_grids(
         done = 0
         with ExitStack() as stack:
             writers = {
-                size: stack.enter_context(FeatureGridWriter(features_dir, settings))
+                size: stack.enter_context(settings.writer(features_dir))
                 for size, settings in todo.settings.items()
             }
             for samples in loader:

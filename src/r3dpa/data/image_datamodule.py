@@ -8,7 +8,7 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
-from r3dpa.data.loaders import module_loader
+from r3dpa.data.loaders import at_least, module_loader
 from r3dpa.data.store import CachedTensors
 
 
@@ -44,15 +44,11 @@ class ImageDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self.prepare_data_per_node = prepare_data_per_node
-        for name, value, least in (
-            ("image_size", image_size, 1),
-            ("batch_size", batch_size, 1),
-            ("num_workers", num_workers, 0),
-            ("seed", seed, 0),
-            ("val_every", val_every, 2),
-        ):
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}.")
+        at_least("image_size", image_size, 1)
+        at_least("batch_size", batch_size, 1)
+        at_least("num_workers", num_workers, 0)
+        at_least("seed", seed, 0)
+        at_least("val_every", val_every, 2)
         self.source, self.image_size, self.batch_size = source, image_size, batch_size
         self.num_workers, self.seed = num_workers, seed
         self.val_every, self.mirrored = val_every, mirrored
@@ -60,11 +56,7 @@ class ImageDataModule(LightningDataModule):
         self.val_set: ImageDataset | None = None
 
     def setup(self, stage: str) -> None:
-        """Index the images.
-
-        Raises:
-            ImageError: If there are none, or a file is damaged.
-        """
+        """Index the images; ``ImageError`` if there are none, or a file is damaged."""
         entries = self.source.entries()
         train = [entry for place, entry in enumerate(entries) if place % self.val_every]
         if self.mirrored:
@@ -79,12 +71,7 @@ class ImageDataModule(LightningDataModule):
         return {"source": kind, "image_size": self.image_size, **self.source.settings()}
 
     def use_posteriors(self, posteriors: CachedTensors[ImageEntry], with_images: bool) -> None:
-        """Train on cached posteriors of a frozen VAE, on those images alone that have one.
-
-        Args:
-            posteriors: Moments of the training images.
-            with_images: Give the images as well, as a teacher needs them.
-        """
+        """Train on cached posteriors, and on the pixels too where a teacher needs them."""
         self.train_set = ImageDataset(
             self.source, posteriors.items, self.image_size, posteriors, with_images
         )

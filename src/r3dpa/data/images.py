@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from r3dpa.data.scans import evenly
-from r3dpa.data.store import CachedTensors
+from r3dpa.data.store import CachedTensors, DataError, ItemKey
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
 
@@ -36,17 +36,8 @@ _BRIGHT = 128
 _MIRRORED = ".mirrored"  # end of the name of an entry that is seen from the other side
 
 
-class ImageError(ValueError):
+class ImageError(DataError):
     """An image or shard that cannot be used; the message names the file."""
-
-
-class ImageSample(TypedDict):
-    """One image: the shapes of :class:`ImageBatch` without B, ``index`` and ``name`` single."""
-
-    image: NotRequired[Tensor]
-    posterior_moments: NotRequired[Tensor]
-    index: int
-    name: str
 
 
 class ImageBatch(TypedDict):
@@ -85,7 +76,7 @@ class ImageEntry:
     mtime_ns: int = 0
 
     @property
-    def cache_key(self) -> tuple[str, int, int]:
+    def cache_key(self) -> ItemKey:
         """Name, size and time of change, which tell images of one name apart."""
         return self.name, self.num_bytes, self.mtime_ns
 
@@ -99,19 +90,11 @@ class ImageSource(ABC):
 
     @abstractmethod
     def entries(self) -> list[ImageEntry]:
-        """All images, sorted by name.
-
-        Raises:
-            ImageError: If there is none, or a file is damaged.
-        """
+        """All images, sorted by name; ``ImageError`` if there is none, or a file is damaged."""
 
     @abstractmethod
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
-        """Square image ``(S, S, 3)`` of one entry, not mirrored.
-
-        Raises:
-            ImageError: If it cannot be read; names the file.
-        """
+        """Square image ``(S, S, 3)`` of an entry, not mirrored; ``ImageError`` names a bad file."""
 
     def settings(self) -> dict[str, Any]:
         """What the pixels depend on beside the entry, as JSON values."""
@@ -142,15 +125,11 @@ class ImageFolder(ImageSource):
 
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
         """Square image ``(S, S, 3)`` of a file."""
-        try:
-            data = entry.path.read_bytes()
-        except OSError as error:
-            raise ImageError(f"{entry.path}: cannot be read ({error.strerror or error})") from error
-        return _decoded(data, str(entry.path), size)
+        return _decoded(entry, str(entry.path), size)
 
 
 class TarImages(ImageSource):
-    """Images of tar shards, as WebDataset writes them: any tar file that is not compressed.
+    """Images of uncompressed tar files, as WebDataset writes them.
 
     The headers of all shards are read once; an image is then one read at a known place, so that
     shuffling needs no unpacking.
@@ -183,14 +162,7 @@ class TarImages(ImageSource):
 
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
         """Square image ``(S, S, 3)`` of a member."""
-        name = f"{entry.path}: {entry.name}"
-        try:
-            with entry.path.open("rb") as file:
-                file.seek(entry.offset)
-                data = file.read(entry.num_bytes)
-        except OSError as error:
-            raise ImageError(f"{name}: cannot be read ({error.strerror or error})") from error
-        return _decoded(data, name, size)
+        return _decoded(entry, f"{entry.path}: {entry.name}", size)
 
 
 def _files(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
@@ -249,10 +221,16 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
     return found
 
 
-def _decoded(data: bytes, name: str, size: int) -> NDArray[np.uint8]:
+def _decoded(entry: ImageEntry, name: str, size: int) -> NDArray[np.uint8]:
     try:
-        with Image.open(io.BytesIO(data)) as file:
-            image: Image.Image = file
+        with entry.path.open("rb") as file:
+            file.seek(entry.offset)
+            data = file.read(entry.num_bytes)
+    except OSError as error:
+        raise ImageError(f"{name}: cannot be read ({error.strerror or error})") from error
+    try:
+        with Image.open(io.BytesIO(data)) as opened:
+            image: Image.Image = opened
             if image.mode.startswith("I"):  # 16 bits of grey, which convert() would clip at 255
                 image = Image.fromarray((np.asarray(image) // 256).astype(np.uint8))
             return center_crop(image.convert("RGB"), size)
@@ -261,19 +239,12 @@ def _decoded(data: bytes, name: str, size: int) -> NDArray[np.uint8]:
 
 
 def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
-    """Largest centred square of an image, resized.
+    """Largest centred square ``(S, S, 3)`` uint8 of an RGB image, resized.
 
     While the shorter side is at least twice ``size`` it is halved by averaging 2 x 2 pixels, so
     that the bicubic resizing after it does not alias.
 
     Source: preprocessing of ADM (Dhariwal and Nichol, 2021), which REPA-E and R3DPA use.
-
-    Args:
-        image: RGB image of any size.
-        size: Side S of the square.
-
-    Returns:
-        ``(S, S, 3)`` uint8.
     """
     while min(image.size) >= 2 * size:
         image = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
@@ -284,7 +255,7 @@ def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
     return np.asarray(image)[top : top + size, left : left + size]
 
 
-class ImageDataset(Dataset[ImageSample]):
+class ImageDataset(Dataset[dict[str, Any]]):
     """Square images of some entries, or the cached posteriors of a VAE, or both.
 
     Args:
@@ -307,17 +278,11 @@ class ImageDataset(Dataset[ImageSample]):
         self.posteriors, self.with_images = posteriors, with_images
 
     def __len__(self) -> int:
-        """Number of images."""
         return len(self.entries)
 
-    def __getitem__(self, index: int) -> ImageSample:
-        """Image and posterior of one entry.
-
-        Raises:
-            ImageError: If the image cannot be used; the message names the file.
-        """
+    def __getitem__(self, index: int) -> dict[str, Any]:
         entry = self.entries[index]
-        sample = ImageSample(index=index, name=entry.name)
+        sample: dict[str, Any] = {"index": index, "name": entry.name}
         if self.with_images:
             pixels = self.source.read(entry, self.size)
             if entry.mirrored:

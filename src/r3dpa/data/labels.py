@@ -22,84 +22,46 @@ from r3dpa.data.scans import ScanError, read_beside
 
 __all__ = ["CLASS_NAMES", "read_labels"]
 
+_NAMES = {
+    6: "ground,road,sidewalk,parking,rail track,building,wall,fence,guard rail,bridge,tunnel",
+    17: "pole,polegroup,traffic light,sign,vegetation,terrain",
+    24: "person,rider,car,truck,bus,caravan,trailer,train,motorcycle,bicycle,garage,gate,stop",
+    37: "smallpole,lamp,trash bin,vending machine,box,unknown construction,unknown vehicle",
+    44: "unknown object",
+}
 #: Names by KITTI-360 class id; every other id counts as unlabelled.
 CLASS_NAMES = {
-    6: "ground",
-    7: "road",
-    8: "sidewalk",
-    9: "parking",
-    10: "rail track",
-    11: "building",
-    12: "wall",
-    13: "fence",
-    14: "guard rail",
-    15: "bridge",
-    16: "tunnel",
-    17: "pole",
-    18: "polegroup",
-    19: "traffic light",
-    20: "sign",
-    21: "vegetation",
-    22: "terrain",
-    24: "person",
-    25: "rider",
-    26: "car",
-    27: "truck",
-    28: "bus",
-    29: "caravan",
-    30: "trailer",
-    31: "train",
-    32: "motorcycle",
-    33: "bicycle",
-    34: "garage",
-    35: "gate",
-    36: "stop",
-    37: "smallpole",
-    38: "lamp",
-    39: "trash bin",
-    40: "vending machine",
-    41: "box",
-    42: "unknown construction",
-    43: "unknown vehicle",
-    44: "unknown object",
+    first + place: name
+    for first, names in _NAMES.items()
+    for place, name in enumerate(names.split(","))
 }
 _ID = {name: number for number, name in CLASS_NAMES.items()}
 # SemanticKITTI's own ids; those from 252 on are of things that move.
-_SEMANTIC_KITTI = {
-    0: 0,  # unlabelled
-    1: 0,  # outlier
-    10: _ID["car"],
-    11: _ID["bicycle"],
-    13: _ID["bus"],
-    15: _ID["motorcycle"],
-    16: _ID["train"],
-    18: _ID["truck"],
-    20: _ID["unknown vehicle"],
-    30: _ID["person"],
-    31: _ID["rider"],
-    32: _ID["rider"],
-    40: _ID["road"],
-    44: _ID["parking"],
-    48: _ID["sidewalk"],
-    49: _ID["ground"],
-    50: _ID["building"],
-    51: _ID["fence"],
-    52: _ID["unknown construction"],
-    60: _ID["road"],  # lane marking
-    70: _ID["vegetation"],
-    71: _ID["vegetation"],  # trunk
-    72: _ID["terrain"],
-    80: _ID["pole"],
-    81: _ID["sign"],
-    99: _ID["unknown object"],
-    252: _ID["car"],
-    253: _ID["rider"],
-    254: _ID["person"],
-    255: _ID["rider"],
-    256: _ID["train"],
-    257: _ID["bus"],
-    258: _ID["truck"],
-    259: _ID["unknown vehicle"],
+_SEMANTIC_IDS = {
+    "car": (10, 252),
+    "bicycle": (11,),
+    "bus": (13, 257),
+    "motorcycle": (15,),
+    "train": (16, 256),
+    "truck": (18, 258),
+    "unknown vehicle": (20, 259),
+    "person": (30, 254),
+    "rider": (31, 32, 253, 255),
+    "road": (40, 60),
+    "parking": (44,),
+    "sidewalk": (48,),
+    "ground": (49,),
+    "building": (50,),
+    "fence": (51,),
+    "unknown construction": (52,),
+    "vegetation": (70, 71),
+    "terrain": (72,),
+    "pole": (80,),
+    "sign": (81,),
+    "unknown object": (99,),
+}
+_SEMANTIC_KITTI = {0: 0, 1: 0} | {
+    own: _ID[name] for name, numbers in _SEMANTIC_IDS.items() for own in numbers
 }
 _KITTI_BOXES = {
     "Car": _ID["car"],
@@ -162,11 +124,9 @@ def _semantic_kitti(path: Path, num_points: int) -> NDArray[np.int64]:
 
 
 def _in_boxes(path: Path, calib: Path, points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Labels of the points in the boxes of the KITTI object benchmark, objects numbered from 1.
-
-    A box stands in the frame of the rectified camera, x right, y down, z forward; its place is the
-    middle of its bottom, and ``rotation_y`` turns it about y.
-    """
+    """Labels of the points in the boxes of the KITTI object benchmark, objects numbered from 1."""
+    # A box stands in the frame of the rectified camera (x right, y down, z forward): its place is
+    # the middle of its bottom, and rotation_y turns it about y.
     to_camera = _camera_of(calib)
     places = np.column_stack([points[:, :3], np.ones(len(points))]) @ to_camera.T
     labels = np.zeros(len(points), dtype=np.int64)

@@ -45,7 +45,6 @@ class EpochSampler(DistributedSampler[Any]):
         self.epoch_shift = 0
 
     def __iter__(self) -> Iterator[Any]:
-        """Indices of this process in the current epoch, from ``start`` on."""
         epoch = self.epoch + self.epoch_shift
         generator = np.random.default_rng((self.seed, epoch))
         order = generator.permutation(len(cast(Sized, self.dataset)))
@@ -57,12 +56,9 @@ class ResumableLoader(DataLoader[Any]):
     """Loader whose state is its place in the data: epoch, and samples of it handed out.
 
     Lightning saves the state in every checkpoint and gives it back when a run is resumed; the
-    next batch is then the one that the interrupted run would have received. Batches that loader
-    processes have prefetched but not handed out are not counted. The loader draws nothing from
-    the global random state.
-
-    Build it with :func:`training_loader`, for Lightning rebuilds loaders from the arguments of
-    ``DataLoader``.
+    next batch is then the one that the interrupted run would have received, whatever loader
+    processes had prefetched. Built by :func:`training_loader`, since Lightning rebuilds loaders
+    from the arguments of ``DataLoader``.
 
     Attributes:
         batches_per_epoch: Batches that the trainer takes of each epoch.
@@ -78,11 +74,7 @@ class ResumableLoader(DataLoader[Any]):
         return cast(int, self.batch_size) * cast(EpochSampler, self.sampler).num_replicas
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        """Batches of the epoch, or of the rest of it after a resume.
-
-        A generator, so that nothing is read before the first batch is asked for: Lightning makes
-        the iterator first and sets the epoch of the sampler later.
-        """
+        # A generator: Lightning makes the iterator first and sets the epoch of the sampler later.
         sampler = cast(EpochSampler, self.sampler)
         first = 0
         if self._resume_at is not None:
@@ -109,12 +101,7 @@ class ResumableLoader(DataLoader[Any]):
         }
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Go on at a saved place.
-
-        Raises:
-            ValueError: If the place lies within an epoch over other data, or of another order, or
-                within one batch of this loader.
-        """
+        """Go on at a saved place; ``ValueError`` within an epoch of other data, order or batch."""
         samples, num_samples = state_dict["samples"], len(cast(Sized, self.dataset))
         seed = cast(EpochSampler, self.sampler).seed
         if samples and (state_dict["dataset_size"], state_dict["seed"]) != (num_samples, seed):
@@ -147,7 +134,7 @@ def training_loader(
     collate_fn: Callable[[list[Any]], Any] | None = None,
     kind: str = "scans",
 ) -> ResumableLoader:
-    """Shuffled, resumable loader of full batches.
+    """Shuffled, resumable loader of full batches; draws nothing from the global random state.
 
     Args:
         dataset: Map-style data set, a function of what it is asked for alone.
@@ -156,13 +143,11 @@ def training_loader(
         seed: Seed of the order.
         num_replicas: Number of training processes.
         rank: This training process.
-        limit_batches: ``limit_train_batches`` of the trainer: an int is a number of batches of each
-            epoch, a float a share of them.
+        limit_batches: ``limit_train_batches`` of the trainer.
         pin_memory: Copy batches to page-locked memory for a GPU.
-        with_epoch: Ask the data set for ``(epoch, index)``, where samples change from epoch to
-            epoch.
+        with_epoch: Ask the data set for ``(epoch, index)``.
         collate_fn: Makes a batch of samples; that of ``DataLoader`` where None.
-        kind: What the samples are, for the message.
+        kind: Of the samples, for the message.
 
     Raises:
         ValueError: If the data set is smaller than one batch over all processes.
@@ -189,21 +174,23 @@ def training_loader(
     return loader
 
 
+def at_least(name: str, value: int | None, least: int) -> None:
+    """Raise ``ValueError`` for an argument below its range; None passes."""
+    if value is not None and value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}.")
+
+
 def module_loader(
     module: Any, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
 ) -> DataLoader[Any]:
-    """Loader of a data module, for the processes of its trainer.
+    """Loader of a data module for the processes of its trainer, if it has one.
 
     Args:
-        module: Data module with ``batch_size``, ``num_workers``, ``seed`` and ``trainer``, which
-            may be None.
-        dataset: What is loaded.
+        module: Data module with ``batch_size``, ``num_workers``, ``seed`` and ``trainer``.
+        dataset: Samples.
         train: Whether shuffled and resumable, see :func:`training_loader`, or in order.
-        kind: What the samples are, for messages.
+        kind: Of the samples, for messages.
         options: ``collate_fn``; for training also ``with_epoch``.
-
-    Raises:
-        ValueError: If there are too few samples for the processes.
     """
     trainer = module.trainer
     replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
@@ -236,17 +223,7 @@ def module_loader(
 def ordered_sampler(
     dataset: Dataset[Any], num_replicas: int, rank: int, kind: str = "scans"
 ) -> UnrepeatedDistributedSampler:
-    """All samples in order, none twice; Lightning's default pads the last batch with some again.
-
-    Args:
-        dataset: Its length is used.
-        num_replicas: Number of processes.
-        rank: This process.
-        kind: What the samples are, for the message.
-
-    Raises:
-        ValueError: If there are fewer samples than processes.
-    """
+    """All samples in order, none twice; Lightning's default pads the last batch with some again."""
     num_samples = len(cast(Sized, dataset))
     if num_samples < num_replicas:
         raise ValueError(

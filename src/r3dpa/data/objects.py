@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -71,7 +71,6 @@ class ObjectLibrary:
     grid_size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        """Check that the parts fit together."""
         names = self.names
         if self.features.shape[:-1] != (len(names),) or len(set(names)) < len(names):
             raise ValueError(
@@ -92,11 +91,7 @@ class ObjectLibrary:
         return str(self.extractor["name"])
 
     def feature(self, name: str) -> Tensor:
-        """Mean feature ``(D,)`` of a class.
-
-        Raises:
-            ValueError: If the library has no such class; lists those that it has.
-        """
+        """Mean feature ``(D,)`` of a class; ``ValueError`` lists those that there are."""
         if name not in self.names:
             raise ValueError(
                 f"there is no {name!r} among the objects; there are {', '.join(self.names)}"
@@ -104,14 +99,11 @@ class ObjectLibrary:
         return self.features[self.names.index(name)]
 
     def check_source(self, source: str | None, dim: int) -> None:
-        """Refuse features that a network was not aligned with.
+        """Raise ``ValueError`` where a network was aligned with another source or width.
 
         Args:
             source: Feature source that the checkpoint records, None for none.
             dim: Width of its projected features.
-
-        Raises:
-            ValueError: If one differs; names both values.
         """
         own = self.features.shape[1]
         if source != self.source or dim != own:
@@ -122,11 +114,7 @@ class ObjectLibrary:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write everything to one ``.safetensors`` file, atomically.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Write everything to one ``.safetensors`` file, atomically."""
         card = {
             "version": _VERSION,
             "classes": [asdict(entry) for entry in self.classes],
@@ -140,11 +128,7 @@ class ObjectLibrary:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            ValueError: If the file is missing, damaged or of something else; it is named.
-        """
+        """Read what :meth:`save` wrote; ``ValueError`` names a missing or damaged file."""
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_CARD])
@@ -162,42 +146,14 @@ class ObjectLibrary:
             ) from error
 
 
-@dataclass
-class _Sums:
-    """What is added up over the cells of one class, each weighted by the class's share of it.
+class _Part(NamedTuple):
+    """Sums over the cells of one class in one scan, weighted by the class's share of each cell."""
 
-    Args:
-        dim: Width D of the features.
-    """
-
-    dim: int
-    features: Tensor = field(init=False)
-    directions: Tensor = field(init=False)
-    weight: float = 0.0
-    num_scans: int = 0
-    num_cells: int = 0
-    num_points: int = 0
-
-    def __post_init__(self) -> None:
-        """Start from nothing."""
-        self.features = torch.zeros(self.dim, dtype=torch.float64)
-        self.directions = torch.zeros(self.dim, dtype=torch.float64)
-
-    def add(self, cells: Tensor, counts: Tensor, shares: Tensor) -> None:
-        """Cells ``(M, D)`` float64 of one scan, points of the class and its share ``(M,)``."""
-        self.features += shares @ cells
-        self.directions += shares @ F.normalize(cells, dim=1)
-        self.weight += shares.sum().item()
-        self.num_scans += 1
-        self.num_cells += len(cells)
-        self.num_points += int(counts.sum())
-
-    def result(self, name: str) -> tuple[Tensor, ObjectClass]:
-        """Feature ``(D,)`` of the class and what it was made from."""
-        mean = self.features / self.weight
-        cosine = (F.normalize(mean, dim=0) @ self.directions / self.weight).item()
-        counts = self.num_scans, self.num_cells, self.num_points
-        return mean.float(), ObjectClass(name, *counts, max(0.0, 1 - cosine))
+    features: Tensor
+    directions: Tensor
+    weight: float
+    num_cells: int
+    num_points: int
 
 
 @torch.no_grad()  # not inference mode: a target of guidance takes part in a backward pass
@@ -216,7 +172,7 @@ def object_library(
         feature = sum_cells share * mean / sum_cells share
 
     so that a cell full of an object counts once whether it holds ten points or a hundred, and the
-    rim of an object, where its features know of what stands behind, counts little.
+    rim of an object, where its features depend on what is behind it, counts little.
 
     Source: R3DPA (ICRA 2026) averages the points of the class in a single scan.
 
@@ -238,36 +194,44 @@ def object_library(
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     wanted = _wanted(classes)
     lift = getattr(extractor, "lift", torch.nn.Identity())
-    sums: dict[str, _Sums] = {}
+    found: dict[str, list[_Part]] = {name: [] for name in wanted}
     shown: set[int] = set()
     for scan in scans:
-        points, labels, values = _features(scan, extractor, projection)
+        whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
+        labels = torch.from_numpy(read_labels(scan.path, whole.numpy())) & 0xFFFF
+        values = extractor.point_features([extractor.prepare(whole)])[0]
+        points = whole[:, :3]
         row, column = projection.pixel_of(points)
         cell = row // cell_rows * grid_size[1] + column // cell_columns
         kept = in_range(points, projection.sensor)
-        shown.update((labels[kept] & 0xFFFF).unique().tolist())
+        shown.update(labels[kept].unique().tolist())
         totals = torch.bincount(cell[kept], minlength=grid_size[0] * grid_size[1])
         for name, number in wanted.items():
-            own = (kept & (labels & 0xFFFF == number)).nonzero()[:, 0]
+            own = (kept & (labels == number)).nonzero()[:, 0]
             if len(own) == 0:
                 continue
-            cells, counts, means = _means(own, cell[own], values)
+            cells, counts = cell[own].unique(return_counts=True)
+            order = own[cell[own].argsort(stable=True)].to(values.device)
+            first = (counts.cumsum(0) - counts).to(values.device)
+            means = F.embedding_bag(order, values.float(), first, mode="mean")
             lifted = lift(means).double().cpu()
             if not lifted.isfinite().all():
                 raise ValueError(
                     f"{scan.path}: extractor {extractor.name} gave NaN or infinite features; leave "
                     "this scan out"
                 )
-            counted = sums.setdefault(name, _Sums(extractor.dim))
-            counted.add(lifted, counts, counts / totals[cells].double())
-    missing = [name for name in wanted if name not in sums]
-    if not sums or (classes is not None and missing):
-        found = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
+            shares = counts / totals[cells].double()
+            directions = shares @ F.normalize(lifted, dim=1)
+            part = _Part(shares @ lifted, directions, shares.sum().item(), len(cells), len(own))
+            found[name].append(part)
+    missing = [name for name, parts in found.items() if not parts]
+    if len(missing) == len(found) or (classes is not None and missing):
+        seen = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
         raise ValueError(
             f"the scans have no labelled point of {', '.join(missing)} within range; they show "
-            f"{found or 'no class at all'}. Give more scans or other classes"
+            f"{seen or 'no class at all'}. Give more scans or other classes"
         )
-    results = [sums[name].result(name) for name in wanted if name in sums]
+    results = [_mean(name, parts) for name, parts in found.items() if parts]
     return ObjectLibrary(
         torch.stack([feature for feature, _ in results]),
         tuple(entry for _, entry in results),
@@ -275,6 +239,18 @@ def object_library(
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
+
+
+def _mean(name: str, parts: list[_Part]) -> tuple[Tensor, ObjectClass]:
+    """Feature ``(D,)`` of a class and what it was made from."""
+    features = torch.stack([part.features for part in parts]).cumsum(0)[-1]
+    directions = torch.stack([part.directions for part in parts]).cumsum(0)[-1]
+    weight = sum(part.weight for part in parts)
+    mean = features / weight
+    cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
+    num_cells = sum(part.num_cells for part in parts)
+    num_points = sum(part.num_points for part in parts)
+    return mean.float(), ObjectClass(name, len(parts), num_cells, num_points, max(0.0, 1 - cosine))
 
 
 def _wanted(classes: Sequence[str] | None) -> dict[str, int]:
@@ -287,28 +263,3 @@ def _wanted(classes: Sequence[str] | None) -> dict[str, int]:
     if unknown := [name for name in classes if name not in ids]:
         raise ValueError(f"there is no class {', '.join(unknown)}; there are {', '.join(ids)}")
     return {name: ids[name] for name in classes}
-
-
-def _features(
-    scan: Scan, extractor: Extractor, projection: Projection
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Points ``(P, 3)`` and labels ``(P,)`` of a scan on the CPU, and values ``(P, K)``."""
-    points = torch.from_numpy(read_scan(scan.path, projection.sensor))
-    labels = torch.from_numpy(read_labels(scan.path, points.numpy()))
-    values = extractor.point_features([extractor.prepare(points)])[0]
-    return points[:, :3], labels, values
-
-
-def _means(own: Tensor, cell: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells ``(M,)`` that hold some points, how many each, and their mean values ``(M, K)``.
-
-    Args:
-        own: Numbers of the points, on the CPU like ``cell``.
-        cell: Cell of each of them.
-        values: ``(P, K)`` of all points of the scan.
-    """
-    cells, counts = cell.unique(return_counts=True)
-    order, first = own[cell.argsort(stable=True)], counts.cumsum(0) - counts
-    device = values.device
-    means = F.embedding_bag(order.to(device), values.float(), first.to(device), mode="mean")
-    return cells, counts, means

@@ -85,12 +85,7 @@ class Sample(NamedTuple):
 class Samples:
     """Samples that are read while they are iterated over, see :func:`read_samples`.
 
-    Args:
-        files: Name and path of every file; an empty name where one file holds all samples.
-        sensor: Image size and range limits.
-        format: Of all files; found for each where None.
-        corner: Whether pixels stand for their corners, where an image comes without points.
-        skip_bad: Leave out samples that cannot be used.
+    Attributes:
         num_read: Usable samples of the current or last iteration.
         bad: Messages of those that were left out.
     """
@@ -104,14 +99,6 @@ class Samples:
     bad: list[str] = field(default_factory=list, init=False)
 
     def __iter__(self) -> Iterator[Sample]:
-        """Read from the start.
-
-        Warns:
-            UserWarning: At the end, of the samples that were left out.
-
-        Raises:
-            SampleError: On the first bad sample, or with ``skip_bad`` if none is usable.
-        """
         self.num_read, self.bad = 0, []
         for prefix, file in self.files:
             arrays = _arrays_of(file, self.format)
@@ -154,11 +141,9 @@ def read_samples(
 ) -> Samples:
     """Samples of a file, or of all files of one format in a folder and its sub-folders.
 
-    Points and pixels outside the sensor's range limits are left out, as they are from real scans.
-    Never more than one sample is in memory.
-
-    The folders that ``r3dpa sample`` and the official R3DPA write hold each scene several times;
-    of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
+    Points and pixels outside the sensor's range limits are left out. Never more than one sample is
+    in memory. The folders that ``r3dpa sample`` and the official R3DPA write hold each scene
+    several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
 
     Args:
         path: File or folder. Files of a folder are read in the order of their names.
@@ -169,13 +154,9 @@ def read_samples(
         skip_bad: Leave bad samples out; they are in ``bad`` of the result, and a warning counts
             them. Else the first one stops.
 
-    Returns:
-        An iterable of :class:`Sample`; every iteration reads the files again.
-
     Raises:
-        SampleError: If nothing is found, or a folder holds several formats. While iterating: if a
-            file cannot be read or is of no known format; a cloud is empty, out of range or holds
-            NaN; an image is of another size than the sensor's or of unknown channels.
+        SampleError: If nothing is found, or a folder holds several formats; while iterating, if a
+            sample cannot be used.
     """
     path = Path(path)
     files, chosen = ([("", path)], format) if path.is_file() else _find(path, format)

@@ -17,7 +17,7 @@ from typing import IO, Literal, TypeVar
 import numpy as np
 import torch
 
-from r3dpa.data.store import ItemKey, item_key
+from r3dpa.data.store import DataError, ItemKey, item_key
 from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, refuse_name
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name
@@ -32,16 +32,17 @@ KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
 RAW = "data_3d_raw"
 VELODYNE = Path("velodyne_points") / "data"
 _BYTES_PER_POINT = 16
-_PLY_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
+_PLY_NAMES = {
+    "i1": "char int8",
+    "u1": "uchar uint8",
+    "<i2": "short int16",
+    "<u2": "ushort uint16",
+    "<i4": "int int32",
+    "<u4": "uint uint32",
+    "<f4": "float float32",
+    "<f8": "double float64",
 }
+_PLY_TYPES = {name: code for code, names in _PLY_NAMES.items() for name in names.split()}
 _FIVE_COLUMNS = (
     "its values are those of 5 columns, as nuScenes has them (x, y, z, intensity 0..255, ring): "
     "save the first 4 as float32, the intensity divided by 255"
@@ -50,7 +51,7 @@ _FIVE_COLUMNS = (
 ARCHIVE_ERRORS = (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError)
 
 
-class ScanError(ValueError):
+class ScanError(DataError):
     """A scan file that cannot be used; the message names the file and the reason."""
 
 
@@ -75,11 +76,7 @@ class Scan:
 
     @property
     def cache_key(self) -> ItemKey:
-        """Name, size and time of change of the file, see :func:`r3dpa.data.store.item_key`.
-
-        Raises:
-            ScanError: If the file cannot be read; names it.
-        """
+        """Name, size and time of change of the file, see :func:`r3dpa.data.store.item_key`."""
         try:
             return item_key(self.name, self.path.stat())
         except OSError as error:
@@ -89,11 +86,10 @@ class Scan:
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
-    Of a data set in the KITTI-360 layout (a folder that holds ``data_3d_raw``), the Velodyne scans
-    alone. Links to folders are followed; hidden files, among them unfinished ones, are left out.
-    The drive of a scan is its folder relative to the root: the given folder itself, or the
-    common parent of the files where a glob or a list is given. The fixed folders of the
-    KITTI-360 layout are left out of the name.
+    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), the Velodyne scans alone. Links
+    to folders are followed; hidden files are left out. The drive of a scan is its folder relative
+    to the given folder, or to the common parent of the files of a glob or list, without the fixed
+    folders of the KITTI-360 layout.
 
     Raises:
         ValueError: If nothing is found, or one file is named twice.
@@ -116,15 +112,8 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
 def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     """Scans of one split of a data set in the KITTI-360 layout, sorted by drive and frame.
 
-    The layout is ``root/data_3d_raw/<drive>/velodyne_points/data/<frame>.bin``; drives that are
-    absent are skipped (``r3dpa check`` names them).
-
-    Args:
-        root: Folder that holds ``data_3d_raw``.
-        split: ``"train"`` or ``"val"``, see :data:`KITTI360_DRIVES`.
-
-    Raises:
-        ValueError: If there is no scan of the split, and none of the other one either.
+    Drives that are absent are skipped (``r3dpa check`` names them); ``ValueError`` if both splits
+    are empty, see :data:`KITTI360_DRIVES`.
     """
     raw = Path(root).absolute() / RAW
     scans = {
@@ -176,12 +165,10 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
 
 
 def _wrong_layout(data: bytes) -> str | None:
-    """Why bytes are not rows of 4 float32; None if they are.
-
-    Of a size that fits 4 and 5 columns, the values decide: an intensity is never negative.
-    """
+    """Why bytes are not rows of 4 float32; None if they are."""
     whole = len(data) % _BYTES_PER_POINT == 0
     if len(data) % 20 == 0:
+        # Where the size fits both, the values decide: an intensity is never negative.
         values = np.frombuffer(data, dtype="<f4")
         four = whole and not (values[3::4] < 0).any()
         if not four and (values[3::5] >= 0).all():
@@ -198,15 +185,12 @@ def out_of_range(path: Path, sensor: LidarSensor) -> ScanError:
 
 
 def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndarray | None:
-    """Label or origin of each point of a simulated scan.
+    """Label or origin ``(P,)`` of each point of a simulated scan; None where there is no such file.
 
     Args:
         scan: The scan's ``data/<frame>.bin``.
         kind: ``"labels"``: uint32, KITTI-360 class in the lower 16 bits and instance in the upper;
             ``"origins"``: uint8, see :class:`r3dpa.simulation.Origin`.
-
-    Returns:
-        ``(P,)``; None where there is no such file, as for real scans.
 
     Raises:
         ScanError: If the file is unreadable or of another length than the scan; it is named.
@@ -226,14 +210,9 @@ def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndar
 
 
 def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
-    """Write one scan as a KITTI ``.bin`` file, atomically.
+    """Write ``(P, 3)`` or ``(P, 4)`` x, y, z (metres), intensity (else 0) as KITTI ``.bin``.
 
-    Args:
-        path: File to write.
-        points: ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and intensity (0 where not given).
-
-    Raises:
-        ValueError: If the shape is another or a value is not finite.
+    Atomic; raises ``ValueError`` for another shape, NaN or infinite values.
     """
     rows = _rows(points)
     if rows.shape[1] == 3:
@@ -243,14 +222,9 @@ def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
 
 
 def write_ply(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
-    """Write one scan as a binary little-endian ``.ply`` file, atomically.
+    """Write ``(P, 3)`` or ``(P, 4)`` x, y, z (metres), intensity as binary ``.ply``.
 
-    Args:
-        path: File to write.
-        points: ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and, where given, intensity.
-
-    Raises:
-        ValueError: If the shape is another or a value is not finite.
+    Atomic; raises ``ValueError`` for another shape, NaN or infinite values.
     """
     rows = _rows(points)
     names = ("x", "y", "z", "intensity")[: rows.shape[1]]
@@ -261,14 +235,11 @@ def write_ply(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
 
 
 def read_ply(path: str | Path) -> np.ndarray:
-    """Points of a binary little-endian ``.ply`` file whose first element is ``vertex``.
-
-    Returns:
-        ``(P, 3)`` float32 x, y, z in metres, or ``(P, 4)`` where the file has an intensity.
+    """Points ``(P, 3)``, or ``(P, 4)`` with intensity, of a binary little-endian ``.ply`` file.
 
     Raises:
-        ScanError: If the file is unreadable, has another format, or lacks x, y or z; the message
-            names the file.
+        ScanError: If the file is unreadable, has another format, other elements than ``vertex``, or
+            lacks x, y or z; the message names the file.
     """
     path = Path(path)
     head, separator, body = _read_bytes(path).partition(b"end_header\n")
@@ -308,11 +279,8 @@ def write_npz(
 
     Args:
         path: File to write.
-        scans: Points by name, or pairs of name and points, which need not be in memory together;
-            each ``(P, 3)`` or ``(P, 4)``, metres.
-
-    Raises:
-        ValueError: If a shape is another or a value is not finite.
+        scans: Points ``(P, 3)`` or ``(P, 4)`` by name, or pairs of name and points, which need not
+            be in memory together; ``ValueError`` for another shape, NaN or infinite values.
     """
     pairs = scans.items() if isinstance(scans, Mapping) else scans
     with (
@@ -325,24 +293,17 @@ def write_npz(
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Scans of a ``.npz`` file by name, each ``(P, 3)`` or ``(P, 4)`` float32, metres.
-
-    Raises:
-        ScanError: If the file is damaged, or holds what :func:`npz_members` refuses.
-    """
+    """Scans ``(P, 3)`` or ``(P, 4)`` of a ``.npz`` file by name; ``ScanError`` if it is damaged."""
     return {name: reader.whole() for name, reader in npz_members(Path(path))}
 
 
 class ArrayReader:
-    """Array in NumPy's format, read whole or row by row from a stream; objects are refused.
+    """Array in NumPy's format, read whole or row by row; objects are refused.
 
     Args:
         stream: Positioned at the start of the array.
         size: Bytes that the stream holds, so that a few cannot ask for much memory.
-        where: For messages.
-
-    Raises:
-        ScanError: If it is not such an array, or larger than the stream.
+        where: For the :class:`ScanError` of a damaged array.
     """
 
     def __init__(self, stream: IO[bytes], size: int, where: str) -> None:
@@ -390,9 +351,7 @@ class ArrayReader:
 def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
     """Name and reader of each array of a ``.npz`` file, each to be read before the next.
 
-    Raises:
-        ScanError: If the file is damaged, or a name leads out of a folder; file and member are
-            named.
+    Names that lead out of a folder, and damaged archives, are a :class:`ScanError`.
     """
     try:
         with zipfile.ZipFile(path) as archive:

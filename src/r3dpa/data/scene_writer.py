@@ -50,14 +50,13 @@ class SceneWriter:
     ``metadata.json``     written last: a folder without it is unfinished
     ===================== =====================================================================
 
-    Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json``, which
-    tells what was asked for, how many scenes are written and what they took. At most three batches
-    are in memory. An error of the thread is raised by the next calls of :meth:`put`, by
-    :meth:`close`, or at the end of the block; where that ends with another error, it is logged.
-    One process at a time writes to a folder.
+    Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
+    request and the number of scenes written. At most three batches are in memory. An error of the
+    thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block; where
+    that ends with another error, it is logged.
 
     Args:
-        out: Folder.
+        out: Folder; one process at a time writes to it.
         num: Number of scenes.
         projection: Of the range images.
         formats: Of :data:`SCENE_FORMATS`.
@@ -83,11 +82,9 @@ class SceneWriter:
         request: dict[str, Any],
         overwrite: bool = False,
     ) -> None:
-        unknown = [name for name in formats if name not in SCENE_FORMATS]
-        if unknown:
-            raise ValueError(
-                f"formats must be some of {', '.join(SCENE_FORMATS)}, got {unknown[0]!r}"
-            )
+        if unknown := [name for name in formats if name not in SCENE_FORMATS]:
+            known = ", ".join(SCENE_FORMATS)
+            raise ValueError(f"formats must be some of {known}, got {unknown[0]!r}")
         self.out, self.num, self.num_done, self.evaluations = out, num, 0, 0
         self._projection = projection
         self._formats = tuple(formats)
@@ -111,7 +108,6 @@ class SceneWriter:
         self._failed = False
 
     def __enter__(self) -> Self:
-        """Closes at the end of the block what :meth:`close` has not."""
         return self
 
     def __exit__(
@@ -120,10 +116,6 @@ class SceneWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Waits for the scenes that were put; after an interrupt they need not be drawn again.
-
-        Where an error came before the first scene, nothing is left behind.
-        """
         with self._alone:
             self._thread.shutdown()
             self._file.close()
@@ -145,13 +137,12 @@ class SceneWriter:
         """Takes the next scenes and returns at once, unless two batches wait already.
 
         Args:
-            range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards. From a
-                GPU it is copied behind what it computes now, and nothing waits for it here.
+            range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
             nfe: Network evaluations that each of them took.
 
         Raises:
             ValueError: If a scene that was put before holds NaN.
-            OSError: Or whatever else went wrong with scenes that were put before.
+            OSError: If a scene that was put before could not be written.
         """
         while len(self._waiting) >= _MOST_WAITING:
             self._waiting.popleft().result()
@@ -164,11 +155,7 @@ class SceneWriter:
         self._waiting.append(self._thread.submit(self._write, range_m, nfe, ready))
 
     def close(self) -> None:
-        """Waits until all scenes are written, and gives ``range_m.npy`` its name.
-
-        Raises:
-            OSError: Or whatever else went wrong with the last scenes.
-        """
+        """Waits until all scenes are written, and gives ``range_m.npy`` its name."""
         while self._waiting:
             self._waiting.popleft().result()
         self._thread.shutdown()

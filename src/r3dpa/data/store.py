@@ -47,7 +47,17 @@ def item_key(name: str, about: os.stat_result) -> ItemKey:
     return name, about.st_size, about.st_mtime_ns
 
 
-class StoreError(ValueError):
+class DataError(ValueError):
+    """A file that cannot be used; in one line, also when a loader process raised it."""
+
+    def __init__(self, message: object) -> None:
+        text = str(message)
+        if "Original Traceback" in text:  # which torch adds to errors of loader processes
+            text = text.strip().rpartition("\n")[2].partition("Error: ")[2]
+        super().__init__(text)
+
+
+class StoreError(DataError):
     """A row that is missing, or a store that is damaged or cannot be written; says the remedy."""
 
 
@@ -101,11 +111,7 @@ class Store(Generic[Item]):
         return np.dtype([("values", kind, self.shape)])
 
     def places(self) -> dict[ItemKey, tuple[int, int]]:
-        """Shard and row of each key.
-
-        Raises:
-            StoreError: If a journal is damaged.
-        """
+        """Shard and row of each key; ``StoreError`` if a journal is damaged."""
         found: dict[ItemKey, tuple[int, int]] = {}
         for path in sorted(self.folder.glob("shard_*.jsonl")):
             shard = int(path.stem.removeprefix("shard_"))
@@ -113,11 +119,7 @@ class Store(Generic[Item]):
         return found
 
     def missing(self, items: Sequence[Item]) -> list[Item]:
-        """Those of the items that have no row.
-
-        Raises:
-            StoreError: If a journal is damaged.
-        """
+        """Those of the items that have no row; ``StoreError`` if a journal is damaged."""
         places = self.places()
         return [item for item in items if find_place(places, item.cache_key) is None]
 
@@ -191,15 +193,7 @@ class Store(Generic[Item]):
 
 
 def store_lock(folder: Path, what: str) -> AbstractContextManager[None]:
-    """Lock of a folder of rows; another process that holds it is waited for.
-
-    Args:
-        folder: Made if missing.
-        what: What its holder does, for the log of those who wait.
-
-    Raises:
-        StoreError: If the folder cannot be made.
-    """
+    """Lock of a folder of rows, made if missing; another process that holds it is waited for."""
     with _writing("rows", folder):
         folder.mkdir(parents=True, exist_ok=True)
     return only_writer(folder / ".lock", what, wait=True)
@@ -244,11 +238,7 @@ class TensorCache(Store[Item]):
 
 
 class StoreWriter:
-    """Appends rows to a shard of its own; a context manager.
-
-    Args:
-        store: Where to; ``settings.json`` is written if it is missing.
-        shard: The first free shard from this number on is taken, with the first row.
+    """Appends rows to a shard of its own, the first free one from ``shard`` on; a context manager.
 
     Raises:
         StoreError: If the store is damaged or cannot be written.
@@ -265,9 +255,7 @@ class StoreWriter:
                 temporary.write_text(store.settings)
 
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
-        """Append the rows of those keys that the store lacks.
-
-        When this returns, the rows are on disk and other processes can read them.
+        """Append the rows of those keys that the store lacks; afterwards they are on the disk.
 
         Args:
             keys: B keys, taken before the files were read.
@@ -275,7 +263,7 @@ class StoreWriter:
 
         Raises:
             StoreError: If the disk is full or cannot be written, or a tensor is not finite; names
-                the folder or the item. The writer is then closed.
+                the folder or the item.
             ValueError: If the shapes do not fit each other or the store.
         """
         expected = (len(keys), *self._store.shape)
@@ -314,11 +302,9 @@ class StoreWriter:
         self._files, self._num_rows = None, 0
 
     def __enter__(self) -> Self:
-        """The writer itself."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close it."""
         self.close()
 
     def _open(self) -> tuple[FileIO, FileIO]:
@@ -400,7 +386,6 @@ class CachedTensors(Generic[Item]):
         return self.store.damaged(rows.with_suffix(".jsonl"), what)
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without the open files: each process maps them itself."""
         return self.__dict__ | {"_maps": {}}
 
 

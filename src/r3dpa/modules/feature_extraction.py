@@ -11,8 +11,9 @@ from lightning.pytorch import LightningDataModule, LightningModule
 from torch.utils.data import DataLoader, DistributedSampler
 
 from r3dpa.data.datasets import PointDataset, PointSample, list_collate
-from r3dpa.data.feature_grids import Extractor, FeatureGridWriter, GridSettings, pooled_grids
+from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.scans import Scan
+from r3dpa.data.store import StoreWriter
 from r3dpa.geometry import LidarSensor, Projection
 
 
@@ -49,7 +50,7 @@ class FeatureExtraction(LightningModule):
         self.grid_sizes = list(grid_sizes)
         self.features_dir = Path(features_dir)
         self.storage = dtype
-        self._writers: dict[tuple[int, int], FeatureGridWriter] = {}
+        self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
         """Take the projection of the first process: the others may lack the scans it is fitted to.
@@ -71,7 +72,7 @@ class FeatureExtraction(LightningModule):
         for size in self.grid_sizes:
             precision = self.trainer.precision
             settings = GridSettings.of(extractor, projection, size, self.storage, precision)
-            self._writers[size] = FeatureGridWriter(self.features_dir, settings, self.global_rank)
+            self._writers[size] = settings.writer(self.features_dir, self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:
         """Pool the features of the scans and write their grids.
