@@ -68,18 +68,27 @@ def pixel_coordinates(points, sensor):
     return rows, (180 - azimuth) / 360 * sensor.columns
 
 
-def touched_by_border_points(points, sensor, row_tolerance, column_tolerance):
+# Distance to a row or column border, in pixels, within which float32 rounding in the official code
+# may put a point next door.
+BORDER = (1e-4, 1e-6)
+
+
+def candidate_pixels(rows, columns, sensor, tolerances):
+    """The pixels that points may fall into, four arrays of rows and columns; the seam wraps."""
+    for row_shift in (-tolerances[0], tolerances[0]):
+        for column_shift in (-tolerances[1], tolerances[1]):
+            row = np.floor(rows + row_shift).clip(0, sensor.beams - 1).astype(int)
+            yield row, np.floor(columns + column_shift).astype(int) % sensor.columns
+
+
+def touched_by_border_points(points, sensor, tolerances=BORDER):
     """Pixels on either side of a border that is nearer to a point than so many pixels."""
     rows, columns = pixel_coordinates(points[in_range(points, sensor)], sensor)
-    near = np.abs(np.round(rows) - rows) < row_tolerance
-    near |= np.abs(np.round(columns) - columns) < column_tolerance
-    rows, columns = rows[near], columns[near]
+    near = np.abs(np.round(rows) - rows) < tolerances[0]
+    near |= np.abs(np.round(columns) - columns) < tolerances[1]
     touched = torch.zeros(sensor.beams, sensor.columns, dtype=torch.bool)
-    for row_shift in (-row_tolerance, row_tolerance):
-        for column_shift in (-column_tolerance, column_tolerance):
-            row = np.clip(np.floor(rows + row_shift), 0, sensor.beams - 1)
-            column = np.clip(np.floor(columns + column_shift), 0, sensor.columns - 1)
-            touched[row.astype(int), column.astype(int)] = True
+    for pixel in candidate_pixels(rows[near], columns[near], sensor, tolerances):
+        touched[pixel] = True
     return touched
 
 
@@ -114,27 +123,25 @@ def accept_any_of_tied(results, key, points, values, range_m, projection, expect
             results[key][pixel] = expected[pixel]
 
 
-def moved_over_row_border(range_m, expected, points, sensor):
-    """Pixels that differ because a float32 row of the official code ended next door.
+def moved_over_border(range_m, expected, points, sensor):
+    """Pixels that differ because the official code put a point on a border next door.
 
-    A level point of the second sensor lies exactly on the border 4.0; the official formula,
-    which subtracts from one in float32, puts it into row 3. Columns must agree exactly, and every
-    point must show in one of its two rows, unless a nearer one hides it there.
+    A level point of the second sensor lies exactly on the row border 4.0; the official formula,
+    which subtracts from one in float32, puts it into row 3. All other points must agree, and every
+    point must show in one of its candidate pixels, unless a nearer one hides it there.
     """
     moved = ~torch.isclose(range_m, expected, atol=1e-5, rtol=1e-5)
-    assert not (moved & ~touched_by_border_points(points, sensor, 1e-4, 0.0)).any()
+    assert not (moved & ~touched_by_border_points(points, sensor)).any()
     points = points[in_range(points, sensor)]
     distance = points.double().norm(dim=-1).float()
     rows, columns = pixel_coordinates(points, sensor)
-    columns = np.floor(columns).clip(0, sensor.columns - 1).astype(int)
     recorded = expected.where(expected > 0, torch.inf)
     shown = torch.full_like(distance, torch.inf)
     found = expected == EMPTY_RANGE_M
-    for shift in (-1e-4, 1e-4):
-        row = np.floor(rows + shift).clip(0, sensor.beams - 1).astype(int)
-        shown = shown.minimum(recorded[row, columns])
-        same = torch.isclose(recorded[row, columns], distance, atol=1e-5, rtol=1e-5)
-        found[row[same], columns[same]] = True
+    for row, column in candidate_pixels(rows, columns, sensor, BORDER):
+        shown = shown.minimum(recorded[row, column])
+        same = torch.isclose(recorded[row, column], distance, atol=1e-5, rtol=1e-5)
+        found[row[same], column[same]] = True
     assert (shown <= distance * (1 + 1e-5) + 1e-5).all()
     assert found.all()
     return moved
@@ -159,7 +166,7 @@ def test_projection_tiny(load_case, close):
         range_m, values = range_image(points, projection, intensity[:, None])
         results |= {f"out/range{suffix}": range_m, key: values[0]}
         accept_any_of_tied(results, key, points, intensity, range_m, projection, case[key])
-        moved = moved_over_row_border(range_m, case[f"out/range{suffix}"], points, sensor)
+        moved = moved_over_border(range_m, case[f"out/range{suffix}"], points, sensor)
         exempt |= {f"out/range{suffix}": moved, key: moved}
     range_m, moved = results["out/range"], exempt["out/range"]
     results["out/remission_variant"] = torch.where(
@@ -181,12 +188,11 @@ def test_projection_tiny(load_case, close):
 def test_projection_tiny_seam(load_case):
     """The one difference of the default: y = +0.0 and y = -0.0 behind the sensor share a column."""
     case = load_case("projection_tiny")
-    points = case["in/points"]
-    behind = points[(points[:, 0] < 0) & (points[:, 1] == 0)]
     sensor = sensor_of(case.config["linear"])
-    assert behind[:, 1].signbit().unique().tolist() == [False, True]
-    assert official(sensor).pixel_of(behind)[1].unique().tolist() == [0, sensor.columns - 1]
-    assert SphericalProjection(sensor).pixel_of(behind)[1].unique().tolist() == [0]
+    behind = torch.tensor([[-5.0, 0.0, -1.0], [-5.0, -0.0, -1.0]])
+    assert official(sensor).pixel_of(behind)[1].tolist() == [0, sensor.columns - 1]
+    assert SphericalProjection(sensor).pixel_of(behind)[1].tolist() == [0, 0]
+    points = case["in/points"]
     rest = points[~((points[:, 0] < 0) & (points[:, 1] == 0))]
     for ours, theirs in zip(
         SphericalProjection(sensor).pixel_of(rest), official(sensor).pixel_of(rest), strict=True
@@ -235,8 +241,8 @@ def test_projection_scan(load_case, real_scans_dir, close):
 
     # The masks follow from the points: certainly those within 1e-4 of a border (a float32
     # rounding error), and nothing farther than one pixel from a point within 2e-3.
-    certain = touched_by_border_points(points, sensor, 1e-4, 1e-4)
-    possible = touched_by_border_points(points, sensor, 2e-3, 2e-3)
+    certain = touched_by_border_points(points, sensor, (1e-4, 1e-4))
+    possible = touched_by_border_points(points, sensor, (2e-3, 2e-3))
     possible = torch.nn.functional.max_pool2d(possible[None].float(), 3, 1, 1)[0].bool()
     results["out/near_border_mask"] = (near_border | certain) & possible
     results["out/intensity_tie_mask"] = tied & ties(points, projection, range_m)

@@ -239,12 +239,18 @@ def test_joint_step_losses_and_gradients(recorded, values, close):
 
 
 def test_joint_step_weights_statistics_and_ema(recorded, values, close):
-    start, checked = recorded.weights(), set()
+    """Weights in units of the learning rate: AdamW amplifies the rounding of tiny gradients."""
+    start, learning_rate = recorded.weights(), recorded.config["lr"]
+    moved = dict.fromkeys(("vae", "sit", "ema", "discriminator"), 0.0)
     for key, value in values.items():
         _, separator, official = key.partition("/weights/")
         if separator:
-            close(value, recorded[key], atol=5e-6, rtol=1e-5)
-            moved = recorded[key].double() - start[official].double()
-            close(value.double() - start[official].double(), moved, atol=5e-6, rtol=0.0)
-            checked.add(official.partition(".")[0])
-    assert checked == {"vae", "sit", "ema", "discriminator"}
+            # Of float32 weights and averages of size 1 two roundings are 2.4e-7.
+            statistic = ".bn." in official or "running_" in official
+            tolerance = {"atol": 5e-6, "rtol": 1e-5} if statistic else {"atol": 0.0, "rtol": 3e-7}
+            tolerance["atol"] = max(tolerance["atol"], 0.01 * learning_rate)
+            close(value, recorded[key], **tolerance)
+            network = official.partition(".")[0]
+            change = (recorded[key].double() - start[official].double()).abs().max().item()
+            moved[network] = max(moved[network], change)
+    assert all(change > 1e-3 * learning_rate for change in moved.values())

@@ -32,11 +32,12 @@ def case(load_case):
 
 def grid_of(config, **intensity):
     minimum, maximum = config["fov"]
-    rows, _ = config["grid_shape"][0]
+    cells = (*config["grid_shape"][0], config["grid_shape"][1][1])  # along x, y, z
+    edges = [(high - low) / n for low, high, n in zip(minimum, maximum, cells, strict=True)]
     return ScanGrid(
         minimum_m=tuple(minimum),
         maximum_m=tuple(maximum),
-        cell_m=(maximum[0] - minimum[0]) / rows,
+        cell_m=edges[0] if len(set(edges)) == 1 else tuple(edges),
         voxel_m=config["voxel_size"],
         num_neighbors=config["num_neighbors"],
         **intensity,
