@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.nn.backbones.voxels import NUM_FEATURES, PLANES, PointCloudBatch
-from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.layers import at_least_float32, no_autocast
 
 # Added to the number of points of a cell, as in the official code.
 _COUNT_EPS = 1e-6
@@ -124,7 +124,7 @@ class Embedding(nn.Module):
     def forward(self, features: Tensor, neighbors: Tensor) -> Tensor:
         """Tokens ``(N, F)`` of features ``(N, 5)`` and rows ``(N, K)`` of their neighbours."""
         # Coordinates in bfloat16 would move a point at 60 m by up to 12 cm.
-        with torch.autocast(features.device.type, enabled=False):
+        with no_autocast(features.device):
             features = self.norm(features)
         if self.training:  # the batch norms need all neighbours at once
             others = features.index_select(0, neighbors.flatten())
@@ -133,12 +133,12 @@ class Embedding(nn.Module):
         else:  # one after the other: a K-th of the memory
             each = (self._around(features[index] - features) for index in neighbors.unbind(dim=1))
             around = reduce(torch.maximum, each)
-        with torch.autocast(features.device.type, enabled=False):
+        with no_autocast(features.device):
             own = self.point(features)
             return self.merge(torch.cat([own, around.to(own.dtype)], dim=1))
 
     def _around(self, offsets: Tensor) -> Tensor:
-        with torch.autocast(offsets.device.type, enabled=False):
+        with no_autocast(offsets.device):
             hidden = self.offset(offsets)
         return self.neighbor(hidden)  # most of the computation, under autocast
 
