@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-import torch.distributed as dist
 from torch import nn
 
 from r3dpa.nn.latent_norm import LatentNorm
@@ -163,37 +162,3 @@ def test_impossible_settings_are_refused():
         LatentNorm(0)
     with pytest.raises(ValueError, match=r"3 and 0\.0"):
         LatentNorm(3, eps=0.0)
-
-
-def run_norm(norm, latents):
-    latents.requires_grad_()
-    normalised = norm.update(latents)
-    (normalised.sin() * torch.linspace(0, 1, 6)).sum().backward()
-    broken = latents.detach().clone()
-    return normalised.detach(), latents.grad, state(norm), broken
-
-
-def run_process(rank, folder):
-    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
-    norm, latents = LatentNorm(3), raw_latents(batch=5)
-    part = latents[:2] if rank == 0 else latents[2:]  # processes with different batch sizes
-    normalised, gradient, statistics, broken = run_norm(norm, part)
-    if rank == 1:
-        broken[0, 0, 0, 0] = torch.nan
-    norm.update(broken)
-    torch.save((normalised, gradient, statistics, state(norm)), f"{folder}/{rank}.pt")
-    dist.destroy_process_group()
-
-
-@pytest.mark.ddp
-def test_two_processes_share_their_statistics(tmp_path):
-    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
-    parts = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
-    normalised, gradient, statistics, _ = run_norm(LatentNorm(3), raw_latents(batch=5))
-    torch.testing.assert_close(torch.cat([part[0] for part in parts]), normalised)
-    torch.testing.assert_close(
-        torch.cat([part[1] for part in parts]), gradient, atol=1e-6, rtol=1e-5
-    )
-    for part in parts:
-        torch.testing.assert_close(part[2], statistics)
-        assert all(torch.equal(part[3][key], part[2][key]) for key in statistics)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-import torch.distributed as dist
 import torch.nn.functional as F
 from torch import nn
 
@@ -163,59 +162,6 @@ def test_synced_batch_norm_in_one_process_is_batch_norm():
     assert torch.equal(ours(image), plain(image))
     for key, value in plain.state_dict().items():
         assert torch.equal(ours.state_dict()[key], value)
-
-
-def batches(offset):
-    """What each of two processes gets: batches of different sizes and distributions."""
-    generator = torch.Generator().manual_seed(3)
-    narrow = torch.randn(2, 3, 4, 5, generator=generator)
-    wide = 2 * torch.randn(3, 3, 4, 5, generator=generator) + 1
-    return [narrow + offset, wide + offset]
-
-
-def run_layer(layer, image):
-    """Output, input gradient and weight gradient of a loss that is a sum over the pixels."""
-    nn.init.constant_(layer.weight, 1.5)
-    image.requires_grad_()
-    output = layer(image)
-    (output.sin() * torch.linspace(0, 1, 5)).sum().backward()
-    state = {key: value.clone() for key, value in layer.state_dict().items()}
-    return output.detach(), image.grad, layer.weight.grad, state
-
-
-def run_process(rank, folder):
-    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
-    results = {offset: run_layer(SyncedBatchNorm2d(3), batches(offset)[rank]) for offset in OFFSETS}
-    evaluated = SyncedBatchNorm2d(3).eval()(batches(0)[rank])
-    torch.save((results, evaluated), f"{folder}/{rank}.pt")
-    dist.destroy_process_group()
-
-
-OFFSETS = (0, 3000)
-
-
-@pytest.mark.ddp
-@pytest.mark.numerics
-def test_synced_batch_norm_in_two_processes_equals_one_with_both_batches(tmp_path):
-    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
-    (first, evaluated), (second, _) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
-    torch.testing.assert_close(evaluated, nn.BatchNorm2d(3).eval()(batches(0)[0]))
-    for offset, tolerance in zip(OFFSETS, (1e-6, 1e-3), strict=True):
-        plain = nn.BatchNorm2d(3).double()
-        image = torch.cat(batches(offset)).double()
-        output, image_grad, weight_grad, state = run_layer(plain, image)
-        actual = [torch.cat([first[offset][i], second[offset][i]]) for i in range(2)]
-        for ours, expected in zip(actual, (output, image_grad), strict=True):
-            torch.testing.assert_close(ours.double(), expected, atol=tolerance, rtol=tolerance)
-        summed = first[offset][2] + second[offset][2]
-        torch.testing.assert_close(summed.double(), weight_grad, atol=10 * tolerance, rtol=1e-5)
-        for result in (first, second):
-            for key, value in state.items():
-                ours = result[offset][3][key]
-                torch.testing.assert_close(ours.to(value.dtype), value, atol=1e-6, rtol=1e-6)
-    narrow = torch.cat(batches(OFFSETS[-1])).transpose(0, 1).flatten(1)
-    naive = narrow.square().mean(1) - narrow.mean(1).square()
-    assert ((naive / narrow.var(1) - 1).abs() > 0.01).any()  # one pass, float32
 
 
 def test_half_precision_batch_norm_keeps_its_dtype():

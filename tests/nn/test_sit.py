@@ -35,68 +35,12 @@ def inputs(batch=2, seed=1):
     return torch.randn(batch, 3, 4, 8, generator=generator), torch.rand(batch, generator=generator)
 
 
-def test_three_ways_of_evaluation_agree():
-    sit, (latents, time) = build(), inputs()
-    velocity, features = sit(latents, time)
-    assert velocity.shape == (2, 3, 4, 8)
-    assert features.shape == (2, 8, 5)
-    assert sit.grid_size == (2, 4)
-    assert torch.equal(velocity, sit.velocity(latents, time))
-    assert torch.equal(features, sit.project_features(latents, time))
-    assert torch.equal(velocity, sit.velocity(latents, time, torch.zeros(2, dtype=torch.long)))
-
-
-def test_a_sample_does_not_depend_on_its_batch():
-    sit, (latents, time) = build(), inputs(batch=3)
-    velocity, features = sit(latents, time)
-    for index in range(3):
-        one = slice(index, index + 1)
-        alone = sit(latents[one], time[one])
-        torch.testing.assert_close(alone.velocity, velocity[one], atol=1e-6, rtol=1e-5)
-        torch.testing.assert_close(alone.features, features[one], atol=1e-6, rtol=1e-5)
-
-
-def test_a_single_sample_under_autocast_equals_that_of_a_batch():
-    """One sample has one modulation, which takes another way through the norm."""
-    sit = build()
-    latents, time = inputs(batch=2)[:2]
-    with torch.autocast("cpu", torch.bfloat16):
-        alone, features = sit(latents[:1], time[:1])
-        both, all_features = sit(latents, time)
-    torch.testing.assert_close(alone, both[:1], atol=0.05, rtol=0.05)
-    torch.testing.assert_close(features, all_features[:1], atol=0.05, rtol=0.05)
-
-
-def gradient_names(sit):
-    return {name.split(".")[0] for name, p in sit.named_parameters() if p.grad is not None}, {
-        int(name.split(".")[1])
-        for name, p in sit.named_parameters()
-        if name.startswith("blocks.") and p.grad is not None
-    }
-
-
-def test_features_train_only_the_first_blocks_and_the_projector():
-    sit, (latents, time) = build(), inputs()
-    sit.project_features(latents, time).sum().backward()
-    parts, blocks = gradient_names(sit)
-    assert parts == {"x_embedder", "t_embedder", "y_embedder", "blocks", "projector"}
-    assert blocks == {0, 1}
-
-
-def test_velocity_trains_all_but_the_projector():
-    sit, (latents, time) = build(), inputs()
-    sit.velocity(latents, time).sum().backward()
-    parts, blocks = gradient_names(sit)
-    assert parts == {"x_embedder", "t_embedder", "y_embedder", "blocks", "final_layer"}
-    assert blocks == {0, 1, 2}
-
-
 def test_alignment_after_the_last_block():
     sit, (latents, time) = build(alignment_depth=3), inputs()
     velocity, features = sit(latents, time)
     assert torch.equal(features, sit.project_features(latents, time))
     sit.project_features(latents, time).sum().backward()
-    assert gradient_names(sit)[1] == {0, 1, 2}
+    assert all(parameter.grad is not None for parameter in sit.blocks.parameters())
     assert velocity.isfinite().all()
 
 
@@ -214,29 +158,6 @@ def test_sizes_that_do_not_fit_are_refused(options, message):
         SiT(**{**SMALL, **options})
 
 
-@pytest.mark.parametrize(
-    ("latents", "time", "labels", "message"),
-    [
-        ((2, 3, 4, 6), 2, None, r"\(B, 3, 4, 8\), got \(2, 3, 4, 6\)"),
-        ((2, 4, 4, 8), 2, None, r"\(B, 3, 4, 8\), got \(2, 4, 4, 8\)"),
-        ((2, 3, 4, 8), 1, None, r"\(2,\), got \(1,\)"),
-        ((2, 3, 4, 8), 2, 3, r"\(2,\), got \(3,\)"),
-    ],
-)
-def test_inputs_of_another_shape_are_named(latents, time, labels, message):
-    labels = None if labels is None else torch.zeros(labels, dtype=torch.long)
-    with pytest.raises(ValueError, match=message):
-        build()(torch.zeros(latents), torch.zeros(time), labels)
-
-
-def test_float64_network_stays_float64():
-    sit, (latents, time) = build().double(), inputs()
-    narrow = build()(latents, time).velocity
-    wide = sit(latents.double(), time.double()).velocity
-    assert wide.dtype == torch.float64
-    torch.testing.assert_close(narrow.double(), wide, atol=1e-5, rtol=1e-5)
-
-
 @pytest.mark.parametrize("qk_norm", [False, True])
 def test_autocast_is_close_to_float32(qk_norm):
     sit, (latents, time) = build(qk_norm=qk_norm), inputs()
@@ -295,41 +216,6 @@ def test_token_norm_of_constant_tokens_is_finite():
     assert latents.grad.isfinite().all()
     tokens = torch.zeros(8, 16)
     assert (tokens / tokens.std(dim=1, keepdim=True)).isnan().all()  # without eps
-
-
-def test_velocity_at_known_modulations():
-    """The rows of a table are those of its times; of one row for all, float32 rounding differs."""
-    sit, (latents, time) = build(), inputs(batch=3)
-    velocity = sit.velocity(latents, time)
-    table = sit.modulations(time)
-    assert table.shape == (3, (6 * 3 + 2) * 16)
-    assert torch.equal(sit.velocity_at(latents, table), velocity)
-    for index in range(3):
-        shared = sit.velocity_at(latents, table[index : index + 1])
-        torch.testing.assert_close(shared[index], velocity[index], atol=1e-5, rtol=1e-5)
-    one_time = time[:1].expand(3)
-    torch.testing.assert_close(
-        sit.velocity_at(latents, table[:1]), sit.velocity(latents, one_time), atol=1e-5, rtol=1e-5
-    )
-
-
-def test_modulations_of_classes():
-    sit, (latents, time) = build(num_classes=2), inputs()
-    labels = torch.tensor([1, 0])
-    table = sit.modulations(time, labels)
-    expected = sit.velocity(latents, time, labels)
-    assert torch.equal(sit.velocity_at(latents, table), expected)
-    with pytest.raises(ValueError, match="2 classes needs labels"):
-        sit.modulations(time)
-
-
-@pytest.mark.parametrize(
-    ("rows", "width", "message"),
-    [(1, 319, "rows of 320 numbers"), (3, 320, "one for each of 2 samples, got 3")],
-)
-def test_modulations_of_another_shape_are_named(rows, width, message):
-    with pytest.raises(ValueError, match=message):
-        build().velocity_at(inputs()[0], torch.zeros(rows, width))
 
 
 @pytest.mark.parametrize("qk_norm", [False, True])

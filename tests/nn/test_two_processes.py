@@ -1,0 +1,106 @@
+"""Batch statistics of two processes (gloo) against those of one process with both batches."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.distributed as dist
+from torch import nn
+
+from r3dpa.nn import LatentNorm
+from r3dpa.nn.layers import SyncedBatchNorm2d
+
+pytestmark = pytest.mark.ddp
+OFFSETS = (0, 3000)
+
+
+def batches(offset):
+    """What each process gets: batches of different sizes and distributions."""
+    generator = torch.Generator().manual_seed(3)
+    narrow = torch.randn(2, 3, 4, 5, generator=generator)
+    wide = 2 * torch.randn(3, 3, 4, 5, generator=generator) + 1
+    return [narrow + offset, wide + offset]
+
+
+def state_of(module):
+    return {key: value.clone() for key, value in module.state_dict().items()}
+
+
+def run_layer(layer, image):
+    """Output, input gradient, state and weight gradient of a loss that is a sum over the pixels."""
+    nn.init.constant_(layer.weight, 1.5)
+    image.requires_grad_()
+    output = layer(image)
+    (output.sin() * torch.linspace(0, 1, 5)).sum().backward()
+    return output.detach(), image.grad, state_of(layer), layer.weight.grad
+
+
+def run_norm(norm, latents):
+    latents.requires_grad_()
+    normalised = norm.update(latents)
+    (normalised.sin() * torch.linspace(0, 1, 5)).sum().backward()
+    return normalised.detach(), latents.grad, state_of(norm)
+
+
+def run_process(rank, folder):
+    dist.init_process_group("gloo", f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    norm, own = LatentNorm(3), batches(0)[rank]
+    results = {"norm": run_norm(norm, own.clone())}
+    own[0, 0, 0, 0] = torch.nan if rank == 1 else 0.0
+    norm.update(own)  # a broken latent in one process leaves the statistics of both alone
+    results["after_nan"] = state_of(norm)
+    for offset in OFFSETS:
+        results[offset] = run_layer(SyncedBatchNorm2d(3), batches(offset)[rank])
+    results["evaluated"] = SyncedBatchNorm2d(3).eval()(batches(0)[rank])
+    torch.save(results, f"{folder}/{rank}.pt")
+    dist.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("two_processes")
+    torch.multiprocessing.spawn(run_process, (str(folder),), nprocs=2)
+    return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
+
+
+def test_latent_norm(processes):
+    expected = run_norm(LatentNorm(3), torch.cat(batches(0)))
+    for ours, theirs in zip(
+        zip(*(part["norm"] for part in processes), strict=True), expected, strict=True
+    ):
+        if isinstance(theirs, dict):
+            for statistics in ours:
+                torch.testing.assert_close(statistics, theirs)
+        else:
+            torch.testing.assert_close(torch.cat(ours), theirs, atol=1e-6, rtol=1e-5)
+    for part in processes:
+        assert all(torch.equal(part["after_nan"][k], v) for k, v in part["norm"][2].items())
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize(("offset", "tolerance"), zip(OFFSETS, (1e-6, 1e-3), strict=True))
+def test_synced_batch_norm(processes, offset, tolerance):
+    first, second = (part[offset] for part in processes)
+    image = torch.cat(batches(offset)).double()
+    output, image_grad, state, weight_grad = run_layer(nn.BatchNorm2d(3).double(), image)
+    for index, expected in enumerate((output, image_grad)):
+        actual = torch.cat([first[index], second[index]]).double()
+        torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
+    summed = (first[3] + second[3]).double()
+    torch.testing.assert_close(summed, weight_grad, atol=10 * tolerance, rtol=1e-5)
+    for key, value in state.items():
+        for result in (first, second):
+            ours = result[2][key].to(value.dtype)
+            torch.testing.assert_close(ours, value, atol=1e-6, rtol=1e-6)
+
+
+def test_evaluation_uses_the_running_statistics(processes):
+    expected = nn.BatchNorm2d(3).eval()(batches(0)[0])
+    torch.testing.assert_close(processes[0]["evaluated"], expected)
+
+
+@pytest.mark.numerics
+def test_one_pass_in_float32_would_lose_the_variance():
+    far = torch.cat(batches(OFFSETS[-1])).transpose(0, 1).flatten(1)
+    naive = far.square().mean(1) - far.mean(1).square()
+    assert ((naive / far.var(1) - 1).abs() > 0.01).any()
