@@ -53,12 +53,6 @@ def test_one_update_moves_by_one_minus_decay(sit, norm):
     assert spread(sit) == (6.0, 6.0)
 
 
-def test_decay_zero_follows_the_weights(sit, norm):
-    ema = EMA(fill(sit, 2.0), norm, decay=0.0)
-    ema.update(fill(sit, 6.0), norm)
-    assert spread(ema.sit) == (6.0, 6.0)
-
-
 @pytest.mark.numerics
 def test_a_thousand_updates_move_by_the_exact_amount(sit, norm):
     """From 0 towards 1 in 1000 steps of 1e-4: 1 - 0.9999^1000 = 0.09516712.

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name, scaled_widths
+from r3dpa.nn.backbones.minkowski import MinkowskiNet, scaled_widths
 from r3dpa.nn.backbones.sparse import Voxels
 from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
 from r3dpa.nn.backbones.spvcnn import SPVCNN, Points, corners, to_points, to_voxels
@@ -140,54 +140,6 @@ def test_interpolation_of_a_plane_is_exact():
     assert torch.autograd.gradcheck(lambda given: to_points(given, exact, voxels), features)
     at_points = torch.randn(5, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda given: to_voxels(given, exact, voxels), at_points)
-
-
-@pytest.fixture
-def official(network):
-    return {official_name(key): value for key, value in network.state_dict().items()}
-
-
-@torch.no_grad()
-def test_checkpoint_of_several_modules(network, official, tmp_path):
-    """A prefix is taken off; sizes follow from the weights."""
-    wrapped = {f"model.{key}": value for key, value in official.items()}
-    torch.save({"state_dict": wrapped | {"loss.weight": torch.ones(2)}}, tmp_path / "model.ckpt")
-    loaded = type(network).from_checkpoint(tmp_path / "model.ckpt").eval()
-    assert loaded.widths == network.widths
-    assert torch.equal(loaded(*cloud(0)), network(*cloud(0)))
-
-
-def test_files_that_are_no_checkpoint(network, official, tmp_path):
-    path, kind = tmp_path / "model.ckpt", type(network)
-
-    def refused(content, message):
-        torch.save(content, path)
-        with pytest.raises(ValueError, match=rf"model\.ckpt: .*{message}"):
-            kind.from_checkpoint(path)
-
-    with pytest.raises(ValueError, match=r"model\.ckpt: no such file"):
-        kind.from_checkpoint(path)
-    path.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"model\.ckpt: is damaged"):
-        kind.from_checkpoint(path)
-    refused([1, 2], "0 weights are named stem.0.kernel")
-    refused({"state_dict": {}}, "0 weights are named stem.0.kernel")
-    refused({"stem.0.kernel": torch.ones(27, 4, 4)}, "holds no such U-Net")
-    refused(official | {"ema.stem.0.kernel": torch.ones(1)}, "2 weights are named")
-    refused(official | {"extra": torch.ones(1)}, r"1 unexpected \['extra'\]")
-    bias = {"stem.1.bias": torch.ones(7)}
-    refused(official | bias, r"weight stem.1.bias has shape \(7,\), but \(4,\)")
-    del official["stem.1.bias"]
-    refused(official, r"1 missing \['stem.1.bias'\]")
-
-
-def test_networks_are_told_apart(tmp_path):
-    weights = {
-        official_name(key): value for key, value in MinkowskiNet(WIDTHS).state_dict().items()
-    }
-    torch.save(weights, tmp_path / "model.ckpt")
-    with pytest.raises(ValueError, match=r"not those of this SPVCNN: 21 missing \['point_trans"):
-        SPVCNN.from_checkpoint(tmp_path / "model.ckpt")
 
 
 def test_voxelize():

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import ScaLR, ScanGrid, WaffleIron, collate_scans, prepare_scan
-from r3dpa.nn.backbones.point_features import official_name
 from r3dpa.nn.backbones.waffleiron import SpatialMixing
 
 GRID = ScanGrid(
@@ -196,38 +195,6 @@ def test_bfloat16_keeps_coordinates_and_sums_in_float32(network):
 
 
 @torch.no_grad()
-def test_compiles_as_one_graph(network):
-    batch = collate_scans([prepare(cloud(80))])
-    compiled = torch.compile(network, backend="eager", fullgraph=True)
-    torch.testing.assert_close(compiled(batch), network(batch))
-
-
-def official_file(network, path, prefix="module.", **changes):
-    """The network as the distillation saves it; a change of None leaves the weight out."""
-    weights = {official_name(key): value for key, value in network.state_dict().items()} | changes
-    weights = {prefix + key: value for key, value in weights.items() if value is not None}
-    torch.save({"model_point": weights, "epoch": 1, "optim": {"state": {}}}, path)
-    return path
-
-
-def test_checkpoint_round_trip(tmp_path):
-    network = WaffleIron(width=4, depth=3, head_dim=5)
-    scalr = ScaLR.from_checkpoint(official_file(network, tmp_path / "ckpt.pth"))
-    assert (scalr.dim, scalr.network.depth, scalr.name) == (4, 3, "scalr")
-    for key, value in scalr.network.state_dict().items():
-        assert torch.equal(value, network.state_dict()[key]), key
-    assert not any(p.requires_grad for p in scalr.parameters())
-    assert not scalr.train().network.embedding.norm.training
-    # The same weights are the same features, others are not.
-    again = ScaLR.from_checkpoint(official_file(network, tmp_path / "again.pth", prefix=""))
-    assert again.settings == scalr.settings
-    assert ScaLR(WaffleIron(width=4, depth=3)).settings != scalr.settings
-    points = cloud(20)
-    assert scalr(points).dtype == torch.float32
-    torch.testing.assert_close(scalr(points).norm(dim=1), torch.ones(20))
-
-
-@torch.no_grad()
 def test_features_of_a_batch_are_those_of_its_scans(network):
     extractor = ScaLR(network, GRID)
     scans = [cloud(200), cloud(5) + 20, cloud(90, 1), cloud(0)]
@@ -251,32 +218,6 @@ def test_preparation_goes_to_other_processes_without_weights():
     again = pickle.loads(packed)(points)  # noqa: S301 - made above
     for actual, expected in zip(again, prepare(points), strict=True):
         assert torch.equal(actual, expected)
-
-
-def test_refused_checkpoints(tmp_path):
-    network = WaffleIron(width=4, depth=2, head_dim=5)
-    path = tmp_path / "ckpt.pth"
-
-    def refused(match):
-        with pytest.raises(ValueError, match=match) as error:
-            ScaLR.from_checkpoint(path)
-        assert str(path) in str(error.value)
-
-    refused("no such file; give ckpt_last.pth")
-    path.write_bytes(b"PK no checkpoint")
-    refused("is damaged")
-    torch.save({"model_point": torch.nn.Linear(1, 1)}, path)
-    refused("holds more than tensors and plain values")
-    torch.save({"state_dict": {}}, path)
-    refused("neither model_points nor model_point")
-    official_file(network, path, **{"classif.weight": None})
-    refused("holds no WaffleIron with a head")
-    official_file(network, path, **{"embed.final.bias": None, "extra": torch.zeros(1)})
-    refused(r"1 missing \['embed.final.bias'\], 1 unexpected \['extra'\]")
-    official_file(network, path, **{"embed.final.weight": torch.zeros(4, 8, 2)})
-    refused(r"embed.final.weight has shape \(4, 8, 2\), but \(4, 8\) is expected")
-    official_file(network, path, **{"waffleiron.spatial_mix.1.scale.weight": None})
-    refused("1 missing")
 
 
 @torch.inference_mode()
