@@ -441,6 +441,7 @@ class TestConvert:
             "vae-latents-stats.pt",
             "vae-discriminator-ckpt.pt",
         }
+        assert "not converted: sensor and encoding (official files of a VAE" in report.table()
         statistics = torch.load(tmp_path / "vae-latents-stats.pt", weights_only=True)
         norm = checkpoint.network("latent_norm").state_dict
         assert statistics["latents_scale"].shape == (1, 4, 1, 1)
@@ -458,6 +459,24 @@ class TestConvert:
             back.network("latent_norm").state_dict["running_var"], norm["running_var"]
         )
         assert back.network("latent_norm").build().fitted
+
+    def test_a_training_checkpoint_and_back_keeps_all_facts(self, checkpoint, tmp_path):
+        """Sensor, encoding, path and arguments; the official code finds its own entries only."""
+        facts = {"feature_source": "geometric", "interpolant": "cosine"}
+        full = replace(checkpoint, **facts)
+        ours = save_checkpoint(full, tmp_path / "a.safetensors")
+        convert(ours, tmp_path / "a.pt", "official")
+        content = torch.load(tmp_path / "a.pt", weights_only=False)
+        expected = to_official(read_checkpoint(ours))
+        assert set(content) == {*expected, "r3dpa"}
+        assert vars(content["args"]) == vars(expected["args"])
+        convert(tmp_path / "a.pt", tmp_path / "b.safetensors")
+        back = read_checkpoint(tmp_path / "b.safetensors")
+        assert_same_networks(back, full)
+        for name in ("stage", "step", "geometry", "feature_source", "interpolant"):
+            assert getattr(back, name) == getattr(read_checkpoint(ours), name), name
+        changed = from_official(content, Path("a.pt"), sit_args={"alignment_depth": 1})
+        assert changed.network("ema").arguments["alignment_depth"] == 1
 
     def test_rgb_weights_into_a_sit_of_range_images(self, checkpoint, tmp_path, capsys):
         """What was kept, resized and dropped is told, and a stage starts from the result."""

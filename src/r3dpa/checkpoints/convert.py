@@ -17,13 +17,15 @@ from r3dpa.checkpoints.files import (
     save_checkpoint,
 )
 from r3dpa.checkpoints.networks import Checkpoint, NetworkState, format_table
-from r3dpa.checkpoints.official import statistics_of, to_official
+from r3dpa.checkpoints.official import facts_of, statistics_of, to_official
 from r3dpa.checkpoints.transfer import TransferReport, transfer_rgb
 from r3dpa.io import atomic_path
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 
 __all__ = ["ConversionReport", "convert"]
+
+_LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,9 @@ def convert(
         outputs = [out, out.with_suffix(".yaml")]
     elif to == "official":
         outputs = _save_official(checkpoint, out, overwrite)
+        if not {"sit", "ema"} & set(checkpoint.networks):
+            lost = dict.fromkeys(_LOST, "official files of a VAE have no place for it")
+            checkpoint = replace(checkpoint, left_out={**checkpoint.left_out, **lost})
     else:
         raise ValueError(f"convert writes 'r3dpa' or 'official' checkpoints, got {to!r}")
     return ConversionReport(source, tuple(outputs), checkpoint, transfer)
@@ -136,7 +141,7 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
         raise ValueError(f"official checkpoints are called <name>.pt, got {out}")
     content = to_official(checkpoint)
     if {"model", "ema"} & set(content):
-        files: dict[Path, Any] = {out: content}
+        files: dict[Path, Any] = {out: content | facts_of(checkpoint)}
     else:
         files = {out: content["vae"]} if "vae" in content else {}
         if "discriminator" in content:

@@ -1,7 +1,9 @@
 """Official R3DPA checkpoints: keys and options of valeoai/R3DPA, translated in both directions.
 
 An official SiT or UNet holds the latent batch norm as ``bn.*`` and its projector as
-``projectors.0.*``; everything else has the same name here.
+``projectors.0.*``; everything else has the same name here. Training checkpoints written by
+:func:`r3dpa.checkpoints.convert` also hold an entry ``r3dpa``, which the official code ignores:
+arguments of the networks, sensor, encoding and other facts without a place in the official layout.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
 
-__all__ = ["from_official", "is_official", "statistics_of", "to_official"]
+__all__ = ["facts_of", "from_official", "is_official", "statistics_of", "to_official"]
 
 StateDict = Mapping[str, Tensor]
 Encoding = Literal["linear", "log2"]
@@ -36,6 +38,8 @@ _UNET_HEAD_CHANNELS = 32  # of both
 _SIT_NETWORKS = {"model": ("sit", "latent_norm"), "ema": ("ema", "ema_latent_norm")}
 _OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
 _STATISTICS = {"latents_scale", "latents_bias"}
+_OURS = "r3dpa"
+_FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
 _DATASET_CONFIGS: dict[Encoding, str] = {"linear": "kitti.yaml", "log2": "kitti_logscale.yaml"}
 _OFFICIAL_PROJECTION: dict[str, Any] = {
     "kind": "spherical",
@@ -70,23 +74,24 @@ def from_official(
 ) -> Checkpoint:
     """Checkpoint from the content of an official file; every key is translated or left out by name.
 
+    The geometry is known if the file holds :func:`facts_of`, or if the options or
+    ``encoding`` give the encoding of a SiT for range images.
+
     Args:
         content: A training checkpoint (``model``, ``ema``, ``vae``, ``discriminator``, ``steps``,
             ``args``, optimisers), or the weights of a VAE, of a discriminator, or latent
             statistics (``latents_scale``, ``latents_bias``) alone.
         path: File that held it.
         args: Options of the official training script, where ``content`` has no ``args``.
-        sit_args: Arguments of SiT or UNet that override what weights and options tell.
-        encoding: Encoding of the range image; taken from the options where None.
-
-    Returns:
-        Its networks, and what was not read with the reason. The geometry is known if the options
-        or ``encoding`` tell the encoding of a SiT for range images.
+        sit_args: Arguments of SiT or UNet that override those of the file.
+        encoding: Encoding of the range image. Default: that of the options.
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
             or UNet can neither be read nor inferred.
     """
+    if isinstance(content.get(_OURS), Mapping):
+        return _from_ours(content, path, sit_args or {})
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
     if _is_vae(content):
@@ -129,14 +134,31 @@ def from_official(
     )
 
 
+def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Mapping[str, Any]) -> Checkpoint:
+    """Checkpoint from an official file with :func:`facts_of`."""
+    about = content[_OURS]
+    networks: dict[str, NetworkState] = {}
+    for name, config in about.get("networks", {}).items():
+        key = next((key for key, names in _SIT_NETWORKS.items() if name in names), name)
+        sit, norm = _split(_weights(key, content.get(key)))
+        weights = norm if name.endswith("latent_norm") else sit
+        changes = sit_args if name in ("sit", "ema") else {}
+        networks[name] = NetworkState(
+            config["class_path"], {**config["init_args"], **changes}, weights
+        )
+        networks[name].check()
+    facts = {key: about[key] for key in _FACTS if key in about}
+    options = about.get("official_args", {})
+    return Checkpoint(
+        path=path, networks=networks, step=content.get("steps"), official_args=options, **facts
+    )
+
+
 def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What an official training checkpoint would hold, without optimisers.
+    """Content of an official training checkpoint, without optimisers.
 
     The statistics of ``ema`` are those of ``latent_norm`` if the checkpoint has no others. Without
     the options of an official run, ``args`` is made from the arguments of the networks.
-
-    Args:
-        checkpoint: Checkpoint in any format.
 
     Returns:
         The networks it has under ``model``, ``ema``, ``vae``, ``discriminator``; ``steps``, and
@@ -169,6 +191,17 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
         content["steps"] = checkpoint.step
     args = dict(checkpoint.official_args) or _args_of(checkpoint)
     return content | {"args": argparse.Namespace(**args)}
+
+
+def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Entry for an official training checkpoint: the facts that its layout has no place for."""
+    about: dict[str, Any] = {key: getattr(checkpoint, key) for key in _FACTS}
+    about["official_args"] = dict(checkpoint.official_args)
+    about["networks"] = {
+        name: {"class_path": state.class_path, "init_args": dict(state.init_args)}
+        for name, state in checkpoint.networks.items()
+    }
+    return {_OURS: about}
 
 
 def statistics_of(norm: StateDict) -> dict[str, Tensor]:
@@ -211,13 +244,8 @@ def _renamed(key: str, old: str, new: str) -> str:
     return new + key.removeprefix(old) if key.startswith(old) else key
 
 
-def _sit(
-    weights: StateDict,
-    args: Mapping[str, Any],
-    sit_args: Mapping[str, Any],
-    strides: tuple[int, int] | None,
-) -> tuple[NetworkState, NetworkState]:
-    """SiT or UNet and its latent statistics from an official one."""
+def _split(weights: StateDict) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Weights of an official network by our names, and its latent statistics."""
     norm = {
         key.removeprefix(_NORM_PREFIX): value
         for key, value in weights.items()
@@ -228,6 +256,17 @@ def _sit(
         for key, value in weights.items()
         if not key.startswith(_NORM_PREFIX)
     }
+    return sit, norm
+
+
+def _sit(
+    weights: StateDict,
+    args: Mapping[str, Any],
+    sit_args: Mapping[str, Any],
+    strides: tuple[int, int] | None,
+) -> tuple[NetworkState, NetworkState]:
+    """SiT or UNet and its latent statistics from an official one."""
+    sit, norm = _split(weights)
     kind: type[nn.Module] = UNet if any(key.startswith("input_blocks.") for key in sit) else SiT
     if kind is UNet:
         init_args = _unet_args(sit, sit_args)
