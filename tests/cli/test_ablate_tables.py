@@ -18,10 +18,10 @@ import wandb
 import yaml
 from scipy.stats import ttest_1samp
 
-from r3dpa.ablation import make_plan, read_scale, runner
-from r3dpa.ablation.configs import merged, read_config
-from r3dpa.ablation.plan import Row, Table
-from r3dpa.ablation.report import mean_of_seeds, order_results
+from r3dpa.ablation import make_plan, read_scale
+from r3dpa.ablation import run as runner
+from r3dpa.ablation.plan import Row, Table, merged, read_config
+from r3dpa.ablation.tables import mean_of_seeds, order_results
 from r3dpa.cli import main
 from r3dpa.metrics.results import Evaluation, MetricResult
 
@@ -191,7 +191,7 @@ class TestWrongFiles:
 
     @pytest.mark.parametrize(
         ("words", "message"),
-        [(["nowhere"], "nowhere: is no folder"), ([str(TABLES), "--seeds", "0,,1"], "whole numb")],
+        [(["nowhere"], "nowhere: is no folder"), ([str(TABLES), "--seeds", "0", "0"], "different")],
     )
     def test_arguments(self, words, message):
         with pytest.raises(ValueError, match=message):
@@ -289,7 +289,6 @@ def scale_file(tmp_path):
     }
     scale = {
         "about": "Smoke.",
-        "num_scans": 12,
         "common": [str(CONF / "trainer.yaml")],
         "data": {"data": data},
         "set": {"trainer": trainer, "scorer": scorer, "checkpoint": smoke["checkpoint"]},
@@ -566,7 +565,7 @@ def test_a_row_that_fails_leaves_the_other(
 def test_processes_are_real(monkeypatch, tmp_path):
     """What is started is this package; a failure shows the end of what it wrote."""
     words = ["check", str(tmp_path / "none")]
-    job = runner._Job("check", words, tmp_path / "check", (), (), "")
+    job = runner.Job("check", words, tmp_path / "check", "")
     with (
         runner._processes() as start,
         pytest.raises(RuntimeError, match=r"status 1; .*(\n.*)*none"),
@@ -586,7 +585,7 @@ def test_a_stopped_ablation_stops_what_it_started(tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "Popen", Sleeping)
-        job = runner._Job("sleep", [], tmp_path / "sleep", (), (), "")
+        job = runner.Job("sleep", [], tmp_path / "sleep", "")
 
         def interrupted():
             with runner.ThreadPoolExecutor(1) as pool, runner._processes() as start:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli import main
+from r3dpa.cli import COMMANDS, main
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
@@ -24,23 +24,6 @@ from r3dpa.io import source_commit
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
-COMMANDS = {
-    *("fit", "validate", "test", "predict", "features"),
-    *(
-        "simulate",
-        "check",
-        "view",
-        "realism",
-        "sample",
-        "convert",
-        "report",
-        "bench",
-        "ablate",
-        "replay",
-    ),
-    *("reference", "evaluate"),
-    *("inpaint", "mix", "complete", "vary", "interpolate", "objects"),
-}
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
 LEGACY_VAE = ["--model.init_args.vae.init_args.legacy_upsample=true"]
@@ -97,8 +80,8 @@ class TestHelp:
             f"import sys; from r3dpa.cli import main; main({args}); "
             f"print('loaded', [name for name in {heavy} if name in sys.modules])"
         )
-        listed = {line.split()[0] for line in out.splitlines() if line.startswith("  ")}
-        assert listed == COMMANDS
+        listed = {line[2:19].strip() for line in out.splitlines() if line.startswith("  ")}
+        assert listed == set(COMMANDS)
         assert out.splitlines()[-1] == "loaded []"
 
     def test_every_line_says_what_the_command_does(self, capsys):
@@ -109,7 +92,7 @@ class TestHelp:
     @pytest.mark.parametrize("command", sorted(COMMANDS))
     def test_every_command_lists_its_options(self, command, capsys):
         with pytest.raises(SystemExit) as stop:
-            main([command, "--help"])
+            main([*command.split(), "--help"])
         assert stop.value.code == 0
         out = capsys.readouterr().out
         assert f"{command} [" in out
@@ -131,9 +114,7 @@ class TestUsageErrors:
         with pytest.raises(SystemExit) as stop:
             main(["smaple"])
         assert stop.value.code == 2
-        out = capsys.readouterr().out
-        assert "unknown command 'smaple'" in out
-        assert "sample" in out
+        assert "unknown command 'smaple': give one of" in capsys.readouterr().err
 
     def test_unknown_option(self, capsys):
         with pytest.raises(SystemExit) as stop:
@@ -167,9 +148,9 @@ class TestErrorsOnTheTerminal:
         assert stop.value.code.startswith(message)
         assert "\n" not in stop.value.code
 
-    def test_of_training_keeps_its_traceback(self, monkeypatch, smoke_args, tmp_path):
+    def test_of_a_fit_that_has_not_started(self, monkeypatch, smoke_args, tmp_path):
         monkeypatch.setattr(sys, "argv", ["r3dpa", *smoke_args("flow_matching", tmp_path)])
-        with pytest.raises(ValueError, match=r"give model\.init_from a checkpoint"):
+        with pytest.raises(SystemExit, match=r"^r3dpa fit: .*give model\.init_from a checkpoint"):
             main()
 
 
@@ -194,7 +175,7 @@ def test_an_out_that_cannot_be_written_is_refused_before_the_work(
 
 @pytest.fixture
 def simulated(tmp_path):
-    main(["simulate", "--out", str(tmp_path), "--scans", "3", "--drives", "['0000', '0003']"])
+    main(["simulate", "--out", str(tmp_path), "--scans", "3", "--drives", "0000", "0003"])
     return tmp_path
 
 
@@ -296,8 +277,7 @@ class TestSimulate:
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=60)
         assert process.returncode == 130
-        out = tmp_path / "out"
-        assert stderr == f"r3dpa simulate: stopped; the same command goes on in {out}\n"
+        assert stderr == "r3dpa simulate: stopped; the same command continues\n"
         assert not list(tmp_path.rglob(".*.partial.*"))
         assert 0 < len(list(tmp_path.rglob("data/*.bin"))) < 300
 
@@ -370,7 +350,7 @@ class TestSample:
         assert not np.array_equal(clouds["000000"], clouds["000001"])
         assert {p.name for p in scenes.iterdir()} == {
             *("bin", "range_m.npy", "range", "birds_eye", "scene_3d", "scenes.png"),
-            "metadata.json",
+            *("scenes.html", "metadata.json"),
         }
 
     def test_other_forms_are_written_on_demand(self, joint_checkpoint, scenes, tmp_path):
@@ -426,7 +406,7 @@ class TestSample:
         }
         assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
         assert metadata["seconds_per_scene"] > metadata["device_seconds_per_scene"] > 0
-        assert metadata["threads"]["torch"] == torch.get_num_threads()
+        assert metadata["threads"] == torch.get_num_threads()
 
     def test_options_reach_the_sampler(self, joint_checkpoint, tmp_path):
         out = sample(joint_checkpoint, tmp_path, "--solver", "heun", "--seed", 5, "--num", 1)
@@ -479,12 +459,12 @@ class TestSample:
             (["--solver", "heun", "--eta", 0.5], "solver heun does not read eta"),
             (["--shift", 2], "solver euler_maruyama does not read shift"),
             (["--solver", "ab2", "--sde_last", "mean"], "solver ab2 does not read sde_last"),
-            (["--guidance_scale", 2], "--guidance_scale says nothing without --autoguidance"),
-            (["--guidance_interval", "[0, 1]"], "--guidance_interval .* without --autoguidance"),
+            (["--guidance_scale", 2], "--guidance_scale, .* need --autoguidance"),
+            (["--guidance_interval", "[0, 1]"], "--guidance_interval .* need --autoguidance"),
             (["--allow_other_latents", "true"], "--allow_other_latents .* --autoguidance"),
             (["--sde_last_time", 2], r"must lie in \(0, 1\), got 2"),
-            (["--seed", -1], "seed and pictures must be at least 0, got -1 and 64"),
-            (["--pictures", -1], "seed and pictures must be at least 0, got 0 and -1"),
+            (["--seed", -1], "seed must be at least 0, got -1"),
+            (["--pictures", -1], "pictures must be at least 0, got -1"),
         ],
     )
     def test_options_that_say_nothing_are_refused_and_nothing_is_touched(
@@ -535,7 +515,7 @@ class TestSample:
         """Batches of 2 and 1 scenes that took 5 and 8: as of a solver that chooses its steps."""
         generate, nfe = SceneGenerator.generate, iter([5, 8])
         monkeypatch.setattr(
-            SceneGenerator, "generate", lambda *args: generate(*args)._replace(nfe=next(nfe))
+            SceneGenerator, "generate", lambda *args: replace(generate(*args), nfe=next(nfe))
         )
         sample(joint_checkpoint, tmp_path, "--batch_size", 2, "--pictures", 0)
         assert json.loads((tmp_path / "metadata.json").read_text())["nfe"] == (2 * 5 + 8) / 3
@@ -584,7 +564,7 @@ class TestSample:
             sample(tmp_path / "nothing.ckpt", tmp_path / "out")
 
     def test_no_scenes_are_refused(self, joint_checkpoint, tmp_path):
-        with pytest.raises(ValueError, match="num and batch_size must be at least 1, got 0 and 8"):
+        with pytest.raises(ValueError, match="num must be at least 1, got 0"):
             sample(joint_checkpoint, tmp_path, "--num", 0)
 
 

@@ -9,8 +9,10 @@ import yaml
 
 import r3dpa.cli.evaluate as command
 from r3dpa.cli import main
+from r3dpa.data import scans
 from r3dpa.data.scans import write_bin, write_npz
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+from r3dpa.metrics import protocol
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.official_statistics import compare, reference_spaces
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
@@ -28,7 +30,7 @@ FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
 def coarse_protocols(monkeypatch):
     """Cells of half a metre: a hundredth of the work."""
     coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
-    monkeypatch.setattr(command, "PROTOCOLS", coarse)
+    monkeypatch.setattr(protocol, "PROTOCOLS", coarse)
 
 
 def range_images(seed, count):
@@ -59,7 +61,7 @@ def data(tmp_path_factory):
 @pytest.fixture
 def reference_file(data, tmp_path):
     out = tmp_path / "reference.safetensors"
-    command.reference(data, out, ["fgeo"])
+    command.reference(data=data, out=out, spaces=("fgeo",))
     return out
 
 
@@ -105,7 +107,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
     names = {}
     for split in ("train", "val", "all"):
         out = tmp_path / f"{split}.safetensors"
-        command.reference(data, out, ["fgeo"], split=split, limit=4)
+        command.reference(data=data, out=out, spaces=("fgeo",), split=split, limit=4)
         names[split] = ReferenceStatistics.load(out).names
     assert names["train"] == ("a/000", "a/002", "a/006", "a/008")
     assert names["val"] == ("b/001", "b/003", "b/007", "b/009")
@@ -115,7 +117,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
 def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
     undisturbed, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     command.reference(data, undisturbed, ["fgeo"])
-    read, seen = command.read_scan, []
+    read, seen = scans.read_scan, []
 
     def dying(path, sensor):
         if len(seen) == 10:
@@ -123,14 +125,14 @@ def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
         seen.append(path)
         return read(path, sensor)
 
-    monkeypatch.setattr(command, "read_scan", dying)
+    monkeypatch.setattr(scans, "read_scan", dying)
     with pytest.raises(KeyboardInterrupt):
-        command.reference(data, out, ["fgeo"], every=8)
+        command.reference(data=data, out=out, spaces=("fgeo",), every=8)
     partial = tmp_path / "b.partial.safetensors"
     assert partial.exists()
     assert not out.exists()
     seen.clear()
-    command.reference(data, out, ["fgeo"], every=8)
+    command.reference(data=data, out=out, spaces=("fgeo",), every=8)
     assert len(seen) == 4  # 8 of 12 were kept
     assert out.read_bytes() == undisturbed.read_bytes()
     assert not partial.exists()
@@ -309,15 +311,15 @@ def test_wrong_options_are_named(reference_file, samples, words, message):
 def test_wrong_options_of_a_reference_are_named(data, reference_file, tmp_path):
     out = tmp_path / "new.safetensors"
     with pytest.raises(ValueError, match=r"reference\.safetensors exists: delete it"):
-        command.reference(data, reference_file, ["fgeo"])
+        command.reference(data=data, out=reference_file, spaces=("fgeo",))
     with pytest.raises(ValueError, match="is no folder of scans and no data YAML"):
-        command.reference(tmp_path / "nothing", out, ["fgeo"])
+        command.reference(data=tmp_path / "nothing", out=out, spaces=("fgeo",))
     with pytest.raises(ValueError, match="limit must be at least 2, got 1"):
-        command.reference(data, out, ["fgeo"], limit=1)
+        command.reference(data=data, out=out, spaces=("fgeo",), limit=1)
     with pytest.raises(ValueError, match=r"frid needs its official weights: give --ckpt\.frid"):
-        command.reference(data, out, ["frid"])
+        command.reference(data=data, out=out, spaces=("frid",))
     assert not out.exists()
     np.full((2, 4), np.nan, "<f4").tofile(tmp_path / "0.bin")
     np.ones((2, 4), "<f4").tofile(tmp_path / "1.bin")
     with pytest.raises(ValueError, match=r"0\.bin: has NaN"):
-        command.reference(tmp_path, out, ["fgeo"])
+        command.reference(data=tmp_path, out=out, spaces=("fgeo",))

@@ -34,7 +34,7 @@ from r3dpa.data.scans import read_ply, read_scan
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    [f"r3dpa.cli.{name}" for name in ("stages", "features", "scenes", "evaluate")]
+    [f"r3dpa.cli.{name}" for name in ("stages", "features", "sample", "evaluate")]
 )
 PATIENCE_S = 100
 STEPS = 4

@@ -1,13 +1,12 @@
-"""Tables of the paper's ablations: rows of training stages, run once each, tested and compared."""
+"""Ablation tables of the paper: rows of training stages, run once each, tested and compared."""
 
-from r3dpa.ablation.budget import Budget, budget_of
+from r3dpa.ablation.budget import budget_of, flop_per_sample
 from r3dpa.ablation.plan import Plan, Row, Scale, Stage, Table, make_plan, read_scale
-from r3dpa.ablation.report import OrderResult, write_table
-from r3dpa.ablation.runner import RunSettings, run_plan
-from r3dpa.ablation.wandb_rows import log_rows
+from r3dpa.ablation.run import RunSettings, run_plan
+from r3dpa.ablation.tables import OrderResult, write_table
+from r3dpa.ablation.tracking import log_rows
 
 __all__ = [
-    "Budget",
     "OrderResult",
     "Plan",
     "Row",
@@ -16,6 +15,7 @@ __all__ = [
     "Stage",
     "Table",
     "budget_of",
+    "flop_per_sample",
     "log_rows",
     "make_plan",
     "read_scale",

@@ -1,127 +1,140 @@
-"""``r3dpa reference`` and ``r3dpa evaluate``: how near anybody's samples are to real scans."""
+"""``r3dpa evaluate``, ``data reference`` and ``data realism``: comparisons with real scans."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
-from jsonargparse import Namespace
-from lightning.pytorch.cli import LightningArgumentParser
-from tqdm import tqdm
+from r3dpa.cli.parser import check_file, check_folder
 
-from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule
-from r3dpa.data.samples import SampleError, Samples, read_samples
-from r3dpa.data.scans import Scan, evenly, read_scan
-from r3dpa.geometry import LidarSensor
-from r3dpa.io import source_commit
-from r3dpa.metrics.evaluation import feature_spaces
-from r3dpa.metrics.official_statistics import (
-    OfficialSplit,
-    compare,
-    load_reference,
-    reference_spaces,
-)
-from r3dpa.metrics.protocol import PROTOCOLS
-from r3dpa.metrics.reference import ReferenceStatistics, complete_reference
-from r3dpa.metrics.result_table import report, save_reports
-from r3dpa.metrics.scene import EvaluationScene
-from r3dpa.metrics.scene_features import FREE_SPACES
-from r3dpa.viz.evaluation import save_figures
+if TYPE_CHECKING:
+    from r3dpa.data.samples import Samples
+    from r3dpa.data.scans import Scan
+    from r3dpa.metrics import RealismTable, ScanStatistics
+    from r3dpa.metrics.scene import EvaluationScene
 
-__all__ = ["evaluate", "reference"]
+__all__ = ["evaluate", "realism", "reference"]
 
-SplitName = Literal["train", "val", "all"]
-_OPTION = "--{}"  # how `r3dpa evaluate` is told to allow something
+_OPTION = "--{}"  # how the metrics name an option of these commands
 
 
 def reference(
+    *,
     data: Path,
     out: Path,
-    spaces: Sequence[str] = FREE_SPACES,
-    ckpt: Mapping[str, Path] | None = None,
-    split: SplitName = "all",
+    spaces: tuple[str, ...] = ("fwid", "fgeo"),
+    ckpt: dict[str, Path] | None = None,
+    split: Literal["train", "val", "all"] = "all",
     limit: int | None = None,
-    protocol: str = "default",
+    protocol: Literal["default", "published"] = "default",
     device: str = "auto",
     every: int = 2000,
 ) -> str:
-    """Statistics of real scans for ``r3dpa evaluate``; see ``r3dpa reference --help``.
+    """Write the statistics of real scans that r3dpa evaluate compares samples with.
+
+    The same command completes an interrupted run, from ``<name>.partial.safetensors``.
 
     Args:
-        data: Folder of scans or data YAML.
-        out: File to write; beside it lies ``<name>.partial.safetensors`` until it is complete, from
-            which the same call goes on.
-        spaces: Feature spaces.
-        ckpt: Their weights by name.
+        data: Folder of scans, in the KITTI-360 layout or any other, or a data YAML.
+        out: File to write, ``.safetensors``.
+        spaces: Feature spaces: ``fwid`` and ``fgeo`` need no file; ``frid``, ``fld``, ``fsvd`` and
+            ``fpvd`` need the weights of the official networks.
+        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Which scans of the data.
-        limit: Use this many at most, spread evenly.
-        protocol: ``default`` or ``published``.
-        device: Where the networks compute.
+        limit: Number of scans at most, spread evenly.
+        protocol: ``published`` prepares scans as the published numbers do: points on the corners
+            of pixels, and pictures of LIP-Loc that wrap around.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         every: Scans after which the unfinished file is saved; it also is on an interrupt.
 
-    Returns:
-        What was written, in a line.
-
     Raises:
-        ValueError: If an argument is not as above, ``out`` exists, there are fewer than two scans,
-            or one cannot be used; the message names it.
+        ValueError: If an argument is invalid, ``out`` exists, there are fewer than two scans, or
+            one cannot be used; names it.
     """
+    import torch
+
+    from r3dpa.cli.features import read_data
+    from r3dpa.data.scans import evenly, read_scan
+    from r3dpa.io import source_commit
+    from r3dpa.metrics.evaluation import feature_spaces
+    from r3dpa.metrics.protocol import PROTOCOLS
+    from r3dpa.metrics.reference import ReferenceStatistics, complete_reference
+    from r3dpa.metrics.scene import EvaluationScene
+
+    check_file(out)
     if out.exists():
         raise ValueError(f"{out} exists: delete it, or give another --out")
-    scans, sensor = _scans(data, split, limit)
-    setting = PROTOCOLS[protocol].with_sensor(sensor)
+    if limit is not None and limit < 2:
+        raise ValueError(f"limit must be at least 2, got {limit}")
+    module = read_data(data)
+    train, val = module.limited_split()
+    scans = {"train": train, "val": val, "all": sorted(train + val)}[split]
+    if len(scans) < 2:
+        raise ValueError(f"{data}: the split {split} has {len(scans)} scans; at least 2 are needed")
+    scans = evenly(scans, limit)
+    setting = PROTOCOLS[protocol].with_sensor(module.sensor)
     found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
-    names = [scan.name for scan in scans]
-    job = ReferenceStatistics.prepare(found, setting, names, about)
+    job = ReferenceStatistics.prepare(found, setting, [scan.name for scan in scans], about)
 
     def scans_from(start: int) -> Iterator[EvaluationScene]:
         for scan in scans[start:]:
-            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
+            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
 
     statistics = complete_reference(job, scans_from, found, out, every)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
 def evaluate(
+    *,
     samples: Path,
     reference: Path,
-    spaces: Sequence[str] | None = None,
-    ckpt: Mapping[str, Path] | None = None,
-    protocol: str | None = None,
+    spaces: list[str] | None = None,
+    ckpt: dict[str, Path] | None = None,
+    protocol: Literal["default", "published"] | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
-    split: OfficialSplit | None = None,
+    split: Literal["val", "all"] | None = None,
 ) -> str:
-    """Compares samples in files with real scans; see ``r3dpa evaluate --help``.
+    """Compare the samples of any generator with real scans.
+
+    Prints every metric with its confidence interval and its floor, the distance of real scans from
+    real scans, and a table beside the published numbers.
 
     Args:
-        samples: File or folder, see :func:`r3dpa.data.samples.read_samples`.
-        reference: File of ``r3dpa reference``, or the official statistics file.
-        spaces: Feature spaces; where None, those of the reference that need no file or that
-            ``ckpt`` has one for.
-        ckpt: Their weights by name.
-        protocol: Must be that of the reference; not compared where None.
+        samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
+            or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
+        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``.
+        spaces: Feature spaces; default: those of the reference that need no file or have one in
+            ``ckpt``.
+        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
+        protocol: Refuse a reference of another protocol than this.
         skip_bad: Leave out samples that cannot be used, and list them.
-        allow_few: Accept fewer samples than features.
-        label: Of the generator; the name of ``samples`` where None.
-        device: Where the networks compute.
-        out: Folder for tables and figures; without figures for the official file.
-        split: Part of the official file, see :meth:`OfficialStatistics.load`.
-
-    Returns:
-        The numbers, and a table with the published ones.
+        allow_few: Accept fewer samples than features: only to try it.
+        label: Name of the generator in tables; default: that of ``samples``.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
+        split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
 
     Raises:
-        ValueError: If an argument is not as above, or samples or reference cannot be used.
+        ValueError: If an argument is invalid, or samples or reference cannot be used.
     """
+    from dataclasses import replace
+
+    from tqdm import tqdm
+
+    from r3dpa.data.samples import read_samples
+    from r3dpa.io import source_commit
+    from r3dpa.metrics.official_statistics import compare, load_reference, reference_spaces
+    from r3dpa.metrics.result_table import report, save_reports
+    from r3dpa.viz.evaluation import save_figures
+
+    check_folder(out)
     made_with = _made_with(samples)
     statistics = load_reference(reference, split)
     found = reference_spaces(statistics, spaces, ckpt, protocol, device)
@@ -141,7 +154,7 @@ def evaluate(
         skip_bad=skip_bad,
         option=_OPTION,
     )
-    if files.bad:  # what the reader refuses never becomes a scene
+    if files.bad:  # the reader refused these, so that they never became scenes
         bad = {"bad_samples": [*files.bad, *evaluation.bad_samples]}
         about: Any = {**evaluation.about, "extra": {**evaluation.about["extra"], **bad}}
         evaluation = replace(evaluation, about=about)
@@ -153,7 +166,10 @@ def evaluate(
 
 
 def _scenes(samples: Samples) -> Iterator[EvaluationScene]:
-    """Samples as scenes; the message of a bad one says how to go on without."""
+    """Samples as scenes; the message of a bad one names the option that leaves it out."""
+    from r3dpa.data.samples import SampleError
+    from r3dpa.metrics.scene import EvaluationScene
+
     try:
         yield from (EvaluationScene(*sample) for sample in samples)
     except SampleError as error:
@@ -163,34 +179,8 @@ def _scenes(samples: Samples) -> Iterator[EvaluationScene]:
         raise SampleError(f"{error}. {advice}") from error
 
 
-def _scans(data: Path, split: SplitName, limit: int | None) -> tuple[list[Scan], LidarSensor]:
-    """Scans of a split of a folder or data YAML, and its sensor."""
-    module: LidarDataModule
-    if data.is_dir():
-        in_layout = (data / "data_3d_raw").is_dir()
-        module = KITTI360DataModule(str(data)) if in_layout else LidarDataModule(str(data))
-    elif data.suffix in (".yaml", ".yml"):
-        parser = LightningArgumentParser()
-        parser.add_argument("--config", action="config")
-        parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-        config: Namespace = parser.parse_args(["--config", str(data)])
-        settings = config.data.init_args
-        settings.extractor = settings.features_dir = None  # the scans are all it is here for
-        module = parser.instantiate_classes(config).data
-        module.prepare_data()  # simulates the scans, where it does
-    else:
-        raise ValueError(f"--data {data}: is no folder of scans and no data YAML")
-    if limit is not None and limit < 2:
-        raise ValueError(f"limit must be at least 2, got {limit}")
-    train, val = module.limited_split()
-    scans = {"train": train, "val": val, "all": sorted(train + val)}[split]
-    if len(scans) < 2:
-        raise ValueError(f"{data}: the split {split} has {len(scans)} scans; at least 2 are needed")
-    return evenly(scans, limit), module.sensor
-
-
 def _made_with(samples: Path) -> dict[str, Any]:
-    """What ``r3dpa sample`` wrote of its samples; nothing for those of others."""
+    """Entries of the metadata of ``r3dpa sample``; empty for samples of others."""
     folders = (samples, samples.parent) if samples.is_dir() else (samples.parent,)
     path = next((f / "metadata.json" for f in folders if (f / "metadata.json").is_file()), None)
     if path is None:
@@ -203,10 +193,87 @@ def _made_with(samples: Path) -> dict[str, Any]:
         return {}
     sampler = found.get("sampler") or {}
     kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
-    return {
-        "solver": sampler.get("solver"),
-        "steps": sampler.get("steps"),
-        **{key: found.get(key) for key in kept},
-        "sampler": sampler,
-        "made_by_commit": found.get("commit"),
-    }
+    made_with = {key: found.get(key) for key in kept}
+    made_with |= {"solver": sampler.get("solver"), "steps": sampler.get("steps")}
+    return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
+
+
+def realism(*, scans: Path, reference: Path, out: Path | None = None) -> RealismTable:
+    """Compare scans with real ones, each measure beside the distance between real drives.
+
+    A reference of a single drive is split in two halves in time, which gives a lower floor than two
+    drives would; a note below the table says so.
+
+    Args:
+        scans: Folder of ``.bin`` scans (A); one drive per folder.
+        reference: Folder of real scans (B), of two or more drives; a single one is halved.
+        out: JSON file for the table and the curves behind it.
+
+    Raises:
+        ValueError: If a folder holds no scan, or a scan cannot be used; names it.
+    """
+    from itertools import groupby
+
+    from tqdm import tqdm
+
+    from r3dpa.data.scans import find_scans
+    from r3dpa.io import atomic_path
+    from r3dpa.metrics import realism_table
+
+    check_file(out)
+    drives = []
+    for folder in (scans, reference):
+        groups = groupby(find_scans(folder), lambda scan: scan.drive)
+        drives.append({drive: list(group) for drive, group in groups})
+    notes = [f"A: {scans}", f"B: {reference}"]
+    if len(drives[1]) == 1:
+        drives[1], note = _halves(drives[1])
+        notes.append(note)
+    total = sum(len(found) for folder in drives for found in folder.values())
+    with tqdm(total=total, unit="scan", desc="realism", disable=None) as bar:
+        ours, real = (
+            {drive: _pooled(_counted(found, bar)) for drive, found in folder.items()}
+            for folder in drives
+        )
+        table = realism_table(ours, real, notes)
+    if out is not None:
+        with atomic_path(out) as temporary:
+            temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
+    return table
+
+
+def _halves(drives: dict[str, list[Scan]]) -> tuple[dict[str, list[Scan]], str]:
+    ((drive, scans),) = drives.items()
+    if len(scans) == 1:
+        return drives, "B is a single scan: there is no floor; give a reference of two drives"
+    middle = len(scans) // 2
+    halves = {f"{drive}, first half": scans[:middle], f"{drive}, second half": scans[middle:]}
+    return halves, (
+        "B is a single drive: the floor compares its first half with its second one, which are "
+        "more alike than two drives; all ratios come out too high"
+    )
+
+
+def _counted(scans: Iterable[Scan], bar: Any) -> Iterator[Scan]:
+    for scan in scans:
+        yield scan
+        bar.update()
+
+
+def _pooled(scans: Iterable[Scan]) -> ScanStatistics:
+    """Statistics of all these scans together.
+
+    Raises:
+        ScanError: If a scan cannot be used; names the file.
+    """
+    from r3dpa.data.scans import ScanError, read_scan
+    from r3dpa.metrics import ScanStatistics, scan_statistics
+
+    total = ScanStatistics()
+    for scan in scans:
+        points = read_scan(scan.path)
+        try:
+            total += scan_statistics(points)
+        except ValueError as error:
+            raise ScanError(f"{scan.path}: {error}") from error
+    return total

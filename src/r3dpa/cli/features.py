@@ -1,4 +1,4 @@
-"""``r3dpa features``: the feature grids of a data set, on one machine or many."""
+"""``r3dpa data features``: the feature grids of a data set, on one machine or many."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any, Literal, cast
 
 from jsonargparse import Namespace
 from lightning import Trainer
-from lightning.pytorch.cli import LightningArgumentParser
 
+from r3dpa.cli.stages import StageParser
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import Extractor, GridPlan, features_lock, plan
 from r3dpa.data.scans import Scan
@@ -56,7 +56,7 @@ def features(words: Sequence[str]) -> None:
         config.data.init_args.extractor = feature_source(config.extractor or "scalr", config.ckpt)
     if config.out:
         config.data.init_args.features_dir = str(config.out)
-    objects = parser.instantiate_classes(config)
+    objects = parser.instantiate(config)
     trainer = Trainer(**objects.trainer, logger=False, enable_checkpointing=False)
     if trainer.precision not in _PRECISIONS:
         raise ValueError(
@@ -73,17 +73,11 @@ def features(words: Sequence[str]) -> None:
             "data.init_args.prepare_data_per_node is for disks of the nodes' own, but "
             "trainer.num_nodes > 1 writes one store for all: leave one of them out."
         )
-    try:
-        _extract(data, trainer, config)
-    except KeyboardInterrupt:
-        if trainer.is_global_zero:
-            where = f"the same command goes on in {data.features_dir}"
-            sys.stderr.write(f"r3dpa features: stopped; {where}\n")
-        sys.exit(130)  # as a shell reports an interrupt
+    _extract(data, trainer, config)
 
 
 def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None:
-    # The module simulates its scans, where it does, and finds them; what extracts is in here.
+    # The data module finds its scans, or simulates them; it must not extract grids itself.
     module, data.extractor = data.extractor, None
     extractor, features_dir = cast(Extractor, module), cast(Path, data.features_dir)
     sizes = config.grid_sizes if config.grid_sizes is not None else [data.grid_size]
@@ -91,7 +85,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
     scans: list[Scan] = []
     with ExitStack() as job:
         if trainer.is_global_zero:
-            # Before Lightning joins the processes: none of them waits for long, or in vain.
+            # Before Lightning starts the other processes, which would wait and time out.
             data.prepare_data()
             data.setup("predict")
             assert data.all_set is not None
@@ -115,7 +109,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
         try:
             trainer.predict(extraction, missing, return_predictions=False)
         except SystemExit as stop:
-            if stop.code == 1:  # what Lightning makes of Ctrl-C
+            if stop.code == 1:  # Lightning turns Ctrl-C into this
                 raise KeyboardInterrupt from None
             raise
         finally:
@@ -145,8 +139,26 @@ def _say(line: str) -> None:
     sys.stdout.flush()  # into a log file at once
 
 
+def read_data(source: Path) -> LidarDataModule:
+    """Data module of a folder of scans or a data YAML, without features; simulates its scans.
+
+    Raises:
+        ValueError: If the path is neither.
+    """
+    parser = StageParser()
+    parser.add_argument("--config", action="config")
+    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
+    config = parser.parse_args(_with_data_class(["--data", str(source)]))
+    settings = config.data.init_args
+    settings.extractor = settings.features_dir = None
+    module: LidarDataModule = parser.instantiate(config).data
+    if source.is_file():
+        module.prepare_data()
+    return module
+
+
 def _with_data_class(words: Sequence[str]) -> list[str]:
-    """The words with a folder or a YAML file after ``--data`` in the form that the parser knows.
+    """The words with a folder or YAML file after ``--data`` as class path or ``--config``.
 
     Raises:
         ValueError: If a path after ``--data`` is neither.
@@ -168,33 +180,33 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
         elif Path(source).suffix in (".yaml", ".yml"):
             found += ["--config", source]
         elif "/" in source:
-            raise ValueError(f"--data {source}: is no folder of scans and no data YAML.")
+            raise ValueError(f"--data {source}: is no folder of scans and no data YAML")
         else:
             found += ["--data", source]
     return found
 
 
-def _parser() -> LightningArgumentParser:
-    parser = LightningArgumentParser(
-        prog="r3dpa features",
+def _parser() -> StageParser:
+    parser = StageParser(
+        prog="r3dpa data features",
         description="Write the feature grids of all scans of --data: a folder of scans, in the "
-        "KITTI-360 layout or any other, or a data YAML. What is made is kept, and the same command "
-        "completes what was interrupted. Of several devices and nodes, each makes its share.",
+        "KITTI-360 layout or any other, or a data YAML. The same command completes an interrupted "
+        "run. Several devices and nodes share the work.",
     )
     parser.add_argument("--config", action="config", help="YAML, the same as after --data")
     parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
     parser.add_argument(
         "--extractor",
         type=str | None,
-        help=f"one of {', '.join(SOURCES)}; that of the data configuration where not given, "
-        "scalr where --ckpt is",
+        help=f"one of {', '.join(SOURCES)}; default: that of the data configuration, "
+        "or scalr if --ckpt is given",
     )
     parser.add_argument("--ckpt", type=Path | None, help="weights of the extractor")
     parser.add_argument(
         "--grid_sizes",
         type=list[tuple[int, int]] | None,
         help="rows and columns of each grid, such as '[[8, 64], [16, 128]]', all from one pass; "
-        "grid_size of the data where not given",
+        "default: grid_size of the data",
     )
     parser.add_argument(
         "--dtype",
@@ -203,7 +215,7 @@ def _parser() -> LightningArgumentParser:
         help="int8 takes half the space: 127 steps on either side of zero in each cell",
     )
     parser.add_argument(
-        "--batch_size", type=int | None, help="scans per pass; that of the data where not given"
+        "--batch_size", type=int | None, help="scans per pass; default: that of the data"
     )
     parser.add_argument(
         "--out", type=Path | None, help="folder of the grids, in place of features_dir of the data"

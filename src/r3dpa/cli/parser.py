@@ -1,17 +1,154 @@
-"""Parser of the commands that are plain functions."""
+"""Command line parsers: one-line errors, flags without a value, lists as words."""
 
 from __future__ import annotations
 
-from typing import Any
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any, NoReturn, Union, get_args, get_origin
 
-from jsonargparse import ArgumentParser
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
+
+__all__ = ["OneLineErrors", "Parser", "check_file", "check_folder", "load", "run_function"]
+
+# jsonargparse denies os.system and its like already when a YAML file names them.
+set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
 
 
-class FlagParser(ArgumentParser):
-    """Takes ``--quick`` for ``--quick true``."""
+class OneLineErrors(ArgumentParser):
+    """Parser that reports what is wrong in one line."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Prints the message and exits with status 2; parsers of nested classes raise it."""
+        if not self.exit_on_error:
+            super().error(message, ex)
+        parser = getattr(ex, "subcommand_parser", None) or self
+        prog = parser.prog.replace(" [options]", "")
+        sys.stderr.write(f"{prog}: {_short(message)}; see {prog} --help\n")
+        sys.exit(2)
+
+
+def _short(message: str) -> str:
+    """An error of jsonargparse in one line, without the types that a union tried."""
+    head, _, tail = message.partition("Does not validate against any of the Union subtypes")
+    causes = re.search(r"Errors:\s*(.*?)\s*Given value type:", tail, re.DOTALL)
+    if causes is not None:
+        found = [" ".join(cause.split()) for cause in re.split(r"(?m)^\s*- ", causes[1])]
+        value = tail.rpartition("Given value: ")[2].strip()
+        message = f"{head}{next((c for c in found if c and 'null' not in c), '')} (got {value})"
+    message = re.sub(r'Parser key "([^"]+)": ', r"--\1: ", " ".join(message.split()).rstrip("."))
+    return re.sub(r"Expected an? <class '(\w+)'>", r"expected \1", message)
+
+
+class Parser(OneLineErrors):
+    """Parser of a function: ``--quick`` stands for ``--quick true``, and lists are words.
+
+    ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
+    """
 
     def add_argument(self, *args: Any, **kwargs: Any) -> Any:
-        """Adds an argument; the value of a boolean one may be left out."""
+        """Adds an argument; boolean ones need no value."""
         if kwargs.get("type") is bool:
             kwargs |= {"nargs": "?", "const": True}
         return super().add_argument(*args, **kwargs)
+
+    def parse_args(  # type: ignore[override] # of argparse; jsonargparse's has more, too
+        self, args: Sequence[str] | None = None, *more: Any, **options: Any
+    ) -> Namespace:
+        """Parses as usual, after the words of a list became one."""
+        words = sys.argv[1:] if args is None else list(args)
+        return super().parse_args(self._with_lists(words), *more, **options)
+
+    def _with_lists(self, words: Sequence[str]) -> list[str]:
+        kinds = {
+            name: kind
+            for action in self._actions
+            for name in action.option_strings
+            if _is_list(kind := getattr(action, "_typehint", None))
+        }
+        found: list[str] = []
+        rest = list(words)
+        while rest:
+            name, equals, value = rest[0].partition("=")
+            found.append(rest.pop(0))
+            if name not in kinds:
+                continue
+            items = [value] if equals else []
+            while rest and not equals and (not rest[0].startswith("-") or _is_number(rest[0])):
+                items.append(rest.pop(0))
+            if items and not items[0].lstrip().startswith("["):
+                parts = [part.strip() for item in items for part in item.split(",")]
+                quoted = parts if _of_numbers(kinds[name]) else map(json.dumps, parts)
+                items = [f"[{', '.join(quoted)}]"]
+            found = [*found[:-1], name, *items]
+        return found
+
+
+def _is_list(kind: Any) -> bool:
+    if get_origin(kind) in (list, tuple):
+        return True
+    union = get_origin(kind) is Union or type(kind).__name__ == "UnionType"
+    return union and any(_is_list(part) for part in get_args(kind))
+
+
+def _of_numbers(kind: Any) -> bool:
+    if get_origin(kind) in (list, tuple):
+        return set(get_args(kind)) <= {int, float}
+    return any(_of_numbers(part) for part in get_args(kind))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def load(target: str) -> Callable[..., Any]:
+    """The function of ``file:name`` below ``r3dpa.cli``."""
+    file, _, name = target.partition(":")
+    function: Callable[..., Any] = getattr(import_module(f"r3dpa.cli.{file}"), name)
+    return function
+
+
+def function_parser(function: Callable[..., Any], prog: str) -> Parser:
+    """Parser of a function; keyword-only arguments are options, others may be positional."""
+    description = cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]
+    parser = Parser(prog=prog, description=description)
+    parser.add_argument("--config", action="config", help="YAML file with options")
+    parser.add_function_arguments(function, as_positional=True, as_group=False)
+    return parser
+
+
+def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) -> Any:
+    """Calls a function with the arguments of a command line; returns its result."""
+    parser = function_parser(function, prog)
+    config = parser.parse_args(words)
+    try:
+        arguments = parser.instantiate(config).as_dict()
+    except ValueError as error:  # of an optional dataclass: the cause is its own check
+        if "Union subtypes" in str(error) and isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise
+    arguments.pop("config", None)
+    return function(**arguments)
+
+
+def check_folder(out: Path | None) -> None:
+    """Refuses an output folder whose place is taken by a file, before the work starts."""
+    for folder in () if out is None else (out, *out.parents):
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is a file; give another --out")
+
+
+def check_file(out: Path | None) -> None:
+    """Refuses an output file whose place is taken by a folder, before the work starts."""
+    if out is not None:
+        if out.is_dir():
+            raise ValueError(f"{out} is a folder; give --out the name of a file")
+        check_folder(out.parent)

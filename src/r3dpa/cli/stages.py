@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import sys
+import uuid
 import warnings
 from contextlib import nullcontext
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, cast
 
+import yaml
 from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.io import atomic_path, delete_unfinished, only_writer
+from r3dpa.cli.parser import OneLineErrors
+from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
 from r3dpa.modules import GenerativeModule
 
-__all__ = ["StageCLI", "run"]
+__all__ = ["StageCLI", "StageParser", "conf_folder", "run"]
 
-# Said by Lightning at every start, and meant that way here: averages and frozen networks stay in
+# Warnings of Lightning at every start that are intended here: averages and frozen networks stay in
 # evaluation mode; the rest is Lightning's own use of torch.
 _HARMLESS = (
     r"Found \d+ module\(s\) in eval mode",
@@ -29,19 +34,36 @@ _HARMLESS = (
 )
 
 
-class _SaveFitConfig(SaveConfigCallback):
-    """Keeps the configuration of the training: evaluating a run does not replace it."""
+class StageParser(OneLineErrors, LightningArgumentParser):
+    """Parser of stages and data modules."""
+
+
+def conf_folder() -> Path:
+    """Folder of the shipped configurations, in a checkout and in an installed package alike."""
+    return Path(str(files("r3dpa") / "conf"))
+
+
+class _RecordConfig(SaveConfigCallback):
+    """Writes the configuration of a training to ``run_dir`` and to wandb; knows when it started."""
+
+    started = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if stage == "fit":
+        if stage == "fit":  # evaluating a run does not replace its configuration
             super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Writes it whole; not to ``trainer.log_dir``, for which the other processes are asked."""
-        text = self.parser.dump(self.config, skip_none=False)
+        """Not to ``trainer.log_dir``, which would need all processes."""
+        text = self.parser.dump(self.config, skip_unset=False)
         path = Path(trainer.default_root_dir) / self.config_filename
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                logger.log_hyperparams(yaml.safe_load(text) | {"commit": source_commit()})
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        self.started = True
 
 
 class StageCLI(LightningCLI):
@@ -91,7 +113,13 @@ class StageCLI(LightningCLI):
             if subcommand == "fit" and first:
                 self._refuse_earlier_run()
                 delete_unfinished(run_dir / "checkpoints")
-            super()._run_subcommand(subcommand)
+            try:
+                super()._run_subcommand(subcommand)
+            except (ValueError, OSError) as error:
+                callbacks = cast(Any, self.trainer).callbacks
+                if any(isinstance(c, _RecordConfig) and c.started for c in callbacks):
+                    error.during_training = True  # type: ignore[union-attr] # for cli.main
+                raise
 
     def instantiate_classes(self) -> None:
         """Builds stage, data module and trainer; checks that the first two belong together.
@@ -125,7 +153,7 @@ class StageCLI(LightningCLI):
         return self.config[self.subcommand].ckpt_path
 
     def before_instantiate_classes(self) -> None:
-        """Points every logger that has a ``save_dir`` at the run's folder."""
+        """Points every logger at the run's folder; names the wandb run."""
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
@@ -136,6 +164,24 @@ class StageCLI(LightningCLI):
         for logger in loggers if isinstance(loggers, list) else [loggers]:
             if hasattr(logger, "init_args") and "save_dir" in logger.init_args:
                 logger.init_args.save_dir = config.run_dir
+                if logger.class_path.endswith(".WandbLogger"):
+                    self._name_wandb_run(logger.init_args, Path(config.run_dir))
+
+    def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
+        """Fills what the configuration leaves open; `test` and a resumed `fit` join the run."""
+        model = self.config[self.subcommand].get("model")
+        note = run_dir / "wandb_id.txt"
+        if self.subcommand == "fit" and not note.exists():
+            note.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
+        names = {
+            "name": "/".join(run_dir.parts[-2:]),
+            "group": run_dir.resolve().parent.name,
+            "job_type": model.class_path.rpartition(".")[2] if model else None,
+            "id": note.read_text(encoding="utf-8") if note.exists() else None,
+        }
+        for key, value in names.items():
+            if init_args.get(key) is None and value is not None:
+                init_args[key] = value
 
     def _refuse_earlier_run(self) -> None:
         run_dir = Path(self.config[self.subcommand].run_dir)
@@ -153,12 +199,45 @@ def _newest(run_dir: Path) -> str | None:
     return str(max(whole, key=lambda path: path.stat().st_mtime_ns)) if whole else None
 
 
+def _with_preset(words: list[str]) -> list[str]:
+    """``STAGE [--preset NAME]`` after the command as the shipped configurations.
+
+    Raises:
+        ValueError: If there is no such stage or preset.
+    """
+    if not words or words[0].startswith("-"):
+        return words
+    stage, preset, rest = words[0], "kitti360", words[1:]
+    if "--preset" in rest[:-1]:
+        place = rest.index("--preset")
+        preset = rest[place + 1]
+        del rest[place : place + 2]
+    conf, demo = conf_folder(), preset == "demo"
+    data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
+    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", f"experiment/{stage}"]
+    for folder, name in (("experiment", stage), ("data", preset)):
+        if not (conf / folder / f"{name}.yaml").is_file():
+            known = sorted(path.stem for path in (conf / folder).glob("*.yaml"))
+            known = [name for name in known if not name.endswith("_demo")]
+            raise ValueError(f"there is no {folder} {name!r}; give one of {', '.join(known)}")
+    if demo and (conf / f"experiment/{stage}_demo.yaml").is_file():
+        names.append(f"experiment/{stage}_demo")
+    configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
+    return [*configs, "--run_dir", f"runs/{preset}/{stage}", *rest]
+
+
 def run(args: list[str]) -> None:
-    """Runs one stage command.
+    """Runs a stage command.
 
     Args:
-        args: Command line after ``r3dpa``, for example ``["fit", "--config", "x.yaml"]``.
+        args: Command line after ``r3dpa``, such as ``["fit", "--config", "x.yaml"]``, or with
+            shipped configurations ``["fit", "joint", "--preset", "demo"]``.
+
+    Raises:
+        ValueError: If the configuration cannot be used; its attribute ``during_training`` tells
+            errors of a running training apart.
     """
+    words = [args[0], *_with_preset(args[1:])]
     for message in _HARMLESS:
         warnings.filterwarnings("ignore", message=message)
     StageCLI(
@@ -166,9 +245,11 @@ def run(args: list[str]) -> None:
         LightningDataModule,
         subclass_mode_model=True,
         subclass_mode_data=True,
-        save_config_callback=_SaveFitConfig,
+        save_config_callback=_RecordConfig,
         save_config_kwargs={"overwrite": True},
         auto_configure_optimizers=False,
-        # Lightning warns where both the process's own command line and a list are given.
-        args=None if args == sys.argv[1:] else args,
+        parser_class=StageParser,
+        parser_kwargs={"prog": "r3dpa"},
+        # Lightning warns if both the process's own command line and a list are given.
+        args=None if words == sys.argv[1:] else words,
     )

@@ -1,32 +1,34 @@
-"""``r3dpa view``: scans as pictures and as a page to walk around in."""
+"""``r3dpa data view``: scans as pictures and as a page of point clouds to turn."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple
-from zipfile import BadZipFile
+from typing import TYPE_CHECKING, NamedTuple
 
-from numpy.typing import NDArray
+from r3dpa.cli.parser import check_folder
 
-from r3dpa import viz
-from r3dpa.data.scans import evenly, find_scans, read_beside, read_npz, read_ply, read_scan
-from r3dpa.geometry import LidarSensor, SphericalProjection
-from r3dpa.io import atomic_path
-from r3dpa.simulation import Origin, Semantic
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-__all__ = ["view"]
+    from r3dpa import viz
+
+__all__ = ["view", "write_page"]
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
 # that is not named here takes one of the palette.
-_COLOURS = {
-    **{"ROAD": "#75688f", "SIDEWALK": "#c77dba", "TERRAIN": "#a7c957", "BUILDING": "#c9b48c"},
-    **{"WALL": "#a08c80", "FENCE": "#c08552", "POLE": "#f2f2f2", "SIGN": "#ffd84d"},
-    **{"VEGETATION": "#46b36b", "PERSON": "#ff5c5c", "CAR": "#4e9bff"},
-    **{"SURFACE": "#56606e", "MIXED": "#ffb000", "FOLIAGE": "#46b36b", "GLASS": "#5ce1e6"},
-    **{"MIRROR": "#c792ea", "FOG": "#aab4c8", "RAIN": "#4e9bff", "SNOW": "#ffffff"},
-    **{"SPRAY": "#7fd1ff", "BLOOMING": "#ff6b6b", "SUN": "#ffe14d", "SECOND_RETURN": "#f78fb3"},
-}
+_COLOURS = dict(
+    re.findall(
+        r"(\w+) (#\w+)",
+        "UNLABELED #8a8f98 ROAD #75688f SIDEWALK #c77dba TERRAIN #a7c957 BUILDING #c9b48c "
+        "WALL #a08c80 FENCE #c08552 POLE #f2f2f2 SIGN #ffd84d VEGETATION #46b36b PERSON #ff5c5c "
+        "RIDER #ff9f1c CAR #4e9bff TRUCK #2459c4 BUS #00b8a9 BICYCLE #e056fd SURFACE #56606e "
+        "MIXED #ffb000 FOLIAGE #46b36b GLASS #5ce1e6 MIRROR #c792ea FOG #aab4c8 RAIN #4e9bff "
+        "SNOW #ffffff SPRAY #7fd1ff BLOOMING #ff6b6b SUN #ffe14d SECOND_RETURN #f78fb3",
+    )
+)
 _DATA = ("velodyne_points", "data")  # of a scan in the KITTI-360 layout, beside labels and origins
 
 
@@ -38,24 +40,28 @@ class _Source(NamedTuple):
     points: NDArray | None = None
 
 
-def view(source: Path, out: Path | None, num: int, reference: Path | None) -> str:
-    """Writes ``range_images.png``, ``birds_eye.png`` and ``view.html``; see ``r3dpa view --help``.
+def view(
+    source: Path, *, out: Path | None = None, num: int = 8, reference: Path | None = None
+) -> str:
+    """Draw scans as range images, from above, and as a page with point clouds to turn.
 
     Args:
-        source: Folder of ``.bin`` scans in any layout, or a ``.bin``, ``.ply`` or ``.npz`` file.
-        out: Folder to write to; ``view/<name of the source>`` if None.
-        num: Scans to show at most, evenly spread over those there are.
-        reference: Scan shown beside the others; of several, the first one.
-
-    Returns:
-        What was shown and the paths, one a line.
+        source: A ``.bin``, ``.ply`` or ``.npz`` file, or a folder of ``.bin`` scans in any layout.
+        out: Folder for the pictures and the page; default: ``view/<name of the source>``.
+        num: Scans to show at most, evenly spread over the folder.
+        reference: Scan to show beside the others, such as a real one beside simulated ones.
 
     Raises:
-        ValueError: If ``num`` is below 1, there is no scan, or a scan or what lies beside it
-            cannot be used; the message names the file.
+        ValueError: If ``num`` is below 1, there is no scan, or a scan or its labels cannot be used;
+            names the file.
     """
+    from r3dpa import viz
+    from r3dpa.data.scans import evenly
+    from r3dpa.geometry import LidarSensor, SphericalProjection
+
     if num < 1:
         raise ValueError(f"num must be 1 or greater, got {num}")
+    check_folder(out)
     sources = _sources(source)
     scans = [_read(entry) for entry in evenly(sources, num)]
     beside = None
@@ -65,30 +71,36 @@ def view(source: Path, out: Path | None, num: int, reference: Path | None) -> st
     drawn = {scan.name: scan.points for scan in [*scans, *([beside] if beside else [])]}
     resolved = source.resolve()
     out = out or Path("view") / (resolved.name if resolved.is_dir() else resolved.stem)
-
     pictures = {
         "range_images.png": viz.range_strips(drawn, SphericalProjection(LidarSensor())),
         "birds_eye.png": viz.birds_eye_sheet(drawn),
     }
     paths = [viz.save(figure, out / name) for name, figure in pictures.items()]
-    page = viz.scan_page(
-        scans,
-        f"{resolved.name} - r3dpa view",
-        {0: viz.Category("no label", "#8a8f98"), **_categories(Semantic)},
-        _categories(Origin),
-        beside,
-    )
-    with atomic_path(out / "view.html") as temporary:
-        temporary.write_text(page, "utf-8")
-    paths.append(out / "view.html")
+    paths.append(write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view", beside))
     lines = [f"{len(scans)} of {len(sources)} scans in {source}"]
     if beside:
         lines.append(beside.name)
     return "\n".join([*lines, *map(str, paths), "open the .html file in a browser"])
 
 
+def write_page(
+    path: Path, scans: Sequence[viz.PageScan], title: str, beside: viz.PageScan | None = None
+) -> Path:
+    """Writes a page of point clouds, coloured by the classes and origins of the simulator too."""
+    from r3dpa import viz
+    from r3dpa.io import atomic_path
+    from r3dpa.simulation import Origin, Semantic
+
+    page = viz.scan_page(scans, title, _categories(Semantic), _categories(Origin), beside)
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, "utf-8")
+    return path
+
+
 def _sources(source: Path) -> list[_Source]:
     """Scans of a folder or file, in order."""
+    from r3dpa.data.scans import find_scans
+
     if source.suffix == ".npz" and source.is_file():
         members = _members(source).items()
         return [_Source(f"{source.stem}/{name}", source, points) for name, points in members]
@@ -104,6 +116,10 @@ def _sources(source: Path) -> list[_Source]:
 
 def _members(path: Path) -> dict[str, NDArray]:
     """Scans of a ``.npz`` file by name."""
+    from zipfile import BadZipFile
+
+    from r3dpa.data.scans import read_npz
+
     try:
         members = read_npz(path)
     except (EOFError, ValueError, BadZipFile) as error:
@@ -120,6 +136,9 @@ def _members(path: Path) -> dict[str, NDArray]:
 
 def _read(source: _Source) -> viz.PageScan:
     """A scan with its labels and origins where there are files of them."""
+    from r3dpa import viz
+    from r3dpa.data.scans import read_beside, read_ply, read_scan
+
     name, path, points = source
     if points is not None:
         return viz.PageScan(name, points)
@@ -131,6 +150,8 @@ def _read(source: _Source) -> viz.PageScan:
 
 def _categories(names: type[IntEnum]) -> dict[int, viz.Category]:
     """Names and colours of the members of an enumeration."""
+    from r3dpa import viz
+
     return {
         int(member): viz.Category(member.name.lower().replace("_", " "), _COLOURS.get(member.name))
         for member in names

@@ -1,4 +1,4 @@
-"""Tables of an ablation: means over seeds, the paper's numbers beside them, and its orders."""
+"""Tables of an ablation: means over seeds, published numbers, and the orders of the paper."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any, Literal
 
+import torch
 from scipy.stats import t as student
 
-from r3dpa.ablation.curves import curves_of
+from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Stage, Table
-from r3dpa.ablation.runner import commit_of, evaluation_of
-from r3dpa.io import atomic_path
+from r3dpa.ablation.run import commit_of, evaluation_of, stage_folder
+from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import About, Evaluation, MetricResult, published_scales
 from r3dpa.metrics.scene_features import SPACES
 
-__all__ = ["OrderResult", "mean_of_seeds", "order_results", "write_table"]
+__all__ = ["OrderResult", "Results", "curves_of", "mean_of_seeds", "order_results", "write_table"]
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _LEVEL = 0.95
@@ -33,16 +34,16 @@ Results = Mapping[str, Mapping[int, Evaluation]]
 
 @dataclass(frozen=True)
 class OrderResult:
-    """What became of one order of the paper, in one metric.
+    """Result for one order of the paper in one metric.
 
     Args:
         first: Row that the claim is about.
         second: The row that it is compared with.
-        claim: What the paper found: in this metric where it printed both, else in general.
+        claim: Claim of the paper: by its numbers in this metric if it printed both.
         metric: Name of the metric.
         change: Relative difference of ``first`` to ``second``, the mean over the seeds.
-        interval: Ends of its 95 % interval: Student's of the differences seed by seed, or with a
-            single seed that of the scenes, without the noise of training.
+        interval: Its 95 % interval: Student's of the differences seed by seed, or with a single
+            seed that of the scenes, without the noise of training.
         direction: Which values are better.
     """
 
@@ -56,10 +57,9 @@ class OrderResult:
 
     @property
     def holds(self) -> Literal["yes", "no", "unclear"]:
-        """Whether the interval lies where the claim has it, or wholly elsewhere.
+        """Whether the interval lies wholly inside or outside the claim.
 
-        *Alike* are rows that differ by no more than 5 %, some times as much as those that the paper
-        calls so.
+        *Alike* means a difference of at most 5 %, a few times that of such rows in the paper.
         """
         low, high = self.interval
         if self.claim == "alike":
@@ -73,14 +73,10 @@ class OrderResult:
 
 
 def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
-    """One evaluation of several that differ in their seed alone.
+    """One evaluation of several, at least one, that differ in their seed alone.
 
-    The interval of a value is Student's, of the mean over the seeds; that of a single seed stays
-    the one of its scenes. A metric without a value in one of them has none.
-
-    Args:
-        label: Of the row.
-        evaluations: At least one.
+    Intervals are Student's, of the mean over the seeds; a single seed keeps those of its scenes. A
+    metric without a value in one seed has none.
     """
     first = evaluations[0]
     if len(evaluations) == 1:
@@ -108,7 +104,7 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
 
 
 def order_results(table: Table, results: Results, metrics: Sequence[str]) -> list[OrderResult]:
-    """What became of the orders of the paper, as far as there are results."""
+    """Orders of the paper for which there are results."""
     rows = {row.key: row for row in table.rows}
     claims = [("better", pair) for pair in table.better] + [("alike", pair) for pair in table.alike]
     found = []
@@ -140,7 +136,7 @@ def order_results(table: Table, results: Results, metrics: Sequence[str]) -> lis
 def _claim(
     general: str, printed: Sequence[float | None], direction: str
 ) -> Literal["better", "worse", "alike"]:
-    """The claim in a metric: what was printed of it may be the reverse of the general claim."""
+    """The claim in a metric: the printed numbers may be the reverse of the general claim."""
     if general == "alike":
         return "alike"
     first, second = printed
@@ -172,19 +168,18 @@ def _students(values: Sequence[float]) -> float:
 
 
 def write_table(
-    plan: Plan, table: Table, out: Path, failed: Mapping[str, str], provenance: Mapping[str, Any]
+    plan: Plan, table: Table, out: Path, failed: Mapping[str, str]
 ) -> tuple[str, Results]:
-    """Writes ``<out>/<table>.md``, ``.tex``, ``.csv`` and ``.json`` of what is there.
+    """Writes ``<out>/<table>.md``, ``.tex``, ``.csv`` and ``.json`` from the existing results.
 
-    The distances are in the first two; the CSV has every metric, and the JSON every seed, the
-    training curves, the orders of the paper and the failures.
+    The first two have the distances, the CSV every metric, and the JSON every seed, the training
+    curves, the orders of the paper and the failures.
 
     Args:
         plan: The plan that was run.
         table: One of its tables.
         out: Folder of the ablation.
-        failed: Why processes failed, by name.
-        provenance: Command, machine and versions, for the JSON.
+        failed: Reasons of failures by name of the job.
 
     Returns:
         The table for the terminal, and the evaluations by row and seed.
@@ -240,7 +235,8 @@ def write_table(
     with atomic_path(out / f"{table.name}.tex") as temporary:
         temporary.write_text(f"% {' '.join(head.split())}\n{shown.latex()}", encoding="utf-8")
     EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
-    about = {**provenance, "commits": commits}
+    about = {"command": command(), "machine": machine(), "versions": versions(torch)}
+    about["commits"] = commits
     _save_json(plan, table, out, results, orders, failed, about)
     return "\n".join([f"{table.name}: {head}", "", str(shown), *told]), results
 
@@ -289,54 +285,44 @@ def _save_json(
     failed: Mapping[str, str],
     about: Mapping[str, Any],
 ) -> None:
+    rows = []
+    for row in table.rows:
+        found = {str(seed): evaluation.rows for seed, evaluation in results[row.key].items()}
+        entry = {
+            "key": row.key,
+            "label": row.label,
+            "published": row.published,
+            "stages": {str(seed): [s.name for s in chain] for seed, chain in row.stages.items()},
+            "values": {seed: {r.name: r.value for r in rs} for seed, rs in found.items()},
+            "intervals": {seed: {r.name: r.interval for r in rs} for seed, rs in found.items()},
+        }
+        rows.append(entry)
+    fields = ("first", "second", "claim", "metric", "change", "interval", "holds")
+    chains = [chain for row in table.rows for chain in row.stages.values()]
     stored = {
         "table": table.name,
         "caption": table.caption,
         "scale": plan.scale.name,
         "about": plan.scale.about,
         **about,
-        "rows": [
-            {
-                "key": row.key,
-                "label": row.label,
-                "published": row.published,
-                "stages": {
-                    str(seed): [stage.name for stage in stages]
-                    for seed, stages in row.stages.items()
-                },
-                "values": {
-                    str(seed): {r.name: r.value for r in e.rows}
-                    for seed, e in results[row.key].items()
-                },
-                "intervals": {
-                    str(seed): {r.name: r.interval for r in e.rows}
-                    for seed, e in results[row.key].items()
-                },
-            }
-            for row in table.rows
-        ],
-        "orders": [
-            {
-                "first": order.first,
-                "second": order.second,
-                "claim": order.claim,
-                "metric": order.metric,
-                "change": order.change,
-                "interval": order.interval,
-                "holds": order.holds,
-            }
-            for order in orders
-        ],
-        "curves": {
-            stage.name: _thinned(out, stage)
-            for row in table.rows
-            for stages in row.stages.values()
-            for stage in stages
-        },
+        "rows": rows,
+        "orders": [{field: getattr(order, field) for field in fields} for order in orders],
+        "curves": {stage.name: _thinned(out, stage) for chain in chains for stage in chain},
         "failed": dict(failed),
     }
     with atomic_path(out / f"{table.name}.json") as temporary:
         temporary.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
+
+
+def curves_of(out: Path, stage: Stage) -> dict[str, dict[int, float]]:
+    """Logged values of a stage by quantity and step; a resumed run overwrites repeated steps."""
+    found: dict[str, dict[int, float]] = {}
+    paths = stage_folder(out, stage).glob("version_*/metrics.csv")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        for name, (steps, values) in viz.read_metrics(path).items():
+            known = found.setdefault(name, {})
+            known.update(zip(map(int, steps), map(float, values), strict=True))
+    return {name: dict(sorted(values.items())) for name, values in found.items()}
 
 
 def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:

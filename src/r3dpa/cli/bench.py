@@ -1,18 +1,18 @@
-"""The commands of ``r3dpa bench``; heavy imports stay inside."""
+"""``r3dpa bench``: speed and accuracy of sampling, cost of training steps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from r3dpa.cli.files import check_file, check_folder, print_text
+from r3dpa.cli.parser import check_file, check_folder
 
-__all__ = ["BENCHES"]
+__all__ = ["sampling", "training"]
 
 
-def bench_training(
-    conf: Path = Path("conf"),
+def training(
+    *,
+    conf: Path | None = None,
     stages: tuple[str, ...] = ("vae_alignment", "joint", "flow_matching"),
     batch_size: int = 1,
     steps: int = 2,
@@ -20,27 +20,30 @@ def bench_training(
     device: Literal["auto", "cpu", "cuda"] = "auto",
     out: Path | None = None,
     quick: bool = False,
-) -> None:
+) -> Any:
     """Train each stage for a few steps at its real size; print time, memory, work and speed.
 
     Args:
-        conf: Folder of the configurations.
-        stages: Experiments below ``<conf>/experiment``, such as ``[joint]``; one process each.
+        conf: Folder of the configurations; default: those of the package.
+        stages: Experiments below ``<conf>/experiment``; one process each.
         batch_size: Scans per step.
         steps: Optimiser steps; two are needed for the peak memory of a long run.
         precision: Precision as the Trainer names it.
-        device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
+        device: ``cpu``, ``cuda``, or ``auto`` for the GPU if there is one.
         out: JSON file for the same figures.
         quick: The demo's networks.
     """
-    from r3dpa.bench.training import StepSettings, training
+    from r3dpa.bench.training import StepSettings
+    from r3dpa.bench.training import training as measure
+    from r3dpa.cli.stages import conf_folder
 
     check_file(out)
     settings = StepSettings(batch_size, steps, precision, device, quick)
-    print_text(training(conf, stages, settings, out))
+    return measure(conf or conf_folder(), stages, settings, out)
 
 
-def bench_sampling(
+def sampling(
+    *,
     out: Path,
     ckpt: Path | None = None,
     quick: bool = False,
@@ -50,25 +53,25 @@ def bench_sampling(
     nfe: list[int] | None = None,
     reference_steps: int | None = None,
     device: str = "auto",
-) -> None:
-    """Measure what accuracy costs in time, for an exact velocity and a trained model; draw it.
+) -> Any:
+    """Measure accuracy against time for an exact velocity and a trained model; draw both.
 
-    Interrupted, the same command goes on.
+    The same command completes an interrupted run.
 
     Args:
         out: Folder for tables, pictures and ``quality.json``.
-        ckpt: Checkpoint of stage joint or flow_matching; without one only a mixture of Gaussians
+        ckpt: Checkpoint of stage joint or flow_matching; default: only a mixture of Gaussians
             whose velocity is exact.
         quick: Few scenes, steps and rounds: minutes on a CPU.
-        scenes: Solved by each way to sample; 256, or 8 with ``--quick``.
-        batch_size: Scenes computed together; 64 on a GPU, 4 on a CPU.
-        rounds: Of the timing; 20, or 3 with ``--quick``.
-        nfe: Network evaluations a scene; 2 to 256, or 4 to 32 with ``--quick``.
-        reference_steps: Heun steps of the converged solution, an even number; 1000, or 200 with
-            ``--quick``.
+        scenes: Scenes of each sampler; default: 256, or 8 with ``--quick``.
+        batch_size: Scenes computed together; default: 64 on a GPU, 4 on a CPU.
+        rounds: Rounds of the timing; default: 20, or 3 with ``--quick``.
+        nfe: Network evaluations per scene; default: 2 to 256, or 4 to 32 with ``--quick``.
+        reference_steps: Heun steps of the converged solution, an even number; default: 1000, or
+            200 with ``--quick``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
-    from r3dpa.bench.sampling import sampling
+    from r3dpa.bench.sampling import sampling as measure
 
     check_folder(out)
     effort = {
@@ -78,10 +81,4 @@ def bench_sampling(
         "rounds": rounds,
         "batch": batch_size,
     }
-    print_text(sampling(out, ckpt, quick, effort, device))
-
-
-BENCHES: dict[str, Callable[..., None]] = {
-    "training": bench_training,
-    "sampling": bench_sampling,
-}
+    return measure(out, ckpt, quick, effort, device)

@@ -1,26 +1,29 @@
-"""What all edits share: a checkpoint, scans and features read for it, results written.
+"""Work shared by the edits: read checkpoint, scans and features, run the edit, write the results.
 
 Letters: B scenes, H beams, W columns, N tokens, F feature width, P points.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 import r3dpa
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.edits import EditJob
-from r3dpa.cli.scenes import draw_scene, written
+from r3dpa.cli.parser import check_folder
+from r3dpa.cli.sample import draw_scene, written
 from r3dpa.data import (
     Extractor,
     PointSample,
@@ -34,16 +37,18 @@ from r3dpa.data import (
 from r3dpa.data.objects import object_library
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
+from r3dpa.flow.solvers import evaluations
 from r3dpa.geometry import LidarSensor, in_range, range_image
-from r3dpa.geometry.gaps import check_view
+from r3dpa.geometry.gaps import check_view, filled, range_error_m
 from r3dpa.io import atomic_path, source_commit, usable_device
 from r3dpa.nn.backbones import feature_source
 
-__all__ = ["EditDesk", "Guidance", "Parts", "ScanView", "without_features"]
+if TYPE_CHECKING:
+    from r3dpa.cli.edit import EditJob
+
+__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors", "without_features"]
 
 _SHOWN = 8  # results on the sheet and the page
-#: Strength and window, where given.
-Guidance = tuple[float | None, tuple[float, float] | None]
 
 
 class ScanView(NamedTuple):
@@ -55,45 +60,42 @@ class ScanView(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Number of the part ``(H, W)`` that each pixel belongs to, and their names."""
+    """Part ``(H, W)`` of the range image that each pixel belongs to, and names of the parts."""
 
     numbers: NDArray[np.uint8]
     names: Sequence[str]
 
 
-class EditDesk:
-    """The checkpoint of a job with all that is read for it, and written of it.
+class EditSession:
+    """A checkpoint opened for one edit.
 
     Args:
-        job: What all edits are asked.
+        job: Options of all edits.
         num: Number of results.
-        guidance: Strength and window, where given.
-
-    Attributes:
-        job: That of the arguments.
-        editor: On the device of the job.
-        projection: Of the checkpoint.
-        sensor: Of the projection.
-        grid_size: Rows and columns of the tokens.
-        feature_dim: Width of the features that guide.
+        strength: Guidance strength; None for the default.
+        window: Guided times; None for the default.
 
     Raises:
         ValueError: If a number is out of its range or the checkpoint cannot be sampled from.
         OSError: If the checkpoint cannot be read.
     """
 
-    def __init__(self, job: EditJob, num: int, guidance: Guidance) -> None:
+    def __init__(
+        self,
+        job: EditJob,
+        num: int,
+        strength: float | None = None,
+        window: tuple[float, float] | None = None,
+    ) -> None:
         if num < 1:
             raise ValueError(f"num must be at least 1, got {num}")
         if job.seed < 0 or job.pictures < 0:
             raise ValueError(
                 f"seed and pictures must be at least 0, got {job.seed} and {job.pictures}"
             )
-        given: dict[str, Any] = {
-            name: value
-            for name, value in zip(("strength", "window"), guidance, strict=True)
-            if value is not None
-        }
+        check_folder(job.out)
+        given: dict[str, Any] = {"strength": strength, "window": window}
+        given = {name: value for name, value in given.items() if value is not None}
         self.job, self.num = job, num
         self.settings = EditSettings(job.solver, job.steps, job.shift, **given)
         self.device = usable_device(job.device)
@@ -107,7 +109,7 @@ class EditDesk:
         )
         generator = self.editor.generator
         self.geometry = generator.geometry
-        self.projection = generator.geometry.projection
+        self.projection = self.geometry.projection
         self.sensor = self.projection.sensor
         self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
 
@@ -125,15 +127,15 @@ class EditDesk:
     def read(
         self, path: Path, missing: Sequence[Tensor] = (), empty_beams: bool = False
     ) -> ScanView:
-        """A scan, refused if it does not fill the field of view but for what is missing.
+        """A scan that fills the field of view outside the ``missing`` masks ``(H, W)``.
 
         Args:
             path: ``.bin``, ``.ply``, or ``.npz`` of one scan.
-            missing: Masks ``(H, W)``.
-            empty_beams: Rows without a return are missing too.
+            missing: Masks of pixels that may be empty.
+            empty_beams: Rows without a return may be empty, too.
 
         Raises:
-            ScanError: If the file cannot be used; it is named.
+            ScanError: If the file cannot be used; names it.
         """
         points = torch.from_numpy(_points(path, self.sensor))
         try:
@@ -153,37 +155,31 @@ class EditDesk:
         return source.to(self.device)
 
     def grid(self, scan: ScanView, extractor: Extractor) -> Tensor:
-        """Feature grid ``(N, F)`` of a scan, as ``r3dpa features`` makes it."""
-        file = Scan(scan.path.parent.name, scan.path.stem, scan.path)
+        """Feature grid ``(N, F)`` of a scan, as ``r3dpa features`` writes it."""
         prepared = extractor.prepare(scan.points)
+        file = Scan(scan.path.parent.name, scan.path.stem, scan.path)
         sample = PointSample(file, file.cache_key, scan.points, prepared)
         grids = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
         return grids[self.grid_size][0].clone()
 
-    def object_feature(
-        self,
-        path: Path,
-        label: str | None,
-        box: Sequence[float] | None,
-        ckpt: Path | None,
-    ) -> Tensor:
-        """Mean feature ``(F,)`` of a class, or of the points in a box, of one scan."""
-        if label is not None:
-            scan = Scan(path.parent.name, path.stem, path)
-            extractor = self.extractor(ckpt)
-            library = object_library([scan], extractor, self.projection, self.grid_size, [label])
-            return library.feature(label)
-        assert box is not None
+    def feature_of_class(self, path: Path, label: str, ckpt: Path | None) -> Tensor:
+        """Mean feature ``(F,)`` of a class of one scan."""
+        scan = Scan(path.parent.name, path.stem, path)
+        extractor = self.extractor(ckpt)
+        library = object_library([scan], extractor, self.projection, self.grid_size, [label])
+        return library.feature(label)
+
+    def feature_in_box(self, path: Path, box: Sequence[float], ckpt: Path | None) -> Tensor:
+        """Mean feature ``(F,)`` of the points of a scan in a box: centre, size, yaw in degrees."""
         if min(box[3:6]) <= 0:
             raise ValueError(f"features_box3d needs a size above 0 on every axis, got {list(box)}")
-        scan_view = self.read(path)
-        points = scan_view.points
-        turned = points[:, :3] - torch.tensor(box[:3])
+        points = self.read(path).points
+        offset = points[:, :3] - torch.tensor(box[:3])
         yaw = torch.tensor(box[6]).deg2rad()
-        along = turned[:, 0] * yaw.cos() + turned[:, 1] * yaw.sin()
-        across = turned[:, 1] * yaw.cos() - turned[:, 0] * yaw.sin()
-        turned = torch.stack([along, across, turned[:, 2]], dim=1).abs()
-        inside = (turned <= torch.tensor(box[3:6]) / 2).all(dim=1)
+        along = offset[:, 0] * yaw.cos() + offset[:, 1] * yaw.sin()
+        across = offset[:, 1] * yaw.cos() - offset[:, 0] * yaw.sin()
+        distance = torch.stack([along, across, offset[:, 2]], dim=1).abs()
+        inside = (distance <= torch.tensor(box[3:6]) / 2).all(dim=1)
         inside &= in_range(points[:, :3], self.sensor)
         if not inside.any():
             raise ValueError(f"{path}: has no point in the box {list(box)}")
@@ -196,17 +192,17 @@ class EditDesk:
     def write(
         self,
         command: str,
-        asked: dict[str, Any],
+        about: dict[str, Any],
         before: Mapping[str, Tensor],
         run: Callable[[], EditResult],
         parts: Parts | None = None,
         measure: Callable[[Tensor], dict[str, Any]] | None = None,
     ) -> str:
-        """Runs an edit and writes all of it; what it was, in words.
+        """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
         Args:
-            command: Its name.
-            asked: What decides about it beside the job.
+            command: Name of the edit.
+            about: Its own options, for the metadata.
             before: Range images ``(H, W)`` of the scans by name.
             run: The edit.
             parts: Parts of the range image.
@@ -216,57 +212,88 @@ class EditDesk:
             ValueError: If the edit is refused, or ``out`` holds other scenes.
             OSError: If a file cannot be written.
         """
-        job, out = self.job, self.job.out
-        settings = asdict(self.settings)
-        if not asked["guided"]:
+        job, settings = self.job, asdict(self.settings)
+        if not about["guided"]:
             del settings["strength"], settings["window"]
-        request = {
+        paths = {key: str(value) for key, value in about.items() if isinstance(value, Path)}
+        request = about | paths
+        request |= {
             "command": command,
-            **asked,
-            **{"checkpoint": str(job.ckpt), "checkpoint_written": written(job.ckpt)},
-            **{"stage": self.checkpoint.stage, "step": self.checkpoint.step},
+            "checkpoint": str(job.ckpt),
+            "checkpoint_written": written(job.ckpt),
+            "stage": self.checkpoint.stage,
+            "step": self.checkpoint.step,
             "feature_source": self.checkpoint.feature_source,
-            **{"weights": job.weights, "num": self.num, "seed": job.seed},
-            **{"settings": settings, "device": self.device, "batch_size": job.batch_size},
+            "weights": job.weights,
+            "num": self.num,
+            "seed": job.seed,
+            "settings": settings,
+            "device": self.device,
+            "batch_size": job.batch_size,
             "interpolant": self.checkpoint.interpolant,
-            "formats": [name.strip() for name in job.formats.split(",")],
+            "formats": list(job.formats),
             "geometry": self.geometry.to_dict(),
-            **{"r3dpa": r3dpa.__version__, "commit": source_commit(), "torch": torch.__version__},
+            "r3dpa": r3dpa.__version__,
+            "commit": source_commit(),
+            "torch": torch.__version__,
         }
-        formats = request["formats"]
-        with SceneWriter(out, self.num, self.projection, formats, request, job.overwrite) as writer:
+        with SceneWriter(
+            job.out, self.num, self.projection, job.formats, request, job.overwrite
+        ) as writer:
             seconds = -time.perf_counter()
-            result = run()
+            with self._progress(command):
+                result = run()
             seconds += time.perf_counter()
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
             self._show(command, before, result.range_m, parts)
-            cosine = None if result.cosine is None else result.cosine.tolist()
             figures = {
-                **{"nfe": result.nfe, "seconds": seconds, "cosine": cosine},
-                **{"vae_error_m": result.vae_error_m, "round_trip_m": result.round_trip_m},
-                **(measure(result.range_m) if measure else {}),
+                "nfe": result.nfe,
+                "seconds": seconds,
+                "cosine": None if result.cosine is None else result.cosine.tolist(),
+                "vae_error_m": result.vae_error_m,
+                "round_trip_m": result.round_trip_m,
             }
+            figures |= measure(result.range_m) if measure else {}
             writer.finish(request | figures)
-        return _summary(command, out, self.num, figures)
+        return _summary(command, job.out, self.num, figures)
+
+    @contextmanager
+    def _progress(self, command: str) -> Iterator[None]:
+        """Bar of network evaluations of whole batches; the total is that of a full way and back."""
+        steps = evaluations(self.job.solver, self.job.steps)
+        batches = math.ceil(self.num / self.job.batch_size)
+        total = self.num * self.job.steps if command == "complete" else steps * (batches + 1)
+        first = next(self.editor.generator.sit.children())  # called once in each evaluation
+        with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
+
+            def count(*_: Any) -> None:
+                bar.update()
+
+            hook = first.register_forward_hook(count)
+            try:
+                yield
+            finally:
+                hook.remove()
 
     def _show(
         self, command: str, before: Mapping[str, Tensor], made: Tensor, parts: Parts | None
     ) -> None:
-        """Pictures of each scene, the sheet, the page, the mask and the scans as they were."""
+        """Pictures of each scene, the sheet, the page, the mask and the scans before the edit."""
         out = self.job.out
+        scans = torch.stack(list(before.values()))
         with atomic_path(out / "before.npy") as temporary, temporary.open("wb") as file:
-            np.save(file, torch.stack(list(before.values())).numpy())
+            np.save(file, scans.numpy())
         for index, range_m in enumerate(made[: self.job.pictures]):
             draw_scene(out, f"{index:06d}", range_m, self.geometry)
         after = {f"{command} {index}": image for index, image in enumerate(made[:_SHOWN])}
         rows = [viz.EditRow(name, image) for name, image in before.items()]
         numbers, names = parts or (None, ())
         if parts is not None:
-            scans = torch.stack(list(before.values()))
-            own = torch.from_numpy(parts.numbers).long() if command == "mix" else torch.zeros(1, 1)
-            asked = scans.gather(0, own.long().expand(1, *scans.shape[1:]))[0]
-            rows.append(viz.EditRow("mask", asked, parts.numbers))
+            shown = scans[0]
+            if command == "mix":  # each part as in the scan that it follows
+                shown = scans.gather(0, torch.from_numpy(parts.numbers).long()[None])[0]
+            rows.append(viz.EditRow("mask", shown, parts.numbers))
             viz.save(parts.numbers * np.uint8(255 // (len(names) - 1)), out / "mask.png")
         rows += [viz.EditRow(name, image, outline=numbers) for name, image in after.items()]
         viz.save(viz.edit_sheet(rows, names, self.projection), out / "edit.png")
@@ -276,7 +303,7 @@ class EditDesk:
 
 
 def _points(path: Path, sensor: LidarSensor) -> NDArray[np.float32]:
-    """Points ``(P, 4)`` of a file; the intensity is 0 where it has none."""
+    """Points ``(P, 4)`` of a file; the intensity is 0 if it has none."""
     if path.suffix == ".bin":
         return read_scan(path, sensor)
     if path.suffix == ".ply":
@@ -314,18 +341,43 @@ def _summary(command: str, out: Path, num: int, figures: Mapping[str, Any]) -> s
         )
     if figures["cosine"] is not None:
         cosines = figures["cosine"]
-        lines.append(f"cosine with the features that guide: {sum(cosines) / len(cosines):.3f}")
+        lines.append(f"cosine with the guiding features: {sum(cosines) / len(cosines):.3f}")
     for name, errors in figures.get("held_out", {}).items():
         lines.append(
             f"held out, {name}: {errors['mae_m']:.3f} m, returns as in the scan in "
             f"{errors['same_returns']:.1%} of the pixels"
         )
-    return "\n".join([*lines, str(out / "edit.png"), str(out / "edit.html")])
+    return "\n".join([*lines, f"open {out / 'edit.png'} and {out / 'edit.html'}"])
 
 
 def without_features(ckpt: Path) -> str:
-    """Why a checkpoint cannot be guided."""
+    """Error message for a checkpoint that features cannot guide."""
     return (
         f"{ckpt} was trained without 3D features, so that none can guide it; give a checkpoint of "
         "a run with an extractor"
     )
+
+
+def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
+    """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
+
+    Ranges are compared where the scan and all methods have a return; empty without any there.
+    """
+    if not ((range_m > 0) & missing).any():
+        return {}
+    methods = {
+        "completed": made,
+        "nearest": filled(range_m, missing, "nearest")[None],
+        "linear": filled(range_m, missing, "linear")[None],
+    }
+    common = missing
+    for images in methods.values():
+        common = common & (images > 0).all(dim=0)
+    held_out = {}
+    for name, images in methods.items():
+        same = ((images > 0) == (range_m > 0))[:, missing]
+        held_out[name] = {
+            "mae_m": range_error_m(images, range_m.expand_as(images), common),
+            "same_returns": float(same.double().mean()),
+        }
+    return {"held_out": held_out}

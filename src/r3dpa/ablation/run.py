@@ -1,4 +1,4 @@
-"""Runs the stages of a plan, each in a process of its own, so that one that fails ends no other."""
+"""Runs a plan: each job is an ``r3dpa`` command in its own process, repeated only if needed."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from typing import Any
 
 import yaml
 
-from r3dpa.ablation.configs import merged, with_value
-from r3dpa.ablation.plan import Plan, Stage
+from r3dpa.ablation.plan import Plan, Stage, merged, with_value
 from r3dpa.io import atomic_path, source_commit
 from r3dpa.metrics.scene_features import FREE_SPACES
 
-__all__ = ["RunSettings", "commit_of", "evaluation_of", "run_plan", "stage_folder"]
+__all__ = ["Job", "RunSettings", "commit_of", "evaluation_of", "run_plan", "stage_folder"]
 
 _TAIL = 12  # lines of a failed process that are shown
-_STOP_SECONDS = 60.0  # that a stopped training gets to save its checkpoint
+_STOP_SECONDS = 60.0  # for a stopped training to save its checkpoint
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Where and how stages run; none of it changes what comes out.
+    """Where and how stages run; the results do not depend on it.
 
     Args:
         out: Folder of the ablation.
-        jobs: Processes at a time; the cores are shared out among them.
+        jobs: Processes at a time, which share the cores.
         devices: Devices of each training, which share its batches.
-        online: Send the curves of stages to wandb while they train.
+        online: Log the stages to wandb while they train.
 
     Raises:
         ValueError: If a count is below 1.
@@ -58,14 +57,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class _State:
-    """What is known of a job that was started.
-
-    Args:
-        content: Settings that it ran with.
-        used: The endings of the jobs whose results it used, by name.
-        commit: Of the code.
-        ending: Another one each time that it ends well; None before.
-    """
+    """Stored state of a started job: settings, inputs, and a new ``ending`` at each success."""
 
     content: str
     used: dict[str, str]
@@ -74,39 +66,35 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """A command, and what must have ended well before it.
+class Job:
+    """A command line, and the jobs that must have ended well before it.
 
     Args:
         name: For the user.
-        words: Of the command line.
+        words: Command line after ``r3dpa``.
         place: Its output goes to ``<place>.log``, its state to ``<place>.state``.
-        needs: Names of other jobs.
-        uses: Those of them whose results change its own.
         content: Settings that its result depends on.
-        makes: File that it must leave behind; one of before is removed.
-        goes_on: Whether it goes on from what its last start left in the folder of ``place``.
+        needs: Names of jobs before it.
+        uses: Those of ``needs`` whose results change its own.
+        makes: File that it must write; an old one is removed.
+        resumes: Whether it resumes the training in the folder of ``place``.
     """
 
     name: str
     words: list[str]
     place: Path
-    needs: tuple[str, ...]
-    uses: tuple[str, ...]
     content: str
+    needs: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
     makes: Path | None = None
-    goes_on: bool = False
-
-    @property
-    def log(self) -> Path:
-        return self.place.with_suffix(".log")
+    resumes: bool = False
 
     def state(self) -> _State | None:
-        """What its last start left."""
+        """State of its last start."""
         return _read_state(self.place.with_suffix(".state"))
 
     def save(self, state: _State) -> None:
-        """Written whole or not at all."""
+        """Writes the state atomically."""
         with atomic_path(self.place.with_suffix(".state")) as temporary:
             temporary.write_text(json.dumps(asdict(state)), encoding="utf-8")
 
@@ -121,7 +109,7 @@ def _read_state(path: Path) -> _State | None:
 
 
 def stage_folder(out: Path, stage: Stage) -> Path:
-    """Folder that a stage is run in."""
+    """Run folder of a stage."""
     return out / "stages" / stage.name
 
 
@@ -131,25 +119,24 @@ def evaluation_of(out: Path, stage: Stage) -> Path:
 
 
 def commit_of(out: Path, stage: Stage) -> str | None:
-    """Commit of the code that trained a stage; None where it is not known."""
+    """Commit of the code that trained a stage, if known."""
     state = _read_state(stage_folder(out, stage) / "fit.state")
     return None if state is None else state.commit
 
 
 def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> dict[str, str]:
-    """Trains and tests what is not done yet; the same call goes on after an interrupt.
+    """Trains and tests what is not done yet; the same call continues after an interrupt.
 
-    Done is what ended well with the same settings and the same results of stages before it. The
-    commit of the code is kept, but another one does not count: remove a stage's folder to have it
-    trained anew. A failed stage takes with it only what starts from it.
+    A job is done if it ended well with the same settings and the same results of the jobs before
+    it; another commit of the code does not count. A failed job fails only the jobs that need it.
 
     Args:
-        plan: What to run.
+        plan: Plan to run.
         settings: Where and how.
-        say: Gets a line for each process that starts or ends.
+        say: Receives a line for each process that starts or ends.
 
     Returns:
-        Why processes failed, by name.
+        Reasons of failures by name of the job.
 
     Raises:
         ValueError: If a stage's batch cannot be shared by the devices.
@@ -157,24 +144,23 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> d
     jobs = _jobs(plan, settings)
     for job in jobs:
         job.place.parent.mkdir(parents=True, exist_ok=True)
-    endings = _endings(jobs)
+    endings = _endings(jobs, {})
     left = {job.name: job for job in jobs if job.name not in endings}
     if endings:
         say(f"{len(endings)} of {len(jobs)} are done already")
     failed: dict[str, str] = {}
-    running: dict[Future[None], tuple[_Job, float]] = {}
+    running: dict[Future[None], tuple[Job, float]] = {}
     with ThreadPoolExecutor(settings.jobs) as pool, _processes() as start:
         while left or running:
-            for job in _lost(left, failed):
-                cause = next(name for name in job.needs if name in failed)
-                failed[job.name] = f"not run, since {cause} failed"
-                say(f"  - {job.name}: {failed[job.name]}")
-                del left[job.name]
             for job in list(left.values()):
-                if len(running) < settings.jobs and endings.keys() >= set(job.needs):
+                if cause := next((name for name in job.needs if name in failed), None):
+                    failed[job.name] = f"not run, since {cause} failed"
+                    say(f"  - {job.name}: {failed[job.name]}")
+                    del left[job.name]
+                elif len(running) < settings.jobs and endings.keys() >= set(job.needs):
                     used = {name: endings[name] for name in job.uses}
-                    future = pool.submit(start, job, used, settings)
-                    running[future] = left.pop(job.name), time.monotonic()
+                    running[pool.submit(start, job, used, settings)] = job, time.monotonic()
+                    del left[job.name]
                     say(f"  > {job.name}")
             if not running:
                 continue
@@ -193,74 +179,52 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> d
     return failed
 
 
-def _endings(jobs: Iterable[_Job], known: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Endings of those jobs that need not be run again; ``known`` are those of jobs before them."""
-    found = dict(known or {})
+def _endings(jobs: Iterable[Job], known: Mapping[str, str]) -> dict[str, str]:
+    """Endings of the jobs that are done, in addition to those of jobs before them."""
+    found = dict(known)
     for job in jobs:
         state = job.state()
+        if state is None or state.ending is None:
+            continue
         used = {name: found.get(name) for name in job.uses}
-        if (
-            state is not None
-            and state.ending is not None
-            and (state.content, state.used) == (job.content, used)
-            and (job.makes is None or job.makes.is_file())
-        ):
+        made = job.makes is None or job.makes.is_file()
+        if (state.content, state.used) == (job.content, used) and made:
             found[job.name] = state.ending
     return found
 
 
-def _lost(left: Mapping[str, _Job], failed: Mapping[str, str]) -> list[_Job]:
-    return [job for job in left.values() if any(name in failed for name in job.needs)]
-
-
-def _jobs(plan: Plan, settings: RunSettings) -> list[_Job]:
-    """Scans and their reference, trainings, tests; each after what it needs."""
+def _jobs(plan: Plan, settings: RunSettings) -> list[Job]:
+    """Scans and their reference, trainings, tests; each after the jobs that it needs."""
     out = settings.out
     data, reference = out / "data.yaml", out / "reference.safetensors"
     block = merged(plan.scale.data, {"data": plan.scale.overrides.get("data", {})})
     _write(data, _placed({"data": block["data"]}, out))
     scans, spaces = json.dumps(block, sort_keys=True), _spaces(plan.scale.scorer)
-    words = ["reference", "--data", str(data), "--out", str(reference), *spaces]
     on_scans = [stage.config["data"]["init_args"] for stage in plan.stages if plan.on_scans(stage)]
     grids = sorted({tuple(init_args["grid_size"]) for init_args in on_scans})
-    made = ["--grid_sizes", json.dumps(grids)]
-    jobs = [
-        _Job(
-            "features",
-            ["features", "--data", str(data), *made],
-            out / "features",
-            needs=(),
-            uses=(),
-            content=f"{scans} {grids}",
-        ),
-        _Job(
-            "reference",
-            words,
-            out / "reference",
-            needs=("features",),
-            uses=(),
-            content=f"{scans} {spaces}",
-            makes=reference,
-        ),
-    ]
+    words = ["features", "--data", str(data), "--grid_sizes", json.dumps(grids)]
+    jobs = [Job("features", words, out / "features", f"{scans} {grids}")]
+    words = ["reference", "--data", str(data), "--out", str(reference), *spaces]
+    place, content = out / "reference", f"{scans} {spaces}"
+    jobs.append(Job("reference", words, place, content, ("features",), makes=reference))
     for stage in plan.stages:
         folder = stage_folder(out, stage)
         config = folder / "stage.yaml"
-        _write(config, _settled(stage, settings))
+        _write(config, settled(stage, settings))
         words = ["fit", "--config", str(config), "--run_dir", str(folder), "--ckpt_path", "last"]
         uses = tuple(before.name for before in stage.before)
         needs = (*uses, "features") if plan.on_scans(stage) else uses
-        jobs.append(_Job(stage.name, words, folder / "fit", needs, uses, stage.name, goes_on=True))
+        name = stage.name
+        jobs.append(Job(name, words, folder / "fit", name, needs, uses, resumes=True))
     for stage in plan.tested:
         folder = stage_folder(out, stage)
         words = ["test", "--config", str(folder / "stage.yaml"), "--run_dir", str(folder)]
         words += ["--ckpt_path", str(_checkpoint(folder)), "--scorer.reference", str(reference)]
         words += ["--trainer.logger", "false", "--trainer.devices", "1"]
         content = json.dumps([scans, stage.config.get("scorer")], sort_keys=True)
-        needs = (stage.name, "reference")
-        numbers = evaluation_of(out, stage)
+        needs, makes = (stage.name, "reference"), evaluation_of(out, stage)
         name = f"test of {stage.name}"
-        jobs.append(_Job(name, words, folder / "test", needs, needs, content, numbers))
+        jobs.append(Job(name, words, folder / "test", content, needs, needs, makes))
     return jobs
 
 
@@ -273,14 +237,13 @@ def _spaces(scorer: Mapping[str, Any]) -> list[str]:
     return ["--spaces", ",".join(names), *given, *protocol]
 
 
-def _settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
+def settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
     """Configuration of a stage with folders, devices and loggers."""
     config = _placed(stage.config, settings.out)
     for key, start in stage.starts.items():
-        path = start
         if isinstance(start, Stage):
-            path = _checkpoint(stage_folder(settings.out, start))
-        config = with_value(config, key, str(path))
+            start = _checkpoint(stage_folder(settings.out, start))
+        config = with_value(config, key, str(start))
     batch = config["data"]["init_args"]["batch_size"]
     if batch % settings.devices:
         raise ValueError(
@@ -289,12 +252,12 @@ def _settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
         )
     config = with_value(config, "data.init_args.batch_size", batch // settings.devices)
     config = with_value(config, "trainer.devices", settings.devices)
-    config = with_value(config, "trainer.enable_progress_bar", False)  # it would go to a file
+    config = with_value(config, "trainer.enable_progress_bar", False)  # the output is a file
     loggers = [{"class_path": "CSVLogger", "init_args": {"save_dir": "runs", "name": ""}}]
     if settings.online:
         init_args = {"project": "r3dpa", "save_dir": "runs", "name": stage.name}
         init_args |= {"job_type": "stage", "group": f"stages of {settings.out.name}"}
-        init_args |= {"id": f"{settings.out.name}-{stage.name}", "resume": "allow"}
+        init_args |= {"id": f"{settings.out.name}-{stage.name}"}
         loggers.append({"class_path": "WandbLogger", "init_args": init_args})
     for logger in loggers:
         logger["class_path"] = f"lightning.pytorch.loggers.{logger['class_path']}"
@@ -320,16 +283,16 @@ def _write(path: Path, config: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def _processes() -> Iterator[Callable[[_Job, dict[str, str], RunSettings], None]]:
-    """A function that runs jobs; when the block is left early, those that still run are stopped."""
+def _processes() -> Iterator[Callable[[Job, dict[str, str], RunSettings], None]]:
+    """A function that runs jobs; an early end of the block stops those that still run."""
     alive: set[Popen[bytes]] = set()
     stopped = False
 
-    def start(job: _Job, used: dict[str, str], settings: RunSettings) -> None:
+    def start(job: Job, used: dict[str, str], settings: RunSettings) -> None:
         if stopped:
             raise RuntimeError("was not started any more")
         before, state = job.state(), _State(job.content, used, source_commit())
-        if job.goes_on and before is not None and before.used != used:  # it would be of others
+        if job.resumes and before is not None and before.used != used:  # of other inputs
             for path in job.place.parent.iterdir():
                 if path.is_dir():
                     shutil.rmtree(path)
@@ -338,18 +301,18 @@ def _processes() -> Iterator[Callable[[_Job, dict[str, str], RunSettings], None]
         job.save(state)
         cores = max(1, (os.cpu_count() or 1) // settings.jobs)
         environment = {"OMP_NUM_THREADS": str(cores)} | os.environ
-        words = [sys.executable, "-m", "r3dpa", *job.words]
-        with job.log.open("ab") as log:
+        words, log_path = [sys.executable, "-m", "r3dpa", *job.words], job.place.with_suffix(".log")
+        with log_path.open("ab") as log:
             process = Popen(words, stdout=log, stderr=log, env=environment)
             alive.add(process)
             status = process.wait()
             alive.discard(process)
-        lines = job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = log_path.read_text(encoding="utf-8", errors="replace").splitlines()
         tail = "\n".join(f"      {line}" for line in lines[-_TAIL:])
         if status:
-            raise RuntimeError(f"ended with status {status}; {job.log} ends with\n{tail}")
+            raise RuntimeError(f"ended with status {status}; {log_path} ends with\n{tail}")
         if job.makes is not None and not job.makes.is_file():
-            raise RuntimeError(f"left no {job.makes.name}; {job.log} ends with\n{tail}")
+            raise RuntimeError(f"left no {job.makes.name}; {log_path} ends with\n{tail}")
         job.save(replace(state, ending=uuid.uuid4().hex))
 
     try:

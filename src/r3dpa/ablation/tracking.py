@@ -1,4 +1,4 @@
-"""Each row of a table as a run of wandb, so that its page shows the table."""
+"""Rows of a table as runs of wandb, so that its project page shows the table."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import shutil
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.ablation.curves import curves_of
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
-from r3dpa.ablation.report import Results
+from r3dpa.ablation.run import commit_of, evaluation_of
+from r3dpa.ablation.tables import Results, curves_of
 from r3dpa.io import atomic_path
 
 __all__ = ["log_rows"]
@@ -19,26 +19,18 @@ __all__ = ["log_rows"]
 def log_rows(
     plan: Plan, table: Table, results: Results, out: Path, mode: Literal["offline", "online"]
 ) -> None:
-    """Writes a run for each row and seed: group, configuration, curves, metrics as its summary.
+    """Logs a run for each row and seed: group, configuration, curves, pictures, metrics.
 
-    A run that is there already is not written again, and takes the place of an offline one of the
-    same row and seed with other numbers. Offline ones lie in ``<out>/wandb``; ``wandb sync``
-    uploads them.
-
-    Args:
-        plan: The plan that was run.
-        table: Its rows; the group of the runs has its name and that of the scale.
-        results: Of the rows.
-        out: Folder of the ablation.
-        mode: Whether to write to disk or to send.
+    A run that was logged before is not logged again; with other numbers it replaces the offline run
+    of the same row and seed. Offline runs are in ``<out>/wandb``, for ``wandb sync``.
     """
     for row in table.rows:
         for seed, evaluation in results[row.key].items():
             metrics = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
             summary: dict[str, Any] = {k: v for k, v in metrics.items() if v is not None}
             stages = [stage.name for stage in row.stages[seed]]
-            told = json.dumps([table.name, row.key, seed, stages, plan.scale.scorer])
-            run_id = hashlib.sha256(told.encode()).hexdigest()[:12]
+            text = json.dumps([table.name, row.key, seed, stages, plan.scale.scorer])
+            run_id = hashlib.sha256(text.encode()).hexdigest()[:12]
             note = out / "wandb" / f"{table.name}-{row.key}-{seed}.{mode}.json"
             text = json.dumps({"id": run_id, "summary": summary})
             if note.is_file():
@@ -61,9 +53,16 @@ def _log_row(
     run_id: str,
     mode: Literal["offline", "online"],
 ) -> None:
-    import wandb  # seconds, where nothing is logged
+    import wandb  # takes seconds
 
     stages = row.stages[seed]
+    starts = {
+        stage.name: {
+            key: start.name if isinstance(start, Stage) else str(start)
+            for key, start in stage.starts.items()
+        }
+        for stage in stages
+    }
     config = {
         "table": table.name,
         "row": row.key,
@@ -72,13 +71,8 @@ def _log_row(
         "seed": seed,
         "stages": {stage.experiment: stage.config for stage in stages},
         "runs": [stage.name for stage in stages],
-        "starts": {
-            stage.name: {
-                key: start.name if isinstance(start, Stage) else str(start)
-                for key, start in stage.starts.items()
-            }
-            for stage in stages
-        },
+        "commits": [commit_of(out, stage) for stage in stages],
+        "starts": starts,
     }
     with wandb.init(
         project="r3dpa",
@@ -95,15 +89,12 @@ def _log_row(
         for stage in stages:
             step_name = f"{stage.experiment}/step"
             run.define_metric(f"{stage.experiment}/*", step_metric=step_name)
-            for step, values in _by_step(out, stage):
-                run.log({step_name: step, **values})
+            by_step: dict[int, dict[str, float]] = {}
+            for name, values in curves_of(out, stage).items():
+                for step, value in values.items():
+                    by_step.setdefault(step, {})[f"{stage.experiment}/{name}"] = value
+            for step, logged in sorted(by_step.items()):
+                run.log({step_name: step, **logged})
+        for path in sorted(evaluation_of(out, row.tested(seed)).parent.rglob("*.png")):
+            run.log({f"samples/{path.stem}": wandb.Image(str(path))})
         run.summary.update(summary)
-
-
-def _by_step(out: Path, stage: Stage) -> list[tuple[int, dict[str, float]]]:
-    """What a stage logged at each step."""
-    found: dict[int, dict[str, float]] = {}
-    for name, values in curves_of(out, stage).items():
-        for step, value in values.items():
-            found.setdefault(step, {})[f"{stage.experiment}/{name}"] = value
-    return sorted(found.items())

@@ -1,0 +1,87 @@
+"""``r3dpa ablate``: the paper's ablation tables, from the cost of the trainings to the files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+from r3dpa.cli.parser import check_folder
+
+__all__ = ["ablate"]
+
+
+def ablate(
+    tables: Path,
+    *,
+    scale: str = "demo",
+    seeds: tuple[int, ...] = (0,),
+    out: Path | None = None,
+    jobs: int = 1,
+    devices: int = 1,
+    rgb_weights: Path | None = None,
+    wandb: Literal["offline", "online", "off"] = "offline",
+    budget_only: bool = False,
+) -> None:
+    """Train, test and compare the rows of the paper's ablations.
+
+    Prints the estimated cost, then trains each stage once, however many rows and tables share it,
+    and writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json``. The same command continues an
+    interrupted run. A row that fails does not stop the others; the exit status is then 1.
+
+    Args:
+        tables: Folder of a table, such as ``conf/ablation/table_3``, or of several.
+        scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
+            file of that kind.
+        seeds: Every row is trained and tested for each, such as ``0 1 2``.
+        out: Folder for everything; default: ``runs/ablation/<scale>``.
+        jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
+        devices: GPUs of each training, which share its batch.
+        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
+        wandb: One run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
+            ``online``, which logs the stages while they train, too.
+        budget_only: Print the cost, and start nothing.
+    """
+    from r3dpa import ablation
+    from r3dpa.io import only_writer
+
+    found = ablation.read_scale(_scale_file(tables, scale))
+    folder = out or Path("runs/ablation") / found.name
+    check_folder(folder)
+    settings = ablation.RunSettings(folder, jobs, devices, wandb == "online")
+    plan = ablation.make_plan(tables, found, seeds, rgb_weights)
+    _say(ablation.budget_of(plan))
+    if budget_only:
+        return
+    if plan.missing_weights:
+        listed = ", ".join(map(str, plan.missing_weights))
+        raise ValueError(f"scale {found.name} needs files that are not there: {listed}")
+    with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
+        failed = ablation.run_plan(plan, settings, _say)
+        for table in plan.tables:
+            text, results = ablation.write_table(plan, table, folder, failed)
+            _say(f"\n{text}")
+            if wandb != "off":
+                ablation.log_rows(plan, table, results, folder, wandb)
+    for name, reason in failed.items():
+        _say(f"failed: {name}: {reason}")
+    files = [folder / f"{table.name}.md" for table in plan.tables]
+    _say(f"tables: {', '.join(str(file) for file in files if file.is_file()) or 'none'}")
+    if failed:
+        sys.exit(1)
+
+
+def _scale_file(tables: Path, scale: str) -> Path:
+    """The YAML file of a scale: itself, or by its name in the folder of the tables."""
+    if not tables.is_dir():
+        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
+    if Path(scale).suffix in (".yaml", ".yml"):
+        return Path(scale)
+    near = [folder / "scale" for folder in (tables, tables.resolve().parent)]
+    place = next((folder for folder in near if folder.is_dir()), near[-1])
+    return place / f"{scale}.yaml"
+
+
+def _say(text: Any) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()  # into a log file at once

@@ -1,0 +1,423 @@
+"""``r3dpa edit``: inpaint, mix, complete, vary and interpolate scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from r3dpa.editing import EditResult
+
+__all__ = ["EditJob", "complete", "inpaint", "interpolate", "mix", "vary"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditJob:
+    """Options of all edits.
+
+    Args:
+        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
+        out: Folder for scenes, pictures, page, mask and metadata; must not hold other scenes.
+        seed: Scene i depends on (seed, i) alone, not on the batch size.
+        solver: ODE solver, to noise and back; ``midpoint`` loses least on that way.
+        steps: Solver steps of a whole way.
+        shift: Finer steps near noise (above 1) or data (below 1).
+        batch_size: Scenes made together.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        weights: Averaged (``ema``) or last weights of the SiT.
+        formats: Files of points: ``bin``, ``ply``, ``npz``.
+        pictures: Number of scenes to draw.
+        overwrite: Write into a folder that holds scenes already.
+    """
+
+    ckpt: Path
+    out: Path
+    seed: int = 0
+    solver: Literal["midpoint", "heun", "euler", "ab2", "ab3", "dpmpp_2m", "unipc"] = "midpoint"
+    steps: int = 32
+    shift: float = 1.0
+    batch_size: int = 8
+    device: str = "auto"
+    weights: Literal["ema", "last"] = "ema"
+    formats: tuple[str, ...] = ("bin",)
+    pictures: int = 8
+    overwrite: bool = False
+
+
+def inpaint(
+    *,
+    scan: Path,
+    box: tuple[float, float, float, float] | None = None,
+    box3d: tuple[float, float, float, float, float, float, float] | None = None,
+    mask: Path | None = None,
+    objects: Path | None = None,
+    object: str | None = None,
+    features_from: Path | None = None,
+    label: str | None = None,
+    features_box3d: tuple[float, float, float, float, float, float, float] | None = None,
+    features_ckpt: Path | None = None,
+    strength: float | None = None,
+    window: tuple[float, float] | None = None,
+    start: float = 1.0,
+    dilation: int = 0,
+    num: int = 8,
+    **options: Any,
+) -> str:
+    """Generate a part of a scan anew, as an object if one is named.
+
+    The part is one of --box, --box3d and --mask; pixels outside it stay those of the scan. The
+    object is a class of a library (--objects FILE --object car) or a part of another scan
+    (--features_from SCAN with --label or --features_box3d); without either the edit is unguided.
+    Azimuth 0 looks forward and grows to the left; 180 is behind.
+
+    Args:
+        scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        box: Azimuth from and to (counted to the left) and inclination from and to, degrees, such
+            as ``-10 10 -20 0``.
+        box3d: Centre x y z, length, width, height in metres and yaw in degrees, in the frame of
+            the sensor, such as ``12 3 -0.9 4.2 1.8 1.6 30``.
+        mask: Picture with one pixel for each of the range image, bright where it is to change.
+        objects: File of ``r3dpa objects``, made with the feature source of the checkpoint.
+        object: Class of that file.
+        features_from: Scan that shows the object.
+        label: Class of its points, from the labels beside the scan.
+        features_box3d: Box around its points, as ``box3d``.
+        features_ckpt: Weights of the feature source, if it has none of its own.
+        strength: Guidance in velocities, 0 to 1; default: 0.5.
+        window: First and last guided time; 0 data, 1 noise; default: all.
+        start: First time of the edit; below 1 keeps some of the original part.
+        dilation: Rings of tokens around the part that are generated anew too, before the pixels
+            outside are restored.
+        num: Number of results, one per seed index.
+        **options: See :class:`EditJob`.
+
+    Raises:
+        ValueError: If the inputs do not fit each other or the checkpoint.
+        OSError: If a file cannot be read or written.
+    """
+    import numpy as np
+
+    from r3dpa.cli.edit_session import EditSession, Parts
+    from r3dpa.data.images import read_mask
+    from r3dpa.data.objects import ObjectLibrary
+    from r3dpa.geometry.regions import angle_box, check_mask
+    from r3dpa.geometry.regions import box3d as solid_box
+
+    guided = objects is not None or features_from is not None
+    if sum(region is not None for region in (box, box3d, mask)) != 1:
+        raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
+    if (objects is None) != (object is None):
+        raise ValueError("--objects FILE and --object NAME go together; `r3dpa objects` writes one")
+    if objects is not None and features_from is not None:
+        raise ValueError("give --object or --features_from, not both")
+    sources = (label is not None) + (features_box3d is not None)
+    if sources != (features_from is not None):
+        raise ValueError("--features_from needs one of --label and --features_box3d")
+    if not guided and (strength, window) != (None, None):
+        raise ValueError("--strength and --window need --object or --features_from")
+    session = EditSession(EditJob(**options), num, strength, window)
+    source = session.read(scan)
+    if mask is not None:
+        region = check_mask(read_mask(mask, session.sensor), str(mask))
+    elif box is not None:
+        region = angle_box(session.projection, *box)
+    else:
+        assert box3d is not None
+        region = solid_box(session.projection, box3d[:3], box3d[3:6], box3d[6])
+    feature = None
+    if objects is not None and object is not None:
+        library = ObjectLibrary.load(objects)
+        library.check_source(session.feature_name, session.feature_dim)
+        feature = library.feature(object)
+    elif features_from is not None and label is not None:
+        feature = session.feature_of_class(features_from, label, features_ckpt)
+    elif features_from is not None and features_box3d is not None:
+        feature = session.feature_in_box(features_from, features_box3d, features_ckpt)
+    about = {
+        "scans": {"scan": str(scan)},
+        "box": box,
+        "box3d": box3d,
+        "mask": mask,
+        "objects": objects,
+        "object": object,
+        "label": label,
+        "features_from": features_from,
+        "features_box3d": features_box3d,
+        "start": start,
+        "dilation": dilation,
+        "guided": guided,
+    }
+
+    def run() -> EditResult:
+        return session.editor.inpaint(
+            source.range_m,
+            region,
+            num,
+            session.job.seed,
+            feature=feature,
+            start=start,
+            dilation=dilation,
+        )
+
+    parts = Parts(region.numpy().astype(np.uint8), ("kept", object or label or "generated anew"))
+    return session.write("inpaint", about, {f"scan {scan.stem}": source.range_m}, run, parts)
+
+
+def mix(
+    *,
+    left: Path | None = None,
+    right: Path | None = None,
+    split: float = 0.0,
+    blend: float = 20.0,
+    layout: list[str] | None = None,
+    mask: Path | None = None,
+    features_ckpt: Path | None = None,
+    strength: float = 0.5,
+    window: tuple[float, float] = (0.0, 1.0),
+    num: int = 8,
+    **options: Any,
+) -> str:
+    """Generate scenes that follow one scan on one side and another scan on the other.
+
+    The features of the scans are stitched, and guide scenes from noise. Azimuth 0 looks forward
+    and grows to the left; 180 is behind.
+
+    Args:
+        left: Scan of the left half: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        right: Scan of the right half.
+        split: Azimuth in degrees where the left half starts; it ends half a turn further.
+        blend: Width of the seams in degrees.
+        layout: In place of left and right: azimuth at which each sector starts, and its scan, such
+            as ``0 a.bin 120 b.bin 240 c.bin``.
+        mask: In place of split and blend: picture with one pixel for each of the range image,
+            bright where the right scan is to be followed.
+        features_ckpt: Weights of the feature source, if it has none of its own.
+        strength: Guidance in velocities, 0 to 1.
+        window: First and last guided time; 0 data, 1 noise.
+        num: Number of results, one per seed index.
+        **options: See :class:`EditJob`.
+
+    Raises:
+        ValueError: If the inputs do not fit each other or the checkpoint.
+        OSError: If a file cannot be read or written.
+    """
+    import numpy as np
+    import torch
+    import torch.nn.functional as F
+
+    from r3dpa.cli.edit_session import EditSession, Parts
+    from r3dpa.data.images import read_mask
+    from r3dpa.geometry.regions import check_mask, mask_of_tokens, sector_weights
+
+    if (left is None) != (right is None) or (left is None) == (layout is None):
+        raise ValueError("give --left and --right, or a --layout of sectors and scans")
+    if mask is not None and layout is not None:
+        raise ValueError("--mask separates --left from --right; drop it or --layout")
+    if left is not None and right is not None:
+        sectors = [(split, left), (split + 180, right)]
+    else:
+        sectors = _sectors(layout or [])
+    paths = list(dict.fromkeys(path for _, path in sectors))
+    if len(paths) < 2:
+        raise ValueError(f"there is nothing to mix: give two scans or more, got {paths}")
+    session = EditSession(EditJob(**options), num, strength, window)
+    grid_size = session.grid_size
+    if mask is not None:
+        share = check_mask(read_mask(mask, session.sensor), str(mask)).float()
+        cell = session.sensor.cell_size(grid_size)
+        right_share = F.avg_pool2d(share[None, None], cell).flatten()
+        weights = torch.stack([1 - right_share, right_share])
+    else:
+        numbered = [(azimuth, paths.index(path)) for azimuth, path in sectors]
+        weights = sector_weights(numbered, grid_size, blend)
+    scans = [session.read(path) for path in paths]
+    extractor = session.extractor(features_ckpt)
+    grids = [session.grid(scan, extractor) for scan in scans]
+    size = (session.sensor.beams, session.sensor.columns)
+    numbers = mask_of_tokens(weights.argmax(dim=0), grid_size, size).numpy().astype(np.uint8)
+    names = [f"{number}: {path.stem}" for number, path in enumerate(paths)]
+    about = {
+        "scans": dict(zip(names, map(str, paths), strict=True)),
+        "layout": [[azimuth, str(path)] for azimuth, path in sectors],
+        "blend": blend,
+        "mask": mask,
+        "guided": True,
+    }
+
+    def run() -> EditResult:
+        return session.editor.mix(grids, weights, num, session.job.seed)
+
+    before = {name: scan.range_m for name, scan in zip(names, scans, strict=True)}
+    return session.write("mix", about, before, run, Parts(numbers, names))
+
+
+def _sectors(layout: list[str]) -> list[tuple[float, Path]]:
+    """Pairs of azimuth and scan from the words of ``--layout``."""
+    try:
+        azimuths = [float(word) for word in layout[::2]]
+    except ValueError:
+        azimuths = []
+    if not azimuths or len(layout) % 2:
+        raise ValueError(
+            f"--layout {' '.join(layout)}: give pairs of azimuth and scan, such as 0 a.bin 120 "
+            "b.bin"
+        )
+    return list(zip(azimuths, map(Path, layout[1::2]), strict=True))
+
+
+def complete(
+    *,
+    scan: Path,
+    sector: tuple[float, float] | None = None,
+    keep_every: int | None = None,
+    beams: list[int] | None = None,
+    empty_beams: bool = False,
+    other_sensor: tuple[int, float, float] | None = None,
+    mask: Path | None = None,
+    start: float = 0.3,
+    num: int = 8,
+    **options: Any,
+) -> str:
+    """Fill a missing sector, dropped beams, or any pixels of a scan.
+
+    All named gaps are filled; where the scan has returns in them, the result is compared with
+    these. Azimuth 0 looks forward and grows to the left; 180 is behind.
+
+    Args:
+        scan: Scan to complete: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        sector: Azimuth from and to, counted to the left, degrees.
+        keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
+        beams: Rows of the range image to keep, such as ``0 4 8``.
+        empty_beams: Rows without a return are missing, as in a scan of fewer beams.
+        other_sensor: Keep what another sensor would see: its number of beams, and lowest and
+            highest inclination in degrees, such as ``32 -25 3``.
+        mask: Picture with one pixel for each of the range image, bright where it is missing.
+        start: Time at which the completion starts, in (0, 1]; large gaps need more.
+        num: Number of results, one per seed index.
+        **options: See :class:`EditJob`.
+
+    Raises:
+        ValueError: If the inputs do not fit each other or the checkpoint.
+        OSError: If a file cannot be read or written.
+    """
+    from dataclasses import replace
+    from functools import partial
+
+    import numpy as np
+    import torch
+
+    from r3dpa.cli.edit_session import EditSession, Parts, held_out_errors
+    from r3dpa.data.images import read_mask
+    from r3dpa.geometry import SphericalProjection, regions
+
+    session = EditSession(EditJob(**options), num)
+    projection, rows = session.projection, session.sensor.beams
+    masks = []
+    if sector is not None:
+        masks.append(regions.sector(projection, *sector))
+    if keep_every is not None:
+        if not 2 <= keep_every <= rows // 2:
+            raise ValueError(
+                f"--keep_every must be 2 to {rows // 2}, so that two or more of the {rows} beams "
+                f"remain; got {keep_every}"
+            )
+        masks.append(regions.dropped_beams(projection, range(0, rows, keep_every)))
+    if beams is not None:
+        masks.append(regions.dropped_beams(projection, beams))
+    if other_sensor is not None:
+        count, low, high = other_sensor
+        sensor = replace(
+            session.sensor, beams=count, inclination_min_deg=low, inclination_max_deg=high
+        )
+        masks.append(regions.sensor_pair(projection, SphericalProjection(sensor)))
+    if mask is not None:
+        masks.append(regions.check_mask(read_mask(mask, session.sensor), str(mask)))
+    source = session.read(scan, masks, empty_beams)
+    if empty_beams:
+        empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
+        masks.append(empty.expand_as(source.range_m))
+    if not masks:
+        raise ValueError(
+            "nothing is missing: give --sector, --keep_every, --beams, --empty_beams, "
+            "--other_sensor or --mask"
+        )
+    missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
+    about = {
+        "scans": {"scan": str(scan)},
+        "sector": sector,
+        "keep_every": keep_every,
+        "beams": beams,
+        "empty_beams": empty_beams,
+        "other_sensor": other_sensor,
+        "mask": mask,
+        "start": start,
+        "guided": False,
+    }
+
+    def run() -> EditResult:
+        return session.editor.complete(source.range_m, missing, num, session.job.seed, start=start)
+
+    known = torch.where(missing, -1.0, source.range_m)
+    before = {f"scan {scan.stem}": source.range_m, "known part": known}
+    parts = Parts(missing.numpy().astype(np.uint8), ("kept", "missing"))
+    measure = partial(held_out_errors, range_m=source.range_m, missing=missing)
+    return session.write("complete", about, before, run, parts, measure)
+
+
+def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str:
+    """Generate scenes similar to a scan: part of the way to noise and back.
+
+    Args:
+        scan: Scan to vary: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        start: Time of the noise, in (0, 1]; larger values differ more from the scan.
+        num: Number of results, one per seed index.
+        **options: See :class:`EditJob`.
+
+    Raises:
+        ValueError: If the inputs do not fit each other or the checkpoint.
+        OSError: If a file cannot be read or written.
+    """
+    from r3dpa.cli.edit_session import EditSession
+
+    session = EditSession(EditJob(**options), num)
+    session.settings.times(start)
+    source = session.read(scan)
+    about = {"scans": {"scan": str(scan)}, "start": start, "guided": False}
+
+    def run() -> EditResult:
+        return session.editor.vary(source.range_m, num, session.job.seed, start=start)
+
+    return session.write("vary", about, {f"scan {scan.stem}": source.range_m}, run)
+
+
+def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> str:
+    """Generate the scenes on the way from one scan to another, through noise.
+
+    Args:
+        left: Scan of the first frame: ``.bin``, ``.ply``, or ``.npz`` of one scan.
+        right: Scan of the last frame.
+        frames: Number of scenes, both ends among them.
+        **options: See :class:`EditJob`.
+
+    Raises:
+        ValueError: If the inputs do not fit each other or the checkpoint.
+        OSError: If a file cannot be read or written.
+    """
+    from r3dpa.cli.edit_session import EditSession
+
+    if frames < 2:
+        raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
+    session = EditSession(EditJob(**options), frames)
+    scans = [session.read(path) for path in (left, right)]
+    names = [f"left: {left.stem}", f"right: {right.stem}"]
+    about = {
+        "scans": dict(zip(names, (str(left), str(right)), strict=True)),
+        "guided": False,
+    }
+
+    def run() -> EditResult:
+        return session.editor.interpolate(scans[0].range_m, scans[1].range_m, frames)
+
+    before = {name: scan.range_m for name, scan in zip(names, scans, strict=True)}
+    return session.write("interpolate", about, before, run)

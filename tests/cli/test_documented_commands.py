@@ -1,0 +1,73 @@
+"""Every command line in README, notebooks, Makefile and the comments of ``conf`` is accepted."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from r3dpa.cli import COMMANDS, _find, main
+from r3dpa.cli.features import _parser, _with_data_class
+from r3dpa.cli.parser import function_parser, load
+
+TOP = Path(__file__).resolve().parents[2]
+CONF = TOP / "conf"
+# Given to `test` and `predict` in place of the configuration of a run that is not there.
+JOINT = [CONF / f"{name}.yaml" for name in ("trainer", "data/simulated", "experiment/joint")]
+
+
+def commands_in(text):
+    """Words after ``r3dpa`` of the lines that start with it, continued lines joined."""
+    for line in text.replace("\\\n", " ").splitlines():
+        found = re.match(r"[\s$!]*r3dpa (?!COMMAND)(.+)", line)
+        if found:
+            words = shlex.split(found[1], comments=True)
+            if "..." not in words and "|" not in words:
+                yield words
+
+
+def documented():
+    found = {"README.md": (TOP / "README.md").read_text()}
+    for path in sorted((TOP / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text())["cells"]
+        text = "\n".join("".join(cell["source"]) for cell in cells)
+        found[path.name] = text
+        spans = re.findall(r"`(r3dpa [^`]*--[^`]+)`", text.replace("\n", " "))
+        found[path.name] += "\n" + "\n".join(spans)
+    make = re.sub(r"\$\(FIT\)", "r3dpa fit", (TOP / "Makefile").read_text())
+    make = re.sub(r"\$\(BIN\)/|OMP_NUM_THREADS=1|\$\(if.*", "", make)
+    found["Makefile"] = re.sub(r"\$\((\w+)\)", r"\1", make)
+    for path in sorted(CONF.rglob("*.yaml")):
+        lines = [line for line in path.open() if re.match(r"#\s{2,}(r3dpa|--)", line)]
+        found[str(path.relative_to(TOP))] = "".join(line.lstrip("# ") for line in lines)
+    for name, text in found.items():
+        for number, words in enumerate(commands_in(text)):
+            yield pytest.param(words, id=f"{name}-{number}-{words[0]}")
+
+
+@pytest.mark.parametrize("words", documented())
+def test_command_is_accepted(words, monkeypatch, capsys):
+    monkeypatch.chdir(TOP)
+    name, rest = _find(words)
+    if name == "data features":
+        _parser().parse_args(_with_data_class(rest))
+    elif COMMANDS[name].own_parser:
+        for place, word in enumerate(words):
+            if word == "--config" and not Path(words[place + 1]).is_file():
+                configs = [w for path in JOINT for w in ("--config", str(path))]
+                words = [*words[:place], *configs, *words[place + 2 :]]
+                break
+        with pytest.raises(SystemExit) as ended:
+            main([*words, "--print_config"])
+        assert ended.value.code == 0, capsys.readouterr().err
+    else:
+        function_parser(load(COMMANDS[name].target), name).parse_args(rest)
+
+
+def test_readme_shows_every_group():
+    shown = {_find(words)[0] for words in commands_in((TOP / "README.md").read_text())}
+    assert {"fit", "sample", "test", "evaluate", "ablate", "convert"} <= shown
+    assert {name.split()[0] for name in shown} >= {"data", "edit", "bench"}
