@@ -47,7 +47,7 @@ from r3dpa.simulation.sweep import Echoes
 # No effect warns, whatever the scene.
 pytestmark = pytest.mark.filterwarnings("error")
 
-SEEDS = range(64)
+SEEDS = range(48)
 NAMES = [effect_name(effect) for effect in EFFECTS]
 each_scene = pytest.mark.parametrize("seed", SEEDS)
 each_effect = pytest.mark.parametrize("name", NAMES)

@@ -117,10 +117,7 @@ def test_echoes_farther_apart_stay_apart(offset, axis_share, rest_m):
         assert sweep.material[ray] == Material.PAINT
         return
     on_axis = 10.0 if offset < 0 else 12.0
-    echoes = {
-        on_axis: axis_share * 0.5 / on_axis**2,
-        rest_m: (1 - axis_share) * 0.5 / rest_m**2,
-    }
+    echoes = {on_axis: axis_share * 0.5 / on_axis**2, rest_m: (1 - axis_share) * 0.5 / rest_m**2}
     ranked = sorted(echoes, key=lambda there_m: -echoes[there_m])
     for found, there_m in zip(sweep.echoes(), ranked, strict=True):
         assert found.range_m[ray] == pytest.approx(there_m * slant, rel=1e-4)

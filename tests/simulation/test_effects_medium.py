@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 
 from r3dpa.simulation.draws import Draws
-from r3dpa.simulation.effects import (
-    DiffuseReflection,
-    DualReturn,
-    Fog,
-    Rain,
-    Snow,
-    Spray,
-)
+from r3dpa.simulation.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spray
 from r3dpa.simulation.effects.medium import soft_waveform
 from r3dpa.simulation.scan import effect_name
 from r3dpa.simulation.scene import Material, Pose, Primitive, Scene, Semantic, Shape, Weather
@@ -246,13 +239,24 @@ def test_drops_against_drop_by_drop(effect, weather, intercept, slope):
         assert dark < weakest
         # Four standard errors of the difference of two counts and two means.
         assert abs(len(seen) - expected.sum()) < 4 * math.sqrt(len(seen) + expected.sum())
-        for mine, theirs in (
-            (np.log(seen), np.log(power[expected])),
-            (where, range_m[expected]),
-        ):
+        for mine, theirs in ((np.log(seen), np.log(power[expected])), (where, range_m[expected])):
             error = math.hypot(mine.std() / math.sqrt(len(mine)), theirs.std() / len(theirs) ** 0.5)
             assert abs(mine.mean() - theirs.mean()) < 4 * error + 0.005 * abs(theirs.mean())
             np.testing.assert_allclose(mine.std(), theirs.std(), rtol=0.1)
+
+
+def test_the_echo_of_a_drop_is_weakened_there_and_back():
+    """The strongest echo of a drop at r0, where it fills the beam, is q exp(-2 k r0) / r0^2.
+
+    A beam of 0.01 mrad is full of any drop; in 1e4 mm/h of rain k = 0.10 per metre, so that from
+    5 m the drop's echo comes back with 0.36 of its power; with the loss of one way it had 0.60.
+    """
+    line = replace(SENSOR, divergence_rad=1e-5, min_range_m=5.0)
+    k = Rain().extinction_per_m(1e4)
+    table = Rain().drop_table(1e4, line)
+    middle = 5.0 + (table.edges[1] - table.edges[0]) / 2
+    assert table.powers[-1] == pytest.approx(0.02 * math.exp(-2 * k * middle) / middle**2, rel=1e-6)
+    assert math.exp(-2 * k * middle) < 0.5
 
 
 def test_number_of_drops():

@@ -19,12 +19,7 @@ from r3dpa.simulation import (
     simulate_scan,
 )
 from r3dpa.simulation.draws import Draws
-from r3dpa.simulation.effects import (
-    EgoOcclusion,
-    FoliageOcclusion,
-    MovingActors,
-    RollingShutter,
-)
+from r3dpa.simulation.effects import EgoOcclusion, FoliageOcclusion, MovingActors, RollingShutter
 from r3dpa.simulation.solids import EGO_BODY
 
 SENSOR = replace(hdl64e(), range_sigma_m=0.0, weak_range_sigma_m=0.0, range_step_m=0.0)

@@ -3,7 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from r3dpa.simulation import Pose, Primitive, Scene, Semantic, Shape, Weather, hdl64e, raycast
+from r3dpa.simulation import (
+    EgoMotion,
+    Pose,
+    Primitive,
+    Scene,
+    Semantic,
+    Shape,
+    Weather,
+    hdl64e,
+    raycast,
+)
 from r3dpa.simulation.raycast import cast, cast_single, normals, surface_distance
 from r3dpa.simulation.sensor import Rays
 from r3dpa.simulation.solids import GROUND, NO_SURFACE, Windows, level, solids_of
@@ -27,6 +37,9 @@ def compass(z):
 
 def solid(shape, centre, half_size, yaw_rad=0.0):
     return Primitive(shape, centre, half_size, Semantic.CAR, 0.4, yaw_rad, 7)
+
+
+BOX = solid(Shape.BOX, (0, 0, 0), (1, 1, 1))
 
 
 class Hits:
@@ -213,9 +226,8 @@ def brute_force(scene, rays):
     return best.reshape(rays.origin.shape[1:]), surface.reshape(rays.origin.shape[1:])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_cast_equals_a_search_along_the_rays(seed):
-    draw = np.random.default_rng(seed)
+def test_cast_equals_a_search_along_the_rays():
+    draw = np.random.default_rng(0)
     primitives = []
     for _ in range(25):
         angle, distance = draw.uniform(0, 2 * np.pi), draw.uniform(5, 30)
@@ -254,7 +266,7 @@ def crowd(seed, num=120, speed_m_s=0.0):
 
 
 @pytest.mark.parametrize("moving", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_windows_never_cut_a_solid(monkeypatch, seed, moving):
     scene = crowd(seed, speed_m_s=15.0 if moving else 0.0)
     sensor = hdl64e(shots=180)
@@ -337,24 +349,29 @@ def test_each_ray_against_its_own_solid():
         )
 
 
-def test_primitive_pose_and_scene_are_checked():
-    with pytest.raises(ValueError, match="half_size must be positive"):
-        solid(Shape.BOX, (0, 0, 0), (1, 0, 1))
-    with pytest.raises(ValueError, match="reflectivity must lie in"):
-        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 1.5)
-    with pytest.raises(ValueError, match="16 bits"):
-        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, 0.0, 65536)
-    with pytest.raises(ValueError, match="extinction_per_m"):
-        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, extinction_per_m=-1)
-    with pytest.raises(ValueError, match="grade"):
-        Primitive(Shape.BOX, (0, 0, 0), (1, 1, 1), Semantic.CAR, 0.5, grade=(0, 0.3))
-    with pytest.raises(ValueError, match="above the ground"):
-        Scene(pose=Pose(z_m=1.0), ground_m=1.0)
-    with pytest.raises(ValueError, match=r"0\.2 rad"):
-        Pose(pitch_rad=0.3)
-    with pytest.raises(ValueError, match="visibility_m"):
-        Weather(visibility_m=0)
-    with pytest.raises(ValueError, match="snow_mm_h"):
-        Weather(snow_mm_h=-1)
-    with pytest.raises(ValueError, match="sun_elevation_deg"):
-        Weather(sun_elevation_deg=91)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: solid(Shape.BOX, (0, 0, 0), (1, 0, 1)), "half_size must be positive"),
+        (lambda: solid(Shape.BOX, (0, float("nan"), 0), (1, 1, 1)), "must be finite"),
+        (lambda: replace(BOX, velocity_m_s=(float("inf"), 0.0)), "must be finite"),
+        (lambda: replace(BOX, yaw_rad=float("nan")), "must be finite"),
+        (lambda: replace(BOX, reflectivity=1.5), "reflectivity must lie in"),
+        (lambda: replace(BOX, reflectivity=float("nan")), "reflectivity must lie in"),
+        (lambda: replace(BOX, instance=65536), "16 bits"),
+        (lambda: replace(BOX, extinction_per_m=-1), "extinction_per_m"),
+        (lambda: replace(BOX, extinction_per_m=float("nan")), "extinction_per_m"),
+        (lambda: replace(BOX, grade=(0, 0.3)), "grade"),
+        (lambda: Scene(pose=Pose(z_m=1.0), ground_m=1.0), "above the ground"),
+        (lambda: Pose(pitch_rad=0.3), r"0\.2 rad"),
+        (lambda: Pose(x_m=float("nan")), "x_m must be finite, got nan"),
+        (lambda: EgoMotion(yaw_rate_rad_s=float("nan")), "yaw_rate_rad_s must be finite"),
+        (lambda: Weather(visibility_m=0.001), "visibility_m must be 1 or greater"),
+        (lambda: Weather(visibility_m=float("nan")), "visibility_m"),
+        (lambda: Weather(snow_mm_h=-1), "snow_mm_h"),
+        (lambda: Weather(sun_elevation_deg=91), "sun_elevation_deg"),
+    ],
+)
+def test_impossible_scenes_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

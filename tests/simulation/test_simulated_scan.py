@@ -1,3 +1,4 @@
+import doctest
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from r3dpa.simulation import (
     Scene,
     Semantic,
     Shape,
+    Simulator,
     Street,
     Weather,
     effect_name,
@@ -20,6 +22,7 @@ from r3dpa.simulation import (
     scan,
     simulate_scan,
 )
+from r3dpa.simulation import scan as scan_module
 from r3dpa.simulation.scan import calibrated_intensity
 
 DRY = Weather()
@@ -204,3 +207,15 @@ def test_scans_look_like_those_of_a_real_hdl64():
     assert 0.42 < np.mean(ground) < 0.62
     assert np.mean(rows) >= 61
     assert 110_000 < np.mean(sizes) < 128_000
+
+
+def test_a_simulator_gives_the_scans_of_its_drive():
+    simulator = Simulator(3, 5, Weather(rain_mm_h=10), hdl64e(32), {"range_noise": "off"})
+    scan = simulator.scan(7)
+    scene = Street(3, 5, Weather(rain_mm_h=10)).scene(7)
+    key = (3, "effects", 5, 7)
+    expected = simulate_scan(scene, hdl64e(32), key, {"range_noise": False})
+    assert scan.points.tobytes() == expected.points.tobytes()
+    assert (scan.scene, list(scan.parts_ms)) == (scene, ["scene", "rays", "cast", "points"])
+    assert Simulator(sensor="vls128").sensor.num_beams == 128
+    assert doctest.testmod(scan_module).failed == 0

@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from r3dpa.simulation import (
-    Lasers,
-    Scene,
-    SpinningLidar,
-    hdl64e,
-    load_sensor,
-    simulate_scan,
-)
+from r3dpa.simulation import Lasers, Scene, SpinningLidar, hdl64e, load_sensor, simulate_scan
 from r3dpa.simulation.sensor import hdl32e, sensor_to_dict, vls128
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from r3dpa.simulation import Material, Semantic, Shape, Street, Weather, WeatherPrior
 from r3dpa.simulation import street as street_module
-from r3dpa.simulation.course import BLOCK_M, CHARACTERS, course_of
+from r3dpa.simulation.course import BLOCK_M, course_of
 
 GROUND = (Semantic.ROAD, Semantic.SIDEWALK, Semantic.TERRAIN)
 DRY = Weather()
@@ -124,9 +124,9 @@ def test_the_sensor_is_at_mount_height_above_the_road_and_tilts_with_it():
 
 def test_neighbouring_ground_boxes_meet_without_a_step():
     steps = []
-    for drive in range(8):
+    for drive in range(4):
         course = course_of(0, drive)
-        for block in range(1, 120):
+        for block in range(1, 60):
             before, after = (
                 [
                     p
@@ -157,9 +157,9 @@ def _z(primitive, x, y):
 def test_nothing_stands_in_the_lane_of_the_recording_car():
     """No standing solid reaches into a tunnel of 2 m x 2 m that the car drives through."""
     across, height = np.meshgrid([-1.0, -0.5, 0.0, 0.5, 1.0], [0.3, 0.9, 1.5, 2.0])
-    for drive in range(11):
+    for drive in range(4):
         course = course_of(0, drive)
-        for s in np.arange(12.5, 100) * BLOCK_M:
+        for s in np.arange(12.5, 60) * BLOCK_M:
             block = int(s // BLOCK_M)
             solids = [
                 p
@@ -180,7 +180,7 @@ def test_nothing_stands_in_the_lane_of_the_recording_car():
 
 def test_traffic_keeps_clear_of_the_recording_car():
     for drive in range(11):
-        for scan in range(0, 600, 30):
+        for scan in range(0, 600, 90):
             scene = Street(0, drive, DRY).scene(scan)
             body = np.array([[x, y, 0] for x in (-2, -1, 0, 1, 2) for y in (-0.9, 0.9)])
             cosine, sine = np.cos(scene.pose.heading_rad), np.sin(scene.pose.heading_rad)
@@ -244,17 +244,6 @@ def test_an_object_has_one_instance_number():
             assert np.ptp(centres, axis=0).max() < 20
             classes = {p.semantic for p in parts}
             assert len(classes) == 1 or classes == {Semantic.RIDER, Semantic.BICYCLE}
-
-
-def test_number_of_primitives():
-    counts = defaultdict(list)
-    for drive in range(24):
-        for scan in range(0, 800, 80):
-            scene = Street(0, drive, DRY).scene(scan)
-            counts[drive % len(CHARACTERS)].append(len(scene.primitives))
-    medians = [np.median(counts[character]) for character in range(len(CHARACTERS))]
-    assert all(190 <= median <= 300 for median in medians), medians
-    assert max(map(max, counts.values())) < 420
 
 
 def test_every_class_and_material_occurs():

@@ -2,23 +2,11 @@
 
 from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.drive_files import drive_name
-from r3dpa.simulation.drives import (
-    TRAIN_DRIVES,
-    VAL_DRIVES,
-    expected_scans,
-    simulate,
-    split_scans,
-)
+from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate, split_scans
 from r3dpa.simulation.effects import EFFECTS
 from r3dpa.simulation.effects.base import Effect, Switch
 from r3dpa.simulation.report import SimulationReport
-from r3dpa.simulation.scan import (
-    EffectRecord,
-    SimulatedScan,
-    Simulator,
-    effect_name,
-    simulate_scan,
-)
+from r3dpa.simulation.scan import EffectRecord, SimulatedScan, Simulator, effect_name, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
     Material,
