@@ -171,11 +171,7 @@ def _primitive(dice, pose, materials, moving, leafy):
 def _car_part(dice):
     """A piece of the recording car, in the sensor frame."""
     return Primitive(
-        Shape.BOX,
-        (dice.even(-2, 2), dice.even(-1, 1), dice.even(-1.2, -0.2)),
-        (dice.even(0.05, 1.5), dice.even(0.05, 1.2), dice.even(0.02, 0.3)),
-        Semantic.EGO_VEHICLE,
-        0.3,
-        dice.among(0.0, dice.even(-1, 1)),
-        material=dice.among(*Material),
-    )
+        Shape.BOX, (dice.even(-2, 2), dice.even(-1, 1), dice.even(-1.2, -0.2)),
+        (dice.even(0.05, 1.5), dice.even(0.05, 1.2), dice.even(0.02, 0.3)), Semantic.EGO_VEHICLE,
+        0.3, dice.among(0.0, dice.even(-1, 1)), material=dice.among(*Material),
+    )  # fmt: skip

@@ -244,14 +244,9 @@ def test_thin_solids_that_all_axes_miss(speed_m_s):
     x, y = start[:2] + 60 * (towards[:2] + RING * left)
     fired_s = SENSOR.time_s.reshape(-1)[ray]
     rod = Primitive(
-        Shape.CYLINDER,
-        (x, y - speed_m_s * fired_s, 0.0),
-        (1e-3, 1e-3, 30.0),
-        Semantic.POLE,
-        0.8,
-        material=Material.PAINT,
-        velocity_m_s=(0, speed_m_s),
-    )
+        Shape.CYLINDER, (x, y - speed_m_s * fired_s, 0.0), (1e-3, 1e-3, 30.0), Semantic.POLE, 0.8,
+        material=Material.PAINT, velocity_m_s=(0, speed_m_s),
+    )  # fmt: skip
     scene = Scene((rod,), Pose(z_m=0.0), ground_m=-1000)
     assert swept(scene, SENSOR, (MovingActors(),), PATH[:1]).first.surface[ray] == NO_SURFACE
     sweep = swept(scene, SENSOR, (MovingActors(),))
@@ -282,14 +277,9 @@ def test_tiles_of_ground_do_not_mix():
 
 def test_leaves_fill_the_beam():
     crown = Primitive(
-        Shape.ELLIPSOID,
-        (12.0, 0, 2.5),
-        (2, 2, 2),
-        Semantic.VEGETATION,
-        0.5,
-        material=Material.FOLIAGE,
-        extinction_per_m=0.8,
-    )
+        Shape.ELLIPSOID, (12.0, 0, 2.5), (2, 2, 2), Semantic.VEGETATION, 0.5,
+        material=Material.FOLIAGE, extinction_per_m=0.8,
+    )  # fmt: skip
     scene = Scene((crown,))
     foliage = (FoliageOcclusion(),)
     plain, sweep = swept(scene, before=foliage, after=PATH[:1]), swept(scene, before=foliage)

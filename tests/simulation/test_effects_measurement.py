@@ -128,21 +128,13 @@ def test_second_returns_are_more_than_a_metre_apart():
     """A pole that fills a part of the beams, 0.9 and 3 m before a wall."""
     for gap_m, expected in ((0.9, False), (3.0, True)):
         pole = Primitive(
-            Shape.CYLINDER,
-            (20.0, 0.0, 3.0),
-            (0.05, 0.05, 3.0),
-            Semantic.POLE,
-            0.5,
+            Shape.CYLINDER, (20.0, 0.0, 3.0), (0.05, 0.05, 3.0), Semantic.POLE, 0.5,
             material=Material.PAINT,
-        )
+        )  # fmt: skip
         wall = Primitive(
-            Shape.BOX,
-            (20.5 + gap_m, 0.0, 3.0),
-            (0.5, 9.0, 3.0),
-            Semantic.WALL,
-            0.5,
+            Shape.BOX, (20.5 + gap_m, 0.0, 3.0), (0.5, 9.0, 3.0), Semantic.WALL, 0.5,
             material=Material.PAINT,
-        )
+        )  # fmt: skip
         quiet = replace(SENSOR, return_mode="dual", range_sigma_m=0.0, weak_range_sigma_m=0.0)
         scan = simulate_scan(Scene((pole, wall)), quiet, ("seed", 1))
         # At its foot the pole stands before the road, which lies farther away at once.

@@ -15,11 +15,9 @@ from r3dpa.simulation import (
     Sweep,
     Weather,
     hdl64e,
-    simulate_scan,
 )
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
-    DetectionLimit,
     DiffuseReflection,
     Glass,
     MovingActors,
@@ -214,18 +212,6 @@ def test_wet_ground_loses_power():
         np.testing.assert_allclose(ratio, 1 - share + share * passed**2 / 1.33**2, rtol=1e-3)
 
 
-def test_far_rings_of_wet_ground_vanish_first():
-    def reach(film_mm):
-        weather = Weather(water_film_mm=film_mm)
-        sweep = swept(effects=[WetGround(), DetectionLimit()], weather=weather)
-        seen = np.isfinite(sweep.first.range_m)
-        return sweep.first.range_m[seen].min(), sweep.first.range_m[seen].max()
-
-    nearest, farthest = zip(*map(reach, (0.0, 0.3, 0.6, 1.2)), strict=True)
-    assert len(set(nearest)) == 1
-    assert (np.diff(farthest) < 0).all()
-
-
 @pytest.mark.parametrize("heading_rad", [0.0, 2.0])
 @pytest.mark.parametrize("pitch_rad", [0.0, 0.02])
 def test_image_in_a_puddle(heading_rad, pitch_rad):
@@ -268,21 +254,3 @@ def test_water_stands_level_on_a_slope():
     expected = surface_reflectance(down, 1.33) ** 2 * 0.5 * ahead / sweep.first.range_m[rays] ** 2
     np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=1e-3)
     np.testing.assert_allclose(image(sweep, rays)[0], 20, rtol=1e-5)
-
-
-def test_no_water_no_puddle():
-    """A puddle shrinks with the film; without one it is neither dark nor a mirror."""
-    puddles = (Puddle(10.0, 0.0, 3.0), Puddle(4.0, 2.0, 1.0))
-
-    def scan(film_mm, switch, spots=puddles):
-        scene = Scene((WALL,), puddles=spots, weather=Weather(water_film_mm=film_mm))
-        return simulate_scan(scene, SENSOR, (5,), {"wet_ground": switch})
-
-    off, on, trace = scan(0.0, "off"), scan(0.0, "on"), scan(1e-6, "auto")
-    for name in ("points", "labels", "origins"):
-        assert getattr(on, name).tobytes() == getattr(off, name).tobytes()
-    reasons = {record.name: record.reason for record in off.effects}
-    assert reasons["wet_ground"] == "switched off"
-    np.testing.assert_allclose(trace.points, off.points, atol=0.011)
-    assert (scan(1.2, "auto").origins == Origin.MIRROR).any()
-    assert not (scan(1.2, "auto", ()).origins == Origin.MIRROR).any()

@@ -13,12 +13,11 @@ from r3dpa.simulation import (
     Semantic,
     Shape,
     Sweep,
-    Weather,
     hdl64e,
     simulate_scan,
 )
 from r3dpa.simulation.draws import Draws
-from r3dpa.simulation.effects import Blooming, DiffuseReflection, Fog, RetroReflection
+from r3dpa.simulation.effects import Blooming, DiffuseReflection, RetroReflection
 
 SENSOR = hdl64e()
 
@@ -58,19 +57,6 @@ def test_gain_is_that_of_the_norm(degrees, coefficient):
     on_sheet = (scan.labels & 0xFFFF) == Semantic.SIGN
     if degrees < 60:
         assert (scan.points[on_sheet, 3] > 0.98).all()
-
-
-def test_sheeting_outshines_fog():
-    """Where the fog hides a matt board, it shows the sheet."""
-
-    def seen(material):
-        scene = Scene((sheet(60, 0, 1.5, material=material),), weather=Weather(visibility_m=60))
-        scan = simulate_scan(scene, SENSOR, (1,))
-        return ((scan.labels & 0xFFFF) == Semantic.SIGN).sum()
-
-    assert Fog().called_by(Scene(weather=Weather(visibility_m=60)), SENSOR)
-    assert seen(Material.RETROREFLECTOR) > 20
-    assert seen(Material.PAINT) == 0
 
 
 def halo_counts(sweep, turns, effect):

@@ -14,7 +14,8 @@ from r3dpa.simulation import (
     hdl64e,
     raycast,
 )
-from r3dpa.simulation.raycast import cast, cast_single, normals, surface_distance
+from r3dpa.simulation.drive_files import velodyne_to_world
+from r3dpa.simulation.raycast import cast, cast_single, normals
 from r3dpa.simulation.sensor import Rays
 from r3dpa.simulation.solids import GROUND, NO_SURFACE, Windows, level, solids_of
 
@@ -161,43 +162,15 @@ def brute_force(scene, rays):
     """Range and surface by a search in float64: march, then bisect each entry."""
     origin = rays.origin.reshape(3, -1).astype(float).T
     direction = rays.direction.reshape(3, -1).astype(float).T
-    pose = scene.pose
-    roll = np.array(
-        [
-            [1, 0, 0],
-            [0, np.cos(pose.roll_rad), -np.sin(pose.roll_rad)],
-            [0, np.sin(pose.roll_rad), np.cos(pose.roll_rad)],
-        ]
-    )
-    pitch = np.array(
-        [
-            [np.cos(pose.pitch_rad), 0, np.sin(pose.pitch_rad)],
-            [0, 1, 0],
-            [-np.sin(pose.pitch_rad), 0, np.cos(pose.pitch_rad)],
-        ]
-    )
-    heading = np.array(
-        [
-            [np.cos(pose.heading_rad), -np.sin(pose.heading_rad), 0],
-            [np.sin(pose.heading_rad), np.cos(pose.heading_rad), 0],
-            [0, 0, 1],
-        ]
-    )
-    turn = heading @ pitch @ roll
-    origin = origin @ turn.T + [pose.x_m, pose.y_m, pose.z_m]
-    direction = direction @ turn.T
+    matrix = velodyne_to_world(scene.pose)
+    origin = origin @ matrix[:, :3].T + matrix[:, 3]
+    direction = direction @ matrix[:, :3].T
 
     def inside(primitive, points):
         offset = points - primitive.centre
         c, s = np.cos(primitive.yaw_rad), np.sin(primitive.yaw_rad)
-        u = np.stack(
-            [
-                c * offset[..., 0] + s * offset[..., 1],
-                c * offset[..., 1] - s * offset[..., 0],
-                offset[..., 2],
-            ],
-            axis=-1,
-        ) / np.array(primitive.half_size)
+        x, y, z = np.moveaxis(offset, -1, 0)
+        u = np.stack([c * x + s * y, c * y - s * x, z], axis=-1) / np.array(primitive.half_size)
         if primitive.shape == Shape.BOX:
             return np.abs(u).max(axis=-1) <= 1
         if primitive.shape == Shape.CYLINDER:
@@ -326,27 +299,6 @@ def test_single_rays_leave_out_and_look_inside():
     assert one(1, NO_SURFACE) == (pytest.approx(0.03, abs=1e-5), 0)
     assert one(1, 0) == (pytest.approx(8.03), 0)
     assert one(0, NO_SURFACE) == (np.inf, NO_SURFACE)
-
-
-def test_each_ray_against_its_own_solid():
-    scene = crowd(3)
-    solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
-    draw = np.random.default_rng(0)
-    index = draw.integers(0, len(solids.shape), 400)
-    towards = solids.centre[index].T + draw.normal(0, 1, (3, 400))
-    direction = (towards / np.linalg.norm(towards, axis=0)).astype(np.float32)
-    origin = np.zeros_like(direction)
-    enter, leave = surface_distance(solids, index, origin, direction)
-    hit = enter > 0
-    assert 100 < hit.sum() < 400
-    for ray in np.flatnonzero(hit)[:40]:
-        alone = type(solids)(*(column[[index[ray]]] for column in solids[:-1]), ground_m=-1e6)
-        at = surface_distance(alone, np.array([0]), origin[:, [ray]], direction[:, [ray]])
-        assert at[0][0] == enter[ray]
-        middle = (enter[ray] + leave[ray]) / 2 * direction[:, [ray]]
-        assert np.isnan(surface_distance(alone, np.array([0]), middle, direction[:, [ray]])[0]) or (
-            surface_distance(alone, np.array([0]), middle, direction[:, [ray]])[0] < 0
-        )
 
 
 @pytest.mark.parametrize(
