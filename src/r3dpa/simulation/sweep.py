@@ -171,6 +171,13 @@ class Sweep:
             found[index] = np.concatenate([every_ray[part].ravel() for part in parts])
         return found
 
+    def all_near(self, solids: Solids, actor_time_s: Floats | None) -> NDArray[np.int64]:
+        """Rays (M,) that can meet any of these solids, see ``rays_near``."""
+        inside = np.zeros(self.num_rays, dtype=bool)
+        for rays in self.rays_near(solids, actor_time_s):
+            inside[rays] = True
+        return np.flatnonzero(inside)
+
     def of_surface(
         self,
         values: list,

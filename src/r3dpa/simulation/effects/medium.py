@@ -164,7 +164,7 @@ class Spray(Effect):
         """Those whose window meets a plume."""
         scene = sweep.scene
         boxes = solids_of(_plumes(scene), scene.pose, scene.ground_m)
-        return np.unique(np.concatenate([_NO_RAYS, *sweep.rays_near(boxes, sweep.time_s)]))
+        return sweep.all_near(boxes, sweep.time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Weaken the echoes from behind each plume and offer its own."""

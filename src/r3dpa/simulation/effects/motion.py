@@ -76,7 +76,9 @@ class MovingActors(Effect):
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those whose azimuth window meets a moving solid at any time of the sweep."""
-        return _rays_near(sweep, np.any(sweep.solids.velocity, axis=1), sweep.time_s)
+        return sweep.all_near(
+            subset(sweep.solids, np.any(sweep.solids.velocity, axis=1)), sweep.time_s
+        )
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Tell the ray cast when these rays are fired."""
@@ -103,7 +105,7 @@ class FoliageOcclusion(Effect):
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Those whose window meets foliage, where it is when they are fired."""
-        return _rays_near(sweep, sweep.solids.extinction > 0, sweep.actor_time_s)
+        return sweep.all_near(subset(sweep.solids, sweep.solids.extinction > 0), sweep.actor_time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Draw for the ray cast how deep each ray gets."""
@@ -163,11 +165,3 @@ def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMas
     reflectivity = np.array([p.reflectivity for p in ego_body], dtype=np.float32)[surface[hit]]
     material = np.array([p.material for p in ego_body], dtype=np.uint8)[surface[hit]]
     return _EgoMask(np.flatnonzero(hit), range_m[hit], cosine, reflectivity, material)
-
-
-def _rays_near(sweep: Sweep, chosen: NDArray, actor_time_s: Floats | None) -> NDArray[np.int64]:
-    """Rays that can meet the chosen solids."""
-    inside = np.zeros(sweep.num_rays, dtype=bool)
-    for rays in sweep.rays_near(subset(sweep.solids, chosen), actor_time_s):
-        inside[rays] = True
-    return np.flatnonzero(inside)
