@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
+from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor
 
 
@@ -82,6 +85,83 @@ def files_of():
         return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
     return files
+
+
+class Recorder(LightningModule):
+    """Keeps the batches that it is trained and validated on; draws from the global state."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.trained, self.validated = [], []
+
+    @property
+    def seen(self):
+        return [batch["index"].tolist() for batch in self.trained]
+
+    def training_step(self, batch, batch_idx):
+        self.trained.append(batch)
+        return (self.weight - torch.rand(())) ** 2
+
+    def validation_step(self, batch, batch_idx):
+        torch.rand(())
+        self.validated.append(batch)
+
+    def predict_step(self, batch, batch_idx):
+        return batch
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+@pytest.fixture
+def trainer(tmp_path):
+    """Function that makes a trainer for some steps."""
+
+    def make(max_steps, *callbacks, **options):
+        return Trainer(
+            default_root_dir=tmp_path,
+            max_steps=max_steps,
+            accelerator="cpu",
+            logger=False,
+            enable_checkpointing=bool(callbacks),
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            callbacks=list(callbacks),
+            **options,
+        )
+
+    return make
+
+
+@pytest.fixture
+def fit(trainer):
+    """Function that trains a recorder on a data module."""
+
+    def run(data, max_steps, *callbacks, ckpt_path=None, **options):
+        module = Recorder()
+        trainer(max_steps, *callbacks, **options).fit(module, data, ckpt_path=ckpt_path)
+        return module
+
+    return run
+
+
+@pytest.fixture
+def recorder():
+    """The module class."""
+    return Recorder
+
+
+@pytest.fixture
+def data(tmp_path, make_scans, sensor):
+    """Function that makes a data module of 11 scans, one of them held out."""
+    folder = make_scans(tmp_path / "scans", 11)
+
+    def build(**options):
+        defaults = {"batch_size": 2, "val_every": 11, "grid_size": (2, 4)}
+        return LidarDataModule(str(folder), sensor=sensor, **defaults | options)
+
+    return build
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,6 @@ from itertools import chain
 
 import pytest
 import torch
-from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from r3dpa.data import (
@@ -20,67 +19,14 @@ from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor
 
 
-class Recorder(LightningModule):
-    """Keeps the indices of every batch it is trained on."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.seen = []
-
-    def training_step(self, batch, batch_idx):
-        self.seen.append(batch["index"].tolist())
-        return (self.weight - torch.rand(())) ** 2
-
-    def validation_step(self, batch, batch_idx):
-        torch.rand(())
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), lr=0.1)
-
-
-def trainer(tmp_path, max_steps, *callbacks, **options):
-    return Trainer(
-        default_root_dir=tmp_path,
-        max_steps=max_steps,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=any(isinstance(c, ModelCheckpoint) for c in callbacks),
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=list(callbacks),
-        **options,
-    )
-
-
-@pytest.fixture
-def data(tmp_path, make_scans, sensor):
-    folder = make_scans(tmp_path / "scans", 11)
-
-    def build(**options):
-        defaults = {"batch_size": 2, "val_every": 11, "grid_size": (2, 4)}
-        return LidarDataModule(str(folder), sensor=sensor, **defaults | options)
-
-    return build
-
-
-def record(tmp_path, data, max_steps, *callbacks, ckpt_path=None, **options):
-    module, run = Recorder(), trainer(tmp_path, max_steps, *callbacks, **options)
-    run.fit(module, data, ckpt_path=ckpt_path)
-    return module, run
-
-
 # 10 training scans and batches of 2: an epoch has 5 batches. Stops: within the first epoch, at its
 # end, within the second, and at the end of the second.
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("stop", [3, 5, 7, 10])
-def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop):
-    whole, _ = record(tmp_path, data(num_workers=workers), 12)
+@pytest.mark.parametrize(("workers", "stop"), [(2, 3), (0, 5), (0, 7), (2, 10)])
+def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop, fit):
+    whole = fit(data(num_workers=workers), 12)
     saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
-    first, _ = record(tmp_path, data(num_workers=workers), stop, saver)
-    second, _ = record(
-        tmp_path, data(num_workers=workers), 12, ckpt_path=tmp_path / f"c/step={stop}.ckpt"
-    )
+    first = fit(data(num_workers=workers), stop, saver)
+    second = fit(data(num_workers=workers), 12, ckpt_path=tmp_path / f"c/step={stop}.ckpt")
     assert first.seen == whole.seen[:stop]
     assert second.seen == whole.seen[stop:]
     assert len(whole.seen) == 12
@@ -89,70 +35,36 @@ def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop):
     assert whole.seen[:5] != whole.seen[5:10]
 
 
-@pytest.mark.parametrize("stop", [3, 5, 7])
-def test_resume_from_a_checkpoint_saved_after_the_fit(tmp_path, data, stop):
-    whole, _ = record(tmp_path, data(), 12)
-    _, run = record(tmp_path, data(), stop)
-    run.save_checkpoint(tmp_path / "after.ckpt")
-    second, run = record(tmp_path, data(), 9, ckpt_path=tmp_path / "after.ckpt")
-    run.save_checkpoint(tmp_path / "again.ckpt")
-    third, _ = record(tmp_path, data(), 12, ckpt_path=tmp_path / "again.ckpt")
-    assert second.seen + third.seen == whole.seen[stop:]
-
-
-@pytest.mark.parametrize("stop", [2, 3, 4])
-def test_resume_under_limited_epochs(tmp_path, data, stop):
+@pytest.mark.parametrize("stop", [2, 3])
+def test_resume_under_limited_epochs(tmp_path, data, stop, fit):
     options = {"limit_train_batches": 3}
-    whole, _ = record(tmp_path, data(), 8, **options)
+    whole = fit(data(), 8, **options)
     saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
-    record(tmp_path, data(), stop, saver, **options)
+    fit(data(), stop, saver, **options)
     path = tmp_path / f"c/step={stop}.ckpt"
-    second, _ = record(tmp_path, data(), 8, ckpt_path=path, **options)
+    second = fit(data(), 8, ckpt_path=path, **options)
     assert second.seen == whole.seen[stop:]
     assert whole.seen[3:5] != whole.seen[:2]
 
 
-def test_resume_with_accumulation_and_validation_within_the_epoch(tmp_path, data):
+def test_resume_with_accumulation_and_validation_within_the_epoch(tmp_path, data, fit):
     options = {"accumulate_grad_batches": 2, "val_check_interval": 2}
-    whole, _ = record(tmp_path, data(), 6, **options)
+    whole = fit(data(), 6, **options)
     saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=2, filename="{step}")
-    record(tmp_path, data(), 2, saver, **options)
-    second, _ = record(tmp_path, data(), 6, ckpt_path=tmp_path / "c/step=2.ckpt", **options)
+    fit(data(), 2, saver, **options)
+    second = fit(data(), 6, ckpt_path=tmp_path / "c/step=2.ckpt", **options)
     assert second.seen == whole.seen[4:]
 
 
-def test_order_does_not_depend_on_workers_but_on_the_seed(tmp_path, data):
-    orders = [record(tmp_path, data(num_workers=w), 6)[0].seen for w in (0, 1, 2)]
+def test_order_does_not_depend_on_workers_but_on_the_seed(tmp_path, data, fit):
+    orders = [fit(data(num_workers=w), 6).seen for w in (0, 1, 2)]
     assert orders[0] == orders[1] == orders[2]
-    assert record(tmp_path, data(seed=1), 6)[0].seen != orders[0]
+    assert fit(data(seed=1), 6).seen != orders[0]
 
 
-def test_fit_twice_in_one_process_starts_over(tmp_path, data):
-    module = data()
-    assert record(tmp_path, module, 3)[0].seen == record(tmp_path, module, 3)[0].seen
-
-
-def test_overfit_batches_takes_the_first_scans_again_and_again(tmp_path, data):
-    module, _ = record(tmp_path, data(), 4, overfit_batches=2)
+def test_overfit_batches_takes_the_first_scans_again_and_again(tmp_path, data, fit):
+    module = fit(data(), 4, overfit_batches=2)
     assert module.seen == [[0, 1], [2, 3], [0, 1], [2, 3]]
-
-
-def test_batches_and_attributes(data, sensor):
-    module = data()
-    module.prepare_data()
-    module.setup("fit")
-    batch = next(iter(module.train_dataloader()))
-    assert batch["range_image"].shape == batch["valid_mask"].shape == (2, 1, 8, 32)
-    assert batch["range_image"].dtype == torch.float32
-    assert batch["valid_mask"].dtype == torch.bool
-    assert "feature_grid" not in batch
-    assert module.sensor == sensor
-    assert module.grid_size == (2, 4)
-    assert module.projection_kind == "spherical"
-    assert module.feature_dim == 768
-    names = [name for batch in module.predict_dataloader() for name in batch["name"]]
-    assert names == [f"scans/{frame:010d}" for frame in range(11)]
-    assert [n for b in module.test_dataloader() for n in b["name"]] == ["scans/0000000000"]
 
 
 def test_missing_grids_are_made_once_and_need_their_extractor(tmp_path, data, scaled_points):
@@ -232,10 +144,6 @@ def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):
         LidarDataModule(str(tmp_path / "scans"), val_drives=["city/c"]).split()
 
 
-def test_training_without_validation_scans(tmp_path, data):
-    assert len(record(tmp_path, data(val_every=None), 2)[0].seen) == 2
-
-
 def test_official_split(tmp_path, make_scans, sensor):
     extra = "2013_05_28_drive_0008_sync"  # recorded for a benchmark, part of no split
     for seed, drive in enumerate([*KITTI360_DRIVES["train"], *KITTI360_DRIVES["val"], extra]):
@@ -277,7 +185,7 @@ def test_rings_do_not_depend_on_the_limit(tmp_path):
 
 
 @pytest.mark.parametrize("part", ["train", "val"])
-def test_one_split_alone(tmp_path, make_scans, sensor, part):
+def test_one_split_alone(tmp_path, make_scans, sensor, part, fit, trainer, recorder):
     """KITTI-360 with drives of one split: usable but for the stage that needs the other one."""
     drive = KITTI360_DRIVES[part][0]
     make_scans(tmp_path / "data_3d_raw" / drive / "velodyne_points/data", 4)
@@ -285,32 +193,23 @@ def test_one_split_alone(tmp_path, make_scans, sensor, part):
     data.setup("predict")
     assert sum(len(batch["name"]) for batch in data.predict_dataloader()) == 4
     if part == "train":
-        assert len(record(tmp_path, data, 2)[0].seen) == 2
+        assert len(fit(data, 2).seen) == 2
         with pytest.raises(ValueError, match=r"No held-out scan in .*missing drives"):
-            trainer(tmp_path, 1).validate(Recorder(), data, verbose=False)
+            trainer(1).validate(recorder(), data, verbose=False)
     else:
-        trainer(tmp_path, 1).validate(Recorder(), data, verbose=False)
+        trainer(1).validate(recorder(), data, verbose=False)
         with pytest.raises(ValueError, match=r"No scan to train on in .*missing drives"):
-            record(tmp_path, data, 1)
+            fit(data, 1)
 
 
-def test_prediction_makes_no_grids(tmp_path, data, scaled_points):
-    class Predicting(Recorder):
-        def predict_step(self, batch, batch_idx):
-            assert "feature_grid" not in batch
-            return len(batch["name"])
-
+def test_prediction_makes_no_grids(tmp_path, data, scaled_points, trainer, recorder):
     extractor = scaled_points()
     module = data(extractor=extractor)
-    assert sum(trainer(tmp_path, 1).predict(Predicting(), module)) == 11
+    batches = trainer(1).predict(recorder(), module)
+    assert sum(len(batch["name"]) for batch in batches) == 11
+    assert not any("feature_grid" in batch for batch in batches)
     assert extractor.calls == 0
     assert not module.features_dir.exists()
-
-
-@pytest.mark.parametrize("per_node", [False, True])
-def test_which_processes_prepare_the_data(data, per_node):
-    assert data().prepare_data_per_node is False
-    assert data(prepare_data_per_node=per_node).prepare_data_per_node is per_node
 
 
 def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_points):
@@ -355,11 +254,6 @@ def test_bad_arguments(data, options, message):
         data(**options)
 
 
-def test_one_simulated_scan_cannot_be_split(tmp_path):
-    with pytest.raises(ValueError, match=r"num_scans must be at least 2, .* got 1"):
-        SimulatedDataModule(str(tmp_path), num_scans=1)
-
-
 def test_a_batch_larger_than_the_data_is_refused(data):
     module = data(batch_size=11)
     module.setup("fit")
@@ -367,7 +261,7 @@ def test_a_batch_larger_than_the_data_is_refused(data):
         module.train_dataloader()
 
 
-def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points):
+def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fit):
     extractor = scaled_points()
     for _ in range(2):
         data = SimulatedDataModule(
@@ -378,7 +272,7 @@ def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points):
             batch_size=1,
             projection="rings",
         )
-        module, _ = record(tmp_path, data, 2)
+        module = fit(data, 2)
         assert len(module.seen) == 2
     assert extractor.calls == 4
     assert check(tmp_path / "sim").ok

@@ -186,11 +186,6 @@ def test_a_damaged_state_is_named(tmp_path):
         writer(tmp_path, 1)
 
 
-def test_unknown_formats_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"some of bin, ply, npz, got 'txt'"):
-        writer(tmp_path, 1, formats=("bin", "txt"))
-
-
 @pytest.mark.parametrize("where", ["put", "close"])
 def test_an_error_while_writing_stops_the_run_with_its_message(tmp_path, monkeypatch, where):
     real = scene_writer.write_bin
@@ -234,10 +229,10 @@ def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
         assert open_writer.num_done == 3
 
 
-def test_1000_scenes_are_never_in_memory_together(tmp_path):
+def test_200_scenes_are_never_in_memory_together(tmp_path):
     batches, most = weakref.WeakSet(), 0
-    with writer(tmp_path, 1000, formats=("bin", "npz")) as open_writer:
-        for first in range(0, 1000, 2):
+    with writer(tmp_path, 200, formats=("bin", "npz")) as open_writer:
+        for first in range(0, 200, 2):
             batch = scenes(2, seed=first)
             batches.add(batch)
             open_writer.put(batch)
@@ -246,7 +241,7 @@ def test_1000_scenes_are_never_in_memory_together(tmp_path):
         open_writer.close()
         open_writer.finish({})
     assert most <= 4  # three and the one that is being handed over
-    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 1000
+    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 200
 
 
 def test_files_of_somebody_else_are_never_removed(tmp_path):

@@ -183,7 +183,9 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
     summary.parent.mkdir(parents=True)
     pose = dict.fromkeys(("x_m", "y_m", "z_m", "heading_rad", "pitch_rad", "roll_rad"), 0.1)
     effect = {"status": "ran", "reason": "", "rays": 3}
-    summary.write_text(json.dumps({"scan": 0, "pose": pose, "effects": {"fog": effect}}))
+    summary.write_text(
+        json.dumps({"scan": 0, "points": 12, "pose": pose, "effects": {"fog": effect}})
+    )
     add("sim/*.json", summary, lambda: drive.summaries(1))
 
 
