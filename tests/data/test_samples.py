@@ -220,6 +220,17 @@ class Payload:
         return print, ("executed",)
 
 
+@pytest.mark.parametrize("width", [3, 4])
+def test_a_stack_of_clouds_is_no_stack_of_images(tmp_path, width):
+    clouds = 5 + np.random.default_rng(0).random((6, 40, width), np.float32)
+    np.save(tmp_path / "a.npy", clouds)
+    samples = list(read_samples(tmp_path / "a.npy", SENSOR))
+    assert [sample.name for sample in samples] == [f"{i:06d}" for i in range(6)]
+    for sample, cloud in zip(samples, clouds, strict=True):
+        assert sample.range_m is None
+        np.testing.assert_array_equal(sample.points, cloud)
+
+
 @pytest.mark.parametrize("suffix", ["pcd", "pth", "npy", "npz"])
 def test_no_file_runs_code(tmp_path, capsys, suffix):
     file = tmp_path / f"evil.{suffix}"
@@ -305,7 +316,7 @@ BAD = {
     "channels": (tensor_file(torch.ones(3, 4, 8)), r"a\.pth: has 3 channels; needs range"),
     "image size": (
         tensor_file(torch.ones(5, 8, 4)),
-        r"a\.pth: has an image of 8 x 4 pixels, but the sensor has 4 x 8; give the sensor",
+        r"a\.pth: has an image of 8 x 4 pixels, but the sensor has 4 x 8; use images of",
     ),
     "encoded": (images_file(lambda s: s[:, :1] / 56 - 1), r"000000: .*values go from -1 to 0\.07"),
     "NaN range": (setting(torch.nan, 1, 0, 3), r"img\.npz, sample 000001: has NaN .* 8 pixels"),

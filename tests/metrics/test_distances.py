@@ -291,7 +291,9 @@ def run_process(rank, folder):
 @pytest.mark.ddp
 @pytest.mark.filterwarnings("ignore:The ``compute`` method")
 def test_two_processes_are_one(tmp_path):
-    torch.multiprocessing.spawn(run_process, (str(tmp_path),), nprocs=2)
+    torch.multiprocessing.start_processes(
+        run_process, (str(tmp_path),), nprocs=2, start_method="fork"
+    )
     for rank in range(2):
         results = torch.load(tmp_path / f"{rank}.pt")
         assert len(results) == 2 * len(NAMES)

@@ -235,6 +235,7 @@ class TestCommand:
         torch.save({"state_dict": weights}, path)
         return path
 
+    @pytest.mark.slow
     def test_prints_and_writes_the_distances(self, tmp_path, network, capsys):
         moments = {"mu": np.zeros(32), "sigma": np.eye(32)}
         value = {"all": {**CONTENT["all"], "minkowskinet": moments}}

@@ -12,7 +12,7 @@ format       content, and who writes it
              LiDAR-Diffusion (three decimals, colours 0)
 ``npz``      clouds ``(P, 3)`` or ``(P, 4)`` by name: ``scenes.npz`` of ``r3dpa sample``; or images
              ``(N, C, H, W)``: ``numpy/img.npz`` of R3DPA (``generate.py``)
-``npy``      one such array
+``npy``      one such array, or clouds ``(N, P, 3)`` or ``(N, P, 4)``
 ``pth``      an image ``(C, H, W)``: R2DM (``sample_and_save.py``); a dictionary of ``depth``,
              ``xyz``, ``reflectance`` ``(c, H, W)``: R2Flow (``sample.py``); or stacks of these
 ===========  =====================================================================================
@@ -264,7 +264,7 @@ def _arrays_of(file: Path, given: SampleFormat | None) -> Iterator[tuple[str, np
 
 
 def _parts(reader: ArrayReader) -> Iterator[tuple[str, np.ndarray]]:
-    """A cloud, or each image of a stack; without a channel axis, these are ranges."""
+    """A cloud, or each cloud or image of a stack; images without a channel axis are ranges."""
     if reader.dtype.kind != "f":
         raise SampleError(f"{reader.where}: holds {reader.dtype} numbers; metres must be floats")
     if len(reader.shape) == 2:
@@ -272,11 +272,12 @@ def _parts(reader: ArrayReader) -> Iterator[tuple[str, np.ndarray]]:
         return
     if len(reader.shape) not in (3, 4) or 0 in reader.shape[1:]:
         raise SampleError(
-            f"{reader.where}: has shape {reader.shape}; needs (P, 3) or (P, 4) points or "
-            "(N, C, H, W) images"
+            f"{reader.where}: has shape {reader.shape}; needs (P, 3) or (P, 4) points, "
+            "(N, P, 3) clouds or (N, C, H, W) images"
         )
-    for index, image in enumerate(reader.rows()):
-        yield f"{index:06d}", image if image.ndim == 3 else image[None]
+    clouds = len(reader.shape) == 3 and reader.shape[2] in (3, 4)
+    for index, part in enumerate(reader.rows()):
+        yield f"{index:06d}", part if clouds or part.ndim == 3 else part[None]
 
 
 def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
@@ -335,7 +336,7 @@ def _image_sample(
     if size != [sensor.beams, sensor.columns]:
         raise SampleError(
             f"{where}: has an image of {size[0]} x {size[1]} pixels, but the sensor has "
-            f"{sensor.beams} x {sensor.columns}; give the sensor of the samples"
+            f"{sensor.beams} x {sensor.columns}; use images of that size, or a reference for theirs"
         )
     if channels not in (1, 2, 4, 5):
         raise SampleError(

@@ -34,9 +34,15 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.measures import MEASURES, Measure, known
 from r3dpa.metrics.protocol import DEFAULT, PUBLISHED, Protocol
-from r3dpa.metrics.realism import RealismRow, RealismTable, realism_table
+from r3dpa.metrics.realism import (
+    MEASURES,
+    Measure,
+    RealismRow,
+    RealismTable,
+    known,
+    realism_table,
+)
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import Evaluation, MetricResult, published_evaluations

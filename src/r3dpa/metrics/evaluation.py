@@ -184,20 +184,7 @@ def gather(
     bad: list[str] | None = None,
     option: str = PYTHON_OPTION,
 ) -> tuple[list[str], bool]:
-    """Updates metrics with generated scenes.
-
-    Args:
-        metrics: Of :func:`scene_metrics`.
-        scenes: Read once; the first usable ones count, as many as the protocol says.
-        spaces: Feature spaces.
-        protocol: How scenes are prepared.
-        batch_size: Scenes per pass of a network.
-        bad: Takes the messages of scenes that cannot be used. Where None, the first one stops.
-        option: How the caller sets ``skip_bad``, for that message.
-
-    Returns:
-        Names of the scenes, and whether there were more than the protocol counts.
-    """
+    """Updates metrics with generated scenes."""
     stream, names = iter(scenes), []
     advice = f". {option.format('skip_bad')} leaves such scenes out, and lists them"
     counted = islice(usable_scenes(stream, protocol, bad, advice), protocol.num_samples)
@@ -215,13 +202,6 @@ def check_counts(
     bad: Sequence[str] = (),
 ) -> None:
     """Refuses fewer than two scenes and, unless allowed, fewer than features.
-
-    Args:
-        counts: How many there are of each kind; ``generated scenes`` among them.
-        spaces: Feature spaces.
-        allow_few: Accept fewer scenes than features.
-        option: How the caller sets ``allow_few``, for the message.
-        bad: Messages of generated scenes that were left out.
 
     Raises:
         TooFewScenesError: If there are fewer than two generated scenes.
@@ -256,17 +236,7 @@ def about_generated(
     commit: str | None,
     source: str,
 ) -> About:
-    """Where the numbers of an evaluation come from.
-
-    Args:
-        count: Scenes compared.
-        more: Whether there were more of them than the protocol counts.
-        spaces: Feature spaces.
-        reference: What has their ``protocol`` and can ``describe`` itself.
-        made_with: As for :func:`evaluate`.
-        commit: As for :func:`evaluate`.
-        source: As for :func:`evaluate`.
-    """
+    """Where the numbers of an evaluation come from."""
     extra, protocol = dict(made_with or {}), reference.protocol
     known = {
         key: extra.pop(key, None)
@@ -296,15 +266,7 @@ def floors_of(
     num_images: int,
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
-    """Rows of the first half of the reference as if it were generated, against the second.
-
-    Args:
-        reference: Complete statistics.
-        spaces: Feature spaces.
-        num_samples: Scans of the first half that are used, or all that it keeps.
-        num_images: The same for MMD.
-        resampling: Gives the seed.
-    """
+    """Rows of the first half of the reference as if it were generated, against the second."""
     if min(reference.count(0), reference.count(1)) < 2:
         return {}
     without = replace(resampling, num_resamples=0)
@@ -394,12 +356,6 @@ def feature_spaces(
     device: str,
 ) -> list[SceneFeatures]:
     """Feature spaces by name.
-
-    Args:
-        names: Of :data:`r3dpa.metrics.scene_features.SPACES`.
-        ckpt: Weight files by name.
-        protocol: How scenes are prepared.
-        device: Where the networks compute; ``auto`` is the GPU where there is one.
 
     Raises:
         ValueError: If a name occurs twice, a file belongs to none of them, or as

@@ -77,6 +77,8 @@ class FeatureMetric(SceneMetric):
         names: Sequence[str] | None = None,
     ) -> None:
         """Add ``(N, F)`` features, or such by space; NaN or another width is a ``ValueError``."""
+        if real and getattr(self, "reference_mean", None) is not None:
+            raise ValueError("real features given beside a reference; build the metric without it")
         side = SIDES[not real]
         values = (features if isinstance(features, Tensor) else features[self.space]).detach()
         if values.ndim != 2 or values.shape[1] != self.num_features:
@@ -109,15 +111,12 @@ class FrechetDistance(FeatureMetric):
     batches give what one process would.
 
     Args:
-        num_features: Feature width F.
-        label: Of the feature space, in results.
-        space: See :class:`FeatureMetric`.
-        max_real: See :class:`FeatureMetric`.
-        max_generated: See :class:`FeatureMetric`.
+        args: Of :class:`FeatureMetric`, ``num_features`` first.
         allow_few_samples: Accept fewer than F + 1 samples, where the covariance is singular and
             the distance mostly tells how many samples there were.
         reference: Mean ``(F,)`` and covariance ``(F, F)`` of the real features, where only these
             are known, as in the official statistics file; real features are then refused.
+        options: Of :class:`FeatureMetric`.
 
     Raises:
         ValueError: By ``compute``, if there are fewer than F + 1 samples.
@@ -136,30 +135,16 @@ class FrechetDistance(FeatureMetric):
 
     def __init__(
         self,
-        num_features: int,
-        label: str = "",
-        space: str = "",
-        max_real: int | None = None,
-        max_generated: int | None = None,
+        *args: Any,
         allow_few_samples: bool = False,
         reference: tuple[Tensor, Tensor] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(num_features, label, space, max_real, max_generated)
+        super().__init__(*args, **options)
         self.allow_few_samples = allow_few_samples
         mean, covariance = reference if reference is not None else (None, None)
         self.register_buffer("reference_mean", mean, persistent=False)
         self.register_buffer("reference_covariance", covariance, persistent=False)
-
-    def update(
-        self,
-        features: Tensor | Mapping[str, Tensor],
-        real: bool,
-        names: Sequence[str] | None = None,
-    ) -> None:
-        """Add features, see :class:`FeatureMetric`."""
-        if real and self.reference_mean is not None:
-            raise ValueError("real features given beside a reference; build the metric without it")
-        super().update(features, real, names)
 
     def compute(self) -> Tensor:
         """Distance ``()`` float64 of everything seen so far, by all processes."""
@@ -308,13 +293,6 @@ def scene_metrics(
 
     ``update`` takes ``clouds``, ``range_m``, ``features`` by space, ``names`` and ``real``; see
     :func:`update_with`.
-
-    Args:
-        protocol: How scenes are prepared.
-        spaces: Label and feature width by name.
-        num_groups: Groups of generated scenes that the bootstrap of histograms resamples.
-        max_rows: Real and generated scenes whose features are kept.
-        max_images: Real and generated scenes whose range images are kept.
     """
     metrics: dict[str, SceneMetric] = {
         "cells": BEVHistogramDistance(protocol.grid, num_groups),
@@ -344,17 +322,7 @@ def update_with(
     features: Mapping[str, Tensor],
     real: bool,
 ) -> None:
-    """Counts scenes in.
-
-    Args:
-        metrics: Of :func:`scene_metrics`.
-        scenes: As :func:`through_sensor` makes them; may be empty.
-        features: ``(B, F)`` by space.
-        real: Whether they are real scans.
-
-    Raises:
-        ValueError: If no point of a scene lies on the grid seen from above.
-    """
+    """Counts scenes in."""
     if scenes:
         metrics.update(
             clouds=[scene.points for scene in scenes],

@@ -24,14 +24,6 @@ _BLOCK = 1024  # rows of a distance matrix held at once
 def checked_features(features: Tensor, name: str = "features", at_least: int = 1) -> Tensor:
     """Features as float64, after a check that they can be judged.
 
-    Args:
-        features: ``(N, F)`` floating point.
-        name: What they are called in an error.
-        at_least: Samples that are needed.
-
-    Returns:
-        ``(N, F)`` float64.
-
     Raises:
         ValueError: If the shape is another one, a value is NaN or infinite, or N is too small.
     """
@@ -143,15 +135,6 @@ def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tenso
 
     Source: Dowson and Landau, 1982; as FID of Heusel et al., 2017.
 
-    Args:
-        mean_a: ``(F,)``.
-        cov_a: ``(F, F)`` symmetric, positive semi-definite.
-        mean_b: ``(F,)``.
-        cov_b: ``(F, F)``.
-
-    Returns:
-        ``()`` float64, never negative.
-
     Raises:
         ValueError: If shapes do not fit or a number is NaN or infinite.
     """
@@ -214,12 +197,6 @@ def fd_infinity(
 
     Source: Chong and Forsyth, "Effectively unbiased FID and Inception score", CVPR 2020.
 
-    Args:
-        real: ``(N, F)``; N may differ from that of ``generated``.
-        generated: ``(M, F)``.
-        generator: Source of the subsets, on the CPU.
-        num_sizes: Distances that are computed, at least 3.
-
     Raises:
         ValueError: If a quarter of the smaller set is less than F + 1 samples.
     """
@@ -257,14 +234,6 @@ def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
     zero and single values may be negative.
 
     Source: Gretton et al., JMLR 2012, eq. 3; kernel of Binkowski et al. (KID), ICLR 2018.
-
-    Args:
-        real: ``(N, F)``, N at least 2.
-        generated: ``(M, F)``, M at least 2.
-        degree: Of the polynomial.
-
-    Returns:
-        ``()`` float64.
     """
     x, y = checked_pair(real, generated, at_least=2)
 
@@ -286,17 +255,6 @@ def polynomial_mmd(
     subset_size: int = 1000,
 ) -> tuple[float, float]:
     """Kernel distance (KID): mean and deviation of :func:`squared_mmd` over random subsets.
-
-    Args:
-        real: ``(N, F)``.
-        generated: ``(M, F)``.
-        generator: Source of the subsets, on the CPU.
-        num_subsets: How many.
-        subset_size: Samples of each set in a subset, drawn without replacement.
-
-    Returns:
-        ``(mean, std)``; the standard error of the mean is below ``std``, but not
-        ``std / sqrt(num_subsets)``, since subsets overlap.
 
     Raises:
         ValueError: If a set is smaller than a subset.
@@ -324,13 +282,6 @@ def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
     is summed between all places where one of them steps. For counts in bins there is
     :func:`wasserstein_1`.
 
-    Args:
-        values_a: ``(N,)``.
-        values_b: ``(M,)``.
-
-    Returns:
-        The distance in the unit of the values.
-
     Raises:
         ValueError: If a set is empty or holds NaN or infinity.
     """
@@ -348,13 +299,7 @@ def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
 def wasserstein_1(
     counts_a: NDArray[np.float64], counts_b: NDArray[np.float64], bin_width: float
 ) -> float:
-    """Earth mover's distance of two normalised histograms: the area between their CDFs.
-
-    Args:
-        counts_a: ``(N,)`` counts in bins of equal width.
-        counts_b: ``(N,)`` counts in the same bins.
-        bin_width: In the unit of the result, which is NaN where a histogram is empty.
-    """
+    """Earth mover's distance of two normalised histograms: the area between their CDFs."""
     if counts_a.sum() == 0 or counts_b.sum() == 0:
         return float("nan")
     cdf_a, cdf_b = counts_a.cumsum() / counts_a.sum(), counts_b.cumsum() / counts_b.sum()
@@ -387,14 +332,7 @@ def curve_rmse(curve_a: NDArray[np.float64], curve_b: NDArray[np.float64]) -> fl
 
 @dataclass(frozen=True)
 class PRDC:
-    """How much of each set the other one covers.
-
-    Args:
-        precision: Share of generated samples inside the ball of some real sample.
-        recall: Share of real samples inside the ball of some generated sample.
-        density: Real balls around a generated sample, on average, divided by k; may exceed 1.
-        coverage: Share of real samples whose ball holds a generated sample.
-    """
+    """How much of each set the other one covers."""
 
     precision: float
     recall: float
@@ -404,14 +342,7 @@ class PRDC:
 
 @dataclass(frozen=True)
 class SharedBalls:
-    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC.
-
-    Args:
-        in_real: ``(M,)`` int64, real balls that a generated sample is in.
-        recalled: ``(N,)`` bool, whether a real sample is in the ball of a generated one.
-        covered: ``(N,)`` bool, whether the ball of a real sample holds a generated one.
-        num_neighbors: k of the balls.
-    """
+    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC."""
 
     in_real: Tensor
     recalled: Tensor

@@ -55,10 +55,6 @@ class BEVGrid:
     def kept(self, points: Tensor, name: str = "cloud") -> Tensor:
         """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one.
 
-        Args:
-            points: x, y, z in metres, then anything.
-            name: What the cloud is called in an error.
-
         Raises:
             ValueError: If a coordinate is NaN or infinite, or no point is inside the limits.
         """
@@ -75,13 +71,6 @@ class BEVGrid:
 
         Index 0 is that of the lower limit. The division is done in the precision of the points,
         as in the official code: another one moves points on the border of two cells.
-
-        Args:
-            points: ``(P, 3 or more)``: x, y, z in metres, then anything.
-            name: What the cloud is called in an error.
-
-        Returns:
-            ``(n,)`` int64.
 
         Raises:
             ValueError: As :meth:`kept`.
@@ -137,10 +126,6 @@ class HistogramDistance:
 def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
     """All distances of two histograms.
 
-    Args:
-        counts_a: Counts of any shape, not negative.
-        counts_b: Counts of the same shape.
-
     Raises:
         ValueError: If shapes differ, a count is negative or not finite, or a histogram is empty.
     """
@@ -181,14 +166,7 @@ def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Matching:
-    """The nearest sample of each reference.
-
-    Args:
-        squared_normalised: ``(R,)`` float64, squared Chamfer distance in units of the squared
-            width of the grid.
-        nearest: ``(R,)`` int64, index of that sample.
-        num_compared: Pairs of the R * S whose second direction had to be computed.
-    """
+    """The nearest sample of each reference."""
 
     squared_normalised: Tensor
     nearest: Tensor
@@ -214,11 +192,6 @@ def minimum_matching(
     first, until the first alone exceeds the best sum.
 
     Source: Achlioptas et al., ICML 2018; in this form LiDM, CVPR 2024.
-
-    Args:
-        references: R vectors of :meth:`BEVGrid.cells`.
-        samples: S vectors.
-        grid: Theirs, square. The work is shared by as many threads as PyTorch uses.
 
     Raises:
         ValueError: If a set or a vector is empty, or the grid is not square.

@@ -121,10 +121,6 @@ class OfficialStatistics:
     def load(cls, path: str | Path, split: OfficialSplit | None = None) -> OfficialStatistics:
         """Reads the file; nothing in it is executed.
 
-        Args:
-            path: ``data_statistics.npy`` or ``range_update_stats.npy``.
-            split: Which part of it; ``val`` where it is there and none is asked for.
-
         Raises:
             ValueError: If the file is missing, damaged or of something else, lacks the split, or a
                 field is not as it must be; file and field are named.
@@ -310,10 +306,6 @@ AnyReference = ReferenceStatistics | OfficialStatistics
 def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
     """Reference of either kind, ready to compare with.
 
-    Args:
-        path: File of ``r3dpa reference``, or the official statistics file.
-        split: Part of the official file, see :meth:`OfficialStatistics.load`.
-
     Raises:
         ValueError: If the file is missing, damaged, of something else or not complete, or a split
             is asked of a file that has none.
@@ -338,14 +330,6 @@ def reference_spaces(
     device: str,
 ) -> list[SceneFeatures]:
     """Feature spaces of a comparison with a reference.
-
-    Args:
-        statistics: The reference.
-        names: Feature spaces; where None, those of the reference that need no file or that
-            ``ckpt`` has one for.
-        ckpt: Weight files by name.
-        protocol: Must be that of the reference; not compared where None.
-        device: As for :func:`feature_spaces`.
 
     Raises:
         ValueError: If the reference is of another protocol or lacks a space, or as
@@ -374,18 +358,7 @@ def compare(
     spaces: Sequence[SceneFeatures],
     **options: Any,
 ) -> tuple[Evaluation, Comparison | None]:
-    """Generated scenes beside a reference of either kind.
-
-    Args:
-        scenes: Read once; a generated one is ``EvaluationScene(name, None, range_m)``.
-        statistics: Reference.
-        spaces: Of :func:`reference_spaces`.
-        options: Those that :func:`r3dpa.metrics.evaluation.evaluate` and ``evaluate_official``
-            share.
-
-    Returns:
-        All numbers, and the data of figures; None for the official file, which holds no scans.
-    """
+    """Generated scenes beside a reference of either kind."""
     if isinstance(statistics, OfficialStatistics):
         return evaluate_official(scenes, statistics, spaces, **options), None
     comparison = evaluate(scenes, statistics, spaces, **options)

@@ -45,12 +45,6 @@ class ReferenceStatistics:
     The halves are of different drives where there are several (see :func:`split_halves`), since
     neighbouring scans of a drive are alike.
 
-    Args:
-        protocol: How scans are prepared.
-        spaces: Cards of the feature spaces by name; each also holds ``dim`` and ``label``.
-        names: Names of all scans, in their order.
-        about: Further facts, such as ``data``, ``split`` and ``commit``.
-
     Attributes:
         halves: Metrics of :func:`scene_metrics` that hold the real scans of a half. Features of up
             to ``num_samples`` scans and images of up to ``num_mmd_references`` are kept, half of
@@ -243,11 +237,7 @@ class ReferenceStatistics:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote, complete or not.
-
-        Raises:
-            ValueError: If the file is missing, damaged or of something else; it is named.
-        """
+        """Reads what ``save`` wrote, complete or not."""
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_ABOUT])
@@ -303,13 +293,6 @@ def complete_reference(
     every: int = _EVERY,
 ) -> ReferenceStatistics:
     """Statistics of scans as a file; goes on where an interrupted call has stopped.
-
-    Args:
-        job: Empty statistics that were prepared for these scans and spaces.
-        scans_from: The scans from a number on, in the order of their names in ``job``.
-        spaces: Those of ``job``.
-        out: File to write; beside it lies ``<name>.partial.safetensors`` until it is complete.
-        every: Scans after which the unfinished file is saved; it also is on an interrupt.
 
     Raises:
         ValueError: If the unfinished file is of another job, another process computes ``out``, or

@@ -97,11 +97,7 @@ class EvaluationTable:
         return tuple(self._columns)
 
     def marks(self, metric: str) -> dict[str, Mark]:
-        """Places of the ranked evaluations in a column, by the name that the table prints.
-
-        Args:
-            metric: One of ``metrics``.
-        """
+        """Places of the ranked evaluations in a column, by the name that the table prints."""
         ranked = {_name(e) for e in self.evaluations if self.rank_published or not e.published}
         left = {name: r for name, r in self._columns[metric].items() if name in ranked}
         marks: dict[str, Mark] = dict.fromkeys(left, Mark())
@@ -330,12 +326,7 @@ def _markdown(text: str) -> str:
 
 
 def report(evaluation: Evaluation, split: str | None) -> str:
-    """All numbers of an evaluation, and below those that the paper has, beside the published.
-
-    Args:
-        evaluation: All numbers.
-        split: Of the reference, ``val`` for the published numbers of the validation drives.
-    """
+    """All numbers of an evaluation, and below those that the paper has, beside the published."""
     text, table = str(evaluation), _beside_published(evaluation, split)
     return text if table is None else f"{text}\n\n{table}"
 
@@ -345,11 +336,6 @@ def save_reports(evaluation: Evaluation, split: str | None, out: Path) -> None:
 
     ``evaluation.json`` and ``metrics.csv`` hold all rows; ``table.md`` and ``table.tex`` the
     distances beside the published ones.
-
-    Args:
-        evaluation: All numbers.
-        split: As for :func:`report`.
-        out: Folder.
     """
     evaluation.save(out / "evaluation.json")
     EvaluationTable((evaluation,)).save(out / "metrics.csv")

@@ -58,31 +58,35 @@ class MetricResult:
 
     def __post_init__(self) -> None:
         """Checks the fields, since results also come from files."""
-        for key in ("name", "unit", "note"):
-            if not isinstance(getattr(self, key), str):
-                raise self._wrong(key, "give a text")
-        if not self.name:
-            raise self._wrong("name", "give the name of the metric")
-        ends: Any = self.interval if self.interval is not None else ()
-        if self.interval is not None and (not isinstance(ends, tuple | list) or len(ends) != 2):
-            raise self._wrong("interval", "give (low, high) or none")
-        for key, numbers in (("value", [self.value]), ("floor", [self.floor]), ("interval", ends)):
-            if not all(number is None or _is_finite(number) for number in numbers):
-                raise self._wrong(key, "give finite numbers; for a value that is none, None")
-        if None in ends or (ends and ends[0] > ends[1]):
-            raise self._wrong("interval", "give two numbers, the lower end first")
-        if self.floor is not None and self.floor < 0:
-            raise self._wrong("floor", "give the distance of real scans from real scans")
-        if self.value is None and not self.note:
-            raise self._wrong("value", "say in the note why there is none")
-        if self.direction not in get_args(Direction):
-            raise self._wrong("direction", f"give one of {', '.join(get_args(Direction))}")
-        if type(self.scale) is not int:
-            raise self._wrong("scale", "give the power of ten as a whole number")
-        for key in ("num_samples", "num_references"):
-            count = getattr(self, key)
-            if count is not None and (type(count) is not int or count < 1):
-                raise self._wrong(key, "give a count of at least 1, or None if it is unknown")
+        ends: Any = () if self.interval is None else self.interval
+        pair = isinstance(ends, tuple | list) and len(ends) in (0, 2) and all(map(_is_finite, ends))
+        counts = {key: getattr(self, key) for key in ("num_samples", "num_references")}
+        checks: dict[str, tuple[Any, str]] = {
+            "name": (isinstance(self.name, str) and self.name, "give the name of the metric"),
+            "unit": (isinstance(self.unit, str), "give a text"),
+            "note": (isinstance(self.note, str), "give a text"),
+            "interval": (
+                pair and (self.interval is None or ends) and list(ends) == sorted(ends),
+                "give two finite numbers, the lower end first, or None",
+            ),
+            "value": (
+                _is_finite(self.value) or (self.value is None and self.note),
+                "give a finite number, or None and say in the note why there is none",
+            ),
+            "floor": (
+                self.floor is None or (_is_finite(self.floor) and self.floor >= 0),
+                "give the distance of real scans from real scans, or None",
+            ),
+            "direction": (self.direction in get_args(Direction), "give lower or higher"),
+            "scale": (type(self.scale) is int, "give the power of ten as a whole number"),
+        }
+        for key, count in counts.items():
+            valid = count is None or (type(count) is int and count >= 1)
+            checks[key] = (valid, "give a count of at least 1, or None if it is unknown")
+        for key, (ok, advice) in checks.items():
+            if not ok:
+                given = getattr(self, key)
+                raise ValueError(f"metric {self.name!r}: {key} is {given!r}; {advice}")
         object.__setattr__(self, "interval", tuple(ends) or None)
 
     @property
@@ -100,12 +104,6 @@ class MetricResult:
 
         The half widths of independent values add in squares. What is not known counts as 0: two
         values without interval and floor tie only if they are equal.
-
-        Args:
-            other: Same metric of another evaluation.
-
-        Raises:
-            ValueError: If one of the values is None.
         """
         if self.value is None or other.value is None:
             raise ValueError(f"{self.name}: a value that is None ties with nothing; leave it out")
@@ -113,36 +111,29 @@ class MetricResult:
         allowed = max(allowed, self.floor or 0.0, other.floor or 0.0)
         return abs(self.value - other.value) <= allowed
 
-    def _wrong(self, key: str, advice: str) -> ValueError:
-        return ValueError(f"metric {self.name!r}: {key} is {getattr(self, key)!r}; {advice}")
-
 
 class About(TypedDict):
-    """Where the numbers of an evaluation come from; None for what is unknown or does not apply."""
+    """Where the numbers of an evaluation come from; None for what is unknown or does not apply.
 
-    #: Card of the backbone by metric: backbone, layer, hash of the weights, preprocessing.
+    ``backbones`` has the card of each feature network (layer, hash of the weights, preprocessing),
+    ``reference`` split, count and hash of the names of the real scans, ``precision`` the number
+    format of the samples, ``commit`` the version of the code that computed the numbers,
+    ``feature_source`` what the generator was aligned to, ``source`` the files of the samples or
+    the line of the publication, and ``extra`` anything else. ``bad_samples`` in ``extra`` lists
+    the samples that were left out, each with the reason.
+    """
+
     backbones: dict[str, dict[str, Any]]
-    #: Fields of the protocol, its name among them.
     protocol: dict[str, Any]
-    #: Real scans that were compared with: split, count, hash of the names.
     reference: str
-    #: Sampler of the generated scans.
     solver: str | None
-    #: Solver steps.
     steps: int | None
     seed: int | None
-    #: Number format in which the samples were made.
     precision: str | None
-    #: Version of the code that computed the numbers.
     commit: str | None
-    #: Features that the generator was aligned to.
     feature_source: str | None
-    #: Taken from a publication instead of computed.
     published: bool
-    #: Files of the samples, or the line of the publication.
     source: str
-    #: Anything else worth keeping, such as weight averaging or guidance. ``bad_samples`` lists the
-    #: samples that could not be used and were left out, each with the reason.
     extra: dict[str, Any]
 
 
@@ -206,16 +197,9 @@ class Evaluation:
         """
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
         table = text_table(map(_cells, self.rows), heads, align="lrrrlrrl")
-        extra = {**self.about["extra"]}
-        bad, head = (
-            extra.pop("bad_samples", []),
-            [extra.pop("verdict", ""), extra.pop("warning", "")],
-        )
-        head = [
-            f"{name}: {text}"
-            for name, text in zip(("verdict", "warning"), head, strict=True)
-            if text
-        ]
+        extra = dict(self.about["extra"])
+        head = [f"{key}: {extra.pop(key)}" for key in ("verdict", "warning") if extra.get(key)]
+        bad = extra.pop("bad_samples", [])
         about = {**self.about, "protocol": self.about["protocol"].get("name"), **extra}
         lines = [
             f"{key}: {value}"
@@ -223,10 +207,8 @@ class Evaluation:
             if isinstance(value, str | int | float) and not isinstance(value, bool)
         ]
         if bad:
-            lines += [
-                f"samples that cannot be used and are left out: {len(bad)}",
-                *bad[:_SHOWN_BAD],
-            ]
+            lines.append(f"samples that cannot be used and are left out: {len(bad)}")
+            lines += bad[:_SHOWN_BAD]
         if len(bad) > _SHOWN_BAD:
             lines.append(f"and {len(bad) - _SHOWN_BAD} more")
         return "\n".join([self.label, *head, "", table, "", *lines])
@@ -239,12 +221,7 @@ class Evaluation:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote.
-
-        Raises:
-            ValueError: If the file is no JSON, or a key is missing, unknown or not as it must be;
-                the error names file and key.
-        """
+        """Reads what ``save`` wrote."""
         try:
             return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
         except ValueError as error:
@@ -271,12 +248,6 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
     neither intervals nor floors, nor the number of references of the other metrics.
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
-
-    Args:
-        split: Real scans that the samples were compared with.
-
-    Raises:
-        ValueError: If there is no such split.
     """
     if split not in get_args(Split):
         raise ValueError(f"split is {split!r}; the paper has {', '.join(get_args(Split))}")

@@ -107,12 +107,6 @@ def usable_scenes(
 ) -> Iterator[EvaluationScene]:
     """Scenes through the sensor, as long as every metric can use them.
 
-    Args:
-        scenes: As files or a generator give them.
-        protocol: How they are prepared.
-        bad: Takes the messages of the scenes that are left out. Where None, the first one stops.
-        advice: Added to the message that stops.
-
     Raises:
         ValueError: As :func:`through_sensor`, or if nothing lies on the grid seen from above.
     """

@@ -93,13 +93,6 @@ def scene_features(
 ) -> SceneFeatures:
     """Feature space by its name.
 
-    Args:
-        name: One of :data:`SPACES`.
-        ckpt: Official ``model.ckpt`` of the first four; of ``fwid`` other weights than those of
-            the package.
-        protocol: Sensor, cast of LIP-Loc's pictures, and size of voxels.
-        device: Where the network computes.
-
     Raises:
         ValueError: If the name is unknown, a file is missing, given where there are no weights, or
             holds something else; the message names it.

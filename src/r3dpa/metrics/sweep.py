@@ -88,16 +88,7 @@ class Sweep:
 
 
 def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
-    """Ring structure of the returns of one scan.
-
-    Args:
-        points: ``(P, 3)`` metres, returns only, in storage order.
-        sensor: Tells ring order from other orders, see ``rings_in_order``.
-
-    Returns:
-        The structure, or None where the scan is not stored ring after ring (highest first, azimuth
-        growing) or has hardly any neighbours.
-    """
+    """Ring structure of the returns of one scan."""
     inclination, azimuth = angles_of(torch.from_numpy(points))
     try:
         in_order, num_rings = rings_in_order(inclination, azimuth, sensor)
@@ -140,13 +131,6 @@ def fit_ground(points: Floats) -> Ground | None:
     """Ground plane around the car by least squares in a band that narrows step by step.
 
     Starts from a level plane 1.73 m below the sensor, the mount of KITTI and KITTI-360.
-
-    Args:
-        points: ``(P, 3)`` metres.
-
-    Returns:
-        The plane, or None where fewer than 500 returns between 3 and 20 m lie near it, or where
-        it is steeper than 20 %.
     """
     distance = np.hypot(points[:, 0], points[:, 1])
     near = points[(distance > GROUND_DISTANCES_M[0]) & (distance < GROUND_DISTANCES_M[1])]
@@ -187,14 +171,7 @@ class Surfaces:
 def surfaces_of(
     points: Floats, range_m: Floats, sweep: Sweep, ground_plane: Ground | None
 ) -> Surfaces:
-    """Surfaces met by the returns of one scan.
-
-    Args:
-        points: ``(P, 3)`` metres in the order of the sweep.
-        range_m: ``(P,)`` their distances.
-        sweep: Ring structure.
-        ground_plane: None where no plane was found; nothing is ground then.
-    """
+    """Surfaces met by the returns of one scan."""
     num_points = len(points)
     is_ground = np.zeros(num_points, dtype=bool)
     if ground_plane is not None:
