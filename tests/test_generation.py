@@ -236,6 +236,7 @@ def test_autoguidance_is_the_written_out_formula():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_compiled_networks_draw_the_same_scenes():
     """Fused kernels round in another order; no shape is met twice, so nothing recompiles."""
     options = {"batch_size": 3, "decode_batch_size": 2, "compile": True}

@@ -10,18 +10,28 @@ A test looks like this::
         naive(f"bfloat16 cosine off by {error:.1e}")
 
 Parameters that are dtypes are the precisions of the list; ``precision="float64"`` in the marker
-says it for a test without them (float32 if left out).
+gives it for a test without them (default: float32). ``elsewhere.csv`` lists the marked tests of
+other folders, and cases without a test with the reason.
 """
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
 import torch
-from rows import ROWS, SECTIONS, Row
 
-_ROW, _NAIVE, _PRECISION = "numerics row", "numerics naive", "numerics precision"
+SECTIONS = {
+    1: "Interpolant and sampler",
+    2: "Feature guidance",
+    3: "Range image",
+    4: "VAE and GAN",
+    5: "Latent statistics and EMA",
+    6: "Alignment loss",
+    7: "Optimisation, distribution, resume",
+    8: "Metrics",
+}
 
 
 @pytest.fixture
@@ -29,35 +39,32 @@ def naive(request):
     """``naive(text)``: record how the naive computation failed, once the test has asserted it."""
 
     def record(text: str) -> None:
-        request.node.user_properties.append((_NAIVE, text))
+        request.node.user_properties.append(("naive", text))
 
     return record
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem):
-    """Add row and precision to the report; a test that names a row must record a failure."""
+    """Adds case and precision to the report; a test that names a case must record a failure."""
     mark = pyfuncitem.get_closest_marker("numerics")
     if mark is None or not mark.kwargs:
-        bare = mark in pyfuncitem.own_markers
-        if bare and not getattr(pyfuncitem.obj, "is_hypothesis_test", False):
-            pytest.fail("a test that is no property must name its hard case in the marker")
         return (yield)
     given = getattr(pyfuncitem, "callspec", None)
     dtypes = [p for p in (given.params if given else {}).values() if isinstance(p, torch.dtype)]
     names = [str(dtype).removeprefix("torch.") for dtype in dtypes]
     pyfuncitem.user_properties += [
-        (_ROW, (mark.kwargs["section"], mark.kwargs["case"])),
-        (_PRECISION, " ".join(names) or mark.kwargs.get("precision", "float32")),
+        ("case", (mark.kwargs["section"], mark.kwargs["case"])),
+        ("precision", " ".join(names) or mark.kwargs.get("precision", "float32")),
     ]
     result = yield
-    if not any(key == _NAIVE for key, _ in pyfuncitem.user_properties):
+    if not any(key == "naive" for key, _ in pyfuncitem.user_properties):
         pytest.fail("the test names a hard case but recorded no failure of the naive computation")
     return result
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Write the list of cases to the file of ``--numerics-list``, of the tests that ran."""
+    """Writes the list of cases to the file of ``--numerics-list``, of the tests that ran."""
     path = config.getoption("--numerics-list", default=None)
     if path is not None:
         reports = [
@@ -71,42 +78,33 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 def _list(reports: list[pytest.TestReport]) -> str:
-    """Markdown: a table per section of what ran, and the rows that were left out."""
-    covered, lines = 0, list[str]()
-    for section, title in SECTIONS.items():
-        lines += ["", f"## {section}. {title}", ""]
-        lines += ["| case | test | naive failure seen | passes in |", "| --- | --- | --- | --- |"]
-        for row in (row for row in ROWS if row.section == section):
-            entries = _entries(row, reports)
-            covered += bool(entries)
-            lines += [f"| {row.case} | {' | '.join(entry)} |" for entry in entries]
-    left_out = [row for row in ROWS if row.left_out]
-    lines += ["", "## Left out", ""]
-    lines += [f"- {row.section}. {row.case}: {row.left_out}" for row in left_out]
-    rows_seen = f"{covered} of {len(ROWS)} rows have tests that ran; {len(left_out)} are left out."
-    return "\n".join(["# Hard numerical cases", "", rows_seen, *lines]) + "\n"
-
-
-def _entries(row: Row, reports: list[pytest.TestReport]) -> list[tuple[str, str, str]]:
-    """Test, naive failure and precisions of every test of a row that ran."""
+    """Markdown: a table per section of the tests that ran, and the cases that are left out."""
     runs: dict[str, list[pytest.TestReport]] = {}
     for report in reports:
         runs.setdefault(report.nodeid.partition("[")[0], []).append(report)
-    entries = []
+    with (Path(__file__).parent / "elsewhere.csv").open(encoding="utf-8") as file:
+        others = list(csv.DictReader(file))
+    found: dict[tuple[int, str], list[tuple[str, str, str]]] = {}
     for test, its_runs in runs.items():
-        if (_ROW, (row.section, row.case)) in its_runs[0].user_properties:
-            texts = [t for run in its_runs for key, t in run.user_properties if key == _NAIVE]
-            names = [
-                name if run.passed else f"{name} FAILED"
-                for run in its_runs
-                for key, name in run.user_properties
-                if key == _PRECISION
-            ]
-            entries.append((test, "; ".join(dict.fromkeys(texts)), ", ".join(dict.fromkeys(names))))
-    for other in row.elsewhere:
-        its_runs = runs.get(f"tests/{other.test}", [])
-        if its_runs:
-            passed = all(run.passed for run in its_runs)
-            names = [other.precisions if passed else f"{other.precisions} FAILED"]
-            entries.append((f"tests/{other.test}", other.naive, *names))
-    return [(Path(test).name, text.replace("|", "\\|"), names) for test, text, names in entries]
+        properties = [dict(run.user_properties) | {"ok": run.passed} for run in its_runs]
+        if "case" in properties[0]:
+            texts = dict.fromkeys(p.get("naive", "") for p in properties)
+            names = dict.fromkeys(p["precision"] + " FAILED" * (not p["ok"]) for p in properties)
+            row = (test, "; ".join(texts), ", ".join(names))
+            found.setdefault(properties[0]["case"], []).append(row)
+    for other in (other for other in others if other["test"] in runs):
+        passed = all(run.passed for run in runs[other["test"]])
+        row = (other["test"], other["naive"], other["precisions"] + " FAILED" * (not passed))
+        found.setdefault((int(other["section"]), other["case"]), []).append(row)
+    lines = ["# Hard numerical cases", "", f"{len(found)} cases have tests that ran."]
+    for section, title in SECTIONS.items():
+        lines += ["", f"## {section}. {title}", ""]
+        lines += ["| case | test | naive failure seen | passes in |", "| --- | --- | --- | --- |"]
+        for (own, case), rows in found.items():
+            for test, text, names in rows if own == section else ():
+                cells = (case, Path(test).name, text.replace("|", "\\|"), names)
+                lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", "## Left out", ""]
+    left_out = [other for other in others if not other["test"]]
+    lines += [f"- {other['section']}. {other['case']}: {other['naive']}" for other in left_out]
+    return "\n".join(lines) + "\n"
