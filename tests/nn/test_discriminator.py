@@ -22,19 +22,6 @@ def test_patch_of_the_default_depth_has_34_pixels():
     assert columns.max() - columns.min() + 1 == 34
 
 
-def test_full_size_has_the_parameters_of_the_paper():
-    with torch.device("meta"):
-        network = PatchDiscriminator()
-    assert sum(weight.numel() for weight in network.parameters()) == 661_313
-
-
-def test_every_parameter_and_the_image_receive_gradients():
-    network, image = PatchDiscriminator(channels=4), torch.randn(2, 1, 16, 64, requires_grad=True)
-    network(image).square().sum().backward()
-    assert all(weight.grad.abs().sum() > 0 for weight in network.parameters())
-    assert image.grad.abs().sum() > 0
-
-
 def test_fresh_weights_follow_pix2pix():
     torch.manual_seed(0)
     network = PatchDiscriminator()

@@ -122,14 +122,6 @@ def test_copied_statistics_keep_up_with_a_drifting_vae(sit, norm):
     assert deviation["decay"] == pytest.approx(-0.039, abs=0.003)
 
 
-def test_fixed_position_table_is_not_averaged_away(sit, norm):
-    """A buffer that never changes stays as it is, whatever the number of updates."""
-    ema = EMA(sit, norm, DECAY, "decay")
-    for _ in range(10):
-        ema.update(sit, norm)
-    torch.testing.assert_close(ema.sit.pos_embed, sit.pos_embed, atol=1e-7, rtol=0)
-
-
 def test_reset_takes_the_present_weights(sit, norm):
     ema = EMA(fill(sit, 2.0), norm)
     fill(sit, 6.0)

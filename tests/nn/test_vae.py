@@ -24,16 +24,6 @@ def test_latents_are_smaller_by_the_product_of_the_strides(vae):
     assert vae.decode(posterior.mean).shape == (2, 1, 8, 64)
 
 
-@pytest.mark.parametrize(
-    "strides", [((1, 4), (2, 1)), ((2, 2), (1, 2))], ids=lambda strides: str(strides)
-)
-def test_any_strides_of_the_layers_give_back_the_image_size(strides):
-    vae = VAE(1, 4, 32, (1, 1, 2), strides, num_res_blocks=1)
-    latents = vae.encode(torch.randn(1, 1, 8, 32)).mean
-    assert tuple(latents.shape[-2:]) == vae.latent_size((8, 32))
-    assert vae.decode(latents).shape == (1, 1, 8, 32)
-
-
 @pytest.mark.parametrize("columns", [1, 3, 7])
 @torch.no_grad()
 def test_rotating_the_scan_rotates_the_latents_and_back(vae, columns):

@@ -18,6 +18,7 @@ SIZES = {
         "depth": 3,
         "num_heads": 2,
         "alignment_depth": 2,
+        "qk_norm": True,
     },
     UNet: {
         "input_size": (4, 16),

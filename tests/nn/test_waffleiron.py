@@ -1,5 +1,6 @@
 import pickle
 
+import numpy as np
 import pytest
 import torch
 
@@ -60,6 +61,22 @@ def test_voxel_keeps_its_first_point_and_the_border_is_left_out():
     assert scan.cells[:, 1].tolist() == [7 * 16 + 8, 7 * 4 + 2, 8 * 4 + 2]
     # Three points: two neighbours each, the farthest repeated.
     assert scan.neighbors.tolist() == [[1, 2, 2, 2], [0, 2, 2, 2], [0, 1, 1, 1]]
+
+
+def test_cells_of_unequal_edges():
+    """64 x 60 x 8 m in 64 x 48 x 16 cells: planes of 64 x 48, 64 x 16 and 48 x 16."""
+    grid = ScanGrid((-32.0, -30.0, -4.0), (32.0, 30.0, 4.0), (1.0, 1.25, 0.5), num_neighbors=1)
+    assert grid.cells == (64, 48, 16)
+    scan = prepare_scan(np.array([[1.5, -3.0, 0.6, 0.2], [-32.5, 0, 0, 0]]), grid)
+    x, y, z = 33, 21, 9  # of 33.5, 27 and 4.6 m from the lowest corner
+    assert scan.cells[:, 0].tolist() == [x * 48 + y, x * 16 + z, y * 16 + z]
+    network = WaffleIron(4, 3, grid.cells)
+    assert network.plane_sizes == [(64, 48), (64, 16), (48, 16)]
+    assert network(collate_scans([scan, scan])).shape == (2, 4)
+    with pytest.raises(ValueError, match="whole number"):
+        ScanGrid(cell_m=(1.0, 1.0, 0.3))
+    with pytest.raises(ValueError, match="cell_m must be positive"):
+        ScanGrid(cell_m=(1.0, 0.0, 1.0))
 
 
 def test_neighbours_agree_with_all_distances():

@@ -181,6 +181,19 @@ def test_unet_of_another_size_comes_from_an_official_file(case, close):
     close(velocity.detach(), case["out/inference/v"])
 
 
+def test_unet_attention_resolutions_are_inferred_from_an_official_file():
+    unet = UNet((4, 16), 3, 32, (1, 2, 1), 1, 16, 5, 12, attention_resolutions=[2, 4])
+    norm = LatentNorm(3)
+    weights = {k.replace("projector.", "projectors.0."): v for k, v in unet.state_dict().items()}
+    weights |= {f"bn.{key}": value for key, value in norm.state_dict().items()}
+    checkpoint = from_official({"ema": weights}, Path("a.pt"), sit_args={"head_channels": 16})
+    state = checkpoint.network("ema")
+    assert list(state.arguments["attention_resolutions"]) == [2, 4]
+    latents, time = torch.randn(2, 3, 4, 16), torch.rand(2)
+    features = unet.project_features(latents, time)
+    assert torch.equal(state.build().project_features(latents, time), features)
+
+
 def test_unet_official_file_without_a_key_is_refused(official_listing):
     shapes = dict(official_listing("unet_state_dicts")["UNet_small"]["state_dict"])
     del shapes["middle_block.1.qkv.bias"]

@@ -20,6 +20,7 @@ __all__ = [
     "CircularConv2d",
     "Downsample",
     "GroupNorm",
+    "Mlp",
     "ResBlock",
     "SelfAttention",
     "SyncedBatchNorm2d",
@@ -240,6 +241,26 @@ class SelfAttention(nn.Module):
         query, key = self.q_norm(query).to(value.dtype), self.k_norm(key).to(value.dtype)
         mixed = F.scaled_dot_product_attention(query, key, value)
         return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
+
+
+class Mlp(nn.Module):
+    """Two linear layers around a GELU, exact or its ``tanh`` approximation."""
+
+    def __init__(
+        self,
+        width: int,
+        hidden: int,
+        linear: Callable[[int, int], nn.Linear] = nn.Linear,
+        approximate: str = "none",
+    ) -> None:
+        super().__init__()
+        self.fc1 = linear(width, hidden)
+        self.fc2 = linear(hidden, width)
+        self.approximate = approximate
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """``(B, N, D)`` to the same shape."""
+        return self.fc2(F.gelu(self.fc1(tokens), approximate=self.approximate))
 
 
 class SyncedBatchNorm2d(nn.BatchNorm2d):

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import SelfAttention, at_least_float32
+from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32
 from r3dpa.nn.velocity_network import (
     TIME_WIDTH,
     VelocityNetwork,
@@ -269,16 +269,6 @@ class _ClassEmbedding(nn.Module):
         return self.embedding_table(labels)
 
 
-class _Mlp(nn.Module):
-    def __init__(self, hidden_size: int, mlp_size: int) -> None:
-        super().__init__()
-        self.fc1 = _xavier_linear(hidden_size, mlp_size)
-        self.fc2 = _xavier_linear(mlp_size, hidden_size)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(tokens), approximate="tanh"))
-
-
 def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:
     return nn.Sequential(nn.SiLU(), _zero(nn.Linear(hidden_size, num_vectors * hidden_size)))
 
@@ -296,7 +286,7 @@ class _Block(nn.Module):
     def __init__(self, hidden_size: int, num_heads: int, mlp_ratio: float, qk_norm: bool) -> None:
         super().__init__()
         self.attn = SelfAttention(hidden_size, num_heads, qk_norm, _xavier_linear)
-        self.mlp = _Mlp(hidden_size, int(hidden_size * mlp_ratio))
+        self.mlp = Mlp(hidden_size, int(hidden_size * mlp_ratio), _xavier_linear, "tanh")
         self.adaLN_modulation = _modulation(hidden_size, 6)
 
     def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Self
 
@@ -28,6 +28,7 @@ from r3dpa.nn.layers import (
 __all__ = ["VAE", "Posterior"]
 
 Size = tuple[int, int]
+LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
 class _StraightThroughClamp(torch.autograd.Function):
@@ -140,10 +141,12 @@ class VAE(nn.Module):
         widths = [channels * multiplier for multiplier in channel_multipliers]
         steps = [(rows, columns) for rows, columns in strides]
         attention = [level in attention_levels for level in range(num_levels)]
-        levels = (widths, steps, attention)
-        self.encoder = _Encoder(in_channels, 2 * latent_channels, *levels, num_res_blocks)
+        shallower, deeper = [widths[0], *widths[:-1]], [*widths[1:], widths[-1]]
+        down = list(zip(shallower, widths, attention, [*steps, None], strict=True))
+        up = list(zip(deeper, widths, attention, [None, *steps], strict=True))
+        self.encoder = _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks)
         self.decoder = _Decoder(
-            latent_channels, in_channels, *levels, num_res_blocks + 1, legacy_upsample
+            latent_channels, in_channels, up, num_res_blocks + 1, legacy_upsample
         )
         self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
@@ -190,24 +193,15 @@ class VAE(nn.Module):
 
 class _Encoder(nn.Module):
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        widths: list[int],
-        strides: list[Size],
-        attention: list[bool],
-        num_blocks: int,
+        self, in_channels: int, out_channels: int, levels: Sequence[LevelSizes], num_blocks: int
     ) -> None:
         super().__init__()
-        self.conv_in = CircularConv2d(in_channels, widths[0], (3, 3))
-        before = [widths[0], *widths[:-1]]
-        self.down = nn.ModuleList(
-            _down_level(*level, num_blocks)
-            for level in zip(before, widths, attention, [*strides, None], strict=True)
-        )
-        self.mid = _Middle(widths[-1])
-        self.norm_out = GroupNorm(widths[-1])
-        self.conv_out = CircularConv2d(widths[-1], out_channels, (3, 3))
+        first, last = levels[0][1], levels[-1][1]
+        self.conv_in = CircularConv2d(in_channels, first, (3, 3))
+        self.down = nn.ModuleList(_down_level(*level, num_blocks) for level in levels)
+        self.mid = _Middle(last)
+        self.norm_out = GroupNorm(last)
+        self.conv_out = CircularConv2d(last, out_channels, (3, 3))
 
     def forward(self, image: Tensor) -> Tensor:
         hidden = self.conv_in(image)
@@ -221,22 +215,17 @@ class _Decoder(nn.Module):
         self,
         in_channels: int,
         out_channels: int,
-        widths: list[int],
-        strides: list[Size],
-        attention: list[bool],
+        levels: Sequence[LevelSizes],
         num_blocks: int,
-        legacy_upsample: bool,
+        legacy: bool,
     ) -> None:
         super().__init__()
-        self.conv_in = CircularConv2d(in_channels, widths[-1], (3, 3))
-        self.mid = _Middle(widths[-1])
-        before = [*widths[1:], widths[-1]]
-        self.up = nn.ModuleList(  # index 0 is the full resolution, as in the encoder
-            _up_level(*level, num_blocks, legacy_upsample)
-            for level in zip(before, widths, attention, [None, *strides], strict=True)
-        )
-        self.norm_out = GroupNorm(widths[0])
-        self.conv_out = WideCircularConv2d(widths[0], out_channels, (1, 4))
+        first, last = levels[0][1], levels[-1][1]  # level 0 has the full resolution
+        self.conv_in = CircularConv2d(in_channels, last, (3, 3))
+        self.mid = _Middle(last)
+        self.up = nn.ModuleList(_up_level(*level, num_blocks, legacy) for level in levels)
+        self.norm_out = GroupNorm(first)
+        self.conv_out = WideCircularConv2d(first, out_channels, (1, 4))
 
     def forward(self, latents: Tensor) -> Tensor:
         hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))

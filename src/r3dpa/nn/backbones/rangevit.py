@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -124,17 +124,15 @@ class RangeViT(nn.Module):
         sensor: LidarSensor | None = None,
         *,
         num_heads: int | None = None,
-        trained_size: Size = (64, 384),
-        patch_size: Size = (2, 8),
+        **sizes: Any,
     ) -> Self:
-        """Network with the weights of an official checkpoint, which determine the other sizes.
+        """Network with the weights of an official checkpoint, which determine most sizes.
 
         Args:
             path: ``model.ckpt`` of the release.
             sensor: Image size, field of view and range limits. Default: those of R3DPA.
             num_heads: Attention heads. Default: those of the released ViT of this width.
-            trained_size: Rows and columns of the images in training.
-            patch_size: Rows and columns of a patch.
+            **sizes: ``trained_size`` and ``patch_size``, if not those of the release.
 
         Raises:
             ValueError: If the file is missing or unreadable, or if a weight is missing, left over
@@ -153,8 +151,7 @@ class RangeViT(nn.Module):
                 stem_channels,
                 skip_channels,
                 _shape(weights, f"{_DECODER}conv_output.0.weight")[0],
-                trained_size,
-                patch_size,
+                **sizes,
             )
             load_official(network, weights)
         except ValueError as error:
@@ -172,23 +169,16 @@ class RangeViT(nn.Module):
             range_m: ``(B, H, W)`` metres, ``EMPTY_RANGE_M`` without a return.
             intensity: ``(B, H, W)`` in [0, 1]; read with ``in_channels`` 5 only.
         """
-        bands = reduce(
-            self.feature_map(range_m, intensity),
-            "B C (band row) W -> B C band",
-            "mean",
-            row=self.band_rows,
-        )
-        return bands.flatten(1)
+        features = self.feature_map(range_m, intensity)
+        return reduce(features, "B C (band row) W -> B (C band)", "mean", row=self.band_rows)
 
     def feature_map(self, range_m: Tensor, intensity: Tensor | None = None) -> Tensor:
         """Result of the decoder ``(B, C, H, W)``; arguments as of :meth:`forward`."""
         if self.in_channels == len(_MEAN) and intensity is None:
             raise ValueError("this network reads the intensity: give it beside the range images")
-        channels = range_channels(range_m, self.sensor, intensity)
-        image = (channels - self.image_mean[:, : channels.shape[1]]) / (
-            self.image_std[:, : channels.shape[1]]
-        )
-        skip = self.stem(image[:, : self.in_channels])
+        channels = range_channels(range_m, self.sensor, intensity)[:, : self.in_channels]
+        used = channels.shape[1]
+        skip = self.stem((channels - self.image_mean[:, :used]) / self.image_std[:, :used])
         tokens = self.norm(self.encoder(self.embed(skip)))[:, 1:]
         rows, columns = self.patch_size
         tokens = rearrange(tokens, "B (h w) D -> B D h w", h=self.sensor.beams // rows)

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import SelfAttention
+from r3dpa.nn.layers import Mlp, SelfAttention
 
 _HEAD_WIDTH = 64  # of every released ViT
 _MLP_RATIO = 4
@@ -94,7 +94,7 @@ class Block(nn.Module):
         self.attn = SelfAttention(width, num_heads)
         self.ls1 = _Scale(width) if layer_scale else nn.Identity()
         self.norm2 = nn.LayerNorm(width, norm_eps)
-        self.mlp = _Mlp(width)
+        self.mlp = Mlp(width, _MLP_RATIO * width)
         self.ls2 = _Scale(width) if layer_scale else nn.Identity()
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -110,13 +110,3 @@ class _Scale(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         return tokens * self.gamma
-
-
-class _Mlp(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(width, _MLP_RATIO * width)
-        self.fc2 = nn.Linear(_MLP_RATIO * width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(tokens)))
