@@ -94,8 +94,8 @@ class TestData:
         page = page_data(scan_page([example()], "", SEMANTICS, ORIGINS | {9: Category("sun")}))
         assert page["categories"]["semantic"] == [
             [7, "road", "#102030"],
-            [26, "car", PALETTE[1]],
-            [33, "number 33", PALETTE[2]],
+            [26, "car", PALETTE[0]],
+            [33, "number 33", PALETTE[1]],
         ]
         assert page["categories"]["origin"] == [[0, "surface", "#56606e"], [6, "rain", "#4e9bff"]]
 
@@ -373,7 +373,7 @@ class TestScript:
         sensor = LidarSensor()
         painted = paint(np.array(drawn["exact"]), PAGE_RANGE_MAP, range_scale(sensor))
         assert drawn["range"] == packed(painted.astype(np.int64))
-        colours = {7: 0xFF302010, 26: 0, 33: packed(np.array([0x3D, 0xDC, 0x97]))}
+        colours = {7: 0xFF302010, 26: 0, 33: packed(np.array([0xFF, 0xB0, 0x00]))}
         semantic = (scan.labels & 0xFFFF).tolist()
         assert drawn["semantic"] == [colours[number] for number in semantic]
         instances = (scan.labels >> 16).tolist()

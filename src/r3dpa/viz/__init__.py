@@ -17,12 +17,17 @@ from r3dpa.viz.features import (
     pca_colours,
     similarity_picture,
 )
-from r3dpa.viz.figures import birds_eye_view, reconstruction_figure, scenes_sheet
+from r3dpa.viz.figures import (
+    birds_eye_sheet,
+    birds_eye_view,
+    range_strips,
+    reconstruction_figure,
+    scenes_sheet,
+)
 from r3dpa.viz.page import Category, PageScan, scan_page
 from r3dpa.viz.pareto import ParetoPoint, discretisation_figure, pareto_figure
-from r3dpa.viz.pixels import save
+from r3dpa.viz.pixels import palette_image, save
 from r3dpa.viz.scans import birds_eye_picture, encoded_picture, range_image_picture, scene_3d
-from r3dpa.viz.sheets import birds_eye_sheet, range_strips
 
 __all__ = [
     "Category",
@@ -45,6 +50,7 @@ __all__ = [
     "latents_picture",
     "loss_curves",
     "matches_figure",
+    "palette_image",
     "pareto_figure",
     "pca_colours",
     "range_histogram",

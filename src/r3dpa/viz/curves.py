@@ -17,23 +17,21 @@ Series = tuple[Sequence[float], Sequence[float]]
 
 
 def loss_curves(curves: str | Path | Mapping[str, Series]) -> Figure:
-    """One small panel per logged quantity: every value, faint, and a centred running mean.
+    """One panel per logged quantity: every value, faint, and a centred running mean.
 
     The title of a panel gives the first and the last value. The axis is logarithmic where all
-    values are positive and differ.
+    values are positive and differ. Quantities with a single value are no curve and left out.
 
     Args:
         curves: ``metrics.csv`` of Lightning's ``CSVLogger``, or name -> (steps, values).
-
-    Returns:
-        Figure of up to four panels per row.
 
     Raises:
         ValueError: If there is nothing to draw or the file is not such a table.
     """
     series = curves if isinstance(curves, Mapping) else read_metrics(curves)
+    series = {name: pair for name, pair in series.items() if len(pair[1]) > 1}
     if not series:
-        raise ValueError(f"no logged values in {curves!r}; train with a CSVLogger for some steps")
+        raise ValueError("no quantity with two values or more; train with a CSVLogger for longer")
     columns = min(4, len(series))
     rows = math.ceil(len(series) / columns)
     figure = Figure(figsize=(3.6 * columns + 0.2, 2.6 * rows + 0.2), layout="constrained")
@@ -46,17 +44,10 @@ def loss_curves(curves: str | Path | Mapping[str, Series]) -> Figure:
 
 
 def read_metrics(path: str | Path) -> dict[str, Series]:
-    """Logged quantities of a ``metrics.csv`` of Lightning's ``CSVLogger``.
+    """Quantities of a ``metrics.csv`` of Lightning's ``CSVLogger``: name -> (steps, values).
 
-    A quantity has its own steps: blank and missing cells are left out, and so is a last line
-    without an end, which a run that was stopped while writing leaves.
-
-    Args:
-        path: File whose first line names the columns, ``step`` among them.
-
-    Returns:
-        Name -> (steps, values) in the order of the columns, without ``step`` and ``epoch`` and
-        without columns that hold no value.
+    A quantity has its own steps: blank cells are left out, and so is a last line without an end,
+    which a run that was stopped while writing leaves. ``step`` and ``epoch`` are no quantities.
 
     Raises:
         ValueError: If there is no column ``step``, or a cell is not a number.

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -20,12 +19,10 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from r3dpa.geometry import Projection, points_of
+from r3dpa.viz.figures import range_bar
 from r3dpa.viz.page import PALETTE, Category, PageScan, scan_page
 from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy
-from r3dpa.viz.scans import RANGE_MAP, range_image_picture, range_scale
-from r3dpa.viz.sheets import range_ticks
-
-__all__ = ["EditRow", "edit_page", "edit_sheet"]
+from r3dpa.viz.scans import range_image_picture
 
 _TINT = 0.55  # share of the colour of a part
 _GREY_SHARES = (0.299, 0.587, 0.114)  # of red, green and blue in their brightness
@@ -93,15 +90,7 @@ def edit_sheet(
         axes.set(xticks=[], yticks=[])
         axes.set_title(row.name, loc="left", fontsize=10, parse_math=False)
     _azimuth_ticks(cells[-1], projection)
-    figure.colorbar(
-        ScalarMappable(range_scale(sensor), RANGE_MAP),
-        ax=list(cells),
-        label="range (m)",
-        ticks=range_ticks(sensor),
-        format="%g",
-        pad=0.01,
-        aspect=9 * len(rows),
-    )
+    range_bar(figure, sensor, ax=list(cells), pad=0.01, aspect=9 * len(rows))
     if part_names:
         handles = [Patch(color=c, label=n) for n, c in zip(part_names, colours, strict=True)]
         figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
@@ -116,7 +105,9 @@ def edit_page(
     projection: Projection,
     title: str,
 ) -> str:
-    """Page with the results beside the first scan, their points coloured by part if wanted.
+    """HTML page with the results beside the first scan, their points coloured by part if wanted.
+
+    It opens on the first result; the scans come after the results.
 
     Args:
         before: Range images ``(H, W)`` of the scans by name; may be none.
@@ -125,9 +116,6 @@ def edit_page(
         part_names: Names of the parts by number.
         projection: Makes the points.
         title: Of the page.
-
-    Returns:
-        HTML, see :func:`r3dpa.viz.scan_page`.
 
     Raises:
         ValueError: If nothing holds a return.
@@ -141,7 +129,7 @@ def edit_page(
             labels = parts[:, order][(image[:, order] > 0).numpy()].astype(np.uint32)
         return PageScan(name, points_of(image, projection), labels)
 
-    images = {**before, **after}
+    images = {**after, **before}
     shown = [
         scan(name, image) for name, image in images.items() if (as_numpy(image, _AXES) > 0).any()
     ]

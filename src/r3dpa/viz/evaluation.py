@@ -1,6 +1,7 @@
 """Figures of an evaluation: where samples and real scans differ, and what matches what.
 
-Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view.
+Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view. Shapes other than
+documented and histograms without counts raise a ``ValueError``.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
+from r3dpa.viz.figures import draw_panorama, range_bar
 from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part, save
-from r3dpa.viz.scans import RANGE_MAP, range_image_picture, range_scale
-from r3dpa.viz.sheets import range_ticks
+from r3dpa.viz.scans import range_image_picture
 
 SAMPLES, REFERENCES = "tab:orange", "tab:blue"
 MAX_CELLS = 250  # drawn along a side; finer histograms are summed over squares of cells
@@ -27,13 +28,7 @@ DECADES = 4  # of the logarithmic scales
 
 
 class MatchedPair(NamedTuple):
-    """A generated scene and the real one that is nearest to it.
-
-    Args:
-        title: Such as the name of the sample and the distance.
-        sample_m: ``(H, W)`` range in metres, not above 0 where there is no return.
-        reference_m: The same of the real scan.
-    """
+    """Title, generated range image ``(H, W)`` in metres, and that of the nearest real scan."""
 
     title: str
     sample_m: Array
@@ -57,12 +52,6 @@ def bev_histograms(
         references: The same of real scans.
         x_m: Limits of x (forward) in metres.
         y_m: Limits of y (left) in metres.
-
-    Returns:
-        Figure of three panels, 16 x 5.4 inches.
-
-    Raises:
-        ValueError: If the shapes differ, or a histogram is empty or has a negative count.
     """
     drawn = _shares(samples, "samples", ("X", "Y"))
     real = _shares(references, "references", ("X", "Y"))
@@ -110,12 +99,8 @@ def bev_histograms(
     panels[0].set_ylabel("x, forward (m)")
     label = f"share of all counts in a cell of {height_m:.3g} x {width_m:.3g} m"
     figure.colorbar(ScalarMappable(share_scale, SHARE_MAP), ax=panels[:2], label=label, shrink=0.8)
-    figure.colorbar(
-        ScalarMappable(difference_scale, "RdBu_r"),
-        ax=panels[2],
-        label="difference of the shares",
-        shrink=0.8,
-    )
+    difference_map = ScalarMappable(difference_scale, "RdBu_r")
+    figure.colorbar(difference_map, ax=panels[2], label="difference of the shares", shrink=0.8)
     return figure
 
 
@@ -137,10 +122,6 @@ def range_histogram(
 
     Returns:
         Figure of two panels: densities, and their ratio to the density of the real scans.
-
-    Raises:
-        ValueError: If the numbers of bins differ, borders do not ascend, or a histogram is empty
-            or has a negative count.
     """
     edges = as_numpy(edges_m, ("K + 1",))
     if len(edges) < 2 or not (np.diff(edges) > 0).all():
@@ -201,17 +182,12 @@ def matches_figure(
 
     Returns:
         Figure, 13 inches wide and about 1.9 inches high for each pair.
-
-    Raises:
-        ValueError: If there is no pair, or the images of a pair have other than one shape
-            ``(H, W)``.
     """
     pairs = [("best", pair) for pair in best] + [("worst", pair) for pair in worst]
     if not pairs:
         raise ValueError("got no pair to draw; give at least one of the best or the worst")
     figure = Figure(figsize=(13.0, 1.9 * len(pairs) + 0.3), dpi=110, layout="constrained")
     blocks = figure.subfigures(len(pairs), 1, squeeze=False).ravel()
-    rows = []
     for block, (kind, pair) in zip(blocks, pairs, strict=True):
         images = [as_numpy(image, ("H", "W")) for image in (pair.sample_m, pair.reference_m)]
         if images[0].shape != images[1].shape:
@@ -220,21 +196,11 @@ def matches_figure(
                 "give two range images of the same sensor"
             )
         cells = block.subplots(2, 1)
-        rows.extend(cells)
-        cells[0].set_title(f"{kind}: {pair.title}", loc="left", fontsize=10, parse_math=False)
         for axes, image, name in zip(cells, images, ("sample", "nearest"), strict=True):
-            axes.imshow(range_image_picture(image, sensor), aspect="auto", interpolation="nearest")
-            axes.set(xticks=[], yticks=[])
+            draw_panorama(axes, range_image_picture(image, sensor))
             axes.set_ylabel(name, fontsize=9)
-        block.colorbar(
-            ScalarMappable(range_scale(sensor), RANGE_MAP),
-            ax=list(cells),
-            label="range (m)",
-            ticks=range_ticks(sensor),
-            format="%g",
-            pad=0.01,
-            aspect=12,
-        )
+        cells[0].set_title(f"{kind}: {pair.title}", loc="left", fontsize=10, parse_math=False)
+        range_bar(block, sensor, ax=list(cells), pad=0.01, aspect=12)
     return figure
 
 

@@ -1,7 +1,8 @@
 """Features and latents as colours.
 
 Letters: P points, N tokens = feature-grid cells, D feature width, F width of point features,
-C latent channels, h w latent size.
+C latent channels, h w latent size. Shapes other than documented and values that are not finite
+raise a ``ValueError``.
 """
 
 from __future__ import annotations
@@ -12,13 +13,12 @@ import numpy as np
 import torch
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from r3dpa.geometry import Projection, range_image
-from r3dpa.viz.figures import EGO_OUTLINE_M
+from r3dpa.viz.figures import draw_birds_eye, draw_panorama
 from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy, bright_part, enlarge, paint
-from r3dpa.viz.scans import birds_eye_picture, scene_3d
+from r3dpa.viz.scans import scene_3d
 
 Rows = NDArray[np.floating]
 
@@ -52,15 +52,7 @@ class FeatureColours:
 
     @classmethod
     def fit(cls, features: Array) -> FeatureColours:
-        """Components of these features.
-
-        Args:
-            features: ``(N, D)``; taken as float32, or float64 where they are wider than that.
-
-        Raises:
-            ValueError: If ``features`` has other than two axes or holds a value that is not
-                finite.
-        """
+        """Components of features ``(N, D)``, in float32 or wider."""
         rows = _checked_rows(features)
         rows = rows[_filled(rows)]
         if not len(rows):
@@ -79,17 +71,7 @@ class FeatureColours:
         return cls(mean, loadings, low, high)
 
     def __call__(self, features: Array) -> NDArray[np.float64]:
-        """Colours of features.
-
-        Args:
-            features: ``(N, D)`` of the width that was fitted.
-
-        Returns:
-            ``(N, 3)`` RGB in [0, 1].
-
-        Raises:
-            ValueError: If the width is another, or as for :meth:`fit`.
-        """
+        """RGB in [0, 1] ``(N, 3)`` of features ``(N, D)`` of the width that was fitted."""
         rows = _checked_rows(features)
         if rows.shape[1] != len(self.mean):
             raise ValueError(
@@ -105,17 +87,7 @@ class FeatureColours:
 
 
 def pca_colours(features: Array) -> NDArray[np.float64]:
-    """First three principal components of features as colours, see :class:`FeatureColours`.
-
-    Args:
-        features: ``(N, D)``; rows of zeros are empty cells and are black.
-
-    Returns:
-        ``(N, 3)`` RGB in [0, 1].
-
-    Raises:
-        ValueError: If ``features`` has other than two axes or holds a value that is not finite.
-    """
+    """RGB ``(N, 3)`` of features ``(N, D)`` by their own :class:`FeatureColours`."""
     return FeatureColours.fit(features)(features)
 
 
@@ -128,14 +100,10 @@ def feature_grid_picture(
         grid: ``(N, D)`` cells row by row, zeros where a cell is empty.
         grid_size: Rows and columns of the grid, with product N.
         scale: Side in pixels of the square drawn for one cell.
-        colours: Components fitted to other features, such as those of the points; by default
-            those of the grid.
+        colours: Components of other features, such as those of the points; of the grid if None.
 
     Returns:
         ``(rows * scale, columns * scale, 3)`` uint8.
-
-    Raises:
-        ValueError: If ``grid`` does not have ``rows * columns`` cells.
     """
     _check_grid(grid, grid_size)
     colours = colours or FeatureColours.fit(grid)
@@ -157,10 +125,6 @@ def similarity_picture(
 
     Returns:
         ``(rows * scale, columns * scale, 3)`` uint8.
-
-    Raises:
-        ValueError: If ``grid`` does not have ``rows * columns`` cells, or the cell is empty or
-            none of the grid.
     """
     _check_grid(grid, grid_size)
     (row, column), (rows, columns) = cell, grid_size
@@ -171,8 +135,7 @@ def similarity_picture(
     chosen = row * columns + column
     if not filled[chosen]:
         raise ValueError(f"cell {cell} is empty; choose one that holds points")
-    lengths = np.where(filled, np.linalg.norm(values, axis=1), 1.0)
-    unit = values / lengths[:, None]
+    unit = values / np.where(filled, np.linalg.norm(values, axis=1), 1.0)[:, None]
     picture = paint(unit @ unit[chosen], SIMILARITY_MAP, Normalize(0.0, 1.0))
     picture[~filled] = 0
     picture = enlarge(picture.reshape(rows, columns, 3), scale)
@@ -209,9 +172,6 @@ def feature_figure(
 
     Returns:
         Figure of 13 x 7.6 inches: from behind and from above, range image, grid.
-
-    Raises:
-        ValueError: If the shapes are not as above, or a feature is not finite.
     """
     colours = FeatureColours.fit(features)
     of_points = colours(features)
@@ -222,17 +182,11 @@ def feature_figure(
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(4.5, 3.1))[:, 0]
     behind, above = upper.subplots(1, 2, width_ratios=(8.6, 4.4))
     image, cells = lower.subplots(2, 1)
-    behind.imshow(scene_3d(points, of_points, size=(480, 920)), aspect="auto")
-    above.imshow(
-        birds_eye_picture(points, extent_m, pixels=480, colours=of_points),
-        extent=(extent_m, -extent_m, -extent_m, extent_m),  # +y is to the left
-    )
-    above.add_patch(Polygon(EGO_OUTLINE_M, facecolor="tab:red", edgecolor="white", lw=0.5))
+    draw_panorama(behind, scene_3d(points, of_points, size=(480, 920)))
+    draw_birds_eye(above, points, extent_m, 480, of_points)
     panorama = as_bytes(nearest.movedim(0, -1).numpy())
-    image.imshow(panorama, aspect="auto", interpolation="nearest")
-    cells.imshow(
-        feature_grid_picture(grid, grid_size, 1, colours), aspect="auto", interpolation="nearest"
-    )
+    draw_panorama(image, panorama)
+    draw_panorama(cells, feature_grid_picture(grid, grid_size, 1, colours))
     beams, columns = panorama.shape[:2]
     for axes, title in (
         (behind, f"{len(xyz):,} points, from behind"),
@@ -246,19 +200,16 @@ def feature_figure(
 
 
 def latents_picture(latents: Array, scale: int = 8) -> Pixels:
-    """Latents of one scene as a picture: principal components of the channels as colours.
+    """Principal components of the channels of latents ``(C, h, w)`` as colours.
 
     Source: R3DPA (ICRA 2026), figure of the effect of end-to-end training on latents.
 
     Args:
-        latents: ``(C, h, w)``, raw or normalised.
+        latents: Of one scene, raw or normalised.
         scale: Side in pixels of the square drawn for one latent pixel.
 
     Returns:
         ``(h * scale, w * scale, 3)`` uint8.
-
-    Raises:
-        ValueError: If ``latents`` has other than three axes.
     """
     channels = as_numpy(latents, ("C", "h", "w"))
     count, *latent_size = channels.shape

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +24,7 @@ from numpy.typing import NDArray
 from r3dpa.geometry import LidarSensor
 from r3dpa.viz.figures import EGO_OUTLINE_M
 from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part
-from r3dpa.viz.scans import HEIGHT_LIMITS_M, HEIGHT_MAP
-from r3dpa.viz.sheets import range_ticks
+from r3dpa.viz.scans import HEIGHT_LIMITS_M, HEIGHT_MAP, range_ticks
 
 #: Step of the coordinates in a page, metres; larger only for a scan that int16 could not hold.
 STEP_M = 0.005
@@ -41,7 +41,7 @@ PALETTE = (
 
 
 class Category(NamedTuple):
-    """What a category number means, and its colour ``#rrggbb`` (one of the palette if None)."""
+    """Name of a category number, and its colour ``#rrggbb`` (one of the palette if None)."""
 
     name: str
     colour: str | None = None
@@ -74,10 +74,9 @@ def scan_page(
 ) -> str:
     """HTML page with one scan at a time, turned, moved and coloured by the reader.
 
-    Coordinates are rounded to steps of 5 mm, so each is off by 2.5 mm at most (for a scan that
-    reaches beyond 163 m: by half of its reach / 32767); intensities to 1/255 of their largest
-    value (at least 1; negative ones become 0). Packed, a scan of 120 000 points takes about half
-    a megabyte.
+    Coordinates are rounded to steps of 5 mm (larger for a scan that reaches beyond 163 m),
+    intensities to 1/255 of their largest value. A scan of 120 000 points takes about half a
+    megabyte.
 
     Args:
         scans: Scans to leaf through, at least one.
@@ -140,20 +139,11 @@ def scan_page(
 
 
 def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
-    """A scan as the page holds it.
+    """Header and data of a scan as the page holds it.
 
     The data are columns, one after the other, deflated (zlib) and in base64: x, y and z as int16
     steps, each the difference from the point before (which wraps around); then, where known,
     semantic and instance as uint16, intensity and origin as uint8. All are little-endian.
-
-    Args:
-        scan: What to pack.
-
-    Returns:
-        Header (``name``, ``count``, ``step_m``, ``intensity_max``, ``columns``), and the data.
-
-    Raises:
-        ValueError: As :func:`scan_page`; the message names the scan.
     """
     points = as_numpy(scan.points, ("P", "3 or 4"))
     count = len(points)
@@ -220,12 +210,16 @@ def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) 
 def _category_rows(
     categories: Mapping[int, Category], used: Sequence[NDArray[np.integer]]
 ) -> list[tuple[int, str, str]]:
-    """Number, name and colour of the categories that occur, and of numbers without a category."""
+    """Number, name and colour of the categories that occur, and of numbers without a category.
+
+    A category without a colour gets one of the palette that no other category has.
+    """
     present = sorted({int(number) for values in used for number in np.unique(values)})
-    order = {number: place for place, number in enumerate(sorted({*categories, *present}))}
-    rows = []
-    for number in present:
-        category = categories.get(number, Category(f"number {number}"))
-        colour = category.colour or PALETTE[order[number] % len(PALETTE)]
-        rows.append((number, category.name, colour))
-    return rows
+    taken = {category.colour for category in categories.values()}
+    free = cycle([colour for colour in PALETTE if colour not in taken] or PALETTE)
+    colours = {}
+    for number in sorted({*categories, *present}):
+        given = categories.get(number, Category("")).colour
+        colours[number] = given or next(free)
+    names = {number: category.name for number, category in categories.items()}
+    return [(n, names.get(n, f"number {n}"), colours[n]) for n in present]

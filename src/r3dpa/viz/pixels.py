@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import matplotlib
@@ -17,27 +18,20 @@ from r3dpa.io import atomic_path
 Array = Tensor | NDArray[np.generic]
 Pixels = NDArray[np.uint8]
 
-BACKGROUND = (10, 10, 14)  # RGB of "no return"; darker than every colour of the maps below
+BACKGROUND = (10, 10, 14)  # RGB of "no return"; darker than every colour of the maps
 
 
 def save(picture: Figure | Pixels, path: str | Path) -> Path:
-    """Writes a figure or a picture; a reader never sees half a file.
-
-    The file is written under a temporary name in the same folder, which is made if missing, and
-    then renamed.
+    """Writes a figure or a picture atomically, in the format of the suffix.
 
     Args:
         picture: Figure, or uint8 pixels ``(rows, columns)`` or ``(rows, columns, 3)``.
-        path: Where to; the suffix gives the format (``.png``; figures also ``.pdf``, ``.svg``).
-
-    Returns:
-        The path.
+        path: Its folder is made if missing.
 
     Raises:
         ValueError: If the suffix is not a known format or the pixels are not uint8.
     """
-    path = Path(path)
-    with atomic_path(path) as temporary:
+    with atomic_path(path := Path(path)) as temporary:
         if isinstance(picture, Figure):
             picture.savefig(temporary)
         elif picture.dtype == np.uint8:
@@ -45,6 +39,14 @@ def save(picture: Figure | Pixels, path: str | Path) -> Path:
         else:
             raise ValueError(f"pixels are {picture.dtype}; give uint8 from 0 to 255")
     return path
+
+
+def palette_image(picture: Figure | Pixels, colours: int = 64) -> Image.Image:
+    """The picture with few colours, a third of the size as PNG: for notebooks."""
+    if isinstance(picture, Figure):
+        picture.savefig(file := io.BytesIO(), format="png")
+        return Image.open(file).convert("RGB").quantize(colours)
+    return Image.fromarray(picture).quantize(colours)
 
 
 def as_numpy(array: Array, axes: tuple[str, ...]) -> NDArray[np.float64]:

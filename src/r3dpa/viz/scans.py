@@ -1,6 +1,6 @@
 """Range images and points as pixels.
 
-Letters: H beams, W columns, P points.
+Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``.
 """
 
 from __future__ import annotations
@@ -35,21 +35,16 @@ HEIGHT_MAP = bright_part("viridis", 0.3)
 
 
 def range_image_picture(range_m: Array, sensor: LidarSensor, scale: int = 1) -> Pixels:
-    """Colours of a range image, pixel for pixel.
-
-    The colour follows the square root of the range from ``range_min_m`` (bright) to
-    ``range_max_m``, because most returns are near; ranges beyond the limits take the end colours.
+    """Colours of a range image by the square root of the range, bright where near.
 
     Args:
-        range_m: ``(H, W)`` range in metres; not above 0 where there is no return.
+        range_m: ``(H, W)`` metres; not above 0 without a return (dark background). Ranges beyond
+            the limits of the sensor take the end colours.
         sensor: Gives the limits of the colour scale.
-        scale: Side of the square drawn for one pixel, at least 1.
+        scale: Side of the square drawn for one pixel.
 
     Returns:
-        ``(H * scale, W * scale, 3)`` uint8; pixels without a return have the dark background.
-
-    Raises:
-        ValueError: If ``range_m`` has other than two axes or ``scale`` is below 1.
+        ``(H * scale, W * scale, 3)`` uint8.
     """
     ranges = as_numpy(range_m, ("H", "W"))
     picture = paint(ranges, RANGE_MAP, range_scale(sensor))
@@ -58,18 +53,9 @@ def range_image_picture(range_m: Array, sensor: LidarSensor, scale: int = 1) -> 
 
 
 def encoded_picture(image: Array) -> Pixels:
-    """Gray values of an encoded range image: [-1, 1] becomes 0 to 255, rounded down.
+    """Gray values of an encoded range image ``(H, W)``: [-1, 1] becomes 0 to 255, rounded down.
 
     Source: the PNG that ``generate.py`` of valeoai/R3DPA writes; same bytes.
-
-    Args:
-        image: ``(H, W)`` encoded range; values outside [-1, 1] are clipped.
-
-    Returns:
-        ``(H, W)`` uint8.
-
-    Raises:
-        ValueError: If ``image`` has other than two axes.
     """
     values = as_numpy(image, ("H", "W")).astype(np.float32)  # its rounding decides the last bit
     return np.clip((values + 1) / 2 * 255, 0, 255).astype(np.uint8)
@@ -81,16 +67,13 @@ def birds_eye_picture(
     """Points seen from above, forward up and left to the left; the highest point of a pixel shows.
 
     Args:
-        points: ``(P, 3+)`` x forward, y left, z up, metres; further columns are not used.
+        points: ``(P, 3+)`` x forward, y left, z up, metres.
         extent_m: Half side of the square around the sensor that is shown.
         pixels: Side of the picture.
         colours: ``(P, 3)`` RGB in [0, 1] of the points, by default from their height.
 
     Returns:
         ``(pixels, pixels, 3)`` uint8.
-
-    Raises:
-        ValueError: If the shapes of ``points`` and ``colours`` are not as above.
     """
     xyz, rgb = _coloured_points(points, colours)
     row = np.floor((extent_m - xyz[:, 0]) / (2 * extent_m) * pixels)
@@ -107,18 +90,8 @@ def scene_3d(
 ) -> Pixels:
     """Points seen by a pinhole camera behind and above the ego vehicle, looking forward.
 
-    Near points hide far ones and are drawn larger; colours fade with distance.
-
-    Args:
-        points: ``(P, 3+)`` x forward, y left, z up, metres.
-        colours: ``(P, 3)`` RGB in [0, 1] of the points, by default from their height.
-        size: Rows and columns of the picture.
-
-    Returns:
-        ``(*size, 3)`` uint8 on a dark background.
-
-    Raises:
-        ValueError: If the shapes of ``points`` and ``colours`` are not as above.
+    Near points hide far ones and are drawn larger; colours fade with distance. Arguments are those
+    of :func:`birds_eye_picture`; ``size`` is rows and columns of the picture, ``(*size, 3)`` uint8.
     """
     xyz, rgb = _coloured_points(points, colours)
     height, width = 2 * size[0], 2 * size[1]  # averaged over 2 x 2 at the end, against jagged edges
@@ -151,6 +124,12 @@ def scene_3d(
 def range_scale(sensor: LidarSensor) -> Normalize:
     """Square-root scale between the range limits of a sensor."""
     return PowerNorm(0.5, sensor.range_min_m, sensor.range_max_m)
+
+
+def range_ticks(sensor: LidarSensor) -> list[float]:
+    """Labels of the range scale: both limits, and round ranges between that do not touch them."""
+    low, high = sensor.range_min_m, sensor.range_max_m
+    return [low, *(tick for tick in (5.0, 10.0, 20.0, 30.0) if 2 * low < tick < 0.75 * high), high]
 
 
 def _coloured_points(
