@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -229,14 +231,13 @@ def folder(ckpt, tmp_path_factory):
     out = tmp_path_factory.mktemp("sampling")
     words = ["--ckpt", str(ckpt), "--out", str(out), "--quick", "--device", "cpu", "--scenes", "4"]
     words += ["--rounds", "2", "--nfe", "[4,2]", "--reference_steps", "16", "--batch_size", "2"]
-    printed = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench, "_SOLVERS", (("euler", 1.0), ("ab2", 1.0), ("ab2", 2.0)))
         patch.setattr(bench, "_TOY_QUICK", replace(TINY, reference_steps=64))
-        patch.setattr("r3dpa.cli.benches.print_text", printed.append)
         patch.setattr("sys.argv", ["/home/me/bin/r3dpa", "bench", "--ckpt", "/home/me/last.ckpt"])
-        main(["bench", "sampling", *words])
-    return out, printed[0]
+        with redirect_stdout(StringIO()) as printed:
+            main(["bench", "sampling", *words])
+    return out, printed.getvalue()
 
 
 class TestFiles:
