@@ -11,7 +11,6 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "r3dpa"
 CORE = {"geometry", "flow", "losses", "nn"}
 ALLOWED = {
     "io": set(),
-    "unpickling": set(),
     "geometry": set(),
     "flow": set(),
     "losses": set(),
@@ -37,7 +36,7 @@ ALLOWED = {
     | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
     | {"metrics", "ablation", "editing"},
 }
-ANYWHERE = {"io", "unpickling", "__version__"}
+ANYWHERE = {"io", "__version__"}
 
 
 def imported(source: str) -> set[str]:

@@ -22,7 +22,7 @@ _BLOCK = 1024  # rows of a distance matrix held at once
 
 
 def checked_features(features: Tensor, name: str = "features", at_least: int = 1) -> Tensor:
-    """Features as float64, after a check that they can be judged.
+    """Features ``(N, F)`` as float64, after a check that there are ``at_least`` finite rows.
 
     Raises:
         ValueError: If the shape is another one, a value is NaN or infinite, or N is too small.
@@ -123,8 +123,9 @@ def merge_packed(packed: Tensor) -> Tensor:
 
 
 def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
-    """Squared Fréchet (2-Wasserstein) distance of two normal distributions.
+    """Squared Fréchet (2-Wasserstein) distance ``()`` float64 of two normal distributions.
 
+    Means are ``(F,)``, covariances ``(F, F)`` symmetric and positive semi-definite.
     The trace of the root of a product is a sum of singular values, so nothing becomes complex and
     singular covariances are exact::
 
@@ -189,7 +190,7 @@ class FDInfinity:
 def fd_infinity(
     real: Tensor, generated: Tensor, generator: torch.Generator, num_sizes: int = 8
 ) -> FDInfinity:
-    """Fréchet distance extrapolated to infinitely many samples.
+    """Fréchet distance of ``(N, F)`` and ``(M, F)`` features, extrapolated to infinitely many.
 
     The distance of N samples is too large by about c / N. Both sets are subsampled without
     replacement at equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all
@@ -230,6 +231,7 @@ def fd_infinity(
 def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
     """Unbiased squared maximum mean discrepancy under ``(x . y / F + 1) ** degree``.
 
+    Takes ``(N, F)`` and ``(M, F)`` with at least 2 rows each, returns ``()`` float64.
     Pairs of a sample with itself are left out, so the mean over samples of one distribution is
     zero and single values may be negative.
 
@@ -256,6 +258,10 @@ def polynomial_mmd(
 ) -> tuple[float, float]:
     """Kernel distance (KID): mean and deviation of :func:`squared_mmd` over random subsets.
 
+    Subsets of ``subset_size`` rows are drawn without replacement from ``(N, F)`` and ``(M, F)``.
+    The standard error of the mean is below the deviation, but not ``std / sqrt(num_subsets)``,
+    since subsets overlap.
+
     Raises:
         ValueError: If a set is smaller than a subset.
     """
@@ -276,7 +282,7 @@ def polynomial_mmd(
 
 
 def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
-    """Earth mover's distance of two sets of numbers, such as ranges in metres.
+    """Earth mover's distance of ``(N,)`` and ``(M,)`` numbers, in their unit.
 
     Exact for sets of unequal size: the area between the two quantile functions, which are steps,
     is summed between all places where one of them steps. For counts in bins there is
@@ -299,7 +305,11 @@ def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
 def wasserstein_1(
     counts_a: NDArray[np.float64], counts_b: NDArray[np.float64], bin_width: float
 ) -> float:
-    """Earth mover's distance of two normalised histograms: the area between their CDFs."""
+    """Earth mover's distance of two normalised histograms: the area between their CDFs.
+
+    Counts are ``(N,)`` in the same bins of equal width; the result has the unit of ``bin_width``
+    and is NaN where a histogram is empty.
+    """
     if counts_a.sum() == 0 or counts_b.sum() == 0:
         return float("nan")
     cdf_a, cdf_b = counts_a.cumsum() / counts_a.sum(), counts_b.cumsum() / counts_b.sum()
@@ -332,7 +342,13 @@ def curve_rmse(curve_a: NDArray[np.float64], curve_b: NDArray[np.float64]) -> fl
 
 @dataclass(frozen=True)
 class PRDC:
-    """How much of each set the other one covers."""
+    """How much of each set the other one covers.
+
+    ``precision`` is the share of generated samples inside the ball of some real sample, ``recall``
+    that of real samples inside the ball of some generated sample, ``density`` the real balls
+    around a generated sample, on average, divided by k (may exceed 1), and ``coverage`` the share
+    of real samples whose ball holds a generated sample.
+    """
 
     precision: float
     recall: float
@@ -342,7 +358,12 @@ class PRDC:
 
 @dataclass(frozen=True)
 class SharedBalls:
-    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC."""
+    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC.
+
+    ``in_real`` ``(M,)`` int64 counts the real balls that a generated sample is in, ``recalled``
+    ``(N,)`` bool says whether a real sample is in a generated ball, and ``covered`` ``(N,)`` bool
+    whether the ball of a real sample holds a generated one.
+    """
 
     in_real: Tensor
     recalled: Tensor

@@ -67,7 +67,7 @@ class BEVGrid:
         return found
 
     def cells(self, points: Tensor, name: str = "cloud") -> Tensor:
-        """Cells that hold a point: ``x index * columns + y index``, ascending, each once.
+        """Cells ``(n,)`` int64 that hold a point, ``x index * columns + y index``, ascending.
 
         Index 0 is that of the lower limit. The division is done in the precision of the points,
         as in the official code: another one moves points on the border of two cells.
@@ -124,7 +124,7 @@ class HistogramDistance:
 
 
 def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
-    """All distances of two histograms.
+    """All distances of two histograms of counts of one shape.
 
     Raises:
         ValueError: If shapes differ, a count is negative or not finite, or a histogram is empty.
@@ -166,7 +166,12 @@ def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Matching:
-    """The nearest sample of each reference."""
+    """The nearest sample of each reference.
+
+    ``squared_normalised`` ``(R,)`` float64 is the squared Chamfer distance in units of the squared
+    width of the grid, ``nearest`` ``(R,)`` int64 the index of the sample, and ``num_compared``
+    counts the pairs of the R * S whose second direction had to be computed.
+    """
 
     squared_normalised: Tensor
     nearest: Tensor
@@ -182,6 +187,9 @@ def minimum_matching(
     references: Sequence[Tensor], samples: Sequence[Tensor], grid: BEVGrid
 ) -> Matching:
     """Smallest Chamfer distance from each reference to any sample, on occupied cells.
+
+    Clouds are vectors of :meth:`BEVGrid.cells` on one square grid; as many threads as PyTorch uses
+    share the work.
 
     The distance of two clouds is ``(mean_x min_y |x - y|^2 + mean_y min_x |x - y|^2) / 2`` over
     the indices of their cells divided by the cells along a side. It is squared and has no unit.
