@@ -2,8 +2,13 @@
 
 from r3dpa.checkpoints.convert import ConversionReport, convert
 from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint
-from r3dpa.checkpoints.fingerprint import weights_sha256
-from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState, load_into
+from r3dpa.checkpoints.networks import (
+    NETWORK_NAMES,
+    Checkpoint,
+    NetworkState,
+    load_into,
+    weights_sha256,
+)
 from r3dpa.checkpoints.official import from_official, to_official
 from r3dpa.checkpoints.transfer import TransferReport, TransferRow, transfer_rgb
 

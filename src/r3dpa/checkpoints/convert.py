@@ -30,7 +30,7 @@ _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What :func:`convert` wrote, network by network, and what became of RGB weights."""
+    """Files, networks and RGB transfer of one :func:`convert`."""
 
     source: Path
     outputs: tuple[Path, ...]
@@ -66,12 +66,13 @@ def convert(
 ) -> ConversionReport:
     """Rewrites a checkpoint of any layout in ours, or in the official one.
 
-    Weights stay equal bit for bit; optimisers are left out. A checkpoint without SiT becomes the
-    official VAE file with its neighbours for discriminator and latent statistics.
+    Weights stay equal bit for bit; optimisers are left out. An official training checkpoint that
+    this writes keeps all facts for the way back. A checkpoint without SiT becomes the official VAE
+    file with its neighbours for discriminator and latent statistics, which lose some.
 
-    With ``into`` the result is the start of another SiT from RGB weights, what ``rgb_weights`` of
-    the training stages would make of them; see :func:`transfer_rgb`. Weights that the source does
-    not have are random, the same ones at each call.
+    With ``into`` the result is another SiT initialised from RGB weights, as with ``rgb_weights`` of
+    the training stages; see :func:`transfer_rgb`. Weights that the source does not have are random,
+    the same ones at each call.
 
     Args:
         source: Checkpoint that :func:`read_checkpoint` understands.

@@ -72,8 +72,8 @@ def read_checkpoint(
 
     Args:
         path: File to read.
-        sit_args: Official files only: arguments of SiT that the file does not tell.
-        encoding: Official files only: range encoding, where the options do not tell.
+        sit_args: Official files only: arguments of SiT that the file does not hold.
+        encoding: Official files only: range encoding, if the options do not name it.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -106,15 +106,7 @@ def read_checkpoint(
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool = False) -> Path:
     """Writes ``<name>.safetensors`` (all weights) and ``<name>.yaml`` (everything else).
 
-    Both appear complete or not at all; the second holds the hash of the first.
-
-    Args:
-        checkpoint: What to write.
-        path: ``<name>.safetensors``.
-        overwrite: Replace existing files.
-
-    Returns:
-        ``path``.
+    Both appear complete or not at all; the second holds the hash of the first. Returns ``path``.
 
     Raises:
         ValueError: If the name ends otherwise, the files exist, or an argument of a network is no
@@ -163,7 +155,7 @@ def official_neighbour(vae: Path, kind: str) -> Path:
 
 
 def _official_neighbours(path: Path, content: Any) -> tuple[Any, dict[str, Any]]:
-    """Content with the files that belong to an official VAE, and the options beside it."""
+    """Content with the files that belong to an official VAE, and the options of ``args.json``."""
     if "encoder.conv_in.weight" in content:
         content = {"vae": content}
         discriminator = official_neighbour(path, "discriminator-ckpt")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import itertools
@@ -16,7 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-__all__ = ["NETWORK_NAMES", "Checkpoint", "NetworkState", "format_table", "load_into"]
+__all__ = [
+    "NETWORK_NAMES",
+    "Checkpoint",
+    "NetworkState",
+    "format_table",
+    "load_into",
+    "weights_sha256",
+]
 
 NETWORK_NAMES = ("vae", "discriminator", "sit", "latent_norm", "ema", "ema_latent_norm")
 """Names a network may have in a checkpoint; ``ema`` is the averaged copy of ``sit``."""
@@ -28,7 +36,6 @@ _BUILD_ERRORS = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError),
     *(NotImplementedError, RuntimeError, TypeError, ValueError),
 )
-_PARAMETERS_PER_TENSOR = 4  # our networks have one, or none; a layer without bias counts it, too
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
 _SHAPELESS_ARGS = {
@@ -68,13 +75,7 @@ def _tuples(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class NetworkState:
-    """One network as data: what rebuilds it, and its weights.
-
-    Args:
-        class_path: Import path of a class inside ``r3dpa.nn``.
-        init_args: Its constructor arguments (plain values).
-        state_dict: Its parameters and buffers by key.
-    """
+    """One network as data: class inside ``r3dpa.nn``, plain constructor arguments, weights."""
 
     class_path: str
     init_args: Mapping[str, Any]
@@ -82,11 +83,7 @@ class NetworkState:
 
     @classmethod
     def of(cls, network: nn.Module, init_args: Mapping[str, Any]) -> NetworkState:
-        """State of a network built by hand.
-
-        Args:
-            network: Instance of a class inside ``r3dpa.nn``.
-            init_args: The arguments it was built with.
+        """State of a network built by hand with the given arguments.
 
         Raises:
             ValueError: If the class is not allowed, or the arguments do not rebuild this network.
@@ -98,20 +95,12 @@ class NetworkState:
 
     @property
     def kind(self) -> type[nn.Module]:
-        """The class of the network.
-
-        Raises:
-            ValueError: If it is not one of ``r3dpa.nn``.
-        """
+        """The class; raises a ``ValueError`` if it is not one of ``r3dpa.nn``."""
         return _network_class(self.class_path)
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The constructor arguments, defaults included.
-
-        Raises:
-            ValueError: If the class is not allowed.
-        """
+        """The constructor arguments, defaults included."""
         parameters = inspect.signature(self.kind).parameters.values()
         defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
         return defaults | {key: _tuples(value) for key, value in self.init_args.items()}
@@ -148,18 +137,15 @@ class NetworkState:
     def check(self) -> None:
         """Checks that class and arguments fit the weights, without allocating memory.
 
-        Arguments that ask for far more layers than there are weights end it at once.
-
         Raises:
             ValueError: As :meth:`build`.
         """
-        most = _PARAMETERS_PER_TENSOR * (len(self.state_dict) + 1)
-        with torch.device("meta"), _at_most(most):
+        with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
             network = self.new()
         _raise_if_any(self.problems(network), f"the weights do not fit {self.class_path}")
 
     def problems(self, network: nn.Module) -> list[str]:
-        """Everything that stops ``network`` from taking these weights; empty if nothing does."""
+        """All keys and shapes that differ between ``network`` and these weights."""
         own = network.state_dict()
         missing = [f"missing in the checkpoint: {key}" for key in own if key not in self.state_dict]
         unexpected = [
@@ -193,7 +179,7 @@ class Checkpoint:
         version: Version of r3dpa that wrote it, None for official files.
         commit: Commit of r3dpa that wrote it, if known.
         official_args: Options of the official training script, kept for the way back.
-        left_out: What the file holds beside the networks, with the reason it is not read.
+        left_out: Entries of the file that are not read, with the reason.
     """
 
     path: Path
@@ -210,11 +196,7 @@ class Checkpoint:
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     def network(self, name: str) -> NetworkState:
-        """The network called ``name``.
-
-        Raises:
-            ValueError: If the checkpoint has none, saying what it has and why it has none.
-        """
+        """The network called ``name``; raises a ``ValueError`` if the checkpoint has none."""
         if name not in self.networks:
             reason = f" ({self.left_out[name]})" if name in self.left_out else ""
             raise ValueError(
@@ -228,15 +210,11 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
     """Copies the weights of a checkpoint into networks, all of them or none.
 
     A key names the network in the checkpoint: ``{"sit": average}`` starts an average from ``sit``.
-
-    Args:
-        networks: Networks to fill, by their name in the checkpoint.
-        checkpoint: Where the weights come from.
-        stage: What the networks are needed for; appears in errors.
+    ``stage`` appears in errors.
 
     Raises:
-        ValueError: If a network is absent or does not fit. Everything that does not fit is
-            collected first, and no network is changed.
+        ValueError: If a network is absent or does not fit; lists everything that does not fit, and
+            no network is changed.
     """
     problems: list[str] = []
     for name, network in networks.items():
@@ -255,6 +233,17 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
         )
     for name, network in networks.items():
         network.load_state_dict(checkpoint.network(name).state_dict, strict=True)
+
+
+def weights_sha256(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 of the names and bytes of weights, whatever device, memory format or file."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(name.encode())
+        # As bytes: numpy knows no bfloat16.
+        values = state[name].detach().cpu().contiguous().flatten().view(torch.uint8)
+        digest.update(values.numpy().data)
+    return digest.hexdigest()
 
 
 def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -282,7 +271,7 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
 
 @contextmanager
 def _at_most(count: int) -> Iterator[None]:
-    """Refuses to make more than so many parameters: a file may ask for a billion layers."""
+    """Limits the number of parameters: a damaged file may ask for a billion layers."""
     left = itertools.count(count, -1)
 
     def counted(*_: Any) -> None:

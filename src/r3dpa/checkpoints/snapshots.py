@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
-from r3dpa.checkpoints.fingerprint import weights_sha256
-from r3dpa.checkpoints.networks import Checkpoint
+from r3dpa.checkpoints.networks import Checkpoint, weights_sha256
 from r3dpa.nn import LatentNorm, VelocityNetwork
 
 __all__ = ["NORM_TOLERANCE", "WeakModel", "read_snapshot", "vae_fingerprint"]
@@ -29,16 +28,10 @@ weak model expects by at most 0.77 d standard deviations.
 
 @dataclass(frozen=True)
 class WeakModel:
-    """What :func:`read_snapshot` reads.
+    """Averaged network in evaluation mode on the CPU, with facts about its training.
 
-    Args:
-        path: Its file.
-        sit: Averaged network, in evaluation mode on the CPU.
-        scale: Its normalised latents are ``scale * latents + shift`` of those of the model that it
-            guides, see :func:`r3dpa.flow.renormalised`.
-        shift: ``(C,)`` float32.
-        step: Optimiser steps that it was trained for, if known.
-        feature_source: Feature source of its training, if known.
+    Its normalised latents are ``scale * latents + shift`` of those of the model that it guides,
+    see :func:`r3dpa.flow.renormalised`; ``shift`` is ``(C,)`` float32.
     """
 
     path: Path
@@ -60,9 +53,9 @@ def read_snapshot(
     Latents mean the same to both only if one VAE made them: then normalisations that drifted apart
     are converted exactly but for differences between channels, see :data:`NORM_TOLERANCE`. Stage
     ``flow_matching`` freezes the VAE. In stage ``joint`` the VAE moves between a snapshot and the
-    end, and no conversion exists: guidance is a guess there, and refused unless allowed. It then
-    takes each model's normalised latents for the same, since the normalisation removes at least
-    what moved in mean and scale.
+    end, and no conversion exists: guidance is an approximation there, and refused unless allowed.
+    It then equates the normalised latents of both models, since the normalisation removes at least
+    the drift of mean and scale.
 
     Args:
         path: File of :class:`r3dpa.callbacks.EMASnapshots`, or another checkpoint.

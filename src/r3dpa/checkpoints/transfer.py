@@ -25,17 +25,12 @@ _NORM = "latent_norm."
 
 @dataclass(frozen=True)
 class TransferRow:
-    """One group of weights: what became of it, and why.
+    """One group of weights: ``num_tensors`` in the receiving network whose keys start alike.
 
-    Args:
-        group: Common beginning of the keys.
-        num_tensors: Number of tensors of the group in the receiving network.
-        fate: ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
-            ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
-            ``extended`` (label table).
-        source: Shape of the group's largest tensor in the RGB checkpoint, ``-`` if absent.
-        target: The same in the receiving network.
-        reason: Why.
+    ``fate`` is ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
+    ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
+    ``extended`` (label table). ``source`` and ``target`` are the shapes of the largest tensor in
+    the RGB checkpoint and in the receiving network, ``-`` if absent.
     """
 
     group: str
@@ -48,7 +43,7 @@ class TransferRow:
 
 @dataclass(frozen=True)
 class TransferReport:
-    """What :func:`transfer_rgb` did, group by group."""
+    """Result of :func:`transfer_rgb`, one row per group."""
 
     path: Path
     rows: tuple[TransferRow, ...]
@@ -82,14 +77,8 @@ def transfer_rgb(
     Source: tuning stages of valeoai/R3DPA, which always cut the label table to one row and keep the
     position table of another latent size if it has as many tokens.
 
-    Args:
-        checkpoint: RGB checkpoint, official or ours.
-        sit: Receives the weights, in place.
-        latent_norm: Receives the statistics, in place.
-        keep_projector: Also take the projector, as VAE alignment does.
-
-    Returns:
-        The fate of every group of weights; fresh ones keep the values they have in ``sit``.
+    ``sit`` and ``latent_norm`` are changed in place; fresh weights keep their values. With
+    ``keep_projector`` the projector is taken too, as VAE alignment does.
 
     Raises:
         ValueError: If the checkpoint holds no SiT, or anything beside those groups does not fit;
@@ -138,7 +127,7 @@ def transfer_rgb(
 def _fate(
     group: str, theirs: Groups, ours: Groups, keep_projector: bool, same_grid: bool
 ) -> tuple[Fate, str]:
-    """What becomes of a group of weights and why, by the rules of the official tuning stages."""
+    """Fate of a group of weights and its reason, by the rules of the official tuning stages."""
     of_channels = group in ("x_embedder", "final_layer.linear", "latent_norm")
     if of_channels and _length(theirs, "x_embedder", 1) != _length(ours, "x_embedder", 1):
         return "fresh", "other number of latent channels"
@@ -174,7 +163,7 @@ def _rows(theirs: Tensor, ours: Tensor) -> Tensor:
 
 
 def _grouped(weights: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Weights by the beginning of their key that decides their fate."""
+    """Weights by the part of their key that decides their fate."""
     groups: dict[str, dict[str, Tensor]] = {}
     for key, value in weights.items():
         parts = key.split(".")
