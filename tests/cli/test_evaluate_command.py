@@ -116,7 +116,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
 
 def test_a_killed_reference_is_completed(data, tmp_path, monkeypatch):
     undisturbed, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
-    command.reference(data, undisturbed, ["fgeo"])
+    command.reference(data=data, out=undisturbed, spaces=("fgeo",))
     read, seen = scans.read_scan, []
 
     def dying(path, sensor):

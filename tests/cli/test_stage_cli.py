@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+import wandb
+import yaml
 from lightning.pytorch.demos.boring_classes import BoringDataModule, BoringModel
 
 from r3dpa.cli import main
@@ -89,5 +91,37 @@ def test_a_stage_names_the_data_modules_that_it_takes(refused, tmp_path):
 )
 def test_a_class_that_is_none_or_of_the_wrong_kind_is_named(refused, tmp_path, model, data, field):
     message = refused(*words(model, data, tmp_path))
-    assert f'"{field}"' in message
+    assert f"r3dpa fit: --{field}: " in message
+    assert message.count("\n") == 1
     assert (model if field == "model" else data) in message
+
+
+def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["fit", "joint", "--preset", "demo", "--trainer.max_steps", "7", "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["model"]["class_path"] == "r3dpa.modules.JointAlignment"
+    assert config["model"]["init_args"]["sit"]["init_args"]["hidden_size"] == 192
+    assert config["data"]["init_args"]["root"] == "runs/demo/data"
+    assert (config["run_dir"], config["trainer"]["max_steps"]) == ("runs/demo/joint", 7)
+    with pytest.raises(ValueError, match=r"there is no experiment 'jointly'; give one of .*joint"):
+        main(["fit", "jointly"])
+    with pytest.raises(ValueError, match=r"there is no data 'kitti'; give one of .*kitti360"):
+        main(["fit", "joint", "--preset", "kitti"])
+
+
+def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):
+    run_dir = tmp_path / "group" / "run"
+    arguments = words(f"{__name__}.LoggingModel", f"{BORING}.BoringDataModule", run_dir)
+    arguments[arguments.index("--trainer.logger=false")] = "--trainer.logger=WandbLogger"
+    arguments += ["--trainer.logger.offline=true", "--trainer.logger.save_dir=x"]
+    main(["fit", *arguments])
+    wandb.finish()
+    main(["validate", *arguments, "--ckpt_path", "last"])
+    wandb.finish()
+    wandb.teardown()  # else its settings hold for all tests after this one
+    run_id = (run_dir / "wandb_id.txt").read_text()
+    runs = list(run_dir.glob(f"wandb/offline-run-*-{run_id}"))
+    assert runs
+    assert len(list(run_dir.glob("wandb/offline-run-*"))) == len(runs)

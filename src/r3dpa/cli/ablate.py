@@ -30,7 +30,8 @@ def ablate(
     interrupted run. A row that fails does not stop the others; the exit status is then 1.
 
     Args:
-        tables: Folder of a table, such as ``conf/ablation/table_3``, or of several.
+        tables: Folder of a table, such as ``conf/ablation/table_3`` (also found in the package), or
+            of several: ``conf/ablation``.
         scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
             file of that kind.
         seeds: Every row is trained and tested for each, such as ``0 1 2``.
@@ -43,8 +44,11 @@ def ablate(
         budget_only: Print the cost, and start nothing.
     """
     from r3dpa import ablation
+    from r3dpa.cli.stages import conf_folder
     from r3dpa.io import only_writer
 
+    if not tables.is_dir() and (conf_folder().parent / tables).is_dir():
+        tables = conf_folder().parent / tables
     found = ablation.read_scale(_scale_file(tables, scale))
     folder = out or Path("runs/ablation") / found.name
     check_folder(folder)

@@ -96,10 +96,6 @@ def objects(
         dim: Width of the features.
         grid_size: Rows and columns of the cells.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-
-    Raises:
-        ValueError: If a scan or its labels cannot be used (names the file), or an argument is
-            invalid.
     """
     from tqdm import tqdm
 

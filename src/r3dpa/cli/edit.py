@@ -91,10 +91,6 @@ def inpaint(
             outside are restored.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
-
-    Raises:
-        ValueError: If the inputs do not fit each other or the checkpoint.
-        OSError: If a file cannot be read or written.
     """
     import numpy as np
 
@@ -197,10 +193,6 @@ def mix(
         window: First and last guided time; 0 data, 1 noise.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
-
-    Raises:
-        ValueError: If the inputs do not fit each other or the checkpoint.
-        OSError: If a file cannot be read or written.
     """
     import numpy as np
     import torch
@@ -296,10 +288,6 @@ def complete(
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
-
-    Raises:
-        ValueError: If the inputs do not fit each other or the checkpoint.
-        OSError: If a file cannot be read or written.
     """
     from dataclasses import replace
     from functools import partial
@@ -373,10 +361,6 @@ def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str
         start: Time of the noise, in (0, 1]; larger values differ more from the scan.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
-
-    Raises:
-        ValueError: If the inputs do not fit each other or the checkpoint.
-        OSError: If a file cannot be read or written.
     """
     from r3dpa.cli.edit_session import EditSession
 
@@ -399,10 +383,6 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
         right: Scan of the last frame.
         frames: Number of scenes, both ends among them.
         **options: See :class:`EditJob`.
-
-    Raises:
-        ValueError: If the inputs do not fit each other or the checkpoint.
-        OSError: If a file cannot be read or written.
     """
     from r3dpa.cli.edit_session import EditSession
 

@@ -48,10 +48,6 @@ def reference(
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         every: Scans after which the unfinished file is saved; it also is on an interrupt.
-
-    Raises:
-        ValueError: If an argument is invalid, ``out`` exists, there are fewer than two scans, or
-            one cannot be used; names it.
     """
     import torch
 
@@ -120,9 +116,6 @@ def evaluate(
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
         split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
-
-    Raises:
-        ValueError: If an argument is invalid, or samples or reference cannot be used.
     """
     from dataclasses import replace
 
@@ -208,9 +201,6 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Realism
         scans: Folder of ``.bin`` scans (A); one drive per folder.
         reference: Folder of real scans (B), of two or more drives; a single one is halved.
         out: JSON file for the table and the curves behind it.
-
-    Raises:
-        ValueError: If a folder holds no scan, or a scan cannot be used; names it.
     """
     from itertools import groupby
 
@@ -261,11 +251,7 @@ def _counted(scans: Iterable[Scan], bar: Any) -> Iterator[Scan]:
 
 
 def _pooled(scans: Iterable[Scan]) -> ScanStatistics:
-    """Statistics of all these scans together.
-
-    Raises:
-        ScanError: If a scan cannot be used; names the file.
-    """
+    """Statistics of all these scans together."""
     from r3dpa.data.scans import ScanError, read_scan
     from r3dpa.metrics import ScanStatistics, scan_statistics
 

@@ -37,9 +37,10 @@ def _short(message: str) -> str:
     head, _, tail = message.partition("Does not validate against any of the Union subtypes")
     causes = re.search(r"Errors:\s*(.*?)\s*Given value type:", tail, re.DOTALL)
     if causes is not None:
-        found = [" ".join(cause.split()) for cause in re.split(r"(?m)^\s*- ", causes[1])]
+        found = re.split(r"(?:^|\s)- (?=[A-Z])", " ".join(causes[1].split()))
+        found = [c for c in found if c and "null" not in c and "Expected a path" not in c]
         value = tail.rpartition("Given value: ")[2].strip()
-        message = f"{head}{next((c for c in found if c and 'null' not in c), '')} (got {value})"
+        message = f"{head}{found[0] if found else 'cannot be used'} (got {value})"
     message = re.sub(r'Parser key "([^"]+)": ', r"--\1: ", " ".join(message.split()).rstrip("."))
     return re.sub(r"Expected an? <class '(\w+)'>", r"expected \1", message)
 

@@ -85,11 +85,6 @@ def sample(
             ``range_m.npy``.
         pictures: Number of scenes to draw.
         overwrite: Write into a folder that holds scenes already, and start anew.
-
-    Raises:
-        ValueError: If ``out`` holds scenes already, or unfinished ones of another request, an
-            option is invalid, or the checkpoint cannot be sampled from.
-        OSError: If a file cannot be written.
     """
     from dataclasses import asdict
 
@@ -347,9 +342,6 @@ def report(run: Path) -> str:
 
     Args:
         run: Folder given to ``r3dpa fit`` as ``--run_dir``.
-
-    Raises:
-        ValueError: If the folder holds no ``metrics.csv`` of a CSVLogger.
     """
     from statistics import fmean
 

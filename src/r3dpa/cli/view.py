@@ -50,10 +50,6 @@ def view(
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
         num: Scans to show at most, evenly spread over the folder.
         reference: Scan to show beside the others, such as a real one beside simulated ones.
-
-    Raises:
-        ValueError: If ``num`` is below 1, there is no scan, or a scan or its labels cannot be used;
-            names the file.
     """
     from r3dpa import viz
     from r3dpa.data.scans import evenly
