@@ -29,11 +29,9 @@ from r3dpa import __version__
 _log = logging.getLogger(__name__)
 _DAMAGED = (pickle.UnpicklingError, struct.error, tokenize.TokenError, zipfile.BadZipFile, EOFError)
 _BAD_VALUES = (ArithmeticError, AttributeError, LookupError, SyntaxError, TypeError, ValueError)
+_SYSTEM = (AssertionError, ImportError, MemoryError, OSError, RuntimeError)
 #: Raised by ``torch.load``, ``numpy.load`` and restricted unpicklers on damaged files.
-UNPICKLING_ERRORS = (
-    *(*_DAMAGED, *_BAD_VALUES),
-    *(AssertionError, ImportError, MemoryError, OSError, RuntimeError),
-)
+UNPICKLING_ERRORS = (*_DAMAGED, *_BAD_VALUES, *_SYSTEM)
 
 
 @contextmanager
@@ -41,15 +39,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
 
     A reader sees the old file or the complete new one, with the usual permissions; the bytes are
-    on the disk before the name. Missing parent folders are made; after an error the temporary file
-    is removed.
-
-    Args:
-        path: File to write. The temporary name is unique, hidden and has the same suffix.
+    on the disk before the name. Missing parent folders are made; after an error the temporary file,
+    which is hidden and has the same suffix, is removed.
 
     Raises:
-        OSError: If the file cannot be written; names ``path`` and the reason, also where the
-            library that writes it does not.
+        OSError: If the file cannot be written; names ``path`` and the reason.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,16 +83,10 @@ def delete_unfinished(folder: Path) -> None:
 
 @contextmanager
 def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
-    """Hold a lock file, which the system releases when the process ends; removed afterwards.
+    """Hold a hidden lock file, which the system releases when the process ends.
 
-    Args:
-        lock: Hidden file; its folder is made if missing.
-        what: For the message: what the other process does, and where to.
-        wait: Wait for another process that holds the lock.
-
-    Raises:
-        ValueError: If another process holds the lock and is not waited for.
-        OSError: If the file cannot be written.
+    While another process holds it, one that does not ``wait`` gets a ``ValueError`` that says what
+    the other one does: ``what``.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     held: AbstractContextManager[Any]
@@ -210,22 +198,14 @@ def command() -> str:
 
 def one_line(values: str | dict[str, Any]) -> str:
     """A text as it is, or names and values in one line."""
-    if isinstance(values, str):
-        return values
-    return ", ".join(f"{name} {value}" for name, value in values.items())
+    pairs = values.items() if isinstance(values, dict) else ()
+    return ", ".join(f"{name} {value}" for name, value in pairs) or str(values)
 
 
 def text_table(
     rows: Iterable[Sequence[str]], heads: Sequence[str], align: str, style: str = "simple"
 ) -> str:
-    """A table of texts.
-
-    Args:
-        rows: Cells of each line.
-        heads: Heads of the columns.
-        align: ``l`` or ``r`` for each column.
-        style: Of ``tabulate``: ``simple`` for a terminal, ``pipe`` for Markdown.
-    """
+    """A table of texts; ``align`` holds ``l`` or ``r`` per column, ``style`` is of ``tabulate``."""
     from tabulate import tabulate
 
     sides = ["left" if side == "l" else "right" for side in align]

@@ -181,7 +181,7 @@ def any_settings(features_dir: str | Path) -> GridSettings:
 
 
 class FeatureGrids(CachedTensors[Scan]):
-    """Grids ``(N, D)`` of one size, cells row by row; safe to hand to loader processes.
+    """Grids ``(N, D)`` of one size, cells row by row; ``dim`` is D. Safe for loader processes.
 
     Args:
         features_dir: Folder of one extractor.
@@ -190,12 +190,8 @@ class FeatureGrids(CachedTensors[Scan]):
         grid_size: Rows and columns (h, w) of the grids.
         extractor: The extractor that must have made them; any if None.
 
-    Attributes:
-        dim: Width D of the features.
-
     Raises:
-        StoreError: If a grid is missing or was made with another sensor, projection, grid size or
-            extractor, or if the store is damaged.
+        StoreError: If a grid is missing or was made otherwise, or if the store is damaged.
     """
 
     def __init__(
@@ -219,16 +215,7 @@ class FeatureGrids(CachedTensors[Scan]):
 
 @dataclass(frozen=True)
 class GridPlan:
-    """Grids that are to be made.
-
-    Attributes:
-        features_dir: Folder of the extractor.
-        settings: Those of the store of each grid size.
-        missing: Scans that lack a grid of at least one size, sorted.
-        num_kept: Scans that lack none.
-        num_bytes: Disk space that the missing grids need.
-        free_bytes: Disk space that there is.
-    """
+    """Grids to make: settings by size, scans that lack one (sorted), and disk space in bytes."""
 
     features_dir: Path
     settings: Mapping[tuple[int, int], GridSettings]

@@ -41,12 +41,11 @@ class ImageError(DataError):
 
 
 class ImageBatch(TypedDict):
-    """What the stages on RGB images receive.
+    """Batch of the stages on RGB images.
 
-    ``image`` ``(B, 3, S, S)`` float32 red, green, blue in [-1, 1], absent where only the posteriors
-    of the image VAE are needed; ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then
-    log-variances of the raw latents, where they are cached; ``index`` ``(B,)`` int64 position in
-    the data set; ``name`` list of B names.
+    ``image`` ``(B, 3, S, S)`` float32 red, green, blue in [-1, 1], absent where posteriors suffice;
+    ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents,
+    where they are cached; ``index`` ``(B,)`` int64; ``name`` list of B names.
     """
 
     image: NotRequired[Tensor]

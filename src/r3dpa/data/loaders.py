@@ -16,15 +16,8 @@ class EpochSampler(DistributedSampler[Any]):
 
     Position p of an epoch goes to process ``p % processes``, so that a batch over all processes
     holds the same samples whatever their number, as long as ``batch_size * processes`` is the
-    same. The order is a function of (seed, epoch) alone. A rest smaller than the number of
-    processes is dropped.
-
-    Args:
-        dataset: Its length is used.
-        seed: Seed of the order, not negative.
-        num_replicas: Number of processes.
-        rank: This process, in ``[0, num_replicas)``.
-        with_epoch: Ask the data set for ``(epoch, index)`` and not for ``index``.
+    same. The order is a function of (seed, epoch) alone; a rest smaller than the number of
+    processes is dropped. ``with_epoch`` asks the data set for ``(epoch, index)``.
 
     Attributes:
         start: Samples of this process that the next pass skips; nothing of them is read.

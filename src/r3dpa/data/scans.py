@@ -136,18 +136,12 @@ def evenly(items: Sequence[T], num: int | None) -> list[T]:
 
 
 def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray:
-    """Points of one ``.bin`` scan, checked.
-
-    Args:
-        path: KITTI ``.bin`` file, float32 rows x, y, z (metres) and intensity 0..1.
-        sensor: If given, at least one point must lie within its range limits.
-
-    Returns:
-        ``(P, 4)`` float32 in storage order, P >= 1.
+    """Points ``(P, 4)`` of one KITTI ``.bin`` scan: float32 x, y, z (metres), intensity 0..1.
 
     Raises:
         ScanError: If the file is unreadable, empty, of another layout, holds NaN or infinite
-            values, or has no point in range; the message names the file.
+            values, or has no point within the range limits of the sensor, where one is given; the
+            message names the file.
     """
     path = Path(path)
     data = _read_bytes(path)
