@@ -71,7 +71,7 @@ class EditSettings:
         """Times from ``start`` in (0, 1] to the data."""
         if not 0 < start <= 1:
             raise ValueError(
-                f"start must be a time above 0 (the scan as it is) up to 1 (noise), got {start:g}"
+                f"start must be a time above 0 (scan), at most 1 (noise), got {start:g}"
             )
         return ode_times(self.steps, start, shift=self.shift)
 
@@ -122,6 +122,7 @@ class SceneEditor:
             raise ValueError(f"edits need networks in fp32, got {generator.precision}")
         self.generator, self.settings, self.batch_size = generator, settings, batch_size
         self._sit = generator.sit
+        self._nfe = evaluations(settings.solver, settings.steps)
         for network in (generator.sit, generator.vae):
             network.requires_grad_(False)
 
@@ -336,8 +337,7 @@ class SceneEditor:
         """Scenes between two scans, on the arc between their noises.
 
         Args:
-            first_m: ``(H, W)`` metres, -1 without a return; the first frame is its round trip
-                through noise.
+            first_m: ``(H, W)`` metres, -1 without a return; the first frame is its round trip.
             second_m: Likewise, the last frame.
             frames: How many, at least 2.
 
@@ -373,10 +373,6 @@ class SceneEditor:
         return EditResult(
             range_m, latents.cpu(), nfe, projection, vae_error_m, round_trip_m, cosine
         )
-
-    @property
-    def _nfe(self) -> int:
-        return evaluations(self.settings.solver, self.settings.steps)
 
     def _inverted(self, latents: Tensor, times: Tensor) -> Trajectory:
         path = self.generator.interpolant

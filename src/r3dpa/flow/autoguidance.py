@@ -41,9 +41,6 @@ def autoguided(
         interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
             waits for a GPU.
 
-    Returns:
-        Guided velocity, in at least float32 where it is guided.
-
     Raises:
         ValueError: If ``scale`` or ``interval`` is out of range or, when called, the two velocities
             have different shapes.

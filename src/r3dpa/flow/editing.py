@@ -55,16 +55,8 @@ def invert(
         solver: A key of :data:`r3dpa.flow.solvers.ODE_SOLVERS`.
         interpolant: Path of the velocity.
 
-    Returns:
-        Every state, in the dtype of ``latents``.
-
     Raises:
         ValueError: If the times do not decrease or there is no solver of that name.
-
-    Example:
-        >>> times = torch.tensor([1.0, 0.5, 0.0])
-        >>> invert(lambda x, time: x, torch.ones(1, 2), times, "euler").states[:, 0, 0]
-        tensor([2.2500, 1.5000, 1.0000])
     """
     if step_pairs(times)[0][0] < times[-1]:
         raise ValueError(
@@ -98,9 +90,6 @@ def renoised(
             ``(B, 1, h, w)``.
         noise: ``(B, ...)`` standard Gaussian draw.
         interpolant: Path of the velocity.
-
-    Returns:
-        ``(B, ...)`` state at the first time, dtype of the trajectory.
 
     Raises:
         ValueError: If the mask is not bool or does not fit, or the noise has another shape.
@@ -158,8 +147,7 @@ def spherical_mean(first: Tensor, second: Tensor, share: float) -> Tensor:
         second: ``(B, ...)`` at share 1.
         share: In [0, 1].
 
-    Returns:
-        ``(B, ...)``; the straight mean of parallel or opposite noises.
+    For parallel or opposite noises it is the straight mean.
 
     Raises:
         ValueError: If the shapes differ or the share is outside [0, 1].
@@ -207,17 +195,12 @@ def pnp_flow_feature(
 
     Args:
         velocity: ``(x (B, C, h, w), time (B,)) -> (B, C, h, w)`` without guidance.
-        feature_term: Guidance term of the same signature, see
-            :meth:`r3dpa.flow.guidance.FeatureGuidance.term`.
+        feature_term: Same signature, see :meth:`r3dpa.flow.guidance.FeatureGuidance.term`.
         latents: ``(B, C, h, w)`` normalised latents of the scene to edit.
         edit_mask: Bool, True where latents are generated anew; broadcasts to the latents.
-        times: ``(T,)`` decreasing times that include both ends, see
-            :func:`r3dpa.flow.times.ode_times`.
+        times: ``(T,)`` decreasing times from 1 to 0.
         noise: T Gaussian draws ``(B, C, h, w)``, one per time.
         exponent: Step sizes are ``t^exponent``.
-
-    Returns:
-        ``(B, C, h, w)`` edited latents, dtype of ``latents``.
 
     Raises:
         ValueError: If ``edit_mask`` does not fit the latents or there are not T draws.

@@ -59,9 +59,6 @@ def euler_maruyama(
         change_drift: ``(drift, x, time) -> drift`` applied in every step but the last.
         after_step: See :mod:`r3dpa.flow.solvers`.
 
-    Returns:
-        ``(B, ...)`` state at the last time, dtype of ``x``.
-
     Raises:
         ValueError: If ``times`` do not decrease, the ``denoise`` step does not end at 0, ``last``
             is unknown, ``eta`` is below 0, or the draws do not suffice or have another shape.
