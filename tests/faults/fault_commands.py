@@ -200,11 +200,20 @@ def assert_whole(folder: Path) -> int:
     return num_files
 
 
+def rows_of(journal: Path) -> dict[str, bytes]:
+    """Row of each scan that a journal names; a resumed run makes another shard."""
+    values = json.loads((journal.parent / "settings.json").read_text())
+    size = GridSettings(**values).store("").row.itemsize
+    data = journal.with_suffix(".rows").read_bytes()
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    return {line["scan"]: data[line["row"] * size : (line["row"] + 1) * size] for line in lines}
+
+
 def _check_rows(path: Path) -> None:
     journal, settings = path.with_suffix(".jsonl"), path.parent / "settings.json"
     values = json.loads(settings.read_text())
-    row = GridSettings(**values).row.itemsize
-    whole = journal.read_bytes().rpartition(b"\n")[0].splitlines()
+    row = GridSettings(**values).store("").row.itemsize
+    whole = (journal.read_bytes() if journal.exists() else b"").rpartition(b"\n")[0].splitlines()
     assert [json.loads(line)["row"] for line in whole] == list(range(len(whole)))
     assert path.stat().st_size >= len(whole) * row
 

@@ -9,7 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from fault_commands import At, Command, Fill, Limit, Pause, Signal, assert_whole, kill_worker
+from fault_commands import (
+    At,
+    Command,
+    Fill,
+    Limit,
+    Pause,
+    Signal,
+    assert_whole,
+    kill_worker,
+    rows_of,
+)
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 # Measured times, and when and where something was made.
@@ -112,7 +122,13 @@ def contents(out):
         return out.read_bytes()
     files = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
     kept = {n: p for n, p in files.items() if n.name not in _NOT_PROMISED and n.name[0] != "."}
-    return {str(name): path.read_bytes() for name, path in kept.items()}
+    found = {}
+    for name, path in kept.items():
+        if name.suffix == ".jsonl":
+            found |= {f"{name.parent}/{scan}": row for scan, row in rows_of(path).items()}
+        elif name.suffix != ".rows":
+            found[str(name)] = path.read_bytes()
+    return found
 
 
 @pytest.fixture(scope="session")
