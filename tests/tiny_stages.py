@@ -11,7 +11,6 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from r3dpa.callbacks import StepGuard
-from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
 from r3dpa.modules.steps import batch_number
@@ -28,14 +27,13 @@ SENSOR = LidarSensor(beams=8, columns=16)
 FEATURE_DIM = 6
 
 
-class TinyData(LidarDataModule):
+class TinyData(L.LightningDataModule):
     """One random batch per step; where ``bad`` says so with a NaN in its features."""
 
-    feature_source = "random"
+    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 4))
 
     def __init__(self, bad=(False,)):
-        L.LightningDataModule.__init__(self)
-        self.features_dir = "random"
+        super().__init__()
         generator = torch.Generator().manual_seed(0)
         self.batches = [
             {
@@ -48,20 +46,8 @@ class TinyData(LidarDataModule):
             if is_bad:
                 batch["feature_grid"][0, 0, 0] = torch.nan
 
-    feature_dim = FEATURE_DIM
-    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 4))
-
-    def prepare_data(self):
-        pass
-
-    def setup(self, stage):
-        pass
-
     def train_dataloader(self):
         return DataLoader(self.batches, batch_size=None)
-
-    def state_dict(self):
-        return {}
 
 
 class Observed:

@@ -82,7 +82,8 @@ def test_a_resumed_run_is_exact_also_at_the_end_of_an_epoch(
 ):
     """An epoch has five batches; a checkpoint is written in its last step, or after it."""
     names, expected = whole
-    first, _ = fit(tmp_path, stop, None, every, val_every)
+    first, stopped = fit(tmp_path, stop, None, every, val_every)
+    assert stopped["global_step"] == stop  # saved at the end, whatever the interval
     second, found = fit(tmp_path, WHOLE, tmp_path / "last.ckpt", every, val_every)
     assert first + second == names
     assert len({tuple(batch) for batch in names}) > 5  # another order in the second epoch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import StochasticWeightAveraging
 from tiny_stages import QUIET, TinyData, group_of, stage_module, train
 from torch import nn
 
@@ -241,3 +242,14 @@ class TestNonFiniteGradients:
         module = stage_module("joint")
         train(module, TinyData([True, False] * 3), StepGuard(2))
         assert len(module.states) == 6
+
+
+@pytest.mark.parametrize("precision", ["bf16-true", "16-true", "64-true"])
+def test_precisions_without_float32_weights_are_refused(precision):
+    with pytest.raises(ValueError, match=rf"precision {precision} is not supported.*bf16-mixed"):
+        train(stage_module("joint"), precision=precision)
+
+
+def test_another_average_of_the_weights_is_refused():
+    with pytest.raises(ValueError, match=r"StochasticWeightAveraging is not supported.*ema_decay"):
+        train(stage_module("joint"), callbacks=[StochasticWeightAveraging(0.1)])

@@ -1,0 +1,49 @@
+"""Losses of the stages never wait for a GPU and never mix devices, see ``one_device``."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from one_device import OneDevice
+from tiny_stages import QUIET, STAGES, stage_module
+
+from r3dpa.modules.steps import PathDraws
+
+pytestmark = QUIET
+
+
+def step(module, **more):
+    """Loss of a training step with draws and batch without values."""
+    module.on_fit_start()
+
+    def values(*shape):
+        return torch.empty(shape, device="meta")
+
+    latents = (2, 4, 4, 8)
+    draws, logged = PathDraws(values(*latents), values(2), values(*latents)), {}
+    module.draw_path, module.log_dict = lambda *_: draws, logged.update
+    batch = {"range_image": values(2, 1, 8, 16), "feature_grid": values(2, 8, 6)}
+    batch |= {name: values(*shape) for name, shape in more.items()}
+    loss = module.training_step(batch, 0)
+    assert {value.device.type for value in (loss, *logged.values())} == {"meta"}
+    assert "train/loss" in logged
+    return loss
+
+
+@pytest.mark.parametrize("stage", [*STAGES, "cached"])
+def test_losses_and_gradients_on_one_device(stage):
+    module = stage_module("flow_matching" if stage == "cached" else stage).to("meta")
+    more = {"posterior_moments": (2, 8, 4, 8)} if stage == "cached" else {}
+    with OneDevice():
+        step(module, **more).backward()
+    trained = [p for n in module.trainable().values() for p in n.parameters() if p.requires_grad]
+    assert all(parameter.grad is not None for parameter in trained)
+
+
+@pytest.mark.parametrize("fault", [lambda loss: loss.item(), lambda loss: loss + torch.ones(1)])
+def test_a_wait_or_a_tensor_of_the_cpu_would_be_seen(fault):
+    module = stage_module("joint").to("meta")
+    weigh = module.weigh_and_log
+    module.weigh_and_log = lambda parts: [fault(loss) for loss in parts.values()] and weigh(parts)
+    with OneDevice(), pytest.raises((RuntimeError, AssertionError), match="meta"):
+        step(module)
