@@ -110,7 +110,9 @@ def test_networks_of_another_size_are_refused(tmp_path):
     (file,) = (tmp_path / "bad_batches").iterdir()
     kept = BadBatch.read(file)
     wide = {**kept.tensors, "feature_grid": torch.zeros(2, 8, 7)}
-    other = dataclasses.replace(kept, tensors=wide, step=1).save(tmp_path / "other")
+    other = dataclasses.replace(kept, tensors=wide, about=kept.about | {"step": 1}).save(
+        tmp_path / "other"
+    )
     ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
     with pytest.raises(ValueError, match=r"step_0000001.*cannot be run with the networks of"):
         replay(other, ckpt)
@@ -122,7 +124,8 @@ def test_networks_of_another_size_are_refused(tmp_path):
 def test_a_precision_that_is_not_repeated_is_said(precision, said, tmp_path):
     train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
     (file,) = (tmp_path / "bad_batches").iterdir()
-    kept = dataclasses.replace(BadBatch.read(file), precision=precision, step=1)
+    kept = BadBatch.read(file)
+    kept = dataclasses.replace(kept, about=kept.about | {"precision": precision, "step": 1})
     text = replay(
         kept.save(tmp_path / "other"),
         save(stage_module("joint"), tmp_path / "before.safetensors"),

@@ -93,13 +93,14 @@ class TestTheReport:
         (file,) = (tmp_path / "bad_batches").iterdir()
         assert str(file) in message
         kept = BadBatch.read(file)
-        assert kept.names == ["drive/1a", "drive/1b"]
-        assert (kept.step, kept.number, kept.stage, kept.seed) == (1, 1, "joint", 0)
+        about = kept.about
+        assert about["names"] == ["drive/1a", "drive/1b"]
+        assert [about[k] for k in ("step", "number", "stage", "seed")] == [1, 1, "joint", 0]
         assert torch.equal(kept.tensors["feature_grid"], data.batches[1]["feature_grid"])
         drawn = module.draw_path(2, 1)
         assert all(map(torch.equal, kept.draws, drawn))
         assert kept.weights == module.weights
-        assert not torch.tensor(kept.losses["loss"]).isfinite()
+        assert not torch.tensor(about["losses"]["loss"]).isfinite()
 
     def test_of_two_batches_of_a_step_only_the_broken_one_is_kept(self, tmp_path):
         train(

@@ -1,4 +1,4 @@
-"""What the tests of faults share: small disks, commands, and the table of what they found."""
+"""What the tests of faults share: small disks and commands."""
 
 from __future__ import annotations
 
@@ -8,35 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fault_commands import Command, fit_words
-
-_ROWS = pytest.StashKey[list]()
-_HEAD = ("fault", "how it was injected", "what was lost", "what the user sees")
-
-
-def pytest_addoption(parser):
-    parser.addoption(
-        "--fault-table", type=Path, default=None, help="Markdown file for what the faults did"
-    )
-
-
-@pytest.fixture
-def fault(pytestconfig):
-    """``fault(name, injection, lost, seen)``: a row of the table, told when all of it holds."""
-
-    def tell(*cells: str) -> None:
-        assert len(cells) == len(_HEAD)
-        pytestconfig.stash.setdefault(_ROWS, []).append(cells)
-
-    return tell
-
-
-def pytest_sessionfinish(session):
-    path = session.config.getoption("--fault-table", default=None)
-    if path is None:
-        return
-    rows = [_HEAD, tuple("---" for _ in _HEAD), *session.config.stash.get(_ROWS, [])]
-    clean = [[" ".join(cell.replace("|", "\\|").split()) for cell in row] for row in rows]
-    path.write_text("".join(f"| {' | '.join(row)} |\n" for row in clean))
 
 
 @pytest.fixture

@@ -42,13 +42,7 @@ CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 class Command:
-    """``r3dpa WORDS`` in a process of its own.
-
-    Args:
-        log: File for what the user sees.
-        words: Command line after ``r3dpa``.
-        faults: Called in the process before the command.
-    """
+    """``r3dpa WORDS`` in a process of its own, in which ``faults`` are called before."""
 
     def __init__(self, log: Path, words: list, *faults: Callable[[], None]) -> None:
         self.log = log
@@ -92,14 +86,7 @@ def _run(log: Path, words: list[str], faults: tuple[Callable[[], None], ...]) ->
 
 @dataclass(frozen=True)
 class At:
-    """Something happens when a function is about to be called.
-
-    Args:
-        target: Its full name.
-        do: What happens.
-        call: At which call, the first is 1.
-        match: Calls count where a path among the arguments ends with this.
-    """
+    """Does something when ``target`` is called with a path that ends with ``match``."""
 
     target: str
     do: Callable[[], None]

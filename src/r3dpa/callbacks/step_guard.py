@@ -34,10 +34,8 @@ class StepGuard(L.Callback):
 
     def __init__(self, max_skipped_steps: int = 10, saved_batches: int = 3) -> None:
         if max_skipped_steps < 1 or saved_batches < 0:
-            raise ValueError(
-                "max_skipped_steps must be at least 1 and saved_batches at least 0, got "
-                f"{max_skipped_steps} and {saved_batches}"
-            )
+            limits = "max_skipped_steps must be at least 1 and saved_batches at least 0"
+            raise ValueError(f"{limits}, got {max_skipped_steps} and {saved_batches}")
         self.max_skipped_steps, self.saved_batches = max_skipped_steps, saved_batches
         self.skipped = self.in_a_row = self.stop = 0
         self._batches: list[tuple[int, Any, dict[str, Tensor]]] = []  # number, content, losses
@@ -61,11 +59,7 @@ class StepGuard(L.Callback):
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: Any, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Skips the step if it is not finite.
-
-        Raises:
-            RuntimeError: After ``max_skipped_steps`` in a row.
-        """
+        """Skips the step if it is not finite; stops after ``max_skipped_steps`` in a row."""
         pl_module.grad_norms = gradient_norms(pl_module, optimizer)
         norms = torch.stack(list(pl_module.grad_norms.values()))
         own_bad, losses_bad, gradients_bad, buffers_bad = self._faults(norms)

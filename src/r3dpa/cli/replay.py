@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from r3dpa.callbacks.bad_batches import BadBatch
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
@@ -20,125 +21,111 @@ _STAGES = {stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMa
 _AUTOCAST = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 
 
-@dataclass
-class _Layers:
-    """What the layers of one network did in a step, in the order of the calls."""
+class _Observer:
+    """Layers of a network that were called, and those whose output or gradient is not finite."""
 
-    called: set[str] = field(default_factory=set)
-    outputs: dict[str, bool] = field(default_factory=dict)  # not finite; were its inputs finite?
-    gradients: dict[str, None] = field(default_factory=dict)  # not finite
+    def __init__(self) -> None:
+        self.called: set[str] = set()
+        self.outputs: dict[str, bool] = {}  # and whether the inputs were finite
+        self.gradients: dict[str, None] = {}
 
-    def observe(self, name: str, inputs: Any, output: Any) -> None:
+    def __call__(self, name: str, layer: nn.Module, inputs: Any, output: Any) -> None:
         self.called.add(name)
-        if not isinstance(output, Tensor):
-            return
         if not _finite(output):
             self.outputs.setdefault(name, all(map(_finite, inputs)))
-        if output.requires_grad:
+        if isinstance(output, Tensor) and output.requires_grad:
+            note = self.gradients.setdefault
+            output.register_hook(lambda grad: None if _finite(grad) else note(name, None))
 
-            def note(gradient: Tensor) -> None:
-                if not _finite(gradient):
-                    self.gradients.setdefault(name, None)
-
-            output.register_hook(note)
+    def row(self, network: str) -> list[str]:
+        first = next(iter(self.outputs), "-")
+        if first in self.outputs:
+            first += " (inputs finite)" if self.outputs[first] else " (inputs not finite)"
+        called, outputs, gradients = map(len, (self.called, self.outputs, self.gradients))
+        return [network, f"{called}", f"{outputs}", first, f"{gradients}", *self.gradients, "-"][:6]
 
 
 def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
-    """Repeats the losses of a skipped step and finds where they stop to be finite.
+    """Repeat a skipped step to find the layer that failed.
 
-    The step is run as it was, with its own draws, loss weights and precision: on the whole batch,
-    where hooks look at what each layer gives and at the gradient of it, and on each scan alone,
-    where batch norm and latent statistics are those of this scan. Not repeated are the scaling of
-    the loss in float16 and the other processes of a distributed run.
+    The losses are computed as in training, with the draws, loss weights and precision of the step:
+    of the whole batch, where hooks look at the output of each layer and at its gradient, and of
+    each scan alone. The loss scale of float16 and the other processes of a distributed run are not
+    repeated.
 
     Args:
-        file: File of ``<run_dir>/bad_batches``.
-        ckpt: Weights, best those of the last step before: they are not kept with the batch.
-        device: ``cpu``, ``cuda`` or ``cuda:1``; the kernels of a GPU may round otherwise.
-
-    Returns:
-        What was run, a table of the losses, one of the networks, and a conclusion.
-
-    Raises:
-        FileNotFoundError: If a file does not exist.
-        ValueError: If a file is not what it should be, or the networks are of other sizes.
+        file: Of ``<run_dir>/bad_batches``.
+        ckpt: Weights, best those of the last step before it.
+        device: ``cpu``, ``cuda`` or ``cuda:1``.
     """
     saved, weights = BadBatch.read(file), read_checkpoint(ckpt)
-    module = _module(saved, weights).to(device)
+    about, module = saved.about, _module(saved, weights).to(device)
     state = {name: value.clone() for name, value in module.state_dict().items()}
-    layers = {name: _Layers() for name in ("vae", "sit", "discriminator") if getattr(module, name)}
+    seen = {name: _Observer() for name in ("vae", "sit", "discriminator") if getattr(module, name)}
     hooks = [
-        layer.register_forward_hook(
-            lambda _, inputs, output, name=name, seen=seen: seen.observe(name, inputs, output)
-        )
-        for network, seen in layers.items()
-        for name, layer in getattr(module, network).named_modules(prefix=network)
+        layer.register_forward_hook(partial(observer, name))
+        for network, observer in seen.items()
+        for name, layer in module.get_submodule(network).named_modules(prefix=network)
         if not list(layer.children())
     ]
-    every = slice(None)
     try:
-        rows = {"recorded": saved.losses, "all scans": _losses(module, saved, every, backward=True)}
+        rows = {"recorded": about["losses"], "all scans": _losses(module, saved, slice(None), True)}
     except RuntimeError as error:  # shapes of the batch against those of the networks
         raise ValueError(f"{file} cannot be run with the networks of {ckpt}: {error}") from error
     for hook in hooks:
         hook.remove()
     for index in range(len(saved.draws.time)):
         module.load_state_dict(state)
-        name = saved.names[index] if saved.names else f"scan {index}"
-        rows[name] = _losses(module, saved, slice(index, index + 1), backward=False)
-    columns = list(dict.fromkeys(name for values in rows.values() for name in values))
+        name = about["names"][index] if about["names"] else f"scan {index}"
+        rows[name] = _losses(module, saved, slice(index, index + 1), False)
     lines = [
-        f"{file}: stage {saved.stage}, step {saved.step}, batch {saved.number}, process "
-        f"{saved.rank} of {saved.world_size}, {saved.precision}",
+        "{0}: stage {stage}, step {step}, batch {number}, process {rank} of {world_size}, "
+        "{precision}".format(file, **about),
         f"weights: {ckpt}, stage {weights.stage}, step {weights.step}",
     ]
-    if saved.precision not in (*_AUTOCAST, "32-true"):
-        lines.append(f"{saved.precision} is not repeated: run in float32, which may not break")
-    tensors = {f"input {name}": value for name, value in saved.tensors.items()}
-    tensors |= {f"input {name}": value for name, value in saved.draws._asdict().items()}
-    for name, value in (
-        tensors | {f"weight {name}": value for name, value in state.items()}
-    ).items():
-        num_bad = int((~value.isfinite()).sum())
-        if num_bad:
-            lines.append(f"{name}: {num_bad} of {value.numel()} values are not finite")
+    if about["precision"] not in (*_AUTOCAST, "32-true"):
+        lines.append(f"{about['precision']} is not repeated: run in float32, which may not break")
+    inputs = saved.tensors | saved.draws._asdict()
+    for kind, tensors in (("input", inputs), ("weight", state)):
+        for name, value in tensors.items():
+            if num_bad := int((~value.isfinite()).sum()):
+                lines.append(f"{kind} {name}: {num_bad} of {value.numel()} values are not finite")
+    columns = list(dict.fromkeys(name for values in rows.values() for name in values))
     cells = [
-        [name, *(f"{values[c]:.4g}" if c in values else "-" for c in columns)]
-        for name, values in rows.items()
+        [name, *(f"{found[c]:.4g}" if c in found else "-" for c in columns)]
+        for name, found in rows.items()
     ]
-    lines.append(format_table(["", *columns], cells))
     head = ["network", "layers", "outputs not finite", "first", "gradients not finite", "first"]
-    lines.append(format_table(head, [_row(name, seen) for name, seen in layers.items()]))
-    return "\n".join([*lines, _conclusion(layers, saved)])
+    lines.append(format_table(["", *columns], cells))
+    lines.append(format_table(head, [observer.row(name) for name, observer in seen.items()]))
+    return "\n".join([*lines, _conclusion(seen, about["world_size"])])
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:
     """The stage with the networks of the checkpoint and the settings of the batch."""
-    if saved.stage not in _STAGES:
-        raise ValueError(f"stage {saved.stage!r} is none of {', '.join(_STAGES)}")
-    names = ["vae", "sit", "latent_norm"]
-    if saved.stage != FlowMatching.stage:
-        names.append("discriminator")
+    stage = _STAGES[saved.about["stage"]]
+    names = ["vae", "sit", "latent_norm", *(["discriminator"] if stage is not FlowMatching else [])]
     networks: dict[str, Any] = {name: weights.network(name).build() for name in names}
-    started = saved.step >= saved.weights.adversarial_start
-    settings = replace(saved.weights, adversarial_start=0) if started else saved.weights
-    return _STAGES[saved.stage](**networks, weights=settings, path=saved.path, seed=saved.seed)
+    settings = saved.weights
+    if saved.about["step"] >= settings.adversarial_start:
+        settings = replace(settings, adversarial_start=0)
+    return stage(**networks, weights=settings, path=saved.about["path"])
 
 
 def _losses(
-    module: GenerativeModule, saved: BadBatch, scans: slice, backward: bool
+    module: GenerativeModule, saved: BadBatch, scans: slice, grad: bool
 ) -> dict[str, float]:
     """Losses of some scans without weights, and ``loss``, their weighted sum."""
     draws = PathDraws(*(values[scans].to(module.device) for values in saved.draws))
     batch: Any = {name: value[scans].to(module.device) for name, value in saved.tensors.items()}
-    # Without a trainer there are no draws of a batch number and nothing to log to.
+    # There is no trainer: no number of the batch, and nothing to log to.
     module.draw_path = lambda *_: draws  # type: ignore[method-assign]
     module.log_dict = lambda *_: None  # type: ignore[method-assign]
-    dtype = _AUTOCAST.get(saved.precision)
-    with torch.set_grad_enabled(backward):
+    dtype = _AUTOCAST.get(saved.about["precision"])
+    with torch.set_grad_enabled(grad):
         with torch.autocast(module.device.type, dtype or torch.bfloat16, enabled=dtype is not None):
             total = cast(Tensor, module.training_step(batch, 0))
-        if backward:
+        if grad:
             total.backward()
     return {name: float(value) for name, value in module.logged_losses.items()}
 
@@ -147,25 +134,13 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, Tensor) or bool(value.isfinite().all())
 
 
-def _row(name: str, seen: _Layers) -> list[str]:
-    first = next(iter(seen.outputs), "-")
-    if first in seen.outputs:
-        first += " (inputs finite)" if seen.outputs[first] else " (inputs not finite)"
-    gradient = next(iter(seen.gradients), "-")
-    counts = [str(len(part)) for part in (seen.called, seen.outputs, seen.gradients)]
-    return [name, counts[0], counts[1], first, counts[2], gradient]
-
-
-def _conclusion(layers: Mapping[str, _Layers], saved: BadBatch) -> str:
-    starts = [n for network in layers.values() for n, sound in network.outputs.items() if sound]
-    if starts:
+def _conclusion(seen: Mapping[str, _Observer], world_size: int) -> str:
+    found = [item for observer in seen.values() for item in observer.outputs.items()]
+    if starts := [name for name, sound in found if sound]:
         return f"layers that turned finite inputs into others: {', '.join(starts)}"
-    if any(network.outputs for network in layers.values()):
+    if found:
         return "no layer turned finite inputs into others: it came with inputs or latents"
-    if any(network.gradients for network in layers.values()):
+    if any(observer.gradients for observer in seen.values()):
         return "all outputs are finite: it starts in a loss or in a gradient"
-    others = " It may lie in the batch of another process." if saved.world_size > 1 else ""
-    return (
-        "everything is finite with these weights: give the checkpoint of an earlier or later step, "
-        f"or the device of the run.{others}"
-    )
+    others = "; it may lie in the batch of another process" if world_size > 1 else ""
+    return f"everything is finite with these weights: give an earlier or later checkpoint{others}"

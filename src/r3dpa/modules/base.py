@@ -148,11 +148,7 @@ class GenerativeModule(L.LightningModule):
         """Checks trainer and data against the networks.
 
         The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches and has a
-        ``geometry`` after its own setup; of other attributes of
-        :class:`r3dpa.data.LidarDataModule` those that it has are used.
-
-        Raises:
-            ValueError: If they do not fit, saying what to change.
+        ``geometry`` after its own setup.
         """
         check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
@@ -217,13 +213,7 @@ class GenerativeModule(L.LightningModule):
     def draw_path(
         self, num_scans: int, batch_number: int | None = None, stream: int = 0
     ) -> PathDraws:
-        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`.
-
-        Args:
-            num_scans: Scans B of the batch on this process.
-            batch_number: Number of the batch; None is the training batch at hand.
-            stream: Separates training (0) from evaluation draws.
-        """
+        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
         shape = (self.vae.latent_channels, *self.sit.input_size)
         return steps.draw_path(
             self, num_scans, shape, self.seed, batch_number, self.time_sampling, stream
@@ -314,24 +304,14 @@ class GenerativeModule(L.LightningModule):
         """One AdamW with a parameter group per trained network."""
         return steps.adamw(self, self.trainable(), self.optimizer_config)
 
-    def configure_gradient_clipping(
-        self,
-        optimizer: torch.optim.Optimizer,
-        gradient_clip_val: int | float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``."""
-        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
+    configure_gradient_clipping = steps.clip_per_network
+    on_train_start = steps.fit_optimizer
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the averages, unless the step was skipped."""
         super().optimizer_step(*args, **kwargs)
         if self.ema is not None and not self.step_skipped:
             self.ema.update(self.sit, self.latent_norm)
-
-    def on_train_start(self) -> None:
-        """Fits the state of a resumed optimiser to this run."""
-        steps.fit_optimizer(self)
 
     # Evaluation
 
@@ -424,14 +404,10 @@ class GenerativeModule(L.LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images.
-
-        Raises:
-            ValueError: Naming both stages or both geometries.
-        """
+        """Refuses the checkpoint of another stage or of other range images."""
         self.loaded_step = checkpoint.get("global_step", 0)
         self._has_weights = True
-        steps.check_stage(checkpoint, self.stage, self.optimizer_config)
+        steps.check_stage(self, checkpoint)
         there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
         if self.geometry is None:
             self.geometry = there

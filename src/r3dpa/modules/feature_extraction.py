@@ -53,21 +53,17 @@ class FeatureExtraction(LightningModule):
         self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
-        """Take the projection of the first process: the others may lack the scans it is fitted to.
-
-        Args:
-            stage: ``"predict"``.
-        """
+        """Takes the projection of the first process: others may lack the scans it is fitted to."""
         self.projection = self.trainer.strategy.broadcast(self.projection)
 
     def transfer_batch_to_device(
         self, batch: list[PointSample], device: torch.device, dataloader_idx: int
     ) -> list[PointSample]:
-        """Leave the batch where it is: what the extractor needs on its device, it moves there."""
+        """Leaves the batch where it is: the extractor moves what it needs."""
         return batch
 
     def on_predict_start(self) -> None:
-        """Open a shard for each grid size; not called in a process that has nothing to do."""
+        """Opens a shard for each grid size; not called in a process that has nothing to do."""
         extractor, projection = self._parts()
         for size in self.grid_sizes:
             precision = self.trainer.precision
@@ -75,11 +71,7 @@ class FeatureExtraction(LightningModule):
             self._writers[size] = settings.writer(self.features_dir, self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:
-        """Pool the features of the scans and write their grids.
-
-        Args:
-            batch: Scans, prepared by the extractor's ``prepare``.
-        """
+        """Pools the features of scans prepared by the extractor and writes their grids."""
         extractor, projection = self._parts()
         grids = pooled_grids(extractor, batch, projection, self.grid_sizes)
         keys = [sample.key for sample in batch]
@@ -87,16 +79,12 @@ class FeatureExtraction(LightningModule):
             writer.add(keys, grids[size])
 
     def teardown(self, stage: str) -> None:
-        """Wait until all processes have written all of their grids.
-
-        Args:
-            stage: ``"predict"``.
-        """
+        """Waits until all processes have written all of their grids."""
         self.close()
         self.trainer.strategy.barrier("feature grids")
 
     def close(self) -> None:
-        """Give the shards free, after an error too."""
+        """Releases the shards, after an error too."""
         for writer in self._writers.values():
             writer.close()
         self._writers.clear()
@@ -139,11 +127,7 @@ class MissingScans(LightningDataModule):
         self.batch_size, self.num_workers = batch_size, num_workers
 
     def setup(self, stage: str) -> None:
-        """Take the list of the first process.
-
-        Args:
-            stage: ``"predict"``.
-        """
+        """Takes the list of the first process."""
         assert self.trainer is not None
         self.scans = self.trainer.strategy.broadcast(self.scans)
 

@@ -75,11 +75,7 @@ class FlowMatching(GenerativeModule):
             )
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks, and cached latents against the data module.
-
-        Raises:
-            ValueError: If the posteriors of its scans cannot be cached.
-        """
+        """Checks data against networks, and whether posteriors of the data can be cached."""
         super().setup(stage)
         if not self.cache_latents or stage != "fit":
             return

@@ -95,24 +95,12 @@ class ImageVAETraining(L.LightningModule):
         """AdamW of the VAE."""
         return steps.adamw(self, {"vae": self.vae}, self.optimizer_config)
 
-    def configure_gradient_clipping(
-        self,
-        optimizer: torch.optim.Optimizer,
-        gradient_clip_val: int | float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clips the gradient norm and logs it."""
-        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
-
-    def on_train_start(self) -> None:
-        """Fits the state of a resumed optimiser to this run."""
-        steps.fit_optimizer(self)
+    configure_gradient_clipping = steps.clip_per_network
+    on_train_start = steps.fit_optimizer
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds the stage and the images that it was trained with."""
         steps.describe_stage(checkpoint, self.stage, "linear")
         checkpoint["r3dpa"]["images"] = image_datamodule(self, self.vae).settings
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage."""
-        steps.check_stage(checkpoint, self.stage, self.optimizer_config)
+    on_load_checkpoint = steps.check_stage

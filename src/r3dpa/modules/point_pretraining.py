@@ -65,12 +65,7 @@ class PointPretraining(LightningModule):
         self.grid: ScanGrid | None = None
 
     def setup(self, stage: str) -> None:
-        """Take the preparation of the scans from the data module.
-
-        Raises:
-            ValueError: If the trainer has no :class:`r3dpa.data.PointDataModule` whose ``prepare``
-                is a :class:`r3dpa.nn.backbones.Masking` with the cells of the network.
-        """
+        """Takes the preparation of the scans from the data module and checks its cells."""
         masking = getattr(getattr(self.trainer, "datamodule", None), "prepare", None)
         if not isinstance(masking, Masking):
             raise ValueError(

@@ -25,23 +25,13 @@ __all__ = ["ImageTeacher", "RGBPretraining"]
 
 
 class ImageTeacher(Protocol):
-    """Frozen network whose features of images a SiT is aligned with.
-
-    Attributes:
-        dim: Width F of the features.
-        trained: Whether it has other than random weights.
-    """
+    """Frozen network whose features of images, of width ``dim``, a SiT is aligned with."""
 
     dim: int
     trained: bool
 
     def __call__(self, image: Tensor, grid_size: tuple[int, int]) -> Tensor:
-        """Features ``(B, N, F)`` of the cells of a grid, row-major.
-
-        Args:
-            image: ``(B, 3, S, S)`` in [-1, 1].
-            grid_size: Rows and columns of the cells.
-        """
+        """Features ``(B, N, F)`` of grid cells, row-major, of images ``(B, 3, S, S)``."""
         ...
 
 
@@ -134,12 +124,7 @@ class RGBPretraining(L.LightningModule):
         return image_datamodule(self, self.vae)
 
     def setup(self, stage: str) -> None:
-        """Checks data against networks.
-
-        Raises:
-            ValueError: If there are no images, their latents have another size than the SiT's, or
-                the teacher of a fit has random weights.
-        """
+        """Checks trainer and data against the networks, and that a teacher has weights."""
         check_trainer(self.trainer)
         size = self._datamodule.image_size
         latent_size = self.vae.latent_size((size, size))
@@ -156,11 +141,7 @@ class RGBPretraining(L.LightningModule):
             )
 
     def on_fit_start(self) -> None:
-        """Loads the VAE, encodes the images that are not encoded yet, measures their latents.
-
-        Raises:
-            ValueError: If there is no trained VAE.
-        """
+        """Loads the VAE, encodes the images that are not encoded yet, measures their latents."""
         if not self._resumed:
             if self.init_from is None:
                 raise ValueError(
@@ -265,24 +246,14 @@ class RGBPretraining(L.LightningModule):
         """AdamW of the SiT."""
         return steps.adamw(self, {"sit": self.sit}, self.optimizer_config)
 
-    def configure_gradient_clipping(
-        self,
-        optimizer: torch.optim.Optimizer,
-        gradient_clip_val: int | float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clips the gradient norm and logs it."""
-        steps.clip_per_network(self, optimizer, gradient_clip_val, gradient_clip_algorithm)
+    configure_gradient_clipping = steps.clip_per_network
+    on_train_start = steps.fit_optimizer
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the averages, unless the step was skipped."""
         super().optimizer_step(*args, **kwargs)
         if not self.step_skipped:
             self.ema.update(self.sit, self.latent_norm)
-
-    def on_train_start(self) -> None:
-        """Fits the state of a resumed optimiser to this run."""
-        steps.fit_optimizer(self)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds the stage and the images that it was trained with."""
@@ -291,5 +262,5 @@ class RGBPretraining(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage."""
-        steps.check_stage(checkpoint, self.stage, self.optimizer_config)
+        steps.check_stage(self, checkpoint)
         self._resumed = True

@@ -42,15 +42,14 @@ def draw_path(
 ) -> PathDraws:
     """Posterior noise, times and path noise for this process's part of a global batch.
 
-    They are a function of ``(seed, stream, batch, sample)`` alone, whatever the number of
-    processes.
+    They are a function of ``(seed, stream, batch, sample)``, whatever the number of processes.
 
     Args:
         module: Attached to a trainer, on its device.
         num_samples: Samples B of the batch on this process.
         latent_shape: ``(C, h, w)``.
         seed: Key of the draws.
-        number: Number of the batch since the start of training, or of the split; None is that of
+        number: Number of the batch since the start of training or of the split; None is that of
             the training batch at hand.
         time_sampling: Density of the times.
         stream: Separates training (0) from evaluation draws.
@@ -115,10 +114,7 @@ def weigh_and_log(
 ) -> Tensor:
     """Sum of weighted losses; logs it as ``train/loss``, and each loss without its weight.
 
-    Args:
-        module: Gets the logged values, detached, as ``module.logged_losses``.
-        parts: Weighted losses under the names of their weights.
-        weights: Losses of weight 0 are not logged.
+    The logged values are kept in ``module.logged_losses``; losses of weight 0 are not logged.
     """
     total = torch.stack(list(parts.values())).sum()
     factors = {name: getattr(weights, name) for name in parts}
@@ -150,13 +146,9 @@ def uses_fused(module: L.LightningModule) -> bool:
 
 
 def arrange_optimizer(optimizer: torch.optim.Optimizer, fused: bool) -> None:
-    """Puts the state of an AdamW where it has to be, in the memory format of the weights.
+    """Moves a state of other settings to its device, in the memory format of the weights.
 
     A fused optimiser walks through the memory of weights and moments alike, unchecked.
-
-    Args:
-        optimizer: It may hold the state of a run with other settings.
-        fused: Whether one kernel moves all weights.
     """
     for group in optimizer.param_groups:
         group["fused"] = fused
@@ -188,20 +180,15 @@ def gradient_norms(
 def clip_per_network(
     module: L.LightningModule,
     optimizer: torch.optim.Optimizer,
-    limit: int | float | None,
-    algorithm: str | None,
+    gradient_clip_val: int | float | None = None,
+    gradient_clip_algorithm: str | None = None,
 ) -> None:
     """Clips each network's gradient norm by itself and logs it as ``grad_norm/<network>``.
 
-    Args:
-        module: ``module.grad_norms`` are taken for the norms where a callback has computed them.
-        optimizer: Of :func:`adamw`.
-        limit: Largest norm; None clips nothing.
-        algorithm: As Lightning gives it; ``norm`` or None.
-
-    Raises:
-        ValueError: If the gradients are to be clipped by value.
+    The norms are those in ``module.grad_norms`` where :class:`r3dpa.callbacks.StepGuard` has
+    computed them.
     """
+    algorithm = gradient_clip_algorithm
     if algorithm not in (None, "norm"):
         raise ValueError(
             "gradients are clipped by norm per network; leave gradient_clip_algorithm out, got "
@@ -209,7 +196,7 @@ def clip_per_network(
         )
     norms = module.__dict__.pop("grad_norms", None) or gradient_norms(module, optimizer)
     module.log_dict({f"grad_norm/{name}": norm for name, norm in norms.items()})
-    limit = float("inf") if limit is None else float(limit)
+    limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
     for group in optimizer.param_groups:
         nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
 
@@ -224,21 +211,17 @@ def describe_stage(checkpoint: dict[str, Any], stage: str, path: str) -> None:
     }
 
 
-def check_stage(checkpoint: dict[str, Any], stage: str, config: OptimizerConfig) -> None:
-    """Refuses the checkpoint of another stage; optimiser settings stay those of this run.
-
-    Raises:
-        ValueError: Naming both stages.
-    """
+def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:
+    """Refuses the checkpoint of another stage; optimiser settings stay those of this run."""
     found = checkpoint.get("r3dpa", {}).get("stage")
-    if found != stage:
+    if found != module.stage:
         raise ValueError(
-            f"the checkpoint is of stage {found!r}, this is {stage!r}; to start a stage from "
-            "another one, give model.init_from instead of ckpt_path"
+            f"the checkpoint is of stage {found!r}, this is {module.stage!r}; to start a stage "
+            "from another one, give model.init_from instead of ckpt_path"
         )
     for state in checkpoint.get("optimizer_states", []):
         for group in state["param_groups"]:
-            group.update(asdict(config))
+            group.update(asdict(module.optimizer_config))
 
 
 def predict(
