@@ -40,9 +40,11 @@ FAULTS = [
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("accumulate", [1, 2])
-@pytest.mark.parametrize(("stage", "fault"), FAULTS)
 class TestABadStep:
+    @pytest.mark.parametrize(
+        ("stage", "fault", "accumulate"),
+        [*((*fault, 1) for fault in FAULTS), ("joint", infinite_image, 2)],
+    )
     def test_is_as_if_it_had_not_been(self, stage, fault, accumulate):
         """Weights, all buffers, averages and moments equal those of a run without its batches.
 
@@ -72,11 +74,10 @@ class TestABadStep:
         for key, value in before.items():
             assert torch.equal(after_bad[key], value), key
 
-    def test_breaks_weights_or_statistics_without_guards(self, stage, fault, accumulate):
+    @pytest.mark.parametrize("fault", [infinite_image, huge_latents, constant_loss])
+    def test_breaks_weights_or_statistics_without_guard(self, fault):
         """The naive way; an infinite loss with finite gradients only moves them on."""
-        module = guarded(stage, [accumulate], fault)
-        data = NamedData(2 * accumulate)
-        train(module, data, None, max_steps=2, accumulate_grad_batches=accumulate)
+        module = train(guarded("joint", [1], fault), NamedData(2), None)
         sound = all(value.isfinite().all() for value in module.state_dict().values())
         assert sound == (fault is constant_loss)
 
@@ -201,10 +202,10 @@ class TestScaledLosses:
         return module, scaler.get_scale()
 
     def test_a_fit_finds_its_scale_beyond_the_most_bad_steps_in_a_row(self, recwarn):
-        """2^60 is far above what 16 bits hold; it is halved in each step until it fits."""
-        module, scale = self.fit(60, 2.0**60)
+        """2^30 is far above what 16 bits hold; it is halved in each step until it fits."""
+        module, scale = self.fit(30, 2.0**30)
         assert module.guard.skipped > module.guard.max_skipped_steps
-        assert scale == 2.0 ** (60 - module.guard.skipped)
+        assert scale == 2.0 ** (30 - module.guard.skipped)
         assert not module.step_skipped
         assert not [w for w in recwarn if "was skipped" in str(w.message)]
 

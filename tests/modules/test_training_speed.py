@@ -21,7 +21,7 @@ def load(run_dir):
 
 
 class TestCachedLatents:
-    @pytest.mark.parametrize("rotate", [False, True])
+    @pytest.mark.parametrize("rotate", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_steps_are_those_with_the_encoder(
         self, rotate, smoke_args, vae_checkpoint, tmp_path, monkeypatch
     ):
@@ -54,7 +54,7 @@ class TestCachedLatents:
                 moved = max(moved, (before[key] - value).abs().max().item())
         assert moved > 1e-3
 
-    @pytest.mark.parametrize("rotate", [False, True])
+    @pytest.mark.parametrize("rotate", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_a_fast_dev_run_encodes_what_it_needs(
         self, rotate, smoke_args, vae_checkpoint, tmp_path
     ):
@@ -65,6 +65,7 @@ class TestCachedLatents:
         (journal,) = tmp_path.glob("latents/posterior_*/shard_*.jsonl")
         assert len(journal.read_text().splitlines()) == 2
 
+    @pytest.mark.slow
     def test_they_are_not_rounded_in_mixed_precision(self, smoke_args, vae_checkpoint, tmp_path):
         """Bit for bit those of float32, in a folder of the same name."""
         more = ["--trainer.fast_dev_run=1", "--model.init_args.init_from", str(vae_checkpoint)]
@@ -101,6 +102,7 @@ class TestLayout:
         assert list(saved) == list(plain.state_dict())
         assert all(value.is_contiguous() for value in saved.values())
 
+    @pytest.mark.slow
     def test_a_run_goes_on_in_the_other_layout(self, smoke_args, vae_checkpoint, tmp_path):
         """Moments that keep the old layout would be applied to other weights, without an error."""
         more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]

@@ -21,30 +21,19 @@ __all__ = ["AtomicCheckpointIO", "RunCheckpoint"]
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints beside their place, then renames them: no moment has half a file there.
+    """Writes checkpoints beside their place, then renames them: a partial file is never visible.
 
-    Lightning's own writes to the system's folder for temporary files. Where that is on another disk
-    than the run, its last move is a copy over the checkpoint before, which a kill or a full disk
-    leaves cut short.
+    Lightning writes to the system's temporary folder; where that is on another disk than the run,
+    its last move is a copy over the previous checkpoint, which a kill or a full disk cuts short.
     """
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
     ) -> None:
-        """Writes a checkpoint.
-
-        Args:
-            checkpoint: What to write.
-            path: Its file.
-            storage_options: Refused, as by Lightning's own.
-
-        Raises:
-            OSError: If it cannot be written; names the file and the reason. A checkpoint that was
-                there before stays.
-        """
+        """Writes a checkpoint; an OSError names the file and the reason."""
         if storage_options is not None:
-            raise TypeError(f"{type(self).__name__} knows no storage_options")
-        # A file object: what torch opens itself fails without telling why.
+            raise TypeError(f"{type(self).__name__} supports no storage_options")
+        # A file object: torch's own errors do not name the reason.
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)
             file.flush()
@@ -56,30 +45,26 @@ class RunCheckpoint(ModelCheckpoint):
 
     Lightning's own saves at the end of training only if it has never saved before.
 
-    A SIGTERM, as job systems send it before they end a job, and Ctrl-C (SIGINT) are obeyed after
-    the next optimiser step, or by a single process after the next batch of a validation:
-    ``last.ckpt`` is saved and the process ends with status 143 or 130. It is enough that one of
-    several gets the signal. A second Ctrl-C ends a single process at once, without saving.
+    After SIGTERM, as job systems send it before they end a job, or Ctrl-C (SIGINT) the next
+    optimiser step, or the next validation batch of a single process, is the last: ``last.ckpt`` is
+    saved and all processes end with status 143 or 130. One of several needs to get the signal. A
+    second Ctrl-C ends a single process at once, without saving.
 
-    Several processes that go on from different checkpoints, as copies on the disks of their own
-    may be, are refused.
+    Processes that resume from different checkpoints are refused, and a run resumed at the end of an
+    epoch starts the next one.
     """
 
     _signal = 0  # that asked to stop
     _step = 0  # optimiser steps when a batch ended last
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Has checkpoints written whole, unless a strategy or plugin writes them its own way."""
+        """Makes writes atomic, unless a strategy or plugin has a checkpoint format of its own."""
         super().setup(trainer, pl_module, stage)
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Takes the signals over from Lightning, which ends training without saving.
-
-        Raises:
-            ValueError: If the processes are at different steps.
-        """
+        """Replaces Lightning's signal handlers, which end training without saving."""
         super().on_train_start(trainer, pl_module)
         first = trainer.strategy.broadcast(trainer.global_step)
         if trainer.global_step != first:
@@ -115,7 +100,7 @@ class RunCheckpoint(ModelCheckpoint):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Saves where it is time to; then stops where that was asked for."""
+        """Saves on time; then stops on a signal."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
         if trainer.global_step != self._step:  # else gradients are still to be accumulated
             self._step = trainer.global_step
@@ -130,9 +115,9 @@ class RunCheckpoint(ModelCheckpoint):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Stops where that was asked for: a validation may take longer than a job system waits.
+        """Stops on a signal: a validation may take longer than a job system waits.
 
-        Several processes wait for the next step: they may have unequal numbers of batches here.
+        Not with several processes, which may have unequal numbers of batches here.
         """
         if trainer.state.fn == "fit" and not trainer.sanity_checking and trainer.world_size == 1:
             self._stop_if_asked(trainer)

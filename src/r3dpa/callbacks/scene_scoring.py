@@ -46,14 +46,12 @@ _OPTION = "--scorer.{} true"  # how the SceneScorer of `r3dpa test` is told to a
 
 
 class SceneScorer(L.Callback):
-    """Samples scenes after a test run and tells how near they are to real scans.
+    """Samples scenes after a test run and compares them with real scans.
 
-    The processes share the sampling; the first one compares. Scenes are sampled in the same
-    batches whatever the number of processes, so that the numbers do not depend on it. It prints
-    the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and writes them with
-    tables and figures to ``<run_dir>/evaluation``, which all processes must see.
-
-    A stage that trains no velocity has nothing to sample, and says so.
+    The processes share the sampling, in the same batches whatever their number; the first one
+    compares. It prints the table of ``r3dpa evaluate``, logs its numbers as ``test/<metric>`` and
+    writes them with tables and figures to ``<run_dir>/evaluation``, which all processes must see.
+    A stage that trains no velocity samples nothing.
 
     Args:
         num_scenes: Scenes to sample, more than there are features; 0 samples none.
@@ -70,11 +68,8 @@ class SceneScorer(L.Callback):
         protocol: ``default`` or ``published``; where None, that of the reference file, or
             ``default`` without one.
         allow_few: Accept fewer scenes than features: only to try it.
-        skip_bad: Leave out scenes that cannot be used, such as those without any return; the tables
-            tell how many and the numbers' file which. Else the first one ends the test.
-
-    Raises:
-        ValueError: If a number is out of its range.
+        skip_bad: Leave out scenes that cannot be used, such as those without any return, and
+            report them; else the first one ends the test.
     """
 
     def __init__(
@@ -121,15 +116,18 @@ class SceneScorer(L.Callback):
         if pl_module.ema is None:
             rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
             return
-        datamodule = getattr(trainer, "datamodule", None)
-        if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
-            raise TypeError(f"SceneScorer needs a LidarDataModule, got {type(datamodule).__name__}")
         device = str(pl_module.device)
         counts, statistics = {"generated scenes": self.num_scenes}, self._loaded()
         scans: list[Scan] = []
         if statistics is not None:
             spaces = reference_spaces(statistics, self.spaces, self.ckpt, self.protocol, device)
         else:
+            datamodule = getattr(trainer, "datamodule", None)
+            if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
+                raise ValueError(
+                    f"scorer.reference: {type(datamodule).__name__} does not list its scans: give "
+                    "a file of `r3dpa reference`, or --scorer.num_scenes 0 to score no scenes"
+                )
             scans = datamodule.all_set.scans
             setting = PROTOCOLS[self.protocol or "default"].with_sensor(datamodule.sensor)
             names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
