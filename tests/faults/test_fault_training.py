@@ -24,26 +24,12 @@ from fault_commands import (
 STEP = "r3dpa.modules.VAEAlignment.training_step"
 
 
-def flat(content, name=""):
-    """All values of a checkpoint by their place in it."""
-    if isinstance(content, dict | list | tuple):
-        pairs = content.items() if isinstance(content, dict) else enumerate(content)
-        return {k: v for key, value in pairs for k, v in flat(value, f"{name}/{key}").items()}
-    return {name: content}
-
-
 def assert_same_training(run_dir, other):
     """Weights, averages, buffers and optimiser, bit by bit."""
     ours, theirs = (torch.load(last(path), weights_only=True) for path in (run_dir, other))
     assert ours["global_step"] == theirs["global_step"] == STEPS
-    for part in ("state_dict", "optimizer_states"):
-        left, right = flat(ours[part]), flat(theirs[part])
-        assert left.keys() == right.keys()
-        for name, value in left.items():
-            if isinstance(value, torch.Tensor):
-                assert torch.equal(value, right[name]), name
-            else:
-                assert value == right[name], name
+    states = [(run["state_dict"], run["optimizer_states"][0]["state"]) for run in (ours, theirs)]
+    torch.testing.assert_close(*states, rtol=0, atol=0)
 
 
 def step_of(path):
@@ -144,15 +130,6 @@ class TestKilled:
         assert_whole(tmp_path / "run")
         if save == 4:
             assert step_of(last(tmp_path / "run")) == 2
-        goes_on(tmp_path / "run")
-
-    @pytest.mark.slow
-    def test_before_a_checkpoint_gets_its_name(self, scans_folder, tmp_path, ended, goes_on):
-        words = fit_words(scans_folder, tmp_path / "run")
-        renamed = At("pathlib.Path.replace", Signal(signal.SIGKILL), call=2, match="last.ckpt")
-        assert ended(words, renamed)[0] == -signal.SIGKILL
-        assert step_of(last(tmp_path / "run")) == 2
-        assert_whole(tmp_path / "run")
         goes_on(tmp_path / "run")
 
     def test_worker(self, scans_folder, tmp_path, ended, goes_on):

@@ -102,22 +102,6 @@ class TestLayout:
         assert list(saved) == list(plain.state_dict())
         assert all(value.is_contiguous() for value in saved.values())
 
-    @pytest.mark.slow
-    def test_a_run_goes_on_in_the_other_layout(self, smoke_args, vae_checkpoint, tmp_path):
-        """Moments that keep the old layout would be applied to other weights, without an error."""
-        more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
-        more += ["--model.init_args.optimizer", "{lr: 1.0e-3, eps: 1.0e-3}"]
-        main(smoke_args("joint", tmp_path / "half", *more))
-        last = str(tmp_path / "half" / "checkpoints" / "last.ckpt")
-        whole = {}
-        for name in ("false", "true"):
-            words = ["--trainer.max_steps", "6", "--ckpt_path", last]
-            words += [f"--model.init_args.channels_last={name}"]
-            main(smoke_args("joint", tmp_path / name, *more, *words))
-            whole[name] = load(tmp_path / name)["state_dict"]
-        for key, value in whole["false"].items():
-            torch.testing.assert_close(whole["true"][key], value, atol=1e-5, rtol=1e-4, msg=key)
-
     @pytest.mark.parametrize("fused", [False, True])
     def test_moments_follow_their_weights(self, fused):
         weight = torch.nn.Parameter(torch.randn(4, 3, 2, 2).to(**CHANNELS_LAST))

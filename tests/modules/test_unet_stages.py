@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import pytest
 import torch
 import yaml
@@ -12,7 +10,7 @@ from torch import nn
 
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
-from r3dpa.generation import SamplerConfig, SceneGenerator, Solver
+from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.modules import LossWeights
 from r3dpa.nn import VAE, PatchDiscriminator, UNet
 
@@ -124,29 +122,12 @@ def test_stages_start_and_go_on_from_one_another(
     assert read_checkpoint(tmp_path / "checkpoints" / "last.ckpt").network("sit").kind is UNet
 
 
-@pytest.mark.parametrize("solver", get_args(Solver))
-def test_every_solver_samples_from_it(solver, joint_checkpoint):
-    config = SamplerConfig(solver) if solver == "dopri5" else SamplerConfig(solver, steps=3)
-    if solver == "dopri5":
-        pytest.importorskip("torchdiffeq")
-    checkpoint = read_checkpoint(joint_checkpoint)
-    batches = {
-        precision: SceneGenerator.from_checkpoint(checkpoint, config, precision=precision).generate(
-            [0, 1]
-        )
-        for precision in ("fp32", "bf16")
-    }
-    wide, half = batches["fp32"].latents, batches["bf16"].latents
-    assert wide.isfinite().all()
-    assert batches["fp32"].range_m.shape == (2, 16, 64)
-    assert half.dtype == torch.float32
-    assert (half - wide).norm() < 0.05 * wide.norm()
-
-
 def test_a_scene_does_not_depend_on_its_batch(joint_checkpoint):
     scenes = SceneGenerator.from_checkpoint(joint_checkpoint, SamplerConfig("heun", steps=3))
     both, alone = scenes.generate([0, 1], seed=3), scenes.generate([1], seed=3)
     torch.testing.assert_close(alone.latents[0], both.latents[1], atol=1e-5, rtol=0)
+    assert both.range_m.shape == (2, 16, 64)
+    assert both.latents.isfinite().all()
 
 
 def test_rgb_weights_are_for_a_sit(smoke_args, unet_file, joint_checkpoint, tmp_path):

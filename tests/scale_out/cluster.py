@@ -17,14 +17,7 @@ PYTHON = sys.executable
 
 @dataclass(frozen=True)
 class Node:
-    """A place to start processes in, with its own address.
-
-    Args:
-        rank: 0 for the first node.
-        address: IPv4 address.
-        interface: Network interface of that address.
-        namespace: Network namespace; that of this process where None.
-    """
+    """A place to start processes in: rank, IPv4 address and its interface, network namespace."""
 
     rank: int
     address: str
@@ -64,9 +57,7 @@ def two_nodes() -> Iterator[list[Node]]:
     """Two nodes joined by a cable, and by nothing with this machine; the disk is shared.
 
     Whatever still runs on them at the end is killed.
-
-    Raises:
-        PermissionError: If this process may not make them; says why.
+    PermissionError: this process may not make them.
     """
     names = [f"r3dpa-{os.getpid()}-{rank}" for rank in (0, 1)]
     nodes = [Node(rank, f"10.77.0.{rank + 1}", "veth0", name) for rank, name in enumerate(names)]

@@ -11,16 +11,12 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-import yaml
 from cluster import PYTHON, Node, child_of, finish, two_nodes
 
 from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
-from r3dpa.data import FeatureGrids, find_scans
-from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.results import Evaluation
 
@@ -119,35 +115,6 @@ def logged(run_dir):
     return values
 
 
-@pytest.fixture
-def scans(tmp_path):
-    """Data YAML of random scans."""
-    folder = tmp_path / "scans"
-    folder.mkdir()
-    generator = np.random.default_rng(0)
-    for index in range(NUM_SCANS):
-        points = generator.uniform((-20, -20, -2, 0), (20, 20, 1, 1), (200, 4))
-        (folder / f"{index:010d}.bin").write_bytes(points.astype(np.float32).tobytes())
-    arguments = {
-        "scans": str(folder),
-        "sensor": {"beams": 16, "columns": 64},
-        "grid_size": [2, 8],
-        "extractor": {"class_path": "r3dpa.nn.backbones.GeometricFeatures"},
-        "batch_size": 2,
-    }
-    path = tmp_path / "data.yaml"
-    config = {"data": {"class_path": "r3dpa.data.LidarDataModule", "init_args": arguments}}
-    path.write_text(yaml.safe_dump(config))
-    return path
-
-
-def grids(out, data):
-    """Bytes of each grid by scan."""
-    found = find_scans(data.parent / "scans")
-    store = FeatureGrids(out, found, SphericalProjection(LidarSensor(beams=16, columns=64)), (2, 8))
-    return {s.name: store.read(s).numpy().tobytes() for s in found}
-
-
 def wait_for_checkpoint(run_dir, jobs):
     end = time.monotonic() + RUN_S
     while not (run_dir / "checkpoints" / "last.ckpt").exists():
@@ -201,20 +168,6 @@ def test_silent_node_ends_the_job(nodes, fit, tmp_path):
         text = log.read_text()
         assert re.search("Timed out waiting 20000ms|Application timeout", text), text
     assert 0 < last(run_dir)["global_step"] < 1000  # whole: it can be read
-
-
-def test_features_are_those_of_one_process(nodes, scans, tmp_path):
-    """Also that a store of both nodes is one store: nothing is made twice or left out."""
-    words = ["features", "--data", scans, "--out"]
-    alone([*words, tmp_path / "one"], tmp_path / "log")
-    texts = together(nodes, [*words, tmp_path / "two", *SPREAD], tmp_path / "logs")
-    expected = grids(tmp_path / "one", scans)
-    assert len(set(expected.values())) == NUM_SCANS
-    assert grids(tmp_path / "two", scans) == expected
-    journals = sorted((tmp_path / "two").rglob("*.jsonl"))
-    assert [len(path.read_text().splitlines()) for path in journals] == [NUM_SCANS // 2] * 2
-    assert f"feature grids: {NUM_SCANS} made, 0 kept, " in texts[0]
-    assert "feature grids:" not in texts[1]
 
 
 def test_scores_are_those_of_one_process(nodes, fit, one, tmp_path, monkeypatch):
