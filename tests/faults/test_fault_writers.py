@@ -89,7 +89,7 @@ def jobs(scans_folder, tmp_path_factory):
         "reference": Job(
             ["reference", "--data", folder / "data.yaml", "--spaces", "fgeo", "--device", "cpu"],
             "--out",
-            At("r3dpa.cli.evaluate.read_scan", None, call=4),
+            At("r3dpa.data.scans.read_scan", None, call=4),
             5000,
             "r3dpa reference: stopped; the same command continues\n",
             is_file=True,
@@ -117,7 +117,7 @@ def at(job, do):
 
 
 def contents(out):
-    """Bytes of all files of which they are promised; of a store those that the journal names."""
+    """Bytes of all files of which they are promised; of a store those of each scan's row."""
     if out.is_file():
         return out.read_bytes()
     files = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
