@@ -70,9 +70,7 @@ class EditSettings:
     def times(self, start: float) -> Tensor:
         """Times from ``start`` in (0, 1] to the data."""
         if not 0 < start <= 1:
-            raise ValueError(
-                f"start must be a time above 0 (scan), at most 1 (noise), got {start:g}"
-            )
+            raise ValueError(f"start must be a time above 0 (scan) up to 1 (noise), got {start:g}")
         return ode_times(self.steps, start, shift=self.shift)
 
 

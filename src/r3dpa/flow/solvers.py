@@ -62,14 +62,7 @@ def unchanged(x: Tensor, time: float, index: int) -> Tensor:
 
 
 class CountingVelocity:
-    """A velocity function that counts its evaluations in ``nfe``.
-
-    Example:
-        >>> counted = CountingVelocity(lambda x, time: -x)
-        >>> _ = heun(counted, torch.ones(2, 3), torch.linspace(1, 0, 5))
-        >>> counted.nfe
-        7
-    """
+    """A velocity function that counts its evaluations in ``nfe``."""
 
     def __init__(self, velocity: Velocity) -> None:
         self._velocity = velocity
