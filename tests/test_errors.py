@@ -126,7 +126,7 @@ class TestFeatureGrids:
         features = write_grids(folder, tmp_path / "grids")
         (folder / "000009.bin").write_bytes((folder / "000000.bin").read_bytes())
         message = refused("joint", *data_args(folder), "--data.init_args.extractor=null", *features)
-        assert f"No feature grid for scan {folder / '000009.bin'}" in message
+        assert f"No feature grids of {folder / '000009.bin'}" in message
         assert "r3dpa features" in message
 
     def test_grids_of_another_size(self, folder, tmp_path, refused):

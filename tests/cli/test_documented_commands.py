@@ -25,7 +25,7 @@ def commands_in(text):
         found = re.match(r"[\s$!]*r3dpa (?!COMMAND)(.+)", line)
         if found:
             words = shlex.split(found[1], comments=True)
-            if "..." not in words and "|" not in words:
+            if "..." not in words and not any("|" in word for word in words):
                 yield words
 
 
