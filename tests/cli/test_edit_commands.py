@@ -178,7 +178,11 @@ def picture(path, size=(64, 16), value=255):
 REFUSED = {
     "no part": ("inpaint", [], "one of --box, --box3d and --mask"),
     "two parts": ("inpaint", ["--box", 0, 9, -9, 0, "--mask", "m.png"], "one of --box, --box3d"),
-    "outside the view": ("inpaint", ["--box", 0, 20, 10, 20], "no ray meets it.*-24.1 to 2.1 degrees"),
+    "outside the view": (
+        "inpaint",
+        ["--box", 0, 20, 10, 20],
+        "no ray meets it.*-24.1 to 2.1 degrees",
+    ),
     "beyond range": (
         *("inpaint", ["--box3d", 90, 0, 0, 4, 2, 2, 0]),
         r"88.0 to 92.\d m away.*no ray meets it.*1 to 56 m",
