@@ -1,0 +1,110 @@
+"""Scans per second from files to batches: reading, projecting, caches, loaders, feature grids."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.data import FeatureGrids, LidarDataModule, kitti360_scans, read_scan, write_feature_grids
+from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, pool_cells, range_image
+from r3dpa.nn.backbones import GeometricFeatures
+
+pytestmark = [pytest.mark.bench, pytest.mark.filterwarnings("ignore")]
+
+PROJECTION, GRID_SIZE, DIM = SphericalProjection(LidarSensor()), (8, 64), 768
+
+
+@pytest.fixture(scope="module")
+def scans(data_root):
+    return kitti360_scans(data_root, "train")
+
+
+@pytest.fixture(scope="module", params=["projected", "cached"])
+def loaded(request, data_root, tmp_path_factory):
+    """A set-up data module that projects each scan, or reads cached range images."""
+    folder = tmp_path_factory.mktemp(request.param)
+    cached = str(folder / "images") if request.param == "cached" else None
+    data = LidarDataModule(
+        str(data_root),
+        extractor=GeometricFeatures(DIM),
+        features_dir=str(folder / "features"),
+        batch_size=4,
+        val_every=None,
+        images_dir=cached,
+    )
+    data.prepare_data()
+    data.setup("fit")
+    return data
+
+
+@pytest.mark.benchmark(group="one scan")
+class BenchScan:
+    def bench_read_bin(self, benchmark, scans, alone):
+        benchmark(read_scan, scans[0].path)
+
+    def bench_project(self, benchmark, points, alone):
+        benchmark(range_image, points[:, :3].contiguous(), PROJECTION)
+
+    def bench_sample(self, benchmark, loaded, alone):
+        benchmark(lambda: loaded.train_set[0])
+
+
+@pytest.mark.benchmark(group="loader, 8 scans", min_rounds=3)
+@pytest.mark.parametrize("workers", [0, 2])
+def bench_epoch(benchmark, loaded, workers, one_thread):
+    loaded.num_workers = workers
+    loader = loaded.train_dataloader()
+    benchmark(lambda: sum(1 for _ in loader))
+
+
+def loop_over_cells(xyz, values):
+    """The feature grid as the official code makes it: a mask and a mean for each cell."""
+    rows, columns = PROJECTION.sensor.cell_size(GRID_SIZE)
+    row, column = PROJECTION.pixel_of(xyz)
+    cell = row // rows * GRID_SIZE[1] + column // columns
+    cell[~in_range(xyz, PROJECTION.sensor)] = -1
+    grid = values.new_zeros(GRID_SIZE[0] * GRID_SIZE[1], values.shape[1])
+    for index in range(len(grid)):
+        members = cell == index
+        if members.any():
+            grid[index] = values[members].mean(dim=0)
+    return grid
+
+
+@pytest.mark.benchmark(group="feature grid of one scan, 768 wide", min_rounds=3)
+class BenchGrid:
+    @pytest.fixture
+    def values(self, points):
+        return torch.randn(len(points), DIM, generator=torch.Generator().manual_seed(0))
+
+    def bench_pool_cells(self, benchmark, points, values, alone):
+        xyz = points[:, :3].contiguous()
+        grid, _ = benchmark(pool_cells, xyz, values, PROJECTION, GRID_SIZE)
+        torch.testing.assert_close(grid, loop_over_cells(xyz, values), atol=1e-5, rtol=1e-4)
+
+    def bench_floor_one_sum_over_all_features(self, benchmark, values, alone):
+        benchmark(values.sum)
+
+    def bench_loop_over_cells(self, benchmark, points, values, alone):
+        benchmark(loop_over_cells, points[:, :3].contiguous(), values)
+
+
+@pytest.mark.benchmark(group="read one feature grid")
+class BenchStore:
+    @pytest.mark.parametrize("dtype", ["float16", "int8"])
+    def bench_store(self, benchmark, scans, dtype, tmp_path, alone):
+        extractor = GeometricFeatures(DIM)
+        write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path, dtype=dtype)
+        store = FeatureGrids(tmp_path, scans, PROJECTION, GRID_SIZE, extractor)
+        benchmark(lambda: store.read(scans[0]))
+
+    def bench_one_npz_a_scan(self, benchmark, tmp_path, alone):
+        """As the official code keeps them."""
+        np.savez(tmp_path / "grid.npz", feats=np.random.default_rng(0).normal(size=(512, DIM)))
+
+        def read():
+            with np.load(tmp_path / "grid.npz") as content:
+                return torch.from_numpy(content["feats"].astype(np.float32))
+
+        benchmark(read)

@@ -1,0 +1,48 @@
+"""A simulated scan on one core, by weather; the budget of a plain street is 60 ms cast, 100 ms."""
+
+from __future__ import annotations
+
+from statistics import median
+
+import pytest
+from conftest import STREET
+
+from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
+
+pytestmark = [pytest.mark.bench, pytest.mark.benchmark(group="simulate one scan", min_rounds=9)]
+
+WEATHERS = {
+    "plain": Weather(),
+    "wet": Weather(water_film_mm=1.0, clear_sky=False),
+    "rain": Weather(rain_mm_h=10.0, water_film_mm=1.0, clear_sky=False),
+    "fog": Weather(visibility_m=100.0, clear_sky=False),
+    "snow": Weather(snow_mm_h=1.5, clear_sky=False),
+    "low sun": Weather(sun_elevation_deg=3.0),
+}
+
+
+@pytest.mark.parametrize("weather", WEATHERS)
+def bench_scan(benchmark, weather):
+    seed, drive, number = STREET
+    scene, sensor = Street(seed, drive, WEATHERS[weather]).scene(number), hdl64e()
+    scans = []
+
+    def run():
+        scans.append(simulate_scan(scene, sensor, (seed, "effects", drive, number)))
+
+    benchmark(run)
+    parts = {name: [scan.parts_ms[name] for scan in scans] for name in scans[0].parts_ms}
+    for effect in scans[0].effects:
+        if effect.status == "ran":
+            parts[effect.name] = [
+                next(e.ms for e in scan.effects if e.name == effect.name) for scan in scans
+            ]
+    idle = [sum(e.ms for e in scan.effects if e.status == "not_called") for scan in scans]
+    benchmark.extra_info |= {f"{name} ms": round(median(ms), 2) for name, ms in parts.items()}
+    benchmark.extra_info["effects not called ms"] = round(median(idle), 3)
+
+
+def bench_scene(benchmark):
+    street = Street(0, 2, Weather())
+    street.scene(40)  # a scan shares its blocks with the one before
+    benchmark(street.scene, 41)
