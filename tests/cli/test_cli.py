@@ -84,6 +84,17 @@ class TestHelp:
         assert listed == set(COMMANDS)
         assert out.splitlines()[-1] == "loaded []"
 
+    def test_options_of_commands_are_listed_without_torch(self):
+        out = python(
+            "import sys; from r3dpa.cli import COMMANDS, main\n"
+            "for name in COMMANDS:\n"
+            "    if not COMMANDS[name].own_parser and name != 'replay':\n"
+            "        try: main([*name.split(), '--help'])\n"
+            "        except SystemExit: pass\n"
+            "print('loaded', [name for name in ('torch', 'lightning') if name in sys.modules])"
+        )
+        assert out.splitlines()[-1] == "loaded []"
+
     def test_every_line_says_what_the_command_does(self, capsys):
         main(["--help"])
         lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]

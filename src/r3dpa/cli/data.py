@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from r3dpa.cli.parser import check_file
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # read by jsonargparse for the options of `simulate`
+    from r3dpa.simulation import Weather
+MYPY = False  # true for mypy alone
+if MYPY:
     from r3dpa.data.objects import ObjectLibrary
     from r3dpa.geometry import LidarSensor
-    from r3dpa.simulation import Weather
 
 __all__ = ["check", "objects", "simulate"]
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-if TYPE_CHECKING:
+MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
+if MYPY:
     from r3dpa.editing import EditResult
 
 __all__ = ["EditJob", "complete", "inpaint", "interpolate", "mix", "vary"]

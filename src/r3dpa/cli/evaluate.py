@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from r3dpa.cli.parser import check_file, check_folder
 
-if TYPE_CHECKING:
+MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
+if MYPY:
     from r3dpa.data.samples import Samples
     from r3dpa.data.scans import Scan
-    from r3dpa.metrics import RealismTable, ScanStatistics
+    from r3dpa.metrics import ScanStatistics
     from r3dpa.metrics.scene import EvaluationScene
 
 __all__ = ["evaluate", "realism", "reference"]
@@ -191,7 +192,7 @@ def _made_with(samples: Path) -> dict[str, Any]:
     return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
 
 
-def realism(*, scans: Path, reference: Path, out: Path | None = None) -> RealismTable:
+def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     """Compare scans with real ones, each measure beside the distance between real drives.
 
     A reference of a single drive is split in two halves in time, which gives a lower floor than two

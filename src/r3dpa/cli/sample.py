@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from r3dpa.cli.parser import check_folder
 
-if TYPE_CHECKING:
+MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
+if MYPY:
     import torch
     from torch import Tensor
 

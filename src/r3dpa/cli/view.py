@@ -6,11 +6,12 @@ import re
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from r3dpa.cli.parser import check_folder
 
-if TYPE_CHECKING:
+MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
+if MYPY:
     from numpy.typing import NDArray
 
     from r3dpa import viz
