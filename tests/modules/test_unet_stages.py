@@ -105,9 +105,8 @@ def joint_checkpoint(smoke_args, unet_file, tmp_path_factory):
     return run_dir / "checkpoints" / "last.ckpt"
 
 
-@pytest.mark.parametrize(
-    "stage", [pytest.param("vae_alignment", marks=pytest.mark.slow), "flow_matching"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["vae_alignment", "flow_matching"])
 def test_stages_start_and_go_on_from_one_another(
     stage, smoke_args, unet_file, joint_checkpoint, tmp_path
 ):

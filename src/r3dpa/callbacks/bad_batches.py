@@ -24,16 +24,12 @@ _FORMAT = "r3dpa bad batch 1"
 
 @dataclass(frozen=True)
 class BadBatch:
-    """One process's batch of a skipped step: as :class:`r3dpa.data.LidarBatch`, with its draws.
-
-    ``about`` holds names of the scans, stage, step, number of the batch, rank, world size,
-    precision, path, losses and gradient norms.
-    """
+    """One process's batch of a skipped step, with its draws, losses and settings."""
 
     tensors: dict[str, Tensor]
     draws: PathDraws
     weights: LossWeights
-    about: dict[str, Any]
+    about: dict[str, Any]  # see _bad_batch
 
     def save(self, folder: Path) -> Path:
         """Writes ``<folder>/step_<step>_batch_<number>_rank_<rank>.safetensors``."""

@@ -94,18 +94,11 @@ class SceneScorer(L.Callback):
         ):
             if value < least:
                 raise ValueError(f"scorer.{name} must be at least {least}, got {value}")
-        self.num_scenes = num_scenes
-        self.batch_size = batch_size
-        self.sampler = sampler
-        self.precision = precision
-        self.seed = seed
-        self.reference = reference
-        self.split = split
-        self.spaces = spaces
-        self.ckpt = ckpt or {}
-        self.protocol = protocol
-        self.allow_few = allow_few
-        self.skip_bad = skip_bad
+        self.num_scenes, self.batch_size, self.seed = num_scenes, batch_size, seed
+        self.sampler, self.precision = sampler, precision
+        self.reference, self.split, self.protocol = reference, split, protocol
+        self.spaces, self.ckpt = spaces, ckpt or {}
+        self.allow_few, self.skip_bad = allow_few, skip_bad
         self._job: tuple[AnyReference, list[SceneFeatures], list[Scan]] | None = None
 
     def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -190,7 +183,6 @@ class SceneScorer(L.Callback):
         _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
 
     def _loaded(self) -> AnyReference | None:
-        """The reference file, None without one."""
         if self.reference is None:
             return None
         try:
@@ -203,13 +195,9 @@ class SceneScorer(L.Callback):
         assert module.ema is not None
         generator = averaged_generator(module, module.ema, self.sampler, self.precision)
         starts = range(0, self.num_scenes, self.batch_size)
+        own = starts[trainer.global_rank :: trainer.world_size]
         quiet = None if trainer.is_global_zero else True
-        for first in tqdm(
-            starts[trainer.global_rank :: trainer.world_size],
-            "sampling",
-            unit="batch",
-            disable=quiet,
-        ):
+        for first in tqdm(own, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
             part = {"range_m": scenes.range_m.cpu().contiguous(), "nfe": torch.tensor(scenes.nfe)}

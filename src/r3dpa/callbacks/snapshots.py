@@ -23,8 +23,7 @@ class EMASnapshots(L.Callback):
 
     Each step makes ``<run_dir>/<folder>/step_<step>.safetensors`` with its ``.yaml``: average,
     latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
-    file that exists is never replaced, so a resumed run adds those that are missing and still
-    ahead. A stage without average, or without a SiT, keeps none and says so.
+    file that exists is never replaced. A stage without average keeps none.
 
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
@@ -32,9 +31,6 @@ class EMASnapshots(L.Callback):
         fractions: Steps as parts of ``trainer.max_steps``, each in (0, 1].
         steps: Optimiser steps, at least 1; where given, ``fractions`` do not count.
         folder: Below the folder of the run.
-
-    Raises:
-        ValueError: If a number is out of its range.
     """
 
     def __init__(
@@ -53,11 +49,7 @@ class EMASnapshots(L.Callback):
         self._due: frozenset[int] = frozenset()
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Works out the steps, and refuses early what could not be written.
-
-        Raises:
-            ValueError: If the number of steps is not known, or the module not its configuration.
-        """
+        """Works out the steps, and refuses early what could not be written."""
         self._due = frozenset()
         if not isinstance(pl_module, GenerativeModule) or pl_module.ema is None:
             stage = getattr(pl_module, "stage", type(pl_module).__name__)
@@ -77,12 +69,7 @@ class EMASnapshots(L.Callback):
             )
 
     def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
     ) -> None:
         """Writes the snapshot of this step if one is due and not there yet."""
         if trainer.global_step not in self._due or not trainer.is_global_zero:

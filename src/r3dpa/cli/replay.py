@@ -63,10 +63,9 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     state = {name: value.clone() for name, value in module.state_dict().items()}
     seen = {name: _Observer() for name in ("vae", "sit", "discriminator") if getattr(module, name)}
     hooks = [
-        layer.register_forward_hook(partial(observer, name))
-        for network, observer in seen.items()
-        for name, layer in module.get_submodule(network).named_modules(prefix=network)
-        if not list(layer.children())
+        layer.register_forward_hook(partial(seen[name.split(".")[0]], name))
+        for name, layer in module.named_modules()
+        if name.split(".")[0] in seen and not list(layer.children())
     ]
     try:
         rows = {"recorded": about["losses"], "all scans": _losses(module, saved, slice(None), True)}
