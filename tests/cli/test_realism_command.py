@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -33,13 +34,13 @@ def test_a_single_drive_is_halved_and_says_so(simulated):
     table = realism(scans=simulated, reference=drive)
     assert "B: 2 scans of 2 drives, 1 to 1 each" in table.notes
     assert "first half" in table.notes[-1]
-    assert any(row.ratio is not None for row in table.rows)
+    assert any(row.within is not None for row in table.rows)
 
 
 def test_a_single_scan_has_no_floor(simulated):
     scan = min(simulated.rglob("*.bin"))
     table = realism(scans=simulated, reference=scan)
-    assert all(row.floor is None for row in table.rows)
+    assert all(math.isnan(row.floor) for row in table.rows)
     assert "there is no floor" in str(table)
 
 

@@ -11,7 +11,7 @@ import torch
 
 from r3dpa.data.scans import find_scans, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of, range_image
-from r3dpa.metrics import ScanStatistics, features, scan_statistics
+from r3dpa.metrics import MEASURES, ScanStatistics, scan_statistics
 
 SHOTS = 2000
 HEIGHT_M = 1.73
@@ -41,6 +41,14 @@ def statistics_of(range_m: np.ndarray, intensity: float = 0.5) -> ScanStatistics
     return scan_statistics(scan_of(range_m, intensity))
 
 
+def feature(name: str, statistics: ScanStatistics) -> np.ndarray:
+    return next(m for m in MEASURES if m.name == name).feature(statistics)
+
+
+def value(name: str, statistics: ScanStatistics) -> float:
+    return next(m for m in MEASURES if m.name == name).value(statistics)
+
+
 def same(a: ScanStatistics, b: ScanStatistics) -> bool:
     return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
 
@@ -49,7 +57,7 @@ def test_a_whole_scan_has_no_dropout():
     statistics = statistics_of(road_and_wall())
     assert statistics.num_beam_scans == statistics.num_ground_scans == 1
     assert statistics.shots == pytest.approx(SHOTS)
-    assert features.dropout(statistics) == pytest.approx(0, abs=1e-4)
+    assert feature("dropout by beam", statistics) == pytest.approx(0, abs=1e-4)
     assert statistics.drop_runs.sum() == 0
     assert statistics.num_returns == 64 * SHOTS
 
@@ -59,9 +67,13 @@ def test_a_tenth_dropped_at_random_keeps_nine_tenths():
     range_m = road_and_wall()
     range_m[generator.random(range_m.shape) < 0.1] = 0
     statistics = statistics_of(range_m)
-    assert features.dropout(statistics) == pytest.approx(0.1, abs=0.03)  # 4 sd of 2000 shots
-    for counts in (*statistics.keep_by_range, *statistics.keep_by_incidence):
-        assert features.overall_keep_rate(counts) == pytest.approx(0.9, abs=0.006)
+    assert feature("dropout by beam", statistics) == pytest.approx(
+        0.1, abs=0.03
+    )  # 4 sd of 2000 shots
+    keep_rates = [m for m in MEASURES if m.name.startswith("keep rate")]
+    assert len(keep_rates) == 5
+    for measure in keep_rates:
+        assert measure.value(statistics) == pytest.approx(0.9, abs=0.006)
     # Runs of independent losses are geometric: 0.9 of them are of a single shot.
     assert statistics.drop_runs[1] / statistics.drop_runs.sum() == pytest.approx(0.9, abs=0.01)
 
@@ -85,13 +97,13 @@ def test_a_lost_sector_is_one_run_per_ring():
     statistics = statistics_of(range_m)
     assert statistics.drop_runs.nonzero()[0].tolist() == [10]
     assert statistics.drop_runs[10] == 64
-    assert features.dropout(statistics) == pytest.approx(10 / SHOTS, abs=1e-4)
+    assert feature("dropout by beam", statistics) == pytest.approx(10 / SHOTS, abs=1e-4)
 
 
 def test_range_noise_is_measured_on_road_and_wall():
     noise = np.random.default_rng(1).normal(0, 0.02, (64, SHOTS))
     statistics = statistics_of(road_and_wall() + noise)
-    measured = features.residual_sd_mm(statistics)
+    measured = feature("range residual sd by beam", statistics)
     # The outer beams have no upright places (no beam beyond), but the last one has ground.
     assert np.isfinite(measured[1:]).all()
     assert measured[1:] == pytest.approx(20, rel=0.15)  # 4 standard errors of a beam
@@ -101,7 +113,7 @@ def test_range_noise_is_measured_on_road_and_wall():
 def test_bias_of_one_beam_shows_against_its_neighbours():
     range_m = road_and_wall()
     range_m[3] += 0.03
-    bias_mm = features.bias_mm(statistics_of(range_m))
+    bias_mm = feature("range bias by beam", statistics_of(range_m))
     assert bias_mm[2:5] == pytest.approx([-15, 30, -15], abs=1)
 
 
@@ -111,17 +123,17 @@ def test_ground_plane_residual_is_the_roughness_of_the_road():
     slope = 0.02 * points[:, 0]
     points[:, 2] += slope + generator.normal(0, 0.03, len(points))
     statistics = scan_statistics(points)
-    assert features.ground_residual_sd_mm(statistics) == pytest.approx(30, rel=0.03)
+    assert value("ground plane residual", statistics) == pytest.approx(30, rel=0.03)
 
 
 def test_ground_rings_lie_where_the_beams_meet_the_road():
     statistics = statistics_of(road_and_wall())
     distance = HEIGHT_M / np.tan(-INCLINATION[~ON_WALL])
-    measured = features.ground_distance_m(statistics)
+    measured = statistics.ground_distance_m / statistics.ground_returns.clip(1)
     on_road = np.flatnonzero(~ON_WALL)
     assert measured[on_road] == pytest.approx(distance, abs=1e-3)
-    assert features.last_ring_m(statistics) == pytest.approx(distance[0], abs=0.5)
-    spacing = features.ring_spacing_m(statistics)
+    assert value("last ground ring", statistics) == pytest.approx(distance[0], abs=0.5)
+    spacing = feature("ground ring spacing", statistics)
     near = distance[:-1] < 25
     assert spacing[on_road[:-1][near]] == pytest.approx(-np.diff(distance)[near], abs=1e-3)
 
@@ -132,7 +144,7 @@ def test_last_ring_needs_a_tenth_of_the_azimuth():
     for share, expected in ((0.2, distance[0]), (0.05, distance[1])):
         range_m = road_and_wall()
         range_m[last, round(share * SHOTS) :] = 0
-        assert features.last_ring_m(statistics_of(range_m)) == pytest.approx(expected, abs=0.5)
+        assert value("last ground ring", statistics_of(range_m)) == pytest.approx(expected, abs=0.5)
 
 
 def test_incidence_on_a_wall_is_the_inclination_and_on_the_road_its_complement():
@@ -149,17 +161,17 @@ def test_mixed_pixels_lie_between_two_surfaces():
     range_m[:, SHOTS // 2 :] = 14.0
     range_m[:, SHOTS // 2] = 12.0  # off both sides
     statistics = statistics_of(range_m)
-    assert features.mixed_share(statistics) == pytest.approx(1 / SHOTS)
-    assert features.jump_share(statistics) == pytest.approx(3 / SHOTS)
+    assert value("mixed pixels", statistics) == pytest.approx(1 / SHOTS)
+    assert value("jumps > 0.5 m to the next", statistics) == pytest.approx(3 / SHOTS)
 
 
 def test_intensity_by_range_and_incidence():
     statistics = statistics_of(road_and_wall(), intensity=0.37)
-    medians = features.median_intensity(statistics.intensity_by_range)
+    medians = feature("median intensity by range", statistics)
     assert np.nanmax(np.abs(medians - 0.37)) < 0.006  # a step of 0.01 counts as an interval
     assert statistics.intensity_by_incidence.sum(axis=(0, 1)).nonzero()[0].tolist() == [37]
-    assert features.saturated_share(statistics) == 0
-    assert features.saturated_share(statistics_of(road_and_wall(), intensity=0.99)) == 1
+    assert value("saturated share", statistics) == 0
+    assert value("saturated share", statistics_of(road_and_wall(), intensity=0.99)) == 1
 
 
 def test_dummies_and_far_points_are_no_returns():
@@ -173,14 +185,14 @@ def test_pooling_adds_what_scans_contribute():
     assert same(near + ScanStatistics(), near)
     both = near + far
     assert both.num_scans == 2
-    means = [features.histogram_mean(s.range_counts.sum(axis=0), 1.0) for s in (near, far, both)]
+    means = [value("range W1", s) for s in (near, far, both)]
     assert means[2] == pytest.approx((means[0] + means[1]) / 2)
 
 
 def test_counts_by_cell_and_sector():
     statistics = statistics_of(road_and_wall())
     cells = np.unique(np.floor(scan_of(road_and_wall())[:, :2]), axis=0)
-    shares = features.sector_shares(statistics)
+    shares = feature("occupied cells by sector", statistics)
     assert shares.mean() == pytest.approx(len(cells) / (math.pi * 50**2))
     assert shares.reshape(4, 4) == pytest.approx(np.tile(shares[:4], (4, 1)))  # quarter turns
     assert statistics.bev_counts.sum() == statistics.num_returns
@@ -225,4 +237,4 @@ def test_real_scans_show_the_known_sensor(real_scans_dir):
     assert total.num_beam_scans == total.num_ground_scans == len(scans)
     assert 2100 < total.shots / len(scans) < 2200
     # Datasheet: accuracy better than 2 cm.
-    assert 5 < features.known_median(features.residual_sd_mm(total)) < 20
+    assert 5 < value("range residual sd by beam", total) < 20

@@ -14,7 +14,6 @@ from r3dpa.metrics.feature_distances import (
     PrecisionRecall,
     scene_metrics,
 )
-from r3dpa.metrics.features import curves
 from r3dpa.metrics.functional import (
     Moments,
     curve_rmse,
@@ -40,7 +39,6 @@ from r3dpa.metrics.realism import (
     Measure,
     RealismRow,
     RealismTable,
-    known,
     realism_table,
 )
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -80,7 +78,6 @@ __all__ = [
     "bootstrap_interval",
     "chamfer_squared",
     "curve_rmse",
-    "curves",
     "evaluate",
     "fd_infinity",
     "feature_spaces",
@@ -88,7 +85,6 @@ __all__ = [
     "frechet_distance_of",
     "histogram_distance",
     "jensen_shannon",
-    "known",
     "minimum_matching",
     "polynomial_mmd",
     "precision_recall",

@@ -1,12 +1,13 @@
-"""Structure of one scan: neighbours along each ring, the ground, and surface directions.
+"""Structure of one scan: neighbours along each ring, ground plane, and surface directions.
 
-Letters: P returns, R rings.
+Letters: P returns, R rings. All functions take float64 points in metres, sensor frame.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +19,14 @@ from r3dpa.geometry.rings import rings_in_order
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-GROUND_BAND_M = 0.2  # returns at most this far above or below the plane are ground
-MAX_GAP_SHOTS = 10  # a longer gap says nothing about the surface on both sides of it
+GROUND_BAND_M = 0.2  # ground returns are at most this far above or below the plane
+GROUND_DISTANCES_M = (3.0, 20.0)  # nearer is the car, farther the road bends away from a plane
+MAX_GAP_SHOTS = 10  # the surface across a longer gap is unknown
 
 _MOUNT_HEIGHT_M = 1.73  # KITTI and KITTI-360
 _GROUND_BANDS_M = (0.5, 0.3, GROUND_BAND_M, GROUND_BAND_M, GROUND_BAND_M)
-GROUND_DISTANCES_M = (3.0, 20.0)  # nearer is the car, farther the road bends away from a plane
 _MIN_GROUND_RETURNS = 500
 _MAX_GROUND_SLOPE = 0.2
 _JITTER_RAD = 0.1  # the azimuth of a real ring may step back by some milliradians
@@ -33,6 +35,7 @@ _SLOPE_PER_SHOT = 0.02  # change of range per shot, as a share of the range: inc
 _SMOOTH_M = 0.1  # 4 standard deviations of the interpolation error at 2 cm noise
 _VERTICAL_SMOOTH_M = 0.4  # lasers of the real HDL-64E are biased by up to 0.1 m against each other
 _REACH = 3  # returns to each side that give the direction along the ring
+_MAX_STEP_DEG = 60.0
 _MAX_UPRIGHT_NORMAL_Z = 0.5  # normals less than 30 degrees from the horizon
 
 
@@ -40,13 +43,9 @@ _MAX_UPRIGHT_NORMAL_Z = 0.5  # normals less than 30 degrees from the horizon
 class Sweep:
     """Returns of one scan in ring order, with their neighbours along azimuth.
 
-    The number of shots per turn is not stored in a scan. It follows from the mean azimuth step
-    over unbroken neighbours; the median would not do, since the encoder of the real HDL-64E gives
-    steps of 0.09 and 0.18 degrees.
-
     Args:
-        order: ``(P,)`` where each return stands among those given.
-        ring: ``(P,)`` ring from 0 (highest), never falling.
+        order: ``(P,)`` index of each return in the scan.
+        ring: ``(P,)`` ring from 0 (highest), ascending.
         num_rings: R.
         azimuth: ``(P,)`` radians in [0, 2 pi).
         shot_rad: Mean azimuth between two shots of a laser.
@@ -67,28 +66,36 @@ class Sweep:
         return 2 * math.pi / self.shot_rad
 
     def neighbour(self, offset: int) -> Indices:
-        """Index ``(P,)`` of the return ``offset`` places further on, around its ring."""
+        """Index ``(P,)`` of the return ``offset`` places further along its ring."""
         return _around(self.ring, offset)
 
-    def other_ring(self, step: int) -> tuple[Indices, NDArray[np.bool_]]:
-        """Return of the ring ``step`` rings lower whose azimuth is the nearest.
+    def other_ring(self, step: int) -> tuple[Indices, Mask]:
+        """Return of nearest azimuth in the ring ``step`` rings lower.
 
         Returns:
-            Index ``(P,)``, and whether it lies within 1.5 shots and in the right ring.
+            Index ``(P,)``, and whether it lies within 1.5 shots and in that ring.
         """
         key = self.ring * 2 * math.pi + self.azimuth
         ascending = np.argsort(key, kind="stable")
         wanted = key + step * 2 * math.pi
         after = np.searchsorted(key, wanted, sorter=ascending).clip(1, len(key) - 1)
         before_key, after_key = key[ascending[after - 1]], key[ascending[after]]
-        nearest = np.where(wanted - before_key < after_key - wanted, after - 1, after)
-        index = ascending[nearest]
+        index = ascending[np.where(wanted - before_key < after_key - wanted, after - 1, after)]
         close = np.abs(key[index] - wanted) < 1.5 * self.shot_rad
         return index, close & (self.ring[index] == self.ring + step)
 
+    def turned(self, start: Indices, end: Indices) -> Floats:
+        """Azimuth from each return ``start`` forward to ``end``, radians in [-0.1, 2 pi - 0.1)."""
+        return _forward(self.azimuth[end] - self.azimuth[start])
+
 
 def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
-    """Ring structure of the returns of one scan."""
+    """Ring structure of the returns of one scan; None if it is not stored ring after ring.
+
+    A scan does not store its number of shots per turn. It follows from the mean azimuth step over
+    unbroken neighbours; the median would be wrong, as the encoder of the real HDL-64E gives steps
+    of 0.09 and 0.18 degrees.
+    """
     inclination, azimuth = angles_of(torch.from_numpy(points))
     try:
         in_order, num_rings = rings_in_order(inclination, azimuth, sensor)
@@ -97,8 +104,7 @@ def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
     ring = in_order.numpy()
     order = np.argsort(ring, kind="stable")
     ring, turn = ring[order], azimuth.numpy()[order] % (2 * math.pi)
-    following = _around(ring, 1)
-    step = (turn[following] - turn + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
+    step = _forward(turn[_around(ring, 1)] - turn)
     ahead = step[step > 0]
     if len(ahead) == 0:
         return None
@@ -107,8 +113,7 @@ def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
     return Sweep(order, ring, num_rings, turn, shot_rad, missing)
 
 
-@dataclass(frozen=True)
-class Ground:
+class Ground(NamedTuple):
     """Plane ``z = slope_x * x + slope_y * y + offset_m`` in the sensor frame."""
 
     slope_x: float
@@ -146,67 +151,48 @@ def fit_ground(points: Floats) -> Ground | None:
     return None if steep else ground
 
 
-@dataclass(frozen=True)
-class Surfaces:
-    """What each return lies on, from its neighbours; arrays ``(P,)`` in the order of a sweep.
+class Upright(NamedTuple):
+    """Smooth surfaces that stand up (facades, sides of cars), for returns in sweep order.
 
     Args:
-        ground: Near the ground plane.
-        upright: On a smooth surface that stands up, such as a facade or the side of a car.
-        incidence_deg: Angle between ray and surface normal, NaN off ground and upright places.
-        residual_m: Range minus the line through both neighbours along the ring, divided by the
-            error growth of that line, so that its deviation is that of one range. NaN where a
-            neighbouring shot is lost or the returns farther out do not lie on a line.
-        step_m: Range minus the line through the neighbouring rings, metres; NaN except on
-            upright places met at less than 60 degrees.
+        incidence_deg: ``(P,)`` angle between ray and surface normal; NaN off upright surfaces.
+        residual_m: ``(P,)`` :func:`_residual`; NaN off the ground and off upright surfaces.
+        step_m: ``(P,)`` range minus the line through the neighbouring rings; NaN off upright
+            surfaces and where one is met at 60 degrees or more.
     """
 
-    ground: NDArray[np.bool_]
-    upright: NDArray[np.bool_]
     incidence_deg: Floats
     residual_m: Floats
     step_m: Floats
 
 
-def surfaces_of(
-    points: Floats, range_m: Floats, sweep: Sweep, ground_plane: Ground | None
-) -> Surfaces:
-    """Surfaces met by the returns of one scan."""
-    num_points = len(points)
-    is_ground = np.zeros(num_points, dtype=bool)
-    if ground_plane is not None:
-        is_ground = np.abs(ground_plane.height_m(points)) < GROUND_BAND_M
+def upright_surfaces(points: Floats, range_m: Floats, sweep: Sweep, ground: Mask) -> Upright:
+    """Surfaces met by the returns ``(P, 3)`` of one scan, all in the order of the sweep."""
     on_line = _on_line(range_m, sweep)
-
     up, has_up = sweep.other_ring(-1)
     down, has_down = sweep.other_ring(1)
     bend = np.abs(range_m[up] - 2 * range_m + range_m[down])
-    upright = ~is_ground & on_line & has_up & has_down & (bend < _VERTICAL_SMOOTH_M)
+    upright = ~ground & on_line & has_up & has_down & (bend < _VERTICAL_SMOOTH_M)
     along = points[sweep.neighbour(_REACH)] - points[sweep.neighbour(-_REACH)]
     normal = np.cross(along, points[up] - points[down])
-    length = np.linalg.norm(normal, axis=1)
-    upright &= np.abs(normal[:, 2]) < _MAX_UPRIGHT_NORMAL_Z * length
-
-    incidence_deg = np.full(num_points, np.nan)
-    if ground_plane is not None:
-        incidence_deg[is_ground] = ground_plane.incidence_deg(points[is_ground])
-    incidence_deg[upright] = _incidence_deg(points[upright], normal[upright])
+    upright &= np.abs(normal[:, 2]) < _MAX_UPRIGHT_NORMAL_Z * np.linalg.norm(normal, axis=1)
+    angle_deg = np.full(len(points), np.nan)
+    angle_deg[upright] = _incidence_deg(points[upright], normal[upright])
 
     inclination = np.arcsin((points[:, 2] / range_m).clip(-1, 1))
-    share = _share(inclination[down], inclination, inclination[up])
+    span = inclination[up] - inclination[down]
+    half = np.full(len(points), 0.5)
+    share = np.divide(inclination - inclination[down], span, out=half, where=span > 0)
     step_m = range_m - (range_m[down] + share * (range_m[up] - range_m[down]))
-    facing = upright & (incidence_deg < 60.0)
-    residual_m = _residual(range_m, sweep)
-    return Surfaces(
-        is_ground,
-        upright,
-        incidence_deg,
-        np.where(on_line & (is_ground | upright), residual_m, np.nan),
-        np.where(facing, step_m, np.nan),
+    smooth = on_line & (ground | upright)
+    return Upright(
+        angle_deg,
+        np.where(smooth, _residual(range_m, sweep), np.nan),
+        np.where(angle_deg < _MAX_STEP_DEG, step_m, np.nan),
     )
 
 
-def level_enough(left_m: Floats, right_m: Floats, shots: Indices) -> NDArray[np.bool_]:
+def level_enough(left_m: Floats, right_m: Floats, shots: Indices) -> Mask:
     """Whether two ranges ``shots`` shots apart along a ring may belong to one surface."""
     return np.abs(left_m - right_m) <= _SLOPE_PER_SHOT * np.minimum(left_m, right_m) * shots
 
@@ -214,49 +200,42 @@ def level_enough(left_m: Floats, right_m: Floats, shots: Indices) -> NDArray[np.
 def _around(ring: Indices, offset: int) -> Indices:
     counts = np.bincount(ring)
     start = (np.cumsum(counts) - counts)[ring]
-    place = start + (np.arange(len(ring)) - start + offset) % counts[ring]
-    return place.astype(np.int64)
+    return (start + (np.arange(len(ring)) - start + offset) % counts[ring]).astype(np.int64)
 
 
-def _on_line(range_m: Floats, sweep: Sweep) -> NDArray[np.bool_]:
-    """Whether the outer neighbours lie on a line; the inner ones and the return have no say.
+def _forward(angle: Floats) -> Floats:
+    return (angle + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
 
-    A test that looked at the residuals themselves would cut their tails.
+
+def _on_line(range_m: Floats, sweep: Sweep) -> Mask:
+    """Whether the outer neighbours along the ring lie on a line.
+
+    The inner ones and the return itself are not tested: that would cut the tails of the residuals.
     """
     first, last = sweep.neighbour(-_REACH), sweep.neighbour(_REACH)
-    from_first = _turned(sweep, first, last)
-    reach = 2 * (_REACH + MAX_GAP_SHOTS) * sweep.shot_rad
-    smooth = (from_first > 0) & (from_first < reach)
-    shots = np.maximum(np.rint(from_first / sweep.shot_rad).astype(np.int64), 1)
+    whole = sweep.turned(first, last)
+    smooth = (whole > 0) & (whole < 2 * (_REACH + MAX_GAP_SHOTS) * sweep.shot_rad)
+    shots = np.maximum(np.rint(whole / sweep.shot_rad).astype(np.int64), 1)
     smooth &= level_enough(range_m[first], range_m[last], shots)
     for inner in (sweep.neighbour(1 - _REACH), sweep.neighbour(_REACH - 1)):
-        share = _turned(sweep, first, inner) / np.where(from_first > 0, from_first, 1.0)
+        share = sweep.turned(first, inner) / np.where(whole > 0, whole, 1.0)
         line = range_m[first] + share * (range_m[last] - range_m[first])
         smooth &= np.abs(range_m[inner] - line) < _SMOOTH_M
     return smooth
 
 
 def _residual(range_m: Floats, sweep: Sweep) -> Floats:
+    """Range minus the line through both neighbours along the ring, NaN next to a lost shot.
+
+    Divided by the error growth of that line: the deviation is that of a single range.
+    """
     before, after = sweep.neighbour(-1), sweep.neighbour(1)
-    whole = _turned(sweep, before, after)
+    whole = sweep.turned(before, after)
     unbroken = (sweep.missing[before] == 0) & (sweep.missing == 0) & (whole > 0)
-    share = _turned(sweep, before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
+    share = sweep.turned(before, np.arange(len(before))) / np.where(unbroken, whole, 1.0)
     line = range_m[before] + share * (range_m[after] - range_m[before])
     growth = np.sqrt(1 + share**2 + (1 - share) ** 2)
-    inside = unbroken & (share > 0) & (share < 1)
-    return np.where(inside, (range_m - line) / growth, np.nan)
-
-
-def _turned(sweep: Sweep, start: Indices, end: Indices) -> Floats:
-    """Azimuth from one return to another one further on, radians in [-0.1, 2 pi - 0.1)."""
-    turned = sweep.azimuth[end] - sweep.azimuth[start]
-    return (turned + _JITTER_RAD) % (2 * math.pi) - _JITTER_RAD
-
-
-def _share(low: Floats, value: Floats, high: Floats) -> Floats:
-    """Place of a value between two others, 0 at the first; halfway where these are equal."""
-    span = high - low
-    return np.where(span > 0, (value - low) / np.where(span > 0, span, 1.0), 0.5)
+    return np.where(unbroken & (share > 0) & (share < 1), (range_m - line) / growth, np.nan)
 
 
 def _incidence_deg(points: Floats, normal: Floats) -> Floats:
