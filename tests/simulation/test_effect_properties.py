@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 import pytest
 from random_scenes import random_case
+from sweeps import box
 
 from r3dpa.simulation import (
     EFFECTS,
@@ -53,12 +54,6 @@ each_scene = pytest.mark.parametrize("seed", SEEDS)
 each_effect = pytest.mark.parametrize("name", NAMES)
 
 
-def box(centre, half_size, **values):
-    return Primitive(
-        Shape.BOX, centre, half_size, **{"semantic": Semantic.WALL, "reflectivity": 0.4} | values
-    )
-
-
 WALL = box((30.5, 0.0, 2.0), (0.5, 40.0, 6.0), material=Material.BRICK)
 POLE = Primitive(Shape.CYLINDER, (9.0, -2.0, 2.0), (0.05, 0.05, 4.0), Semantic.POLE, 0.5)
 CAR = box(
@@ -71,7 +66,7 @@ CROWN = Primitive(
 PANE = box((8.0, -6.0, 1.5), (2.0, 0.02, 1.5), reflectivity=0.02, material=Material.GLASS)
 METAL = box((7.0, 2.5, 0.8), (0.1, 1.5, 0.8), reflectivity=0.2, material=Material.POLISHED_METAL)
 SHEET = box((9.0, -3.0, 1.5), (0.02, 1.0, 3.0), material=Material.RETROREFLECTOR)
-ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2))
+ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2), material=Material.CONCRETE)
 PUDDLES = (Puddle(15.0, 2.0, 4.0), Puddle(0.0, 4.0, 1.0))
 SUNNY = Weather(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=100.0)
 FOUL = Weather(visibility_m=80.0, rain_mm_h=30.0, snow_mm_h=2.0, water_film_mm=1.0)

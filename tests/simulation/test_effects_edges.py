@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sweeps
+from sweeps import box, pole
 
 from r3dpa.simulation import (
     EgoMotion,
@@ -14,10 +16,9 @@ from r3dpa.simulation import (
     Scene,
     Semantic,
     Shape,
-    Sweep,
     hdl64e,
 )
-from r3dpa.simulation.draws import Draws, generator_for
+from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.effects import (
     DiffuseReflection,
     DualReturn,
@@ -36,21 +37,8 @@ RING = np.sqrt(2 / 3) * SENSOR.divergence_rad / 2
 PATH = (DiffuseReflection(), MixedPixels())
 
 
-def applied(sweep, effect):
-    rays = effect.rays(sweep)
-    if isinstance(rays, slice) or len(rays):
-        effect.apply(sweep, rays, Draws(sweep.num_rays, "test", type(effect).__name__))
-    return sweep
-
-
 def swept(scene, sensor=SENSOR, before=(), after=PATH):
-    sweep = Sweep(scene, sensor)
-    for effect in before:
-        applied(sweep, effect)
-    sweep.cast()
-    for effect in after:
-        applied(sweep, effect)
-    return sweep
+    return sweeps.swept(scene, sensor, before=before, after=after)
 
 
 def state(sweep):
@@ -72,9 +60,7 @@ def beside_ray(near_m, far_m, offset):
 
     def wall(distance_m, edge_m):
         centre = start[:2] + (distance_m + 0.05) * ahead + (edge_m + 10) * left
-        return Primitive(
-            Shape.BOX, (*centre, 0), (0.05, 10, 30), Semantic.WALL, 0.5, yaw, 0, Material.PAINT
-        )
+        return box((*centre, 0), (0.05, 10, 30), yaw_rad=yaw)
 
     walls = [wall(near_m, offset * RING * near_m)]
     if far_m is not None:
@@ -151,14 +137,13 @@ def test_hit_rate_of_thin_poles(divergence_rad):
     width_m, distance_m = 0.03, 40.0
     bearings = np.linspace(0, 2 * np.pi, 50, endpoint=False) + generator_for(1).random(50) / 20
     poles = tuple(
-        Primitive(
-            Shape.CYLINDER,
-            (distance_m * np.cos(bearing), distance_m * np.sin(bearing), 0.0),
-            (width_m / 2, width_m / 2, 40.0),
-            Semantic.POLE,
-            0.3,
+        pole(
+            (distance_m * np.cos(angle), distance_m * np.sin(angle), 0.0),
+            width_m / 2,
+            40.0,
+            reflectivity=0.3,
         )
-        for bearing in bearings
+        for angle in bearings
     )
     sensor = replace(SENSOR, divergence_rad=divergence_rad)
     sweep = swept(Scene(poles, Pose(z_m=0.0), ground_m=-1000), sensor)
@@ -243,10 +228,8 @@ def test_thin_solids_that_all_axes_miss(speed_m_s):
     left = np.array([-towards[1], towards[0]]) / np.hypot(*towards[:2])
     x, y = start[:2] + 60 * (towards[:2] + RING * left)
     fired_s = SENSOR.time_s.reshape(-1)[ray]
-    rod = Primitive(
-        Shape.CYLINDER, (x, y - speed_m_s * fired_s, 0.0), (1e-3, 1e-3, 30.0), Semantic.POLE, 0.8,
-        material=Material.PAINT, velocity_m_s=(0, speed_m_s),
-    )  # fmt: skip
+    at, velocity = (x, y - speed_m_s * fired_s, 0.0), (0, speed_m_s)
+    rod = pole(at, 1e-3, 30.0, reflectivity=0.8, material=Material.PAINT, velocity_m_s=velocity)
     scene = Scene((rod,), Pose(z_m=0.0), ground_m=-1000)
     assert swept(scene, SENSOR, (MovingActors(),), PATH[:1]).first.surface[ray] == NO_SURFACE
     sweep = swept(scene, SENSOR, (MovingActors(),))
@@ -259,15 +242,9 @@ def test_thin_solids_that_all_axes_miss(speed_m_s):
 
 def test_tiles_of_ground_do_not_mix():
     """A pavement of tiles that meet at grazing incidence, with a step of 12 cm."""
+    paving = {"semantic": Semantic.SIDEWALK, "reflectivity": 0.2, "material": Material.PAVING}
     tiles = tuple(
-        Primitive(
-            Shape.BOX,
-            (5.0 * number, 0, 0.06 * (number % 2)),
-            (2.5, 50, 0.06),
-            Semantic.SIDEWALK,
-            0.2,
-            material=Material.PAVING,
-        )
+        box((5.0 * number, 0, 0.06 * (number % 2)), (2.5, 50, 0.06), **paving)
         for number in range(-8, 9)
     )
     plain, sweep = swept(Scene(tiles), after=PATH[:1]), swept(Scene(tiles))
@@ -287,9 +264,9 @@ def test_leaves_fill_the_beam():
     for before, after in zip(state(plain), state(sweep), strict=True):
         np.testing.assert_array_equal(before, after)
     # A pole before the crown takes its share of the leaves behind it.
-    pole = Primitive(Shape.CYLINDER, (8.0, 0.0, 2.0), (0.1, 0.1, 3.0), Semantic.POLE, 0.3)
-    both = swept(Scene((crown, pole)), before=foliage, after=PATH[:1])
-    mixed = swept(Scene((crown, pole)), before=foliage)
+    before_it = pole((8.0, 0.0, 2.0), 0.1, 3.0, reflectivity=0.3)
+    both = swept(Scene((crown, before_it)), before=foliage, after=PATH[:1])
+    mixed = swept(Scene((crown, before_it)), before=foliage)
     less = (both.first.origin == Origin.FOLIAGE) & (mixed.first.power != both.first.power)
     assert less.sum() > 3
 

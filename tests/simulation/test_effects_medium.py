@@ -3,6 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sweeps
+from sweeps import box
 
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spray
@@ -21,7 +23,7 @@ SENSOR = replace(
     overlap_range_m=5.0,
     threshold_spread=0.0,
 )
-WALL = Primitive(Shape.BOX, (31.0, 0, 2), (1, 40, 6), Semantic.WALL, 0.6)
+WALL = box((31.0, 0, 2), (1, 40, 6), reflectivity=0.6, material=Material.CONCRETE)
 CAR = Primitive(
     Shape.BOX, (25.0, 1.0, 0.95), (2.0, 0.9, 0.75), Semantic.CAR, 0.2, instance=7,
     material=Material.PAINT, velocity_m_s=(15.0, 0.0),
@@ -38,21 +40,12 @@ NAMES = [effect_name(effect) for effect, _ in CALLED]
 
 def surfaces(scene, sensor=SENSOR):
     """The echoes of the solids."""
-    sweep = Sweep(scene, sensor)
-    sweep.cast()
-    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "surface"))
-    return sweep
+    return sweeps.swept(scene, sensor, after=[DiffuseReflection()])
 
 
-def applied(effect, scene, sensor=SENSOR, key="draws", dual=False):
-    sweep = Sweep(scene, sensor)
-    if dual:
-        DualReturn().apply(sweep, slice(None), Draws(sweep.num_rays, "dual"))
-    sweep.cast()
-    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "surface"))
-    rays = effect.rays(sweep)
-    effect.apply(sweep, rays, Draws(sweep.num_rays, key))
-    return sweep
+def applied(effect, scene, sensor=SENSOR, dual=False):
+    before = [DualReturn()] if dual else []
+    return sweeps.swept(scene, sensor, before=before, after=[DiffuseReflection(), effect])
 
 
 # All four.

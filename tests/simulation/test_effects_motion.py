@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sweeps
+from sweeps import applied, box
 
 from r3dpa.simulation import (
     EgoMotion,
@@ -18,7 +20,6 @@ from r3dpa.simulation import (
     hdl64e,
     simulate_scan,
 )
-from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import EgoOcclusion, FoliageOcclusion, MovingActors, RollingShutter
 from r3dpa.simulation.solids import EGO_BODY
 
@@ -28,10 +29,7 @@ LEVEL = 5  # a beam within 0.3 degrees of the horizon
 
 
 def wall(x, y, half_size, **changes):
-    primitive = Primitive(
-        Shape.BOX, (x, y, 2), half_size, Semantic.WALL, 0.5, material=Material.PAINT
-    )
-    return replace(primitive, **changes)
+    return box((x, y, 2), half_size, **changes)
 
 
 def room(distance_m=20.0):
@@ -45,13 +43,8 @@ def room(distance_m=20.0):
     )
 
 
-def swept(scene, *effects, sensor=SENSOR):
-    sweep = Sweep(scene, sensor)
-    for effect in effects:
-        rays = effect.rays(sweep)
-        effect.apply(sweep, rays, Draws(sweep.num_rays, "test", type(effect).__name__))
-    sweep.cast()
-    return sweep
+def swept(scene, *effects):
+    return sweeps.swept(scene, SENSOR, before=effects)
 
 
 def azimuth_of(sweep):
@@ -90,8 +83,7 @@ def test_rolling_shutter_while_turning_rotates_what_is_seen():
     turned = (true - azimuth_of(sweep) + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, rate * sweep.sensor.time_s, atol=2e-6)
     # On a curve the car ends beside its tangent by v w t^2 / 2.
-    curve = Sweep(Scene((), motion=EgoMotion(10.0, rate)), SENSOR)
-    RollingShutter().apply(curve, slice(None), Draws(curve.num_rays, "test"))
+    curve = applied(Sweep(Scene((), motion=EgoMotion(10.0, rate)), SENSOR), RollingShutter())
     late = int(curve.time_s.argmax())
     moved = curve.start[:, late] - still.start[:, late]
     t = curve.time_s[late]
@@ -156,10 +148,8 @@ def test_the_recording_car_hides_the_same_rays_in_every_scene():
     for scene in (Scene(room()), Scene((), Pose(pitch_rad=0.02, z_m=1.8))):
         with_car = replace(scene, ego_body=(roof,))
         sweep = swept(with_car)
-        effect = EgoOcclusion()
-        before = sweep.first.range_m.copy()
-        rays = effect.rays(sweep)
-        effect.apply(sweep, rays, Draws(sweep.num_rays, "test"))
+        before, rays = sweep.first.range_m.copy(), EgoOcclusion().rays(sweep)
+        applied(sweep, EgoOcclusion())
         mask.append(rays)
         assert (sweep.first.surface[rays] == EGO_BODY).all()
         assert (sweep.reflectivity[rays] == np.float32(0.3)).all()

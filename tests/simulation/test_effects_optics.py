@@ -2,21 +2,19 @@
 
 import numpy as np
 import pytest
+import sweeps
+from sweeps import applied, box
 
 from r3dpa.simulation import (
     Material,
     Origin,
     Pose,
-    Primitive,
     Puddle,
     Scene,
     Semantic,
-    Shape,
-    Sweep,
     Weather,
     hdl64e,
 )
-from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DiffuseReflection,
     Glass,
@@ -29,23 +27,18 @@ from r3dpa.simulation.effects.optics import fresnel_reflectance
 SENSOR = hdl64e(shots=720)
 
 
-def box(centre, half_size, material=Material.PAINT, reflectivity=0.5, **others):
-    return Primitive(
-        Shape.BOX, centre, half_size, Semantic.BUILDING, reflectivity, material=material, **others
-    )
+def pane(centre, half_size, **values):
+    return box(centre, half_size, material=Material.GLASS, reflectivity=1e-4, **values)
 
 
 WALL = box((10.5, 0, 3), (0.5, 30, 3))
-PANE = box((5.01, 0, 3), (0.01, 2, 3), Material.GLASS, 1e-4)
+PANE = pane((5.01, 0, 3), (0.01, 2, 3))
 
 
-def swept(*primitives, effects=(), sensor=SENSOR, **others):
+def swept(*primitives, effects=(), **others):
     """A sweep after the ray cast, diffuse reflection and some effects."""
-    sweep = Sweep(Scene(primitives, **others), sensor)
-    sweep.cast()
-    for effect in (DiffuseReflection(), *effects):
-        effect.apply(sweep, effect.rays(sweep), Draws(sweep.num_rays, "test"))
-    return sweep
+    scene = Scene(primitives, **others)
+    return sweeps.swept(scene, SENSOR, after=(DiffuseReflection(), *effects))
 
 
 def with_origin(sweep, origin):
@@ -111,7 +104,7 @@ def test_a_pane_before_nothing_shows_its_dirt():
 def test_a_window_shows_the_back_wall_of_its_own_house_only(of_house, of_window, gap_m, seen_at):
     house = box((11.0, 0, 3), (5.0, 30, 3), instance=of_house)
     at = (6 - gap_m - 0.01, 0, 3)
-    window = box(at, (0.01, 2, 3), Material.GLASS, 1e-4, instance=of_window)
+    window = pane(at, (0.01, 2, 3), instance=of_window)
     sweep = swept(house, window, effects=[Glass()])
     rays = with_origin(sweep, Origin.GLASS)
     # The room is 30 m wide and 6 m high: the rest sees its side walls, ceiling and the floor.
@@ -123,18 +116,12 @@ def test_a_window_shows_the_back_wall_of_its_own_house_only(of_house, of_window,
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (0.0, 20.0)])
 def test_a_cabin_is_crossed_by_two_panes(velocity):
-    cabin = box((6, 0, 3), (1, 4, 3), Material.GLASS, 1e-4, instance=3, velocity_m_s=velocity)
-    seat = box((6, 1, 1.2), (0.2, 0.4, 0.5), Material.CLOTH, instance=3, velocity_m_s=velocity)
-    scene = Scene((WALL, cabin, seat))
-    bare = Scene((WALL, seat))
-    sweeps = []
-    for each in (bare, scene):
-        sweep = Sweep(each, SENSOR)
-        MovingActors().apply(sweep, MovingActors().rays(sweep), Draws(sweep.num_rays, "test"))
-        sweep.cast()
-        DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
-        sweeps.append(sweep)
-    plain, sweep = sweeps
+    cabin = pane((6, 0, 3), (1, 4, 3), instance=3, velocity_m_s=velocity)
+    of_cabin = {"instance": 3, "velocity_m_s": velocity}
+    seat = box((6, 1, 1.2), (0.2, 0.4, 0.5), material=Material.CLOTH, **of_cabin)
+    effects = {"before": [MovingActors()], "after": [DiffuseReflection()]}
+    solids = ((WALL, seat), (WALL, cabin, seat))
+    plain, sweep = (sweeps.swept(Scene(each), SENSOR, **effects) for each in solids)
     # In by the front and out by the back, which is parallel to it.
     rays = Glass().rays(sweep)
     front = np.abs(sweep.position(rays)[0] - 5) < 1e-3
@@ -142,7 +129,7 @@ def test_a_cabin_is_crossed_by_two_panes(velocity):
     low = sweep.direction[2, rays] < 0.1
     rays = rays[front & inside_y & low & (plain.first.range_m[rays] < 15)]
     cosine = sweep.cos_incidence[rays]
-    Glass().apply(sweep, Glass().rays(sweep), Draws(sweep.num_rays, "test"))
+    applied(sweep, Glass())
     rays, cosine = (a[sweep.first.origin[rays] == Origin.GLASS] for a in (rays, cosine))
     passed = pane_transmittance(cosine.clip(max=1 - 1e-6)) ** 2
     ratio = sweep.first.power[rays] / plain.first.power[rays]
@@ -156,9 +143,9 @@ def test_a_cabin_is_crossed_by_two_panes(velocity):
 
 def test_glass_mirrors_at_grazing_incidence():
     """A long pane beside the street shows the wall at its end behind itself."""
-    pane = box((20, 2.01, 3), (15, 0.01, 3), Material.GLASS, 1e-4)
+    long_pane = pane((20, 2.01, 3), (15, 0.01, 3))
     wall = box((40.5, -10, 3), (0.5, 11, 3), reflectivity=0.8)
-    sweep = swept(pane, wall, effects=[Glass()])
+    sweep = swept(long_pane, wall, effects=[Glass()])
     rays = with_origin(sweep, Origin.MIRROR)
     rays = rays[sweep.first.surface[rays] == 1]
     x, y, _ = image(sweep, rays)
@@ -180,7 +167,8 @@ def test_image_in_a_metal_mirror():
     at, thick = np.array([10.0, 0.0]), 0.02
     normal = np.array([-1.0, 1.0]) / np.sqrt(2)
     centre = (*(at - thick * normal), 2.0)
-    mirror = box(centre, (2, thick, 2), Material.POLISHED_METAL, 0.2, yaw_rad=np.pi / 4)
+    metal = {"material": Material.POLISHED_METAL, "reflectivity": 0.2}
+    mirror = box(centre, (2, thick, 2), yaw_rad=np.pi / 4, **metal)
     wall = box((10, 8.5, 3), (6, 0.5, 3), reflectivity=0.6)
     plain = swept(mirror, wall)
     sweep = swept(mirror, wall, effects=[PolishedMetal()])
@@ -240,10 +228,8 @@ def test_image_in_a_puddle(heading_rad, pitch_rad):
 
 
 def test_water_stands_level_on_a_slope():
-    road = Primitive(
-        Shape.BOX, (10, 0, -0.2), (6, 6, 0.3), Semantic.ROAD, 0.1, 0.0, 0, Material.ASPHALT,
-        grade=(0.08, 0.0),
-    )  # fmt: skip
+    asphalt = {"semantic": Semantic.ROAD, "reflectivity": 0.1, "material": Material.ASPHALT}
+    road = box((10, 0, -0.2), (6, 6, 0.3), grade=(0.08, 0.0), **asphalt)
     wall = box((20.5, 0, 3), (0.5, 20, 3))
     wet = {"weather": Weather(water_film_mm=2.0), "puddles": (Puddle(10.0, 0.0, 2.0),)}
     dry, sweep = swept(road, wall), swept(road, wall, effects=[WetGround()], **wet)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sweeps import box, swept
 
-from r3dpa.simulation import Material, Pose, Primitive, Scene, Semantic, Shape, Sweep, hdl64e
-from r3dpa.simulation.draws import Draws
+from r3dpa.simulation import Material, Pose, Scene, Semantic, hdl64e
 from r3dpa.simulation.effects import (
     DetectionLimit,
     DiffuseReflection,
@@ -20,12 +20,9 @@ SENSOR = hdl64e()
 def power_of_wall(distance_m, tilt_deg=0.0, material=Material.PAINT):
     """Power of the shot that meets a wall closest to straight on."""
     centre = (distance_m + 0.5 / np.cos(np.radians(tilt_deg)), 0, 2)
-    wall = Primitive(
-        Shape.BOX, centre, (0.5, 90, 9), Semantic.WALL, 0.6, np.radians(tilt_deg), 0, material
-    )
-    sweep = Sweep(Scene((wall,)), SENSOR)
-    sweep.cast()
-    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+    turned = {"yaw_rad": np.radians(tilt_deg), "material": material}
+    wall = box(centre, (0.5, 90, 9), reflectivity=0.6, **turned)
+    sweep = swept(Scene((wall,)), SENSOR, after=[DiffuseReflection()])
     _, direction = SENSOR.rays
     ahead = int((direction[0] - np.abs(direction[2])).reshape(-1).argmax())
     assert sweep.first.surface[ahead] == 0
@@ -55,9 +52,7 @@ def test_rough_surfaces_return_more_at_grazing_incidence():
 
 
 def test_no_surface_gives_no_power():
-    sweep = Sweep(Scene(), SENSOR)
-    sweep.cast()
-    DiffuseReflection().apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+    sweep = swept(Scene(), SENSOR, after=[DiffuseReflection()])
     nothing = np.isinf(sweep.first.range_m)
     assert nothing.any()
     assert (sweep.first.power[nothing] == 0).all()
@@ -74,9 +69,7 @@ def test_last_ground_return(smooth):
     # Raised, so that the shots of a beam of each height start 1.73 m above it.
     lasers = replace(SENSOR.lasers, height_m=(0.0,) * 64)
     sensor = replace(SENSOR, lasers=lasers, min_power=1.38e-6 if smooth else SENSOR.min_power)
-    floor = Primitive(
-        Shape.BOX, (0, 0, -1), (200, 200, 1), Semantic.ROAD, 0.1, material=Material.PAINT
-    )
+    floor = box((0, 0, -1), (200, 200, 1), semantic=Semantic.ROAD, reflectivity=0.1)
     farthest = 0.0
     # A pitch of the sensor sweeps its beams over the ground in steps far below their pitch.
     for pitch in np.linspace(0, 0.006, 25):
@@ -86,10 +79,7 @@ def test_last_ground_return(smooth):
             if smooth
             else Scene((), pose, ground_reflectivity=0.1)
         )
-        sweep = Sweep(scene, sensor)
-        sweep.cast()
-        for effect in (DiffuseReflection(), DetectionLimit()):
-            effect.apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+        sweep = swept(scene, sensor, after=[DiffuseReflection(), DetectionLimit()])
         farthest = max(farthest, sweep.first.range_m[np.isfinite(sweep.first.range_m)].max())
     expected = (0.1 * 1.73 / 1.38e-6) ** (1 / 3) if smooth else 50.0
     assert expected == pytest.approx(50.0, abs=0.1)
@@ -98,11 +88,9 @@ def test_last_ground_return(smooth):
 
 def test_texture_scatters_the_power_around_its_median():
     """ln(power) of one material at one range has the standard deviation of its spread."""
-    wall = Primitive(Shape.BOX, (12, 0, 2), (2, 60, 9), Semantic.WALL, 0.5, material=Material.BRICK)
+    wall = box((12, 0, 2), (2, 60, 9), material=Material.BRICK)
     hedge = replace(wall, centre=(-12, 0, 2), material=Material.FOLIAGE)
-    sweep = Sweep(Scene((wall, hedge)), SENSOR)
-    sweep.cast()
-    SurfaceTexture(0.3, 0.8).apply(sweep, slice(None), Draws(sweep.num_rays, "test"))
+    sweep = swept(Scene((wall, hedge)), SENSOR, after=[SurfaceTexture(0.3, 0.8)])
     for index, spread in enumerate((0.3, 0.8)):
         drawn = np.log(sweep.first.power[sweep.first.surface == index]) / spread
         assert len(drawn) > 5000

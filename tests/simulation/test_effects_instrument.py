@@ -5,22 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sweeps import applied, box, pole
 
 from r3dpa.simulation import (
     EgoMotion,
     Material,
     Origin,
-    Primitive,
     Scene,
     Semantic,
-    Shape,
     Street,
     Sweep,
     Weather,
     hdl64e,
     simulate_scan,
 )
-from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
     DetectionLimit,
     DualReturn,
@@ -39,11 +37,6 @@ def swept(sensor, range_m=20.0, power=1.0):
     sweep = Sweep(Scene(), sensor)
     sweep.first.range_m[:] = range_m
     sweep.first.power[:] = power
-    return sweep
-
-
-def applied(sweep, effect):
-    effect.apply(sweep, effect.rays(sweep), Draws(sweep.num_rays, "test", type(effect).__name__))
     return sweep
 
 
@@ -127,16 +120,10 @@ def test_strongest_returns_are_the_first_of_dual_returns():
 def test_second_returns_are_more_than_a_metre_apart():
     """A pole that fills a part of the beams, 0.9 and 3 m before a wall."""
     for gap_m, expected in ((0.9, False), (3.0, True)):
-        pole = Primitive(
-            Shape.CYLINDER, (20.0, 0.0, 3.0), (0.05, 0.05, 3.0), Semantic.POLE, 0.5,
-            material=Material.PAINT,
-        )  # fmt: skip
-        wall = Primitive(
-            Shape.BOX, (20.5 + gap_m, 0.0, 3.0), (0.5, 9.0, 3.0), Semantic.WALL, 0.5,
-            material=Material.PAINT,
-        )  # fmt: skip
+        post = pole((20.0, 0.0, 3.0), 0.05, 3.0, material=Material.PAINT)
+        wall = box((20.5 + gap_m, 0.0, 3.0), (0.5, 9.0, 3.0))
         quiet = replace(SENSOR, return_mode="dual", range_sigma_m=0.0, weak_range_sigma_m=0.0)
-        scan = simulate_scan(Scene((pole, wall)), quiet, ("seed", 1))
+        scan = simulate_scan(Scene((post, wall)), quiet, ("seed", 1))
         # At its foot the pole stands before the road, which lies farther away at once.
         second = set(scan.labels[scan.origins == Origin.SECOND_RETURN] & 0xFFFF)
         assert (Semantic.WALL in second) == expected
