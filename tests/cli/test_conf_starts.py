@@ -29,7 +29,7 @@ ELSEWHERE = {  # and the test that starts them
     "net/image_vae_demo": "test_rgb_stages",
     "net/sit_rgb_demo": "test_rgb_stages",
     **{
-        path.relative_to(CONF).with_suffix("").as_posix(): "test_ablate_stages"
+        path.relative_to(CONF).with_suffix("").as_posix(): "test_ablate"
         for path in CONF.glob("ablation/*/*.yaml")
     },
 }

@@ -2,82 +2,44 @@
 
 from __future__ import annotations
 
+import asyncio
+import ctypes
 import json
+import math
 import os
 import shutil
+import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from subprocess import Popen, TimeoutExpired
-from typing import Any
+from typing import Any, NamedTuple
 
+import lightning as L
+import torch
 import yaml
+from lightning.pytorch.cli import LightningArgumentParser
+from torch.utils.flop_counter import FlopCounterMode
 
-from r3dpa.ablation.plan import Plan, Stage, merged, with_value
-from r3dpa.io import atomic_path, source_commit
+from r3dpa.ablation.plan import Plan, Stage, with_value
+from r3dpa.io import atomic_path, only_writer, source_commit
 from r3dpa.metrics.scene_features import FREE_SPACES
-
-__all__ = ["Job", "RunSettings", "commit_of", "evaluation_of", "run_plan", "stage_folder"]
+from r3dpa.modules import GenerativeModule
+from r3dpa.modules.steps import PathDraws
 
 _TAIL = 12  # lines of a failed process that are shown
 _STOP_SECONDS = 60.0  # for a stopped training to save its checkpoint
+#: Operations per second: A100 by the paper's 1 M joint steps of 32 scans in 70 h, 15 % of the peak
+#: of eight; the same share of an H200's peak is assumed.
+_RATES = {"1 x H200": 150e12, "8 x A100": 8 * 48e12}
 
 
-@dataclass(frozen=True)
-class RunSettings:
-    """Where and how stages run; the results do not depend on it.
+class Job(NamedTuple):
+    """A command, with its output in ``<place>.log`` and its state in ``<place>.state``.
 
-    Args:
-        out: Folder of the ablation.
-        jobs: Processes at a time, which share the cores.
-        devices: Devices of each training, which share its batches.
-        online: Log the stages to wandb while they train.
-
-    Raises:
-        ValueError: If a count is below 1.
-    """
-
-    out: Path
-    jobs: int = 1
-    devices: int = 1
-    online: bool = False
-
-    def __post_init__(self) -> None:
-        """Checks the counts."""
-        if self.jobs < 1 or self.devices < 1:
-            raise ValueError(
-                f"--jobs and --devices must be at least 1, got {self.jobs} and {self.devices}"
-            )
-
-
-@dataclass(frozen=True)
-class _State:
-    """Stored state of a started job: settings, inputs, and a new ``ending`` at each success."""
-
-    content: str
-    used: dict[str, str]
-    commit: str | None
-    ending: str | None = None
-
-
-@dataclass(frozen=True)
-class Job:
-    """A command line, and the jobs that must have ended well before it.
-
-    Args:
-        name: For the user.
-        words: Command line after ``r3dpa``.
-        place: Its output goes to ``<place>.log``, its state to ``<place>.state``.
-        content: Settings that its result depends on.
-        needs: Names of jobs before it.
-        uses: Those of ``needs`` whose results change its own.
-        makes: File that it must write; an old one is removed.
-        resumes: Whether it resumes the training in the folder of ``place``.
+    ``content`` holds the settings that its result depends on, ``needs`` the jobs before it,
+    ``uses`` those of them whose results change its own, ``makes`` a file that it must write.
     """
 
     name: str
@@ -87,24 +49,21 @@ class Job:
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     makes: Path | None = None
-    resumes: bool = False
 
-    def state(self) -> _State | None:
-        """State of its last start."""
-        return _read_state(self.place.with_suffix(".state"))
-
-    def save(self, state: _State) -> None:
-        """Writes the state atomically."""
-        with atomic_path(self.place.with_suffix(".state")) as temporary:
-            temporary.write_text(json.dumps(asdict(state)), encoding="utf-8")
+    def ending(self, endings: Mapping[str, str]) -> str | None:
+        """Mark of its last success; None if settings or results before it have changed since."""
+        state = state_of(self.place)
+        used = {name: endings.get(name) for name in self.uses}
+        same = (state.get("content"), state.get("used")) == (self.content, used)
+        return state.get("ending") if same and (not self.makes or self.makes.is_file()) else None
 
 
-def _read_state(path: Path) -> _State | None:
-    if not path.is_file():
-        return None
+def state_of(place: Path) -> dict[str, Any]:
+    """Settings, inputs and commit of a job's last start, and ``ending`` if it succeeded."""
+    path = place.with_suffix(".state")
     try:
-        return _State(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: is damaged ({error}); remove it to run its job again") from error
 
 
@@ -118,13 +77,14 @@ def evaluation_of(out: Path, stage: Stage) -> Path:
     return stage_folder(out, stage) / "evaluation" / "evaluation.json"
 
 
-def commit_of(out: Path, stage: Stage) -> str | None:
-    """Commit of the code that trained a stage, if known."""
-    state = _read_state(stage_folder(out, stage) / "fit.state")
-    return None if state is None else state.commit
-
-
-def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> dict[str, str]:
+def run_plan(
+    plan: Plan,
+    out: Path,
+    say: Callable[[str], None],
+    jobs: int = 1,
+    devices: int = 1,
+    online: bool = False,
+) -> dict[str, str]:
     """Trains and tests what is not done yet; the same call continues after an interrupt.
 
     A job is done if it ended well with the same settings and the same results of the jobs before
@@ -132,75 +92,120 @@ def run_plan(plan: Plan, settings: RunSettings, say: Callable[[str], None]) -> d
 
     Args:
         plan: Plan to run.
-        settings: Where and how.
+        out: Folder of the ablation.
         say: Receives a line for each process that starts or ends.
+        jobs: Processes at a time, which share the cores.
+        devices: Devices of each training, which share its batches.
+        online: Log the stages to wandb while they train.
 
     Returns:
         Reasons of failures by name of the job.
 
     Raises:
-        ValueError: If a stage's batch cannot be shared by the devices.
+        ValueError: If a count is below 1, or a stage's batch cannot be shared by the devices.
     """
-    jobs = _jobs(plan, settings)
-    for job in jobs:
-        job.place.parent.mkdir(parents=True, exist_ok=True)
-    endings = _endings(jobs, {})
-    left = {job.name: job for job in jobs if job.name not in endings}
-    if endings:
-        say(f"{len(endings)} of {len(jobs)} are done already")
+    if jobs < 1 or devices < 1:
+        raise ValueError(f"--jobs and --devices must be at least 1, got {jobs} and {devices}")
+    every = _jobs(plan, out, devices, online)
+    endings: dict[str, str] = {}
     failed: dict[str, str] = {}
-    running: dict[Future[None], tuple[Job, float]] = {}
-    with ThreadPoolExecutor(settings.jobs) as pool, _processes() as start:
-        while left or running:
-            for job in list(left.values()):
-                if cause := next((name for name in job.needs if name in failed), None):
-                    failed[job.name] = f"not run, since {cause} failed"
-                    say(f"  - {job.name}: {failed[job.name]}")
-                    del left[job.name]
-                elif len(running) < settings.jobs and endings.keys() >= set(job.needs):
-                    used = {name: endings[name] for name in job.uses}
-                    running[pool.submit(start, job, used, settings)] = job, time.monotonic()
-                    del left[job.name]
-                    say(f"  > {job.name}")
-            if not running:
-                continue
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, began = running.pop(future)
-                error = future.exception()
-                if error is None:
-                    endings |= _endings([job], endings)
-                    took, num_done = time.monotonic() - began, f"{len(endings)} of {len(jobs)}"
-                    say(f"  = {job.name}: {took:.0f} s ({num_done})")
-                elif isinstance(error, RuntimeError):
-                    failed[job.name] = str(error)
-                    say(f"  ! {job.name} {error}")
-                else:
-                    raise error
+    for job in every:
+        if job.words[0] == "fit":  # that a killed call has left may still save its checkpoint
+            with only_writer(job.place.parent / ".fit.lock", f"trains {job.name}", wait=True):
+                pass
+        if ending := job.ending(endings):
+            endings[job.name] = ending
+    if endings:
+        say(f"{len(endings)} of {len(every)} are done already")
+    cores = max(1, (os.cpu_count() or 1) // jobs)
+    slots = asyncio.Semaphore(jobs)
+    tasks: dict[str, asyncio.Task[None]] = {}
+
+    async def finish(job: Job) -> None:
+        for name in job.needs:
+            if name in tasks:
+                await tasks[name]
+        if cause := next((name for name in job.needs if name in failed), None):
+            failed[job.name] = f"not run, since {cause} failed"
+            say(f"  - {job.name}: {failed[job.name]}")
+            return
+        async with slots:
+            say(f"  > {job.name}")
+            began = time.monotonic()
+            used = {name: endings[name] for name in job.uses}
+            if failure := await _run(job, used, cores):
+                failed[job.name] = failure
+                say(f"  ! {job.name} {failure}")
+                return
+            endings[job.name] = state_of(job.place)["ending"]
+            took = time.monotonic() - began
+            say(f"  = {job.name}: {took:.0f} s ({len(endings)} of {len(every)})")
+
+    async def finish_all() -> None:
+        for job in every:
+            if job.name not in endings:
+                tasks[job.name] = asyncio.create_task(finish(job))
+        await asyncio.gather(*tasks.values())
+
+    asyncio.run(finish_all())
     return failed
 
 
-def _endings(jobs: Iterable[Job], known: Mapping[str, str]) -> dict[str, str]:
-    """Endings of the jobs that are done, in addition to those of jobs before them."""
-    found = dict(known)
-    for job in jobs:
-        state = job.state()
-        if state is None or state.ending is None:
-            continue
-        used = {name: found.get(name) for name in job.uses}
-        made = job.makes is None or job.makes.is_file()
-        if (state.content, state.used) == (job.content, used) and made:
-            found[job.name] = state.ending
-    return found
+async def _run(job: Job, used: Mapping[str, str], cores: int) -> str | None:
+    """Runs the process of a job; why it failed, if it did."""
+    if job.words[0] == "fit" and state_of(job.place).get("used", used) != used:  # of other inputs
+        for path in job.place.parent.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+    if job.makes is not None:
+        job.makes.unlink(missing_ok=True)
+    state = {"content": job.content, "used": used, "commit": source_commit()}
+    _write(job.place.with_suffix(".state"), state)
+    log_path = job.place.with_suffix(".log")
+    with log_path.open("ab") as log:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "r3dpa", *job.words),
+            stdout=log,
+            stderr=log,
+            env={"OMP_NUM_THREADS": str(cores)} | os.environ,
+            process_group=0,  # Ctrl-C reaches it once, by way of this process
+            preexec_fn=_end_with_parent,
+        )
+        try:
+            status = await process.wait()
+        except asyncio.CancelledError:
+            process.terminate()  # a training saves its checkpoint
+            try:
+                await asyncio.wait_for(process.wait(), _STOP_SECONDS)
+            except TimeoutError:
+                process.kill()
+            raise
+    if status or (job.makes is not None and not job.makes.is_file()):
+        why = f"ended with status {status}" if status else f"left no {job.makes and job.makes.name}"
+        lines = log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-_TAIL:]
+        return "\n      ".join([f"{why}; {log_path} ends with", *lines])
+    _write(job.place.with_suffix(".state"), state | {"ending": uuid.uuid4().hex})
+    return None
 
 
-def _jobs(plan: Plan, settings: RunSettings) -> list[Job]:
+def _end_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
+def _jobs(plan: Plan, out: Path, devices: int, online: bool) -> list[Job]:
     """Scans and their reference, trainings, tests; each after the jobs that it needs."""
-    out = settings.out
     data, reference = out / "data.yaml", out / "reference.safetensors"
-    block = merged(plan.scale.data, {"data": plan.scale.overrides.get("data", {})})
-    _write(data, _placed({"data": block["data"]}, out))
-    scans, spaces = json.dumps(block, sort_keys=True), _spaces(plan.scale.scorer)
-    on_scans = [stage.config["data"]["init_args"] for stage in plan.stages if plan.on_scans(stage)]
+    _write(data, _placed({"data": plan.scale.data["data"]}, out))
+    scorer = plan.scale.scorer
+    files = scorer.get("ckpt") or {}
+    names = scorer.get("spaces") or list(dict.fromkeys((*FREE_SPACES, *files)))
+    spaces = ["--spaces", ",".join(names)]
+    for name, file in files.items():
+        spaces += [f"--ckpt.{name}", str(file)]
+    spaces += ["--protocol", scorer["protocol"]] if scorer.get("protocol") else []
+    scans = json.dumps(plan.scale.data, sort_keys=True)
+    on_scans = [stage.config["data"]["init_args"] for stage in plan.stages if stage.on_scans]
     grids = sorted({tuple(init_args["grid_size"]) for init_args in on_scans})
     words = ["features", "--data", str(data), "--grid_sizes", json.dumps(grids)]
     jobs = [Job("features", words, out / "features", f"{scans} {grids}")]
@@ -209,13 +214,11 @@ def _jobs(plan: Plan, settings: RunSettings) -> list[Job]:
     jobs.append(Job("reference", words, place, content, ("features",), makes=reference))
     for stage in plan.stages:
         folder = stage_folder(out, stage)
-        config = folder / "stage.yaml"
-        _write(config, settled(stage, settings))
-        words = ["fit", "--config", str(config), "--run_dir", str(folder), "--ckpt_path", "last"]
-        uses = tuple(before.name for before in stage.before)
-        needs = (*uses, "features") if plan.on_scans(stage) else uses
-        name = stage.name
-        jobs.append(Job(name, words, folder / "fit", name, needs, uses, resumes=True))
+        _write(folder / "stage.yaml", settled(stage, out, devices, online))
+        words = ["fit", "--config", str(folder / "stage.yaml"), "--run_dir", str(folder)]
+        words += ["--ckpt_path", "last"]
+        needs = (*stage.before, "features") if stage.on_scans else stage.before
+        jobs.append(Job(stage.name, words, folder / "fit", stage.name, needs, stage.before))
     for stage in plan.tested:
         folder = stage_folder(out, stage)
         words = ["test", "--config", str(folder / "stage.yaml"), "--run_dir", str(folder)]
@@ -223,108 +226,95 @@ def _jobs(plan: Plan, settings: RunSettings) -> list[Job]:
         words += ["--trainer.logger", "false", "--trainer.devices", "1"]
         content = json.dumps([scans, stage.config.get("scorer")], sort_keys=True)
         needs, makes = (stage.name, "reference"), evaluation_of(out, stage)
-        name = f"test of {stage.name}"
-        jobs.append(Job(name, words, folder / "test", content, needs, needs, makes))
+        jobs.append(
+            Job(f"test of {stage.name}", words, folder / "test", content, needs, needs, makes)
+        )
     return jobs
 
 
-def _spaces(scorer: Mapping[str, Any]) -> list[str]:
-    """Options of ``r3dpa reference`` for the feature spaces that are scored."""
-    files = scorer.get("ckpt") or {}
-    names = scorer.get("spaces") or list(dict.fromkeys((*FREE_SPACES, *files)))
-    given = [word for name, file in files.items() for word in (f"--ckpt.{name}", str(file))]
-    protocol = ["--protocol", scorer["protocol"]] if scorer.get("protocol") else []
-    return ["--spaces", ",".join(names), *given, *protocol]
-
-
-def settled(stage: Stage, settings: RunSettings) -> dict[str, Any]:
+def settled(stage: Stage, out: Path, devices: int = 1, online: bool = False) -> dict[str, Any]:
     """Configuration of a stage with folders, devices and loggers."""
-    config = _placed(stage.config, settings.out)
+    config = _placed(stage.config, out)
     for key, start in stage.starts.items():
-        if isinstance(start, Stage):
-            start = _checkpoint(stage_folder(settings.out, start))
-        config = with_value(config, key, str(start))
+        path = _checkpoint(stage_folder(out, start)) if isinstance(start, Stage) else start
+        config = with_value(config, key, str(path))
     batch = config["data"]["init_args"]["batch_size"]
-    if batch % settings.devices:
+    if batch % devices:
         raise ValueError(
-            f"--devices {settings.devices}: a batch of {batch} scans ({stage.experiment}) cannot "
-            "be shared by them; give a divisor of it"
+            f"--devices {devices}: a batch of {batch} scans ({stage.experiment}) cannot be shared "
+            "by them; give a divisor of it"
         )
-    config = with_value(config, "data.init_args.batch_size", batch // settings.devices)
-    config = with_value(config, "trainer.devices", settings.devices)
-    config = with_value(config, "trainer.enable_progress_bar", False)  # the output is a file
-    loggers = [{"class_path": "CSVLogger", "init_args": {"save_dir": "runs", "name": ""}}]
-    if settings.online:
-        init_args = {"project": "r3dpa", "save_dir": "runs", "name": stage.name}
-        init_args |= {"job_type": "stage", "group": f"stages of {settings.out.name}"}
-        init_args |= {"id": f"{settings.out.name}-{stage.name}"}
-        loggers.append({"class_path": "WandbLogger", "init_args": init_args})
-    for logger in loggers:
-        logger["class_path"] = f"lightning.pytorch.loggers.{logger['class_path']}"
-    return with_value(config, "trainer.logger", loggers)
+    loggers = {"CSVLogger": {"name": ""}}
+    if online:
+        group = f"stages of {out.name}"
+        names = {"name": stage.name, "job_type": "stage", "group": group}
+        loggers["WandbLogger"] = {"project": "r3dpa", **names}
+    listed = [
+        {"class_path": f"lightning.pytorch.loggers.{name}", "init_args": {"save_dir": "runs"} | own}
+        for name, own in loggers.items()
+    ]
+    trainer = {"devices": devices, "enable_progress_bar": False, "logger": listed}
+    config = with_value(config, "data.init_args.batch_size", batch // devices)
+    return with_value(config, "trainer", trainer)
 
 
 def _checkpoint(folder: Path) -> Path:
     return folder / "checkpoints" / "last.ckpt"
 
 
-def _placed(value: Any, out: Path) -> Any:
-    """``{out}`` in all texts replaced by the folder of the ablation."""
-    if isinstance(value, Mapping):
-        return {key: _placed(item, out) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_placed(item, out) for item in value]
-    return value.replace("{out}", str(out)) if isinstance(value, str) else value
+def _placed(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
+    """A configuration with the folder of the ablation for ``{out}``."""
+    placed: dict[str, Any] = json.loads(
+        json.dumps(config).replace("{out}", json.dumps(str(out))[1:-1])
+    )
+    return placed
 
 
-def _write(path: Path, config: Mapping[str, Any]) -> None:
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    dump = yaml.safe_dump if path.suffix == ".yaml" else json.dumps
     with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(dict(config), sort_keys=False), encoding="utf-8")
+        temporary.write_text(dump(dict(content)), encoding="utf-8")
 
 
-@contextmanager
-def _processes() -> Iterator[Callable[[Job, dict[str, str], RunSettings], None]]:
-    """A function that runs jobs; an early end of the block stops those that still run."""
-    alive: set[Popen[bytes]] = set()
-    stopped = False
+def budget_of(plan: Plan) -> str:
+    """Estimated cost of all trainings, without sampling and metrics, in a line."""
+    flop = 0.0
+    for stage in plan.stages:
+        trainer, batch = stage.config["trainer"], stage.config["data"]["init_args"]["batch_size"]
+        batch *= trainer.get("accumulate_grad_batches", 1)
+        flop += trainer["max_steps"] * batch * flop_per_sample(stage.config)
+    hours = [f"{flop / rate / 3600:.3g} h on {machine}" for machine, rate in _RATES.items()]
+    return (
+        f"budget: {len(plan.stages)} trainings, {flop:.3g} FLOP; {', '.join(hours)} (for large "
+        "networks; small ones do not use a GPU fully)"
+    )
 
-    def start(job: Job, used: dict[str, str], settings: RunSettings) -> None:
-        if stopped:
-            raise RuntimeError("was not started any more")
-        before, state = job.state(), _State(job.content, used, source_commit())
-        if job.resumes and before is not None and before.used != used:  # of other inputs
-            for path in job.place.parent.iterdir():
-                if path.is_dir():
-                    shutil.rmtree(path)
-        if job.makes is not None:
-            job.makes.unlink(missing_ok=True)
-        job.save(state)
-        cores = max(1, (os.cpu_count() or 1) // settings.jobs)
-        environment = {"OMP_NUM_THREADS": str(cores)} | os.environ
-        words, log_path = [sys.executable, "-m", "r3dpa", *job.words], job.place.with_suffix(".log")
-        with log_path.open("ab") as log:
-            process = Popen(words, stdout=log, stderr=log, env=environment)
-            alive.add(process)
-            status = process.wait()
-            alive.discard(process)
-        lines = log_path.read_text(encoding="utf-8", errors="replace").splitlines()
-        tail = "\n".join(f"      {line}" for line in lines[-_TAIL:])
-        if status:
-            raise RuntimeError(f"ended with status {status}; {log_path} ends with\n{tail}")
-        if job.makes is not None and not job.makes.is_file():
-            raise RuntimeError(f"left no {job.makes.name}; {log_path} ends with\n{tail}")
-        job.save(replace(state, ending=uuid.uuid4().hex))
 
-    try:
-        yield start
-    except BaseException:
-        stopped = True
-        for process in list(alive):
-            process.terminate()
-        deadline = time.monotonic() + _STOP_SECONDS
-        for process in list(alive):
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except TimeoutExpired:
-                process.kill()
-        raise
+def flop_per_sample(config: Mapping[str, Any]) -> float:
+    """Operations of a training step on one scan or image, counted on the meta device."""
+    if config["model"]["init_args"].get("teacher"):
+        config = with_value(config, "model.init_args.teacher.init_args.weights", None)
+    parser = LightningArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(L.LightningModule, "model")
+    parsed = parser.parse_object({"model": config["model"]})
+    with torch.device("meta"):
+        module = parser.instantiate(parsed).model.train()
+        channels, side = module.vae.latent_channels, config["data"]["init_args"].get("image_size")
+        batch = {}
+        if isinstance(module, GenerativeModule):
+            rows, columns = module.sit.input_size
+            grid = math.prod(module.sit.grid_size), module.sit.feature_dim
+            batch["feature_grid"] = torch.empty(1, *grid)
+            size = rows * module.vae.stride[0], columns * module.vae.stride[1]
+            batch["range_image"] = torch.empty(1, 1, *size)
+        elif side is not None:
+            rows, columns = module.vae.latent_size((side, side))
+            batch["image"] = torch.empty(1, 3, side, side)
+        if getattr(module, "cache_latents", not isinstance(module, GenerativeModule)):
+            batch["posterior_moments"] = torch.empty(1, 2 * channels, rows, columns)
+        latents = torch.empty(1, channels, rows, columns)
+        draws = PathDraws(latents, torch.empty(1), latents)
+    module.draw_path, module.log_dict = lambda *_: draws, lambda *_: None
+    with FlopCounterMode(display=False) as counter:
+        module.training_step(batch, 0).backward()
+    return counter.get_total_flops()

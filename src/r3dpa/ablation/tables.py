@@ -2,74 +2,60 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from scipy.stats import t as student
 
 from r3dpa import viz
-from r3dpa.ablation.plan import Plan, Stage, Table
-from r3dpa.ablation.run import commit_of, evaluation_of, stage_folder
+from r3dpa.ablation.plan import Plan, Row, Stage, Table
+from r3dpa.ablation.run import evaluation_of, settled, stage_folder, state_of
 from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import About, Evaluation, MetricResult, published_scales
+from r3dpa.metrics.results import (
+    About,
+    Evaluation,
+    MetricResult,
+    published_evaluations,
+    published_scales,
+)
 from r3dpa.metrics.scene_features import SPACES
-
-__all__ = ["OrderResult", "Results", "curves_of", "mean_of_seeds", "order_results", "write_table"]
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _LEVEL = 0.95
-_ALIKE = 0.05
+_ALIKE = 0.05  # a few times the differences of such rows in the paper
 _POINTS = 100  # at most, of a curve in the JSON file
 
 Results = Mapping[str, Mapping[int, Evaluation]]
 """Evaluations by row and seed; a failed one is missing."""
 
 
-@dataclass(frozen=True)
-class OrderResult:
+class Order(NamedTuple):
     """Result for one order of the paper in one metric.
 
-    Args:
-        first: Row that the claim is about.
-        second: The row that it is compared with.
-        claim: Claim of the paper: by its numbers in this metric if it printed both.
-        metric: Name of the metric.
-        change: Relative difference of ``first`` to ``second``, the mean over the seeds.
-        interval: Its 95 % interval: Student's of the differences seed by seed, or with a single
-            seed that of the scenes, without the noise of training.
-        direction: Which values are better.
+    ``claim`` (better, worse, alike) is by the paper's numbers in this metric if it printed both.
+    ``change`` is the relative difference of ``first`` to ``second``, the mean over the seeds, with
+    its 95 % interval: Student's of the differences seed by seed, or with a single seed that of the
+    scenes, without the noise of training. ``holds`` (yes, no, unclear) tells whether the interval
+    lies inside or outside the claim; *alike* means a difference of at most 5 %.
     """
 
     first: str
     second: str
-    claim: Literal["better", "worse", "alike"]
+    claim: str
     metric: str
     change: float
     interval: tuple[float, float]
-    direction: Literal["lower", "higher"] = "lower"
-
-    @property
-    def holds(self) -> Literal["yes", "no", "unclear"]:
-        """Whether the interval lies wholly inside or outside the claim.
-
-        *Alike* means a difference of at most 5 %, a few times that of such rows in the paper.
-        """
-        low, high = self.interval
-        if self.claim == "alike":
-            if max(-low, high) <= _ALIKE:
-                return "yes"
-            return "no" if low > _ALIKE or high < -_ALIKE else "unclear"
-        if low <= 0 <= high:
-            return "unclear"
-        better = (high < 0) == (self.direction == "lower")
-        return "yes" if better == (self.claim == "better") else "no"
+    holds: str
 
 
 def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -89,82 +75,48 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
             rows.append(replace(row, value=None, interval=None, note="not in every seed"))
             continue
         mean, half = fmean(values), _students(values)
-        notes = dict.fromkeys(other.note for other in found if other.note)
-        rows.append(
-            replace(row, value=mean, interval=(mean - half, mean + half), note="; ".join(notes))
-        )
-    extra = {
-        **first.about["extra"],
-        "bad_samples": [name for e in evaluations for name in e.bad_samples],
-        "seeds": len(evaluations),
-        "of each seed": [e.about["source"] for e in evaluations],
-    }
+        notes = "; ".join(dict.fromkeys(other.note for other in found if other.note))
+        rows.append(replace(row, value=mean, interval=(mean - half, mean + half), note=notes))
+    bad = [name for e in evaluations for name in e.bad_samples]
+    extra = first.about["extra"] | {"bad_samples": bad, "seeds": len(evaluations)}
     about: About = {**first.about, "seed": None, "extra": extra}
     return Evaluation(label, tuple(rows), about)
-
-
-def order_results(table: Table, results: Results, metrics: Sequence[str]) -> list[OrderResult]:
-    """Orders of the paper for which there are results."""
-    rows = {row.key: row for row in table.rows}
-    claims = [("better", pair) for pair in table.better] + [("alike", pair) for pair in table.alike]
-    found = []
-    for claim, (first, second) in claims:
-        ours, theirs = results.get(first, {}), results.get(second, {})
-        for metric in metrics:
-            both = [
-                (a, b)
-                for seed in sorted(ours.keys() & theirs.keys())
-                if (a := ours[seed].row(metric)) and (b := theirs[seed].row(metric))
-            ]
-            both = [(a, b) for a, b in both if a.value is not None and b.value]
-            if both:
-                direction = both[0][0].direction
-                printed = [rows[key].published.get(metric) for key in (first, second)]
-                found.append(
-                    OrderResult(
-                        first,
-                        second,
-                        _claim(claim, printed, direction),
-                        metric,
-                        *_difference(both),
-                        direction,
-                    )
-                )
-    return found
-
-
-def _claim(
-    general: str, printed: Sequence[float | None], direction: str
-) -> Literal["better", "worse", "alike"]:
-    """The claim in a metric: the printed numbers may be the reverse of the general claim."""
-    if general == "alike":
-        return "alike"
-    first, second = printed
-    if first is None or second is None or first == second:
-        return "better"
-    return "better" if (first < second) == (direction == "lower") else "worse"
-
-
-def _difference(
-    both: Sequence[tuple[MetricResult, MetricResult]],
-) -> tuple[float, tuple[float, float]]:
-    """Mean relative difference, and the ends of its interval."""
-    changes = []
-    for a, b in both:
-        assert a.value is not None
-        assert b.value is not None
-        changes.append((a.value - b.value) / abs(b.value))
-        half = math.hypot(a.half_width, b.half_width) / abs(b.value)
-    if len(changes) > 1:
-        half = _students(changes)
-    mean = fmean(changes)
-    return mean, (mean - half, mean + half)
 
 
 def _students(values: Sequence[float]) -> float:
     """Half the width of Student's interval of a mean."""
     num = len(values)
     return float(student.ppf((1 + _LEVEL) / 2, num - 1)) * stdev(values) / math.sqrt(num)
+
+
+def order_results(table: Table, results: Results, metrics: Sequence[str]) -> list[Order]:
+    """Orders of the paper for which there are results."""
+    printed = {row.key: row.published for row in table.rows}
+    found = []
+    for (claim, first, second), metric in product(table.orders, metrics):
+        ours, theirs = results.get(first, {}), results.get(second, {})
+        changes, half, lower = [], 0.0, True
+        for seed in sorted(ours.keys() & theirs.keys()):
+            a, b = ours[seed].row(metric), theirs[seed].row(metric)
+            if a and b and a.value is not None and b.value:
+                changes.append((a.value - b.value) / abs(b.value))
+                half = math.hypot(a.half_width, b.half_width) / abs(b.value)
+                lower = a.direction == "lower"
+        if not changes:
+            continue
+        half = _students(changes) if len(changes) > 1 else half
+        low, high = fmean(changes) - half, fmean(changes) + half
+        x, y = printed[first].get(metric), printed[second].get(metric)
+        if claim == "better" and x is not None and y is not None and x != y and (x < y) != lower:
+            claim = "worse"  # the printed numbers are the reverse of the general claim
+        if claim == "alike":
+            inside, outside = max(-low, high) <= _ALIKE, low > _ALIKE or high < -_ALIKE
+        else:
+            ends = (low, high) if lower == (claim == "better") else (-high, -low)
+            inside, outside = ends[1] < 0, ends[0] > 0
+        holds = "yes" if inside else "no" if outside else "unclear"
+        found.append(Order(first, second, claim, metric, fmean(changes), (low, high), holds))
+    return found
 
 
 def write_table(
@@ -184,25 +136,18 @@ def write_table(
     Returns:
         The table for the terminal, and the evaluations by row and seed.
     """
-    results: dict[str, dict[int, Evaluation]] = {}
+    results: dict[str, dict[int, Evaluation]] = {row.key: {} for row in table.rows}
+    own, lost, num_seeds = [], [], len(plan.seeds)
     for row in table.rows:
-        results[row.key] = {}
-        for seed in plan.seeds:
-            stage = row.tested(seed)
-            path = evaluation_of(out, stage)
-            if f"test of {stage.name}" not in failed and path.is_file():
+        for seed, chain in row.stages.items():
+            path = evaluation_of(out, chain[-1])
+            if f"test of {chain[-1].name}" not in failed and path.is_file():
                 results[row.key][seed] = Evaluation.load(path)
-    own = [
-        mean_of_seeds(_counted(row.label, found, plan), list(found.values()))
-        for row in table.rows
-        if (found := results[row.key])
-    ]
-    lost = [
-        f"{row.label}, seed {seed}: no result"
-        for row in table.rows
-        for seed in plan.seeds
-        if seed not in results[row.key]
-    ]
+            else:
+                lost.append(f"{row.label}, seed {seed}: no result")
+        if found := list(results[row.key].values()):
+            few = "" if len(found) == num_seeds else f" ({len(found)} of {num_seeds} seeds)"
+            own.append(mean_of_seeds(row.label + few, found))
     if not own:
         for suffix in ("md", "tex", "csv", "json"):  # of another run, they would look like its own
             (out / f"{table.name}.{suffix}").unlink(missing_ok=True)
@@ -211,107 +156,86 @@ def write_table(
         replace(e, rows=tuple(row for row in e.rows if row.name in _DISTANCES)) for e in own
     ]
     shown = EvaluationTable((*_published(table), *distances))
-    metrics = [name for name in shown.metrics if any(e.row(name) for e in distances)]
-    orders = order_results(table, results, metrics)
-    head = (
-        f"{table.caption} Scale {plan.scale.name}: {plan.scale.about} Seeds "
-        f"{', '.join(map(str, plan.seeds))}."
+    orders = order_results(
+        table, results, [name for name in shown.metrics if any(e.row(name) for e in distances)]
     )
-    if len(plan.seeds) > 1:
-        head += (
-            " Intervals are Student's, of the mean over the seeds, which share scans and prior; "
-            "those of orders are of the differences seed by seed."
+    seeds = ", ".join(map(str, plan.seeds))
+    intervals = "those of the scenes: another training differs by more."
+    if num_seeds > 1:
+        intervals = (
+            "Student's, of the mean over the seeds, which share scans and prior; those of orders "
+            "are of the differences seed by seed."
         )
-    else:
-        head += " Intervals are those of the scenes: another training differs by more."
-    commits = _commits(out, table, results)
-    told = [*_told(table, orders), *lost]
-    if len(commits) > 1:
-        told.append(f"trained or tested by different commits: {', '.join(commits)}")
-    with atomic_path(out / f"{table.name}.md") as temporary:
-        listed = "\n".join(f"- {line}" for line in told)
-        text = f"# {table.name}\n\n{head}\n\n{shown.markdown()}\n{listed}\n"
-        temporary.write_text(text, encoding="utf-8")
-    with atomic_path(out / f"{table.name}.tex") as temporary:
-        temporary.write_text(f"% {' '.join(head.split())}\n{shown.latex()}", encoding="utf-8")
-    EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
-    about = {"command": command(), "machine": machine(), "versions": versions(torch)}
-    about["commits"] = commits
-    _save_json(plan, table, out, results, orders, failed, about)
-    return "\n".join([f"{table.name}: {head}", "", str(shown), *told]), results
-
-
-def _counted(label: str, found: Mapping[int, Evaluation], plan: Plan) -> str:
-    """Label of a row, with the number of its seeds where some are missing."""
-    num, total = len(found), len(plan.seeds)
-    return label if num == total else f"{label} ({num} of {total} seeds)"
-
-
-def _commits(out: Path, table: Table, results: Results) -> list[str]:
-    """Commits of the code that trained and tested the rows, shortened."""
-    found: dict[str, None] = {}
+    head = (
+        f"{table.caption} Scale {plan.scale.name}: {plan.scale.about} Seeds {seeds}. Intervals are "
+        f"{intervals}"
+    )
+    by: list[str | None] = []
     for row in table.rows:
         for seed, evaluation in results[row.key].items():
-            trained = [commit_of(out, stage) for stage in row.stages[seed]]
-            for commit in (*trained, evaluation.about["commit"]):
-                found[commit[:10] if commit else "unknown"] = None
-    return list(found)
-
-
-def _told(table: Table, orders: Sequence[OrderResult]) -> list[str]:
-    """Each order of the paper in a line."""
-    labels = {row.key: row.label for row in table.rows}
-    lines: dict[tuple[str, str, bool], list[str]] = {}
-    for order in orders:
-        low, high = (100 * end for end in order.interval)
-        reverse = " (worse there)" if order.claim == "worse" else ""
-        lines.setdefault((order.first, order.second, order.claim == "alike"), []).append(
-            f"{order.metric}{reverse} {order.holds}, {100 * order.change:+.0f} % "
-            f"[{low:+.0f}, {high:+.0f}]"
-        )
-    return [
-        f"Paper: {labels[first]} {'like' if alike else 'better than'} {labels[second]}. "
-        f"Here: {'; '.join(found)}"
-        for (first, second, alike), found in lines.items()
-    ]
-
-
-def _save_json(
-    plan: Plan,
-    table: Table,
-    out: Path,
-    results: Results,
-    orders: Sequence[OrderResult],
-    failed: Mapping[str, str],
-    about: Mapping[str, Any],
-) -> None:
-    rows = []
-    for row in table.rows:
-        found = {str(seed): evaluation.rows for seed, evaluation in results[row.key].items()}
-        entry = {
-            "key": row.key,
-            "label": row.label,
-            "published": row.published,
-            "stages": {str(seed): [s.name for s in chain] for seed, chain in row.stages.items()},
-            "values": {seed: {r.name: r.value for r in rs} for seed, rs in found.items()},
-            "intervals": {seed: {r.name: r.interval for r in rs} for seed, rs in found.items()},
-        }
-        rows.append(entry)
-    fields = ("first", "second", "claim", "metric", "change", "interval", "holds")
-    chains = [chain for row in table.rows for chain in row.stages.values()]
+            by += [*(commit_of(out, s) for s in row.stages[seed]), evaluation.about["commit"]]
+    commits = list(dict.fromkeys(commit[:10] if commit else "unknown" for commit in by))
+    notes = [*_described(table, orders), *lost]
+    if len(commits) > 1:
+        notes.append(f"trained or tested by different commits: {', '.join(commits)}")
+    listed = "\n".join(f"- {line}" for line in notes)
+    _save(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown.markdown()}\n{listed}\n")
+    _save(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
+    EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
+    trained = [stage for row in table.rows for chain in row.stages.values() for stage in chain]
     stored = {
         "table": table.name,
         "caption": table.caption,
         "scale": plan.scale.name,
         "about": plan.scale.about,
-        **about,
-        "rows": rows,
-        "orders": [{field: getattr(order, field) for field in fields} for order in orders],
-        "curves": {stage.name: _thinned(out, stage) for chain in chains for stage in chain},
+        "command": command(),
+        "machine": machine(),
+        "versions": versions(torch),
+        "commits": commits,
+        "rows": [_stored_row(row, results[row.key]) for row in table.rows],
+        "orders": [order._asdict() for order in orders],
+        "curves": {stage.name: _thinned(out, stage) for stage in trained},
         "failed": dict(failed),
     }
-    with atomic_path(out / f"{table.name}.json") as temporary:
-        temporary.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
+    _save(out / f"{table.name}.json", json.dumps(stored, indent=1) + "\n")
+    return "\n".join([f"{table.name}: {head}", "", str(shown), *notes]), results
+
+
+def _save(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def commit_of(out: Path, stage: Stage) -> str | None:
+    """Commit of the code that trained a stage, if known."""
+    return state_of(stage_folder(out, stage) / "fit").get("commit")
+
+
+def _described(table: Table, orders: Sequence[Order]) -> list[str]:
+    """Each order of the paper in a line."""
+    labels = {row.key: row.label for row in table.rows}
+    lines: dict[str, list[str]] = {}
+    for order in orders:
+        relation = "like" if order.claim == "alike" else "better than"
+        claim = f"{labels[order.first]} {relation} {labels[order.second]}"
+        low, high = (100 * end for end in order.interval)
+        reverse = " (worse there)" if order.claim == "worse" else ""
+        lines.setdefault(claim, []).append(
+            f"{order.metric}{reverse} {order.holds}, {100 * order.change:+.0f} % "
+            f"[{low:+.0f}, {high:+.0f}]"
+        )
+    return [f"Paper: {claim}. Here: {'; '.join(found)}" for claim, found in lines.items()]
+
+
+def _stored_row(row: Row, found: Mapping[int, Evaluation]) -> dict[str, Any]:
+    return {
+        "key": row.key,
+        "label": row.label,
+        "published": row.published,
+        "stages": {seed: [stage.name for stage in chain] for seed, chain in row.stages.items()},
+        "values": {seed: {r.name: r.value for r in e.rows} for seed, e in found.items()},
+        "intervals": {seed: {r.name: r.interval for r in e.rows} for seed, e in found.items()},
+    }
 
 
 def curves_of(out: Path, stage: Stage) -> dict[str, dict[int, float]]:
@@ -343,26 +267,74 @@ def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
 def _published(table: Table) -> list[Evaluation]:
     """The rows as the paper printed them; KITTI-360, other networks and other data than here."""
     scales = published_scales()
-    found = []
-    for row in table.rows:
-        values = tuple(
+    source = f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}"
+    about: About = {**published_evaluations("train-val")[0].about, "source": source}
+    about |= {"solver": None, "steps": None, "extra": {}}
+    rows = {
+        row.label: tuple(
             MetricResult(name, float(f"{printed}e{scales[name]}"), scale=scales[name])
             for name, printed in row.published.items()
         )
-        about: About = {
-            "backbones": {},
-            "protocol": {"name": "published"},
-            "reference": "KITTI-360, train-val",
-            "solver": None,
-            "steps": None,
-            "seed": None,
-            "precision": None,
-            "commit": None,
-            "feature_source": None,
-            "published": True,
-            "source": f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}",
-            "extra": {},
-        }
-        if values:
-            found.append(Evaluation(row.label, values, about))
-    return found
+        for row in table.rows
+    }
+    return [Evaluation(label, values, about) for label, values in rows.items() if values]
+
+
+def log_rows(
+    plan: Plan, table: Table, results: Results, out: Path, mode: Literal["offline", "online"]
+) -> None:
+    """Logs a wandb run for each row and seed: group, configuration, curves, pictures, metrics.
+
+    A run that was logged before is not logged again; with other numbers it replaces the offline run
+    of the same row and seed. Offline runs are in ``<out>/wandb``, for ``wandb sync``.
+    """
+    import wandb  # takes seconds
+
+    for row in table.rows:
+        for seed, evaluation in results[row.key].items():
+            stages = row.stages[seed]
+            summary = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
+            summary = {name: value for name, value in summary.items() if value is not None}
+            content = json.dumps([[stage.name for stage in stages], plan.scale.scorer])
+            of_row = f"{table.name}-{row.key}-{seed}"
+            run_id = f"{of_row}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
+            note, text = out / "wandb" / f"{run_id}.{mode}.json", json.dumps(summary)
+            if note.is_file() and note.read_text(encoding="utf-8") == text:
+                continue
+            for stale in note.parent.glob(f"offline-run-*-{of_row}-????????"):
+                shutil.rmtree(stale)
+            config = {
+                "table": table.name,
+                "row": row.key,
+                "label": row.label,
+                "scale": plan.scale.name,
+                "seed": seed,
+                "stages": {stage.experiment: settled(stage, out) for stage in stages},
+                "runs": [stage.name for stage in stages],
+                "commits": [commit_of(out, stage) for stage in stages],
+            }
+            with wandb.init(
+                project="r3dpa",
+                group=f"{table.name} {plan.scale.name}",
+                job_type="row",
+                name=f"{row.label}, seed {seed}",
+                id=run_id,
+                resume="allow" if mode == "online" else None,
+                dir=out,
+                mode=mode,
+                config=config,
+                settings=wandb.Settings(silent=True, console="off"),
+            ) as run:
+                for stage in stages:
+                    prefix = stage.experiment
+                    run.define_metric(f"{prefix}/*", step_metric=f"{prefix}/step")
+                    by_step: dict[int, dict[str, float]] = {}
+                    for name, values in curves_of(out, stage).items():
+                        for step, value in values.items():
+                            by_step.setdefault(step, {})[f"{prefix}/{name}"] = value
+                    for step, logged in sorted(by_step.items()):
+                        run.log({f"{prefix}/step": step} | logged)
+                for path in sorted(evaluation_of(out, stages[-1]).parent.rglob("*.png")):
+                    run.log({f"samples/{path.stem}": wandb.Image(str(path))})
+                run.summary.update(summary)
+            _save(note, text)

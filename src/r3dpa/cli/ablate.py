@@ -52,16 +52,15 @@ def ablate(
     found = ablation.read_scale(_scale_file(tables, scale))
     folder = out or Path("runs/ablation") / found.name
     check_folder(folder)
-    settings = ablation.RunSettings(folder, jobs, devices, wandb == "online")
     plan = ablation.make_plan(tables, found, seeds, rgb_weights)
+    if plan.missing_weights and not budget_only:
+        listed = ", ".join(map(str, plan.missing_weights))
+        raise ValueError(f"scale {found.name} needs files that are not there: {listed}")
     _say(ablation.budget_of(plan))
     if budget_only:
         return
-    if plan.missing_weights:
-        listed = ", ".join(map(str, plan.missing_weights))
-        raise ValueError(f"scale {found.name} needs files that are not there: {listed}")
     with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
-        failed = ablation.run_plan(plan, settings, _say)
+        failed = ablation.run_plan(plan, folder, _say, jobs, devices, wandb == "online")
         for table in plan.tables:
             text, results = ablation.write_table(plan, table, folder, failed)
             _say(f"\n{text}")

@@ -1,0 +1,589 @@
+"""``r3dpa ablate``: what is shared, what is run, what a failure costs, and what is written."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import json
+import re
+import shutil
+import signal
+import subprocess
+import threading
+from collections import Counter
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import wandb
+import yaml
+from scipy.stats import ttest_1samp
+
+from r3dpa.ablation import make_plan, read_scale, run_plan
+from r3dpa.ablation import run as runner
+from r3dpa.ablation.plan import Row, Table, merged, read_config
+from r3dpa.ablation.tables import mean_of_seeds, order_results
+from r3dpa.cli import main
+from r3dpa.metrics.results import Evaluation, MetricResult
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+TABLES = CONF / "ablation"
+SCALES = sorted(path.stem for path in (TABLES / "scale").glob("*.yaml"))
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:LightningCLI's args parameter",
+    "ignore:.*does not have many workers",
+    "ignore:.*LeafSpec.*is deprecated",
+    "ignore:Attribute '.*' is an instance of `nn.Module`",
+)
+
+
+def scale_of(name):
+    return read_scale(TABLES / "scale" / f"{name}.yaml")
+
+
+def plan_of(scale, seeds=(0,), tables=TABLES, rgb_weights=None):
+    return make_plan(tables, scale_of(scale), seeds, rgb_weights)
+
+
+def rows_of(plan):
+    return {(table.name, row.key): row for table in plan.tables for row in table.rows}
+
+
+def names_of(stages):
+    return [stage.name for stage in stages]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+class TestShippedPlans:
+    def test_what_rows_share_is_run_once(self, scale):
+        """Two VAEs, four baselines, three joint trainings; table II ends as table III begins."""
+        plan = plan_of(scale)
+        assert [len(table.rows) for table in plan.tables] == [3, 3, 2]
+        rows = rows_of(plan)
+        assert all(len(row.published) == 6 for row in rows.values())
+        assert Counter(stage.experiment for stage in plan.stages if stage.on_scans) == {
+            "vae_alignment": 2,
+            "flow_matching": 4,
+            "joint": 2,
+            "joint_unet": 1,
+        }
+        last = [
+            rows[key].stages[0][-1] for key in (("table_2", "3_aligned"), ("table_3", "1_none"))
+        ]
+        assert last[0].name == last[1].name
+        assert len(plan.tested) == 7
+        seen = set()
+        for stage in plan.stages:
+            assert seen.issuperset(stage.before)
+            seen.add(stage.name)
+
+    def test_a_second_seed_repeats_all_but_the_prior(self, scale):
+        one, two = plan_of(scale), plan_of(scale, (0, 1))
+        prior = [stage for stage in one.stages if not stage.on_scans]
+        assert len(two.stages) == 2 * len(one.stages) - len(prior)
+        assert set(names_of(one.stages)) < set(names_of(two.stages))
+
+    def test_the_command_line_accepts_every_stage(self, scale, tmp_path, capsys):
+        kinds = {stage.experiment: stage for stage in plan_of(scale).stages}
+        for stage in kinds.values():  # rows set known keys of them
+            path = tmp_path / f"{stage.experiment}.yaml"
+            path.write_text(yaml.safe_dump(runner.settled(stage, tmp_path)))
+            with pytest.raises(SystemExit) as ended:
+                main(["fit", "--config", str(path), "--print_config"])
+            assert ended.value.code == 0
+            assert yaml.safe_load(capsys.readouterr().out)["model"]["class_path"]
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [scale if scale == "demo" else pytest.param(scale, marks=pytest.mark.slow) for scale in SCALES],
+)
+def test_every_stage_steps_at_its_full_size_without_memory(scale):
+    """Losses and gradients of the whole networks, on the meta device."""
+    text = runner.budget_of(plan_of(scale))
+    assert re.match(r"budget: \d+ trainings, \d\.\d+e\+\d+ FLOP; .* h on 1 x H200", text)
+
+
+def test_paper_scale_has_the_networks_of_the_paper():
+    configs = {stage.experiment: stage.config for stage in plan_of("paper").stages}
+    networks = {name: config["model"]["init_args"]["sit"] for name, config in configs.items()}
+    assert networks["joint_unet"]["class_path"] == "r3dpa.nn.UNet"
+    assert networks["joint"]["class_path"] == "r3dpa.nn.SiT"
+    steps = {name: config["trainer"]["max_steps"] for name, config in configs.items()}
+    assert steps.pop("rgb_pretraining") == 1_000_000
+    assert set(steps.values()) == {400_000}
+
+
+class TestContentOfAStage:
+    def test_given_weights_replace_the_pretraining(self, tmp_path):
+        weights = tmp_path / "rgb.pt"
+        weights.write_bytes(b"one")
+        first = plan_of("demo", rgb_weights=weights)
+        assert all(stage.on_scans for stage in first.stages)
+        start = rows_of(first)["table_2", "2_rgb"].stages[0][-1].starts
+        assert start["model.init_args.rgb_weights"] == weights
+        weights.write_bytes(b"other")
+        second = plan_of("demo", rgb_weights=weights)
+        both = [rows_of(plan) for plan in (first, second)]
+        scratch, aligned = (
+            [names_of(rows["table_2", key].stages[0]) for rows in both]
+            for key in ("1_scratch", "3_aligned")
+        )
+        assert scratch[0] == scratch[1]
+        assert not set(aligned[0]) & set(aligned[1])
+
+    def test_how_it_is_tested_does_not_count(self, tmp_path):
+        text = (TABLES / "scale" / "demo.yaml").read_text().replace("../../", f"{CONF}/")
+        names = []
+        for new in ("num_scans: 144", "num_scans: 145"):
+            path = tmp_path / "demo.yaml"
+            path.write_text(text.replace("num_scenes: 144", "num_scenes: 7"))
+            path.write_text(path.read_text().replace("num_scans: 144", new))
+            names.append(names_of(make_plan(TABLES, read_scale(path), (0,)).stages))
+        assert names_of(plan_of("demo").stages) == names[0]
+        assert names[0] != names[1]
+
+    def test_another_class_takes_no_argument_of_the_one_before(self):
+        before = {"sit": {"class_path": "a", "init_args": {"depth": 3, "width": 1}}, "x": 1}
+        deeper = {"sit": {"class_path": "a", "init_args": {"depth": 4}}}
+        other = {"sit": {"class_path": "b", "init_args": {"depth": 4}}}
+        assert merged(before, deeper)["sit"]["init_args"] == {"depth": 4, "width": 1}
+        assert merged(before, other)["sit"]["init_args"] == {"depth": 4}
+
+    def test_merged_files_are_what_the_command_line_makes_of_them(self, capsys, tmp_path):
+        files = ["trainer", "trainer_demo", "data/demo", "experiment/joint"]
+        files = [CONF / f"{name}.yaml" for name in (*files, "experiment/joint_demo")]
+        single, config = tmp_path / "one.yaml", {}
+        for path in files:
+            config = merged(config, read_config(path))
+        single.write_text(yaml.safe_dump(config))
+        printed = []
+        for given in (files, [single]):
+            words = [word for path in given for word in ("--config", str(path))]
+            with pytest.raises(SystemExit):
+                main(["fit", *words, "--print_config"])
+            printed.append(yaml.safe_load(capsys.readouterr().out))
+        assert printed[0] == printed[1]
+
+
+ROW = {"label": "x", "stages": [{"name": "a", "experiment": "joint"}]}
+
+
+class TestWrongFiles:
+    @pytest.mark.parametrize(
+        ("row", "message"),
+        [
+            ({"label": "x"}, r"2_b.yaml: lacks the keys \['stages'\]"),
+            ({"label": "x", "stages": [], "colour": 1}, r"unknown keys \['colour'\]"),
+            ({"label": "x", "stages": []}, "has no stage to train"),
+            (
+                {"label": "y", "stages": [{"name": "a", "experiment": "fly"}]},
+                r"stages\[0\]: the scale demo has no experiment 'fly'; give one of image_vae",
+            ),
+            (
+                {"label": "y", "stages": [ROW["stages"][0] | {"start": {"k": "b"}}]},
+                "no stage before it is called 'b'",
+            ),
+            (ROW, "2 rows have the label 'x'; give different labels"),
+            (ROW | {"published": {"FID": 1.0}}, "published: 'FID' is no metric of the paper"),
+        ],
+    )
+    def test_it_is_named(self, row, message, tmp_path):
+        (tmp_path / "table.yaml").write_text("caption: c")
+        (tmp_path / "1_a.yaml").write_text(yaml.safe_dump(ROW))
+        (tmp_path / "2_b.yaml").write_text(yaml.safe_dump(row))
+        with pytest.raises(ValueError, match=message):
+            plan_of("demo", tables=tmp_path)
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["nowhere"], "nowhere: is no folder"),
+            ([str(CONF / "net")], r"holds no table\.yaml"),
+            ([str(TABLES), "--scale", "huge"], "no such scale; give one of demo"),
+            ([str(TABLES), "--seeds", "0", "0"], "different numbers"),
+            ([str(TABLES), "--seeds", "-1"], "from 0 on"),
+            ([str(TABLES), "--rgb_weights", "none.pt"], "none.pt: there is no such file"),
+            (
+                [str(TABLES), "--scale", "paper"],
+                "needs files that are not there: data/weights/dino",
+            ),
+        ],
+    )
+    def test_arguments(self, words, message, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        scale = [] if "--scale" in words else ["--scale", str(TABLES / "scale" / "demo.yaml")]
+        with pytest.raises(ValueError, match=message):
+            main(["ablate", *words, *scale, "--out", "out"])
+        assert not (tmp_path / "out").exists()
+
+
+def evaluation(label="x", **values):
+    about = {
+        "backbones": {}, "protocol": {"name": "default"}, "reference": "r", "solver": None,
+        "steps": None, "seed": 0, "precision": None, "commit": None, "feature_source": None,
+        "published": False, "source": "s", "extra": {},
+    }  # fmt: skip
+    rows = tuple(
+        MetricResult(name, value, (value - 0.1, value + 0.1), scale=-2)
+        for name, value in values.items()
+    )
+    return Evaluation(label, rows, about)
+
+
+class TestSeeds:
+    def test_mean_and_students_interval(self):
+        values = (1.0, 2.0, 4.0)
+        row = mean_of_seeds("row", [evaluation(JSD=v) for v in values]).row("JSD")
+        expected = ttest_1samp(values, 0).confidence_interval()
+        assert row.value == pytest.approx(7 / 3)
+        assert row.interval == pytest.approx((expected.low, expected.high))
+        assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
+
+    def test_a_row_with_fewer_seeds_keeps_what_must_be_known_of_each(self):
+        one, other = evaluation(JSD=1.0, MMD=2.0), evaluation(JSD=2.0)
+        few = replace(other.rows[0], note="few scenes")
+        bad = {**other.about, "extra": {"bad_samples": ["7"]}}
+        mean = mean_of_seeds("row", [one, replace(other, rows=(few,), about=bad)])
+        assert mean.row("JSD").note == "few scenes"
+        assert mean.row("MMD") is None
+        assert mean.bad_samples == ["7"]
+
+
+class TestOrders:
+    def holds(self, ours, theirs, published=({}, {})):
+        rows = [Row(key, key, found, {}) for key, found in zip("ab", published, strict=True)]
+        table = Table("t", "", rows, [("better", "a", "b"), ("alike", "a", "b")])
+        results = {
+            key: {seed: evaluation(JSD=value) for seed, value in enumerate(values)}
+            for key, values in (("a", ours), ("b", theirs))
+        }
+        return {order.claim: order for order in order_results(table, results, ["JSD"])}
+
+    @pytest.mark.parametrize(
+        ("ours", "theirs", "better", "alike"),
+        [
+            ((1.0,), (2.0,), "yes", "no"),
+            ((2.0,), (1.0,), "no", "no"),
+            ((1.0,), (1.1,), "unclear", "unclear"),  # half widths of 0.1 each
+            ((20.0,), (20.1,), "unclear", "yes"),
+            ((1.0, 1.01), (2.0, 2.0), "yes", "no"),
+            ((1.0, 1.9), (2.0, 2.0), "unclear", "unclear"),  # both better, by very unlike amounts
+            ((1.0, 2.0), (2.0, 1.0), "unclear", "unclear"),
+            ((3.0, 5.0), (3.01, 5.01), "unclear", "yes"),  # in pairs: seeds differ more than rows
+        ],
+    )
+    def test_an_order_is_told_by_the_interval_of_the_difference(self, ours, theirs, better, alike):
+        found = self.holds(ours, theirs)
+        assert (found["better"].holds, found["alike"].holds) == (better, alike)
+
+    def test_intervals(self):
+        single = self.holds((1.0,), (2.0,))["better"]
+        assert single.change == -0.5
+        assert single.interval == pytest.approx((-0.5 - 0.02**0.5 / 2, -0.5 + 0.02**0.5 / 2))
+        expected = ttest_1samp((-0.5, -0.6, -0.4), 0).confidence_interval()
+        several = self.holds((1.0, 0.8, 1.2), (2.0, 2.0, 2.0))["better"]
+        assert several.interval == pytest.approx((expected.low, expected.high))
+
+    def test_what_the_paper_printed_goes_before_its_claim(self):
+        reverse = ({"JSD": 3.0}, {"JSD": 2.0})
+        assert self.holds((1.0,), (2.0,), reverse)["worse"].holds == "no"
+        assert self.holds((2.0,), (1.0,), reverse)["worse"].holds == "yes"
+
+
+class Processes:
+    """Stands in for processes, since the imports of each would take ten seconds."""
+
+    def __init__(self):
+        self.started = []
+        self.run = main
+        self.broken = ""
+
+    async def __call__(self, *words, stdout, **_):
+        words, status = list(words[3:]), 0
+        self.started.append(words)
+        if self.broken and self.broken in " ".join(words):
+            stdout.write(b"it broke\n")
+            stdout.flush()
+            status = 3
+        else:
+            status = self.run(words) or 0
+        return SimpleNamespace(wait=lambda: asyncio.sleep(0, status))
+
+    def kinds(self):
+        found = Counter(words[0] for words in self.started)
+        self.started.clear()
+        return found
+
+
+@pytest.fixture
+def processes(monkeypatch):
+    found = Processes()
+    monkeypatch.setattr("r3dpa.ablation.budget_of", lambda plan: f"{len(plan.stages)} trainings")
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", found)
+    return found
+
+
+@pytest.fixture
+def command(tmp_path):
+    """Words of an ablation of two rows at smoke size: a VAE, without and with aligned SiT."""
+    smoke = read_config(CONF / "smoke.yaml")
+    configs = {
+        name: {
+            "configs": [str(CONF / "experiment" / f"{name}.yaml")],
+            "set": {"model": smoke["model"]},
+        }
+        for name in ("vae_alignment", "flow_matching")
+    }
+    scale = {
+        "about": "Smoke.",
+        "common": [str(CONF / "trainer.yaml")],
+        "data": {"data": merged(smoke["data"], {"init_args": {"root": "{out}/data"}})},
+        "set": {
+            "trainer": smoke["trainer"] | {"callbacks": [], "limit_val_batches": 0},
+            "scorer": smoke["scorer"] | {"spaces": ["fgeo"]},
+            "checkpoint": smoke["checkpoint"],
+        },
+        "experiments": configs,
+    }
+    (tmp_path / "smoke.yaml").write_text(yaml.safe_dump(scale))
+    folder = tmp_path / "table_x"
+    folder.mkdir()
+    (folder / "table.yaml").write_text("caption: A table.\nbetter: [[2_b, 1_a]]\n")
+    for key, weight in (("1_a", 0.0), ("2_b", 0.5)):
+        flow = {
+            "name": "flow",
+            "experiment": "flow_matching",
+            "start": {"model.init_args.init_from": "vae"},
+            "set": {"model": {"init_args": {"weights": {"sit_alignment": weight}}}},
+        }
+        stages = [{"name": "vae", "experiment": "vae_alignment"}, flow]
+        row = {"label": f"row {key}", "published": {"JSD": 5.0}, "stages": stages}
+        (folder / f"{key}.yaml").write_text(yaml.safe_dump(row))
+    words = ["ablate", str(folder), "--scale", str(tmp_path / "smoke.yaml")]
+    return [*words, "--out", str(tmp_path / "out"), "--wandb", "off"]
+
+
+def without_training(words):
+    """Leaves behind what others need."""
+    run_dir = Path(words[words.index("--run_dir") + 1]) if "--run_dir" in words else None
+    if words[0] == "fit":
+        (run_dir / "checkpoints").mkdir(exist_ok=True)
+        (run_dir / "checkpoints" / "last.ckpt").touch()
+        (run_dir / "version_0").mkdir(exist_ok=True)
+        (run_dir / "version_0" / "metrics.csv").write_text("step,train/loss\n0,2.0\n1,1.0\n")
+    if words[0] == "test":
+        evaluation(JSD=1.0).save(run_dir / "evaluation" / "evaluation.json")
+    if words[0] == "reference":
+        Path(words[words.index("--out") + 1]).touch()
+
+
+ALL = {"features": 1, "reference": 1, "fit": 3, "test": 2}
+
+
+@pytest.mark.parametrize("jobs", ["1", "3"])
+def test_only_what_is_missing_is_run(command, jobs, tmp_path, processes, capsys):
+    processes.run = without_training
+    main([*command, "--jobs", jobs])
+    assert processes.kinds() == ALL  # the VAE of both rows is trained once
+    main(command)
+    assert not processes.started
+    assert "7 of 7 are done already" in capsys.readouterr().out
+    out = tmp_path / "out"
+    old = sorted(out.glob("stages/flow_matching-*/checkpoints/last.ckpt"))
+    for path in old:
+        path.write_text("of the VAE before")
+    (vae,) = out.glob("stages/vae_alignment-*")
+    shutil.rmtree(vae)
+    main(command)
+    assert processes.kinds() == {"fit": 3, "test": 2}
+    assert [path.read_text() for path in old] == ["", ""]
+    (out / "reference.safetensors").unlink()
+    main(command)
+    assert processes.kinds() == {"reference": 1, "test": 2}
+
+
+def test_files_and_text_of_a_table(command, tmp_path, processes, capsys):
+    processes.run = without_training
+    main(command)
+    out = tmp_path / "out"
+    for text in (capsys.readouterr().out, (out / "table_x.md").read_text()):
+        assert "A table. Scale smoke: Smoke. Seeds 0." in text
+        assert "Paper: row 2_b better than row 1_a. Here: JSD unclear, +0 % [-14, +14]" in text
+        assert "row 1_a (published)" in text.replace("\\_", "_")
+    assert r"\bottomrule" in (out / "table_x.tex").read_text()
+    with (out / "table_x.csv").open(newline="") as file:
+        values = {line["label"]: (line["value"], line["low"]) for line in csv.DictReader(file)}
+    assert values == {"row 1_a": ("1.0", "0.9"), "row 2_b": ("1.0", "0.9")}
+    stored = json.loads((out / "table_x.json").read_text())
+    assert [row["values"] for row in stored["rows"]] == [{"0": {"JSD": 1.0}}] * 2
+    assert list(stored["curves"].values()) == [{"train/loss": [[0, 1], [2.0, 1.0]]}] * 3
+
+
+def test_an_interrupted_training_continues(command, tmp_path, processes):
+    processes.run = lambda words: without_training(words) or (words[0] == "fit") * 143
+    with pytest.raises(SystemExit):
+        main(command)
+    (checkpoint,) = (tmp_path / "out").glob("stages/vae_alignment-*/checkpoints/last.ckpt")
+    checkpoint.write_text("half way")
+    processes.run = lambda words: None
+    with pytest.raises(SystemExit):
+        main(command)
+    assert checkpoint.read_text() == "half way"
+    assert all(
+        words[-2:] == ["--ckpt_path", "last"] for words in processes.started if "fit" in words
+    )
+
+
+def test_a_test_without_numbers_is_a_failure_and_old_ones_are_gone(
+    command, tmp_path, processes, capsys
+):
+    """As `r3dpa test` ends where scenes are too few to compare."""
+    processes.run = without_training
+    main(command)
+    assert (tmp_path / "out" / "table_x.md").is_file()
+    scale = tmp_path / "smoke.yaml"
+    scale.write_text(scale.read_text().replace("num_scenes: 4", "num_scenes: 5"))
+    processes.run = lambda words: None
+    processes.kinds()
+    for _ in range(2):
+        with pytest.raises(SystemExit):
+            main(command)
+        assert processes.kinds() == {"test": 2}
+        printed = capsys.readouterr().out
+        assert "left no evaluation.json" in printed
+        assert "no row has a result" in printed
+        assert printed.endswith("tables: none\n")
+    assert not list((tmp_path / "out").glob("table_x.*"))
+
+
+def test_a_row_that_fails_leaves_the_other(command, tmp_path, processes, capsys):
+    processes.run = without_training
+    plan = make_plan(tmp_path / "table_x", read_scale(tmp_path / "smoke.yaml"), (0,))
+    broken = plan.tables[0].rows[1].stages[0][-1].name
+    processes.broken = f"fit --config {tmp_path}/out/stages/{broken}"
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 1
+    printed = capsys.readouterr().out
+    assert f"! {broken} ended with status 3" in printed
+    assert "it broke" in printed
+    assert f"test of {broken}: not run, since {broken} failed" in printed
+    assert "row 2_b, seed 0: no result" in printed
+    stored = json.loads((tmp_path / "out" / "table_x.json").read_text())
+    assert [bool(row["values"]) for row in stored["rows"]] == [True, False]
+    processes.broken = ""
+    processes.kinds()
+    main(command)
+    assert processes.kinds() == {"fit": 1, "test": 1}
+
+
+def test_wandb_gets_the_newest_numbers_of_each_row(command, tmp_path, processes, monkeypatch):
+    logged = []
+
+    def init(**options):
+        (options["dir"] / "wandb" / f"offline-run-x-{options['id']}").mkdir(parents=True)
+        run = SimpleNamespace(**options, summary={}, lines=[], define_metric=lambda *_, **__: None)
+        run.log = run.lines.append
+        logged.append(run)
+        return nullcontext(run)
+
+    monkeypatch.setattr(wandb, "init", init)
+    processes.run = without_training
+    main(command[:-2])
+    for run, key, weight in zip(logged, ("1_a", "2_b"), (0.0, 0.5), strict=True):
+        assert (run.group, run.job_type, run.mode) == ("table_x smoke", "row", "offline")
+        assert run.name == f"row {key}, seed 0"
+        model = run.config["stages"]["flow_matching"]["model"]["init_args"]
+        assert model["weights"]["sit_alignment"] == weight
+        assert run.summary == {"JSD": 1.0}
+        assert {"vae_alignment/step": 1, "vae_alignment/train/loss": 1.0} in run.lines
+    main(command[:-2])
+    assert len(logged) == 2  # nothing new
+    (one, _) = sorted((tmp_path / "out").glob("stages/flow_matching-*/evaluation/evaluation.json"))
+    evaluation(JSD=2.0).save(one)
+    main(command[:-2])
+    assert len(logged) == 3
+    assert logged[-1].summary == {"JSD": 2.0}
+    assert len(list((tmp_path / "out" / "wandb").glob("offline-run-*"))) == 2
+
+
+def test_processes_are_real(tmp_path):
+    """What is started is this package; a failure shows the end of what it wrote."""
+    job = runner.Job("check", ["check", str(tmp_path / "none")], tmp_path / "check", "")
+    assert "ended with status 1" in (failure := asyncio.run(runner._run(job, {}, 1)))
+    assert "none" in failure.splitlines()[-1]
+    assert job.ending({}) is None
+
+
+def test_a_stopped_ablation_stops_what_it_started(tmp_path, monkeypatch):
+    real, sleeping = asyncio.create_subprocess_exec, []
+
+    async def sleep(*_, **options):
+        sleeping.append(await real("sleep", "60", **options))
+        return sleeping[-1]
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", sleep)
+    job = runner.Job("x", ["sleep"], tmp_path / "sleep", "")
+
+    async def stopped():
+        task = asyncio.create_task(runner._run(job, {}, 1))
+        while not sleeping:
+            await asyncio.sleep(0.01)
+        assert not task.done()
+        raise KeyboardInterrupt  # as by Ctrl-C between two lines
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(stopped())
+    assert sleeping[0].returncode == -signal.SIGTERM
+
+
+def test_a_killed_ablation_leaves_no_process():
+    """Linux signals a child when the thread that has started it ends."""
+    started = []
+
+    def start():
+        words, option = ["sleep", "60"], runner._end_with_parent
+        started.append(subprocess.Popen(words, preexec_fn=option))
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert started[0].wait(5) == -signal.SIGTERM
+
+
+@pytest.mark.slow
+def test_two_rows_from_nothing_to_the_tables(command, tmp_path, processes):
+    main(command[:-2])
+    assert processes.kinds() == ALL
+    stored = json.loads((tmp_path / "out" / "table_x.json").read_text())
+    for row in stored["rows"]:
+        vae, flow = (stored["curves"][name] for name in row["stages"]["0"])
+        assert len(vae["train/loss"][0]) == len(vae["train/loss"][1]) == 3
+        assert "train/denoising" in flow
+    assert len(list((tmp_path / "out").glob("wandb/offline-run-*/*.wandb"))) == 2
+    wandb.teardown()  # else it keeps its settings of now for all tests after this one
+
+
+@pytest.mark.slow
+def test_all_rows_of_the_demo_run_in_miniature(tmp_path, processes):
+    """One step of each training at the sizes of the demo, on few images and scans."""
+    scale = scale_of("demo")
+    step = {"max_steps": 1, "val_check_interval": 1, "limit_val_batches": 1}
+    change = {"trainer": step, "checkpoint": {"every_n_train_steps": 1}}
+    images = {"source": {"init_args": {"num_images": 40}}, "val_every": 2, "num_workers": 0}
+    scorer = {"num_scenes": 4, "batch_size": 4, "spaces": ["fgeo"]}
+    scorer["sampler"] = {"solver": "euler", "steps": 1, "shift": 1.0}
+    few = {"data": {"init_args": {"num_scans": 12}}}
+    for given in scale.experiments.values():
+        data = few if given.get("scans", True) else {"data": {"init_args": images}}
+        more = {"scorer": scorer} if given.get("scans", True) else {}
+        given["config"] = merged(merged(given["config"], change), data | more)
+    scale = scale._replace(data=merged(scale.data, few), scorer=merged(scale.scorer, scorer))
+    plan = make_plan(TABLES, scale, (0,))
+    assert not run_plan(plan, tmp_path, lambda _: None)
+    assert processes.kinds() == {"features": 1, "reference": 1, "fit": 11, "test": 7}
+    for stage in plan.tested:
+        assert json.loads(runner.evaluation_of(tmp_path, stage).read_text())
