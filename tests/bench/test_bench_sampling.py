@@ -14,7 +14,7 @@ import torch
 from tiny_networks import tiny_checkpoint
 
 from r3dpa.bench import sampling as bench
-from r3dpa.bench.measure import Series
+from r3dpa.bench.measure import Spent
 from r3dpa.bench.mixture import GaussianMixture, toy_mixture
 from r3dpa.bench.problems import MixtureProblem, ModelProblem, Setting
 from r3dpa.bench.rows import (
@@ -52,7 +52,7 @@ def row(label, seconds, error, precision="fp32", batch=4, precision_error=0.0):
     solver, steps = label.rsplit(" ", 1)
     way = Setting(SamplerConfig(solver, int(steps)), precision, batch=batch)
     errors = Errors([error**2] * 4, error, precision_error, None, None)
-    return Row(label, way, errors, Series((seconds,), (seconds,), (True,), True), 1.0, 1.0, 0.0)
+    return Row(label, way, errors, [seconds], [seconds], 1.0, 1.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -327,6 +327,7 @@ class TestInterruptedRun:
         assert not solved
         assert not (tmp_path / "work").exists()
         found = json.loads((tmp_path / "sampling.json").read_text())["problems"]["model"]
-        series = [line["rounds"] for line in found["rows"]]
-        assert all(len(each["device"]) == 3 for each in series)
-        assert series[0]["end_to_end"][0] == first[0][1][1]
+        rounds = [line["rounds"] for line in found["rows"]]
+        assert all(len(each) == 3 for each in rounds)
+        threads = torch.get_num_threads()
+        assert rounds[0][0] == Spent(*first[0]).judged(threads)

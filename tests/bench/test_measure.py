@@ -1,4 +1,4 @@
-"""Interleaved timing: order, ratios with intervals, dropping rule, A/A check; FLOP and peak."""
+"""Interleaved timing: order, ratios with intervals, A/A check; FLOP and peak."""
 
 from __future__ import annotations
 
@@ -30,56 +30,29 @@ class TestCompare:
         found = compare(cases, rounds=2)
         assert calls == ["a", "b", "a", *["a", "b", "a"], *["a", "b", "a"]]
         # Backwards in the first round that counts: the repeat comes first there.
-        assert found.series["a"].device == (4, 6)
-        assert found.series["b"].device == (6, 12)
-        assert found.series["b"].seconds == 9
+        assert found.device == {"a": [4, 6], "b": [6, 12]}
         assert found.over_first("b").value == pytest.approx(9 / 5)
         assert found.repeat.value == pytest.approx(5 / 5)
-        assert found.summary()["ms"] == {"a": 5000, "b": 9000}
 
     def test_kept_rounds_are_not_run_again(self):
         calls = []
-        kept = {1: [(1.0, Spent(1, 1)), (1.0, Spent(2, 2)), (1.0, Spent(1, 1))]}
+        kept = {1: [Spent(1, 1), Spent(2, 2), Spent(1, 1)]}
 
         def keep(number, run):
             return kept[number] if number in kept else run()
 
         cases = {"a": lambda: calls.append(1) or Spent(3, 3), "b": case([6.0])}
-        found = compare(cases, 2, keep=keep)
+        found = compare(cases, 2, keep)
         assert len(calls) == 2 * 2  # warm-up and the second round
-        assert found.series["b"].device == (2, 6)
+        assert found.device["b"] == [2, 6]
 
-    def test_measurements_after_an_unusual_control_are_dropped(self):
-        """Three measurements a round (a, b, a again), the warm-up first.
-
-        The control is 10 % slow before "b" in its second of three rounds, and 4 % in the third.
-        """
-        usual, slow, near = 1.0, 1.1, 1.04
-        controls = case([usual] * 3 + [usual] * 3 + [usual, slow, usual] + [usual, near, usual])
-        found = compare({"a": case([1.0]), "b": case([7.0, 2.0, 9.0, 4.0])}, 3, controls)
-        assert found.series["a"].kept == (True, True, True)
-        assert found.series["b"].kept == (True, False, True)
-        assert found.series["b"].of_kept(found.series["b"].device) == [2.0, 4.0]
-        assert found.series["b"].seconds == 3
-        assert found.over_first("b").value == 3
-        assert found.dropped == pytest.approx(1 / 9)
-        assert found.sound
-
-    def test_steal_drops_measurements_of_one_thread(self):
-        stolen = case([1.0], core=0.8)
-        found = compare({"a": stolen}, 2, case([1.0]), threads=1)
-        assert found.dropped == 1
-        assert not found.series["a"].enough
-        assert found.series["a"].kept == (True, True)  # what is left would tell nothing
-        assert found.series["a"].device == (0.8, 0.8)  # the processor's own time
-        several = compare({"a": stolen}, 2, case([1.0]), threads=2)
-        assert several.dropped == 0
-        assert several.series["a"].device == (1.0, 1.0)
+    def test_processor_time_counts_for_one_thread(self, one_thread):
+        assert compare({"a": case([1.0], core=0.8)}, 2).device["a"] == [0.8, 0.8]
 
     def test_a_case_that_differs_from_itself_is_not_sound(self):
         """Its two runs of a round take 1 s and 2 s; every second round goes backwards."""
         slower = case([1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 2.0, 1.0])
-        found = compare({"a": slower}, 4, case([1.0]))
+        found = compare({"a": slower}, 4)
         assert not found.sound
         assert found.tolerance >= 0.5
 
@@ -109,8 +82,7 @@ class TestWork:
 
     def test_a_processor_is_measured(self, one_thread):
         peak = peak_of(torch.device("cpu"), "fp32")
-        assert peak.source == "measured"
-        assert 1e8 < peak.flop_s < 1e13
+        assert 1e8 < peak < 1e13
 
     def test_peak_memory_grows_with_what_is_held(self):
         before = peak_bytes(torch.device("cpu"))

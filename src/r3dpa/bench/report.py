@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from r3dpa import viz
-from r3dpa.bench.measure import Comparison, Peak
+from r3dpa.bench.measure import Comparison
 from r3dpa.bench.rows import Row, duration, front_of, quality_levels, sentences
 from r3dpa.checkpoints.networks import format_table
 from r3dpa.io import atomic_path, one_line
@@ -28,14 +28,8 @@ _TITLES = {
 class Finding(NamedTuple):
     """All figures of one problem.
 
-    Attributes:
-        rows: All ways to sample.
-        steps: Heun steps of the converged solution.
-        samples: Scenes of it.
-        self_error: Its RMSE from the solution of half the steps.
-        timing: Times of the rows, by label.
-        peak: Of the device, in the fastest precision of the rows.
-        flop: Of one evaluation, and of everything else of a scene.
+    ``steps`` are the Heun steps of the converged solution and ``self_error`` its RMSE from that of
+    half the steps; ``flop`` is that of one evaluation, and of everything else of a scene.
     """
 
     rows: Sequence[Row]
@@ -43,7 +37,7 @@ class Finding(NamedTuple):
     samples: int
     self_error: float
     timing: Comparison
-    peak: Peak
+    peak_flop_s: float
     flop: tuple[float, float]
 
 
@@ -102,11 +96,10 @@ def _record(found: Finding) -> dict[str, Any]:
         "front": [row.label for row in front],
         "sentences": sentences(front),
         "timing": {
-            "dropped_share": found.timing.dropped,
             "a_a": asdict(found.timing.repeat),
             "sound": found.timing.sound,
         },
-        "peak": asdict(found.peak),
+        "peak_flop_s": found.peak_flop_s,
         "flop": {"evaluation": found.flop[0], "rest": found.flop[1]},
     }
 
@@ -122,7 +115,7 @@ def _picture(name: str, found: Finding) -> Figure:
         _points(found.rows),
         _points(front),
         {"bf16 against fp32": bf16[0].precision_error or 0.0} if bf16 else {},
-        {nfe: (nfe * found.flop[0] + found.flop[1]) / found.peak.flop_s for nfe in counts},
+        {nfe: (nfe * found.flop[0] + found.flop[1]) / found.peak_flop_s for nfe in counts},
         sentences(front),
     )
 
@@ -156,7 +149,7 @@ def _table(found: Finding) -> str:
                 str(record["nfe"]),
                 error + ("" if record["converged"] else " ?"),
                 *others,
-                duration(record["seconds"]) + ("" if record["quiet"] else " ~"),
+                duration(record["seconds"]),
                 duration(record["end_to_end"]),
                 f"{record['flop'] / 1e9:.3g}",
                 f"{record['flop_s'] / 1e12:.3g}",
@@ -173,10 +166,8 @@ def _notes(found: Finding) -> list[str]:
     return [
         f"error: RMSE from Heun-{found.steps} of {found.samples} samples, itself "
         f"{found.self_error:.3g} from half its steps; ?: too small for that reference",
-        f"timing: {found.timing.dropped:.0%} of the measurements dropped by rule; first row over "
-        f"itself {found.timing.repeat}"
+        f"timing: first row over itself {found.timing.repeat}"
         + ("" if found.timing.sound else ": the machine was too busy, claim nothing"),
-        "~: more than half of the rounds were disturbed, and all of them count",
-        f"peak {found.peak.flop_s / 1e12:.3g} TFLOP/s ({found.peak.source}); "
+        f"peak {found.peak_flop_s / 1e12:.3g} TFLOP/s; "
         f"{found.flop[0] / 1e9:.3g} GFLOP an evaluation, {found.flop[1] / 1e9:.3g} the rest",
     ]

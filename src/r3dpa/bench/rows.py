@@ -6,14 +6,13 @@ Letters: R rows, N scenes, K resamples.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.bench.measure import Series
 from r3dpa.bench.problems import Setting
 
 Floats = NDArray[np.float64]
@@ -29,12 +28,9 @@ _AS_CHEAP = 1.1
 class Errors(NamedTuple):
     """Errors of a setting against the converged solution of the same noise.
 
-    Attributes:
-        squared: ``(N,)`` mean squared error of the latents of each scene.
-        discretisation: RMSE of the same solver in fp32, not compiled.
-        precision: RMSE from the same solver in fp32, not compiled.
-        range_rmse_m: Of the pixels with a return in both, metres; None without a decoder.
-        mask_iou: Pixels with a return in both over pixels with a return in either.
+    ``squared`` is the mean squared error of the latents of each scene; ``discretisation`` the RMSE
+    of the same solver in fp32, not compiled, and ``precision`` that from it. ``range_rmse_m`` is of
+    pixels with a return in both, ``mask_iou`` of returns; both None without a decoder.
     """
 
     squared: list[float]
@@ -54,7 +50,8 @@ class Row:
     label: str
     way: Setting
     errors: Errors
-    series: Series
+    device_s: list[float]
+    end_to_end_s: list[float]
     flop: float
     peak_flop_s: float
     self_error: float
@@ -85,11 +82,11 @@ class Row:
     @property
     def seconds(self) -> float:
         """Per scene until the range image is there, median of the rounds."""
-        return self.series.seconds
+        return float(np.median(self.device_s))
 
     def record(self) -> dict[str, Any]:
         """Plain values for tables and files."""
-        way, errors, taken = self.way, self.errors, self.series.of_kept(self.series.device)
+        way, errors = self.way, self.errors
         return {
             "label": self.label,
             "name": way.name,
@@ -108,28 +105,25 @@ class Row:
             "mask_iou": errors.mask_iou,
             "converged": self.converged,
             "seconds": self.seconds,
-            "seconds_interval": np.quantile(taken, [0.25, 0.75]).tolist(),
-            "end_to_end": float(np.median(self.series.of_kept(self.series.end_to_end))),
-            "quiet": self.series.enough,
+            "seconds_interval": np.quantile(self.device_s, [0.25, 0.75]).tolist(),
+            "end_to_end": float(np.median(self.end_to_end_s)),
             "flop": self.flop,
             "flop_s": self.flop / self.seconds,
             "peak_share": self.flop / self.seconds / self.peak_flop_s,
             "memory_bytes": self.memory_bytes,
-            "rounds": asdict(self.series),
+            "rounds": self.device_s,
         }
 
 
 def front_of(rows: Sequence[Row], tolerance: float) -> list[Row]:
     """Rows of the Pareto front, from the fastest on, each better than the one before at 95 %.
 
-    Args:
-        rows: All rows.
-        tolerance: Times are equal up to this share, see :attr:`Comparison.tolerance`.
+    Times are equal up to the share ``tolerance``, see :attr:`Comparison.tolerance`.
     """
     errors = resampled_errors(np.array([row.errors.squared for row in rows]))
     rng, seconds = np.random.default_rng(0), []
     for row in rows:
-        taken = np.array(row.series.of_kept(row.series.device))
+        taken = np.array(row.device_s)
         drawn = rng.integers(0, len(taken), (_RESAMPLES, len(taken)))
         seconds.append(np.median(taken[drawn], axis=1))
     front, better = pareto_front(np.array(seconds), errors, tolerance), _smaller(errors)
@@ -148,12 +142,9 @@ def resampled_errors(squared: Floats) -> Floats:
 
 
 def pareto_front(seconds: Floats, errors: Floats, tolerance: float = 0.0) -> NDArray[np.bool_]:
-    """Rows ``(R,)`` that no other dominates: better in one and not worse in the other, at 95 %.
+    """Rows of ``(R, K)`` resampled times and errors that no other row dominates at 95 %.
 
-    Args:
-        seconds: ``(R, K)`` resampled times, equal up to the share ``tolerance``.
-        errors: ``(R, K)`` resampled errors.
-        tolerance: See :func:`front_of`.
+    A row dominates another if it is better in one of them and not worse in the other.
     """
     faster, better = _smaller(seconds, tolerance), _smaller(errors)
     dominates = (faster & ~better.T) | (better & ~faster.T)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.bench.measure import Comparison, Spent, compare, control_kernel, peak_of
+from r3dpa.bench.measure import Comparison, Spent, compare, peak_of
 from r3dpa.bench.mixture import toy_mixture
 from r3dpa.bench.problems import MixtureProblem, ModelProblem, Problem, Setting, Solved
 from r3dpa.bench.report import EVALUATIONS, Finding, write_report
@@ -38,15 +38,7 @@ Advance = Callable[[int], object]  # of a progress bar, by evaluations
 
 @dataclass(frozen=True)
 class Effort:
-    """Amount of work for a problem.
-
-    Args:
-        samples: Solved by each row.
-        reference_steps: Of Heun's method.
-        evaluations: NFE of the rows.
-        rounds: Of the timing.
-        batch: Scenes timed together.
-    """
+    """Samples of each row, Heun steps of the reference, NFE of the rows, timing rounds, batch."""
 
     samples: int
     reference_steps: int
@@ -73,15 +65,7 @@ _TOY_QUICK = Effort(256, 1000, EVALUATIONS[:-2], 3, 256)
 
 
 class Work:
-    """Pieces of an interrupted run, one file each, for the next run of the same request.
-
-    Args:
-        folder: Where they are; nothing is kept if None.
-        request: Plain values that the pieces depend on.
-
-    Raises:
-        ValueError: If the folder holds pieces of another request.
-    """
+    """Pieces of an interrupted run in a folder (if any), for the next run of the same request."""
 
     def __init__(self, folder: Path | None = None, request: Any = None) -> None:
         self.folder = folder
@@ -172,15 +156,10 @@ def sampling(
 
 
 def settings_of(effort: Effort, device: str, compiled: Sequence[bool]) -> list[Setting]:
-    """All ways to sample that are measured.
+    """All ways to sample: on a GPU in bf16 and compiled where wanted, on a CPU in fp32 as written.
 
-    On a GPU they run in bf16 and compiled where that is wanted, on a CPU in fp32 as written. AB2
-    with 32 steps also runs in each precision, compiled and not, and with single scenes.
-
-    Args:
-        effort: Gives NFE and batch.
-        device: ``cuda`` or ``cpu``.
-        compiled: Whether to compile that, or each; none where only the solver matters.
+    AB2 with 32 steps also runs in each precision, with and without compilation as ``compiled``
+    says, and with single scenes; not at all if that is empty.
     """
     usual = Setting(SamplerConfig("euler", 1), batch=effort.batch)
     if device == "cuda" and True in compiled:
@@ -222,16 +201,16 @@ def run_problem(
             label,
             way,
             error,
-            measured.series[label],
+            measured.device[label],
+            measured.end_to_end[label],
             way.nfe * flop[0] + flop[1],
-            peaks[way.precision].flop_s,
+            peaks[way.precision],
             self_error,
             problem.memory(way),
         )
         for label, way, error in zip(labels, ways, errors, strict=True)
     ]
-    peak = max(peaks.values(), key=lambda peak: peak.flop_s)
-    return Finding(rows, steps, num, self_error, measured, peak, flop)
+    return Finding(rows, steps, num, self_error, measured, max(peaks.values()), flop)
 
 
 def _solved(
@@ -325,17 +304,16 @@ def _timed(
         advance(way.nfe * way.batch)
         return spent
 
-    def keep(number: int, run: Callable[[], Any]) -> Any:
-        found = work.piece(f"round_{number}", lambda: [(c, tuple(spent)) for c, spent in run()])
-        return [(controlled, Spent(*spent)) for controlled, spent in found]
+    def keep(number: int, run: Callable[[], list[Spent]]) -> list[Spent]:
+        found = work.piece(f"round_{number}", lambda: [tuple(spent) for spent in run()])
+        return [Spent(*spent) for spent in found]
 
     with tempfile.TemporaryDirectory(prefix="r3dpa_bench_") as folder:
         cases = {
             label: partial(case, way, problem.case(way, Path(folder)))
             for label, way in ways.items()
         }
-        control = control_kernel(problem.device)
-        return compare(cases, effort.rounds, control, torch.get_num_threads(), keep)
+        return compare(cases, effort.rounds, keep)
 
 
 def _labels(ways: Sequence[Setting], batch: int) -> list[str]:

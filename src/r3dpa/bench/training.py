@@ -37,21 +37,15 @@ from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
 
 STAGES = ("vae_alignment", "joint", "flow_matching")
-_GIB = 2**30
 _LOADER_EPOCHS = 4  # of one batch; the first one does not count
 
 
 @dataclass(frozen=True)
 class StepSettings:
-    """How the measured steps are run.
+    """How the measured steps are run; ``quick`` takes the networks of the demo.
 
-    Args:
-        batch_size: Scans per step.
-        steps: Optimiser steps. The first one pays for warm-up and runs before the optimiser has
-            moments: the peak of a long run takes two.
-        precision: Precision as the Trainer names it.
-        device: ``cpu``, ``cuda``, or ``auto`` for the GPU where there is one.
-        quick: The small networks of ``<conf>/experiment/<stage>_demo.yaml``.
+    The first of ``steps`` pays for warm-up and runs before the optimiser has moments: the peak of a
+    long run takes two.
     """
 
     batch_size: int = 1
@@ -72,23 +66,14 @@ class StepSettings:
 class StageCost:
     """Cost of training one stage.
 
-    Args:
-        stage: Name of the experiment.
-        num_parameters: Of ``vae``, ``sit`` and ``sit_without_projector`` (both with the position
-            embedding, as published counts have it), ``discriminator`` (0 where there is none), and
-            ``trained``, those that the optimiser moves.
-        step_seconds: Wall time of each step: losses, backward, clipping, optimiser and averages,
-            without loading the batch.
-        loss: Weighted loss of the last step.
-        peak_host_bytes: Largest resident memory of the process, everything included.
-        peak_gpu_bytes: Largest memory of tensors on the GPU; None on a CPU.
-        flop: Floating-point operations of a step, counted in one more.
-        images_per_second: Scans that the model takes.
-        loader_images_per_second: Scans that one process reads.
+    ``num_parameters`` are in millions: VAE, SiT and SiT without projector (both with the position
+    embedding, as published counts have it), discriminator, and those that are trained.
+    ``step_seconds`` hold losses, backward, clipping, optimiser and averages, not loading; ``flop``
+    is of one step; ``peak_host_bytes`` of the whole process, ``peak_gpu_bytes`` of tensors.
     """
 
     stage: str
-    num_parameters: dict[str, int]
+    num_parameters: dict[str, float]
     step_seconds: list[float]
     loss: float
     peak_host_bytes: int
@@ -97,23 +82,23 @@ class StageCost:
     images_per_second: float
     loader_images_per_second: float
 
-    def row(self, batch_size: int) -> list[str]:
-        """Cells of the table: millions, seconds (first, median of the others), GiB, FLOP."""
+    def row(self) -> dict[str, Any]:
+        """Cells of the table."""
         first, *others = self.step_seconds
-        usual = median(others or [first])
-        return [
-            self.stage,
-            *(f"{count / 1e6:.2f}" for count in self.num_parameters.values()),
-            f"{first:.3g}",
-            f"{median(others):.3g}" if others else "-",
-            f"{self.peak_host_bytes / _GIB:.2f}",
-            "-" if self.peak_gpu_bytes is None else f"{self.peak_gpu_bytes / _GIB:.2f}",
-            f"{self.loss:.4g}",
-            f"{self.images_per_second:.3g}",
-            f"{self.loader_images_per_second:.3g}",
-            f"{self.flop / batch_size / 1e9:.4g}",
-            f"{self.flop / usual / 1e9:.4g}",
-        ]
+        usual, gpu = median(others or [first]), self.peak_gpu_bytes
+        return {
+            "stage": self.stage,
+            **{f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()},
+            "first s": f"{first:.3g}",
+            "next s": f"{median(others):.3g}" if others else "-",
+            "host GiB": f"{self.peak_host_bytes / 2**30:.2f}",
+            "GPU GiB": "-" if gpu is None else f"{gpu / 2**30:.2f}",
+            "loss": f"{self.loss:.4g}",
+            "images/s": f"{self.images_per_second:.3g}",
+            "loader images/s": f"{self.loader_images_per_second:.3g}",
+            "GFLOP/step": f"{self.flop / 1e9:.4g}",
+            "GFLOP/s": f"{self.flop / usual / 1e9:.4g}",
+        }
 
 
 def training(
@@ -122,11 +107,9 @@ def training(
     settings: StepSettings = StepSettings(),
     out: Path | None = None,
 ) -> str:
-    """Trains each stage for a few steps, as configured, and returns a table of its cost.
+    """Trains each stage for a few steps on simulated scans; returns a table of its cost.
 
     Each stage runs in a fresh process, so that no peak contains what another stage left behind.
-    The scans are simulated, as many as a batch has, with the image and grid size that the networks
-    expect; weights start from random values.
 
     Args:
         conf: Folder of the configurations; stage ``joint`` is ``<conf>/experiment/joint.yaml``.
@@ -156,9 +139,8 @@ def training(
         content = about | {"stages": [asdict(cost) for cost in costs]}
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
-    header = ["stage", "VAE M", "SiT M", "no proj. M", "discr. M", "trained M", "first s", "next s"]
-    header += ["host GiB", "GPU GiB", "loss", "images/s", "loader images/s", "GFLOP/image"]
-    table = format_table([*header, "GFLOP/s"], (cost.row(settings.batch_size) for cost in costs))
+    rows = [cost.row() for cost in costs]
+    table = format_table(list(rows[0]), ([*row.values()] for row in rows))
     return "\n".join([table, *(f"{name}: {one_line(values)}" for name, values in about.items())])
 
 
@@ -230,8 +212,7 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
 def _build(files: list[Path], fresh_vae: Path) -> GenerativeModule:
     """The module of an experiment, to start from a VAE with random weights.
 
-    Stage flow_matching refuses to start without the VAE of another stage. Random weights cost the
-    same, so all stages are given such a file.
+    Stage flow_matching refuses to start without one; random weights cost the same.
     """
     parser = LightningArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(GenerativeModule, "model")
@@ -316,19 +297,18 @@ def _loader_rate(trainer: L.Trainer) -> float:
     return median(rates[1:])
 
 
-def _num_parameters(module: GenerativeModule) -> dict[str, int]:
+def _num_parameters(module: GenerativeModule) -> dict[str, float]:
     sit, discriminator = module.sit, module.discriminator
-    whole = _count((*sit.parameters(), *sit.buffers()))  # a fixed position embedding counts
+    trainable = [p for net in module.trainable().values() for p in net.parameters()]
+    whole = _millions((*sit.parameters(), *sit.buffers()))  # a fixed position embedding counts
     return {
-        "vae": _count(module.vae.parameters()),
-        "sit": whole,
-        "sit_without_projector": whole - _count(sit.projector.parameters()),
-        "discriminator": 0 if discriminator is None else _count(discriminator.parameters()),
-        "trained": _count(
-            p for net in module.trainable().values() for p in net.parameters() if p.requires_grad
-        ),
+        "VAE": _millions(module.vae.parameters()),
+        "SiT": whole,
+        "no proj.": whole - _millions(sit.projector.parameters()),
+        "discr.": 0.0 if discriminator is None else _millions(discriminator.parameters()),
+        "trained": _millions(p for p in trainable if p.requires_grad),
     }
 
 
-def _count(tensors: Iterable[Tensor]) -> int:
-    return sum(tensor.numel() for tensor in tensors)
+def _millions(tensors: Iterable[Tensor]) -> float:
+    return sum(tensor.numel() for tensor in tensors) / 1e6
