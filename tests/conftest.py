@@ -26,6 +26,12 @@ def pytest_addoption(parser):
     )
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Micro-benchmarks are collected for `-m bench` alone."""
+    wanted = config.getoption("markexpr") == "bench"
+    return True if collection_path.name.startswith("bench_") and not wanted else None
+
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from statistics import median
 
 import pytest
-from conftest import STREET
 
 from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
 
 pytestmark = [pytest.mark.bench, pytest.mark.benchmark(group="simulate one scan", min_rounds=9)]
 
+STREET = (0, 2, 40)  # seed, drive, scan
 WEATHERS = {
     "plain": Weather(),
     "wet": Weather(water_film_mm=1.0, clear_sky=False),

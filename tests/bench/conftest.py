@@ -7,21 +7,12 @@ import torch
 
 from r3dpa.simulation import Street, Weather, hdl64e, simulate, simulate_scan
 
-STREET = (0, 2, 40)  # seed, drive, scan
-
-
-def pytest_ignore_collect(collection_path, config):
-    """Micro-benchmarks are collected for `make bench` alone."""
-    wanted = config.getoption("markexpr") == "bench"
-    return True if collection_path.name.startswith("bench_") and not wanted else None
-
 
 @pytest.fixture(scope="session")
 def points():
     """A scan ``(P, 4)`` of a dry street."""
-    seed, drive, number = STREET
-    scene = Street(seed, drive, Weather()).scene(number)
-    return torch.from_numpy(simulate_scan(scene, hdl64e(), (seed, "effects", drive, number)).points)
+    scan = simulate_scan(Street(0, 2, Weather()).scene(40), hdl64e(), (0, "effects", 2, 40))
+    return torch.from_numpy(scan.points)
 
 
 @pytest.fixture(scope="session")

@@ -27,8 +27,6 @@ import torch.nn.functional as F
 import yaml
 from torch import Tensor, nn
 
-__all__ = ["COMMIT", "OfficialCode", "OneProcess", "Overlay", "load_official"]
-
 COMMIT = "aa08e6d"
 """Commit of valeoai/R3DPA that is compared with."""
 
@@ -55,53 +53,30 @@ _PACKAGES = ("generate", "train_repae", "samplers", "utils", "dataset_kitti", "m
 
 
 class Overlay:
-    """An object of which some attributes are replaced; all others are those of the original.
-
-    Args:
-        base: Original, a module as a rule. It stays as it is.
-        **replaced: Attributes by name.
-    """
+    """An object of which some attributes are replaced; all others are those of the original."""
 
     def __init__(self, base: Any, **replaced: Any) -> None:
         self._base = base
         self.__dict__.update(replaced)
 
     def __getattr__(self, name: str) -> Any:
-        """What is not replaced."""
         return getattr(self._base, name)
 
 
 @dataclass(frozen=True)
 class OfficialCode:
-    """Imported modules of a checkout.
-
-    Args:
-        repo: Folder of the checkout.
-        modules: By the name under which they import each other.
-        stand_ins: What was replaced, and by what.
-    """
+    """Imported modules of a checkout."""
 
     repo: Path
     modules: Mapping[str, Any]
     stand_ins: Mapping[str, str]
 
     def __getitem__(self, name: str) -> Any:
-        """Module of this name."""
         return self.modules[name]
 
 
 def load_official(repo: Path) -> OfficialCode:
-    """Imports the official code.
-
-    Packages that are installed are used as they are. For the others there are stand-ins below,
-    which are seen by the official modules alone.
-
-    Args:
-        repo: Folder of a checkout of valeoai/R3DPA at :data:`COMMIT`.
-
-    Raises:
-        ValueError: If the folder or a file is missing, or a file is not that of the commit.
-    """
+    """Imports the official code."""
     _check_checkout(repo)
     stand_ins = _stand_ins()
     replaced: dict[str, ModuleType] = {}
@@ -226,15 +201,7 @@ def _never(*args: Any, **kwargs: Any) -> Any:
 
 
 class PatchEmbed(nn.Module):
-    """Patches of an image as tokens, as ``timm.layers.PatchEmbed`` numbers and names them.
-
-    Args:
-        img_size: Rows and columns.
-        patch_size: Side of a patch.
-        in_chans: Channels of the image.
-        embed_dim: Token width.
-        bias: Whether the convolution has one.
-    """
+    """Patches of an image as tokens, as ``timm.layers.PatchEmbed`` numbers and names them."""
 
     def __init__(
         self,
@@ -251,22 +218,11 @@ class PatchEmbed(nn.Module):
         self.proj = nn.Conv2d(in_chans, embed_dim, patch_size, patch_size, bias=bias)
 
     def forward(self, image: Tensor) -> Tensor:
-        """``(B, C, H, W)`` to ``(B, N, D)``, row-major."""
         return self.proj(image).flatten(2).transpose(1, 2)
 
 
 class Attention(nn.Module):
-    """Multi-head attention with the weights of ``timm.layers.Attention``.
-
-    Args:
-        dim: Token width.
-        num_heads: Heads.
-        qkv_bias: Whether queries, keys and values have a bias.
-        qk_norm: Layer norm on queries and keys.
-
-    Attributes:
-        fused_attn: Whether torch's fused attention is used, or matrices and a softmax.
-    """
+    """Multi-head attention with the weights of ``timm.layers.Attention``."""
 
     def __init__(
         self, dim: int, num_heads: int = 8, qkv_bias: bool = False, qk_norm: bool = False
@@ -280,7 +236,6 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Attend within each sample of ``(B, N, D)``."""
         batch, number, width = tokens.shape
         split = self.qkv(tokens).view(batch, number, 3, self.num_heads, -1)
         query, key, value = split.permute(2, 0, 3, 1, 4)
@@ -294,17 +249,7 @@ class Attention(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two linear layers with the weights of ``timm.layers.Mlp``, without dropout.
-
-    Args:
-        in_features: Token width.
-        hidden_features: Width between the layers.
-        act_layer: Builds the activation.
-        drop: Share of dropped values; only 0 is known here.
-
-    Raises:
-        ValueError: If ``drop`` is not 0.
-    """
+    """Two linear layers with the weights of ``timm.layers.Mlp``, without dropout."""
 
     def __init__(
         self,
@@ -321,21 +266,11 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(hidden_features, in_features)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """``(B, N, D)`` to ``(B, N, D)``."""
         return self.fc2(self.act(self.fc1(tokens)))
 
 
 class OneProcess:
-    """What a training script asks of ``accelerate.Accelerator``, for one process on the CPU.
-
-    It is not the main process, which would keep logs, pictures and checkpoints.
-
-    Args:
-        clock: Seconds since some time.
-
-    Attributes:
-        seconds: Time of each step, from its first forward pass to the averaged weights.
-    """
+    """What a training script asks of ``accelerate.Accelerator``, for one process on the CPU."""
 
     is_main_process = is_local_main_process = use_distributed = False
     sync_gradients = True
@@ -349,29 +284,23 @@ class OneProcess:
 
     @contextmanager
     def accumulate(self, models: list[nn.Module]) -> Iterator[None]:
-        """A step, which is timed."""
         start = self.clock()
         yield
         self.seconds.append(self.clock() - start)
 
     def autocast(self) -> nullcontext[None]:
-        """Full precision."""
         return nullcontext()
 
     def backward(self, loss: Tensor) -> None:
-        """Gradients of a loss."""
         loss.backward()
 
     def prepare(self, *things: Any) -> tuple[Any, ...]:
-        """The same: there is nothing to distribute."""
         return things
 
     def unwrap_model(self, model: nn.Module) -> nn.Module:
-        """The same: nothing was wrapped."""
         return model
 
     def gather(self, values: Tensor) -> Tensor:
-        """The same: there is one process."""
         return values
 
     def wait_for_everyone(self) -> None:

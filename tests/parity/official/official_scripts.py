@@ -19,30 +19,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import lightning as L
 import numpy as np
 import torch
-from official_imports import OfficialCode, OneProcess, Overlay
+from official_code import OfficialCode, OneProcess, Overlay
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from r3dpa.checkpoints import Checkpoint, to_official
+from r3dpa.checkpoints.networks import NetworkState
+from r3dpa.modules import JointAlignment
+from r3dpa.modules.base import PathDraws
 
-__all__ = [
-    "PATCHES",
-    "Trained",
-    "official_sit",
-    "official_vae",
-    "replaced",
-    "save_for_official",
-    "train_official",
-    "write_official_scenes",
-]
-
-PATCHES = (
-    "generate.py: CUDA answers for the CPU, one process instead of torch.distributed, weights read "
-    "with weights_only; progress bars off",
-    "train_repae.py: scans, loss weights and networks come from memory; the preview at step 1, "
-    "which is not timed, decodes a narrow strip",
-)
 _MODEL, _VAE = "r3dpa/2", "h2p4d8"
 _STRIDE = (4, 8)
 _STEP = 1
@@ -56,13 +44,7 @@ class _Cpu:
 
 
 def official_sit(code: OfficialCode, checkpoint: Checkpoint, **given: Any) -> nn.Module:
-    """The official SiT with the sizes of ``sit`` in a checkpoint; fresh weights.
-
-    Args:
-        code: Imported checkout.
-        checkpoint: Whose arguments are taken.
-        **given: Arguments that an official script gives.
-    """
+    """The official SiT with the sizes of ``sit`` in a checkpoint; fresh weights."""
     sizes = checkpoint.network("sit").arguments
     arguments = {
         "input_size": sizes["input_size"],
@@ -107,11 +89,7 @@ def official_vae(code: OfficialCode, checkpoint: Checkpoint) -> nn.Module:
 
 
 def save_for_official(code: OfficialCode, checkpoint: Checkpoint, folder: Path) -> None:
-    """Writes the experiment folder that ``generate.py`` reads: ``args.json`` and one checkpoint.
-
-    Raises:
-        ValueError: If the latents are not those of ``h2p4d8``, the layout the script knows.
-    """
+    """Writes the experiment folder that ``generate.py`` reads: ``args.json`` and one checkpoint."""
     sizes = checkpoint.network("sit").arguments
     strides = checkpoint.network("vae").arguments["strides"]
     if tuple(np.prod(strides, axis=0)) != _STRIDE or sizes["in_channels"] != 8:
@@ -146,26 +124,8 @@ def write_official_scenes(
     batch_size: int,
     steps: int,
     noise: Tensor | None = None,
-    parts: dict[str, float] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> np.ndarray:
-    """Runs ``main`` of the official ``generate.py``: Euler steps, decode, all of its files.
-
-    Args:
-        code: Imported checkout.
-        checkpoint: What :func:`save_for_official` wrote.
-        experiment: Where it wrote.
-        out: Folder for the scenes.
-        num: Scenes, a multiple of ``batch_size``.
-        batch_size: Scenes at once.
-        steps: Euler steps.
-        noise: ``(num, C, h, w)`` in place of its own draws.
-        parts: If given, seconds by part are added here; timing them costs a little.
-        clock: Seconds since some time.
-
-    Returns:
-        Ranges ``(num, H, W)`` in metres before any limit, as the script keeps them.
-    """
+    """Runs ``main`` of the official ``generate.py``: Euler steps, decode, all of its files."""
     generate = code["generate"]
     overlay: dict[str, Any] = {
         "cuda": Overlay(
@@ -189,27 +149,9 @@ def write_official_scenes(
         barrier=_nothing,
         destroy_process_group=_nothing,
     )
-    timed = partial(_timed, {} if parts is None else parts, clock)
-    watched: dict[str, Any] = {}
-    if parts is not None:
-        watched = {
-            "np": Overlay(
-                np,
-                savetxt=timed("text files written", np.savetxt),
-                loadtxt=timed("text files read again", np.loadtxt),
-                concatenate=timed("array grown", np.concatenate),
-                savez=timed("npz", np.savez),
-            ),
-            "euler_sampler": timed("sampler", generate.euler_sampler),
-            "range2pcd": timed("points (range2pcd, range2xyz)", generate.range2pcd),
-            "range2xyz": timed("points (range2pcd, range2xyz)", generate.range2xyz),
-        }
 
     def vae() -> Any:
-        network: Any = official_vae(code, checkpoint)
-        if parts is not None:
-            network.decode = timed("decode", network.decode)
-        return network
+        return official_vae(code, checkpoint)
 
     options = Namespace(
         tf32=False,
@@ -236,7 +178,6 @@ def write_official_scenes(
             SiT_models={_MODEL: partial(official_sit, code, checkpoint)},
             UNet_models={},
             vae_models={_VAE: vae},
-            **watched,
         ),
         contextlib.redirect_stdout(io.StringIO()),
         torch.enable_grad(),  # it switches gradients off for good
@@ -247,12 +188,7 @@ def write_official_scenes(
 
 
 class Trained(NamedTuple):
-    """What some training steps took and led to.
-
-    Attributes:
-        seconds: Of each step.
-        weights: Of ``vae``, ``sit`` and ``discriminator`` after them, by official name.
-    """
+    """What some training steps took and led to."""
 
     seconds: list[float]
     weights: dict[str, dict[str, Tensor]]
@@ -266,22 +202,10 @@ def train_official(
     draws: tuple[Tensor, Tensor, Tensor],
     steps: int,
     folder: Path,
-    clock: Callable[[], float],
 ) -> Trained:
-    """Runs ``main`` of the official ``train_repae.py`` for some steps on one batch.
-
-    Args:
-        code: Imported checkout.
-        checkpoint: Weights to start from; the latent statistics start at (0, 1) as in the script.
-        image: ``(B, 1, H, W)`` range images.
-        features: ``(B, N, F)`` feature grids.
-        draws: Posterior noise ``(B, C, h, w)``, times ``(B,)`` and noise of every step.
-        steps: Optimiser steps of each of the three optimisers.
-        folder: For what the script writes; it writes nothing.
-        clock: Seconds since some time.
-    """
+    """Runs ``main`` of the official ``train_repae.py`` for some steps on one batch."""
     script = code["train_repae"]
-    weights, process = to_official(checkpoint), OneProcess(clock)
+    weights, process = to_official(checkpoint), OneProcess(time.perf_counter)
     networks: dict[str, nn.Module] = {}
     posterior_noise, times, noise = draws
 
@@ -402,19 +326,82 @@ def replaced(module: Any, **names: Any) -> Iterator[None]:
         vars(module).update(before)
 
 
-def _timed(
-    parts: dict[str, float], clock: Callable[[], float], name: str, function: Callable[..., Any]
-) -> Callable[..., Any]:
-    """The function, which adds the seconds it takes to a part."""
-
-    def run(*args: Any, **kwargs: Any) -> Any:
-        start = clock()
-        result = function(*args, **kwargs)
-        parts[name] = parts.get(name, 0.0) + clock() - start
-        return result
-
-    return run
-
-
 def _nothing(*args: Any, **kwargs: Any) -> None:
     """In place of what has no meaning for one process on the CPU."""
+
+
+class _GivenDraws(JointAlignment):
+    """Joint training without a data module, with the same draws in every step."""
+
+    draws: PathDraws
+
+    def setup(self, stage: str) -> None:
+        """Needs no scans: the batch is given."""
+
+    def draw_path(
+        self, num_scans: int, batch_number: int | None = None, stream: int = 0
+    ) -> PathDraws:
+        return self.draws
+
+
+class _Timer(L.Callback):
+    """Time of each step: losses, backward, clipping, optimiser and averages."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.clock = clock
+        self.seconds: list[float] = []
+        self.start = 0.0
+
+    def on_train_batch_start(self, *args: Any) -> None:
+        self.start = self.clock()
+
+    def on_train_batch_end(self, *args: Any) -> None:
+        self.seconds.append(self.clock() - self.start)
+
+
+def train_ours(
+    checkpoint: Checkpoint,
+    image: Tensor,
+    features: Tensor,
+    draws: tuple[Tensor, Tensor, Tensor],
+    steps: int,
+) -> Trained:
+    """Trains as `train_official` does, by a Trainer with one optimiser and one backward pass."""
+    networks: dict[str, Any] = {
+        name: checkpoint.network(name).build()
+        for name in ("vae", "sit", "discriminator", "latent_norm")
+    }
+    module = _GivenDraws(**networks, ema_buffers="decay")
+    module.draws = PathDraws(*draws)
+    timer = _Timer(time.perf_counter)
+    batch = {"range_image": image, "feature_grid": features}
+    level = logging.getLogger("lightning.pytorch").level
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # advice on loaders and loggers
+        trainer = L.Trainer(
+            accelerator="cpu",
+            max_steps=steps,
+            gradient_clip_val=1.0,
+            callbacks=[timer],
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        trainer.fit(module, DataLoader([batch] * steps, batch_size=None))  # type: ignore[arg-type]
+    logging.getLogger("lightning.pytorch").setLevel(level)
+    states = {
+        name: NetworkState(
+            checkpoint.network(name).class_path,
+            checkpoint.network(name).init_args,
+            network.state_dict(),
+        )
+        for name, network in networks.items()
+    }
+    content = to_official(Checkpoint(checkpoint.path, checkpoint.stage, states))
+    weights = {
+        ours: {key: value.detach() for key, value in content[theirs].items()}
+        for ours, theirs in (("vae", "vae"), ("sit", "model"), ("discriminator", "discriminator"))
+    }
+    return Trained(timer.seconds, weights)
