@@ -54,15 +54,11 @@ class SphericalProjection(PixelRays):
     legacy_seam: bool = False
 
     def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Row and column of the range-image pixel that each point falls into.
+        """Row and column ``(...)`` int64 of the range-image pixel of points ``(..., 3)``.
 
-        Computed in float64: arcsin and float32 lose up to 4e-4 rad towards the zenith.
-
-        Args:
-            points: ``(..., 3)`` metres. A point that is not finite counts as the origin.
-
-        Returns:
-            ``(row, column)``, each ``(...)`` int64, in ``[0, H)`` and ``[0, W)``.
+        Computed in float64: arcsin and float32 lose up to 4e-4 rad towards the zenith. A point that
+        is
+        not finite counts as the origin.
 
         Raises:
             ValueError: If the last axis of ``points`` is not of size 3.

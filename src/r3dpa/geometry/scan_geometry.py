@@ -54,11 +54,7 @@ class ScanGeometry:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Inverse of :meth:`to_dict`.
-
-        Raises:
-            ValueError: If an entry is missing or unknown.
-        """
+        """Inverse of :meth:`to_dict`; ValueError if an entry is missing or unknown."""
         try:
             arguments = dict(values["projection"])
             kind = _PROJECTIONS[arguments.pop("kind")]

@@ -46,8 +46,8 @@ def loss_curves(curves: str | Path | Mapping[str, Series]) -> Figure:
 def read_metrics(path: str | Path) -> dict[str, Series]:
     """Quantities of a ``metrics.csv`` of Lightning's ``CSVLogger``: name -> (steps, values).
 
-    A quantity has its own steps: blank cells are left out, and so is a last line without an end,
-    which a run that was stopped while writing leaves. ``step`` and ``epoch`` are no quantities.
+    Blank cells are left out, and so is a last line without an end (of a run that was stopped while
+    writing). ``step`` and ``epoch`` are no quantities.
 
     Raises:
         ValueError: If there is no column ``step``, or a cell is not a number.
@@ -79,7 +79,6 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
 def _draw_curve(
     axes: Axes, name: str, steps: NDArray[np.float64], values: NDArray[np.float64]
 ) -> None:
-    """One panel of the loss curves."""
     axes.plot(steps, values, color="tab:blue", alpha=0.3, linewidth=0.8)
     axes.plot(
         steps,
@@ -107,7 +106,7 @@ def _draw_curve(
 
 
 def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Mean of up to ``width`` finite values around each; stays blank where a value is."""
+    """Mean of up to ``width`` finite values around each; NaN where a value is NaN."""
     finite = np.isfinite(values)
     window = np.ones(width)
     total = np.convolve(np.where(finite, values, 0.0), window, mode="same")

@@ -1,4 +1,4 @@
-"""Edits of scans: what was there, what was to change, and what came of it.
+"""Figures and pages of edited scans: before, mask and result.
 
 Letters: H beams, W columns.
 """
@@ -37,10 +37,9 @@ class EditRow(NamedTuple):
     Attributes:
         name: Shown above it.
         range_m: ``(H, W)`` metres, not above 0 without a return.
-        parts: ``(H, W)`` number of the part that each pixel belongs to, shown as a tint of a grey
-            picture; none where None.
-        outline: ``(H, W)`` likewise, but only the borders between the parts are drawn, over the
-            colours of the range.
+        parts: ``(H, W)`` part number of each pixel, shown as a tint of a grey picture.
+        outline: ``(H, W)`` likewise; only the borders between parts are drawn, over the range
+        colours.
     """
 
     name: str
@@ -50,7 +49,7 @@ class EditRow(NamedTuple):
 
 
 def _part_colours(names: Sequence[str]) -> list[str]:
-    """A colour ``#rrggbb`` for each part; grey for the first of a scan that is kept in part."""
+    """A colour ``#rrggbb`` for each part; grey for ``kept``."""
     free = iter(("#ff6b6b", *PALETTE))
     return [_GREY if name == _KEPT else next(free) for name in names]
 
@@ -58,15 +57,12 @@ def _part_colours(names: Sequence[str]) -> list[str]:
 def edit_sheet(
     rows: Sequence[EditRow], part_names: Sequence[str], projection: Projection
 ) -> Figure:
-    """Range images one below the other under their names, those with parts tinted.
+    """Range images one below the other under their names, with the tints of their parts.
 
     Args:
         rows: At least one. Azimuths are written below the last.
-        part_names: Names of the parts by number; empty where no row has any. ``kept`` is clear.
+        part_names: Names of the parts by number; empty where no row has any.
         projection: Gives the limits of the colour scale.
-
-    Returns:
-        Figure, 13 inches wide and about 1.2 inches high per row.
 
     Raises:
         ValueError: If there is no row, or an image has other than two axes.
@@ -105,14 +101,12 @@ def edit_page(
     projection: Projection,
     title: str,
 ) -> str:
-    """HTML page with the results beside the first scan, their points coloured by part if wanted.
-
-    It opens on the first result; the scans come after the results.
+    """HTML page that opens on the first result, with the first scan beside it.
 
     Args:
-        before: Range images ``(H, W)`` of the scans by name; may be none.
-        after: Those of the results; those without a return are left out.
-        parts: ``(H, W)`` number of the part of each pixel; None for none.
+        before: Range images ``(H, W)`` of the scans by name, may be empty; shown after the results.
+        after: Those of the results; images without a return are left out.
+        parts: ``(H, W)`` part number of each pixel, for the colours; None for none.
         part_names: Names of the parts by number.
         projection: Makes the points.
         title: Of the page.
@@ -144,7 +138,7 @@ def edit_page(
 
 
 def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
-    """Eighths of a turn below a range image, as they are given to the commands."""
+    """Ticks at eighths of a turn, in degrees as the commands take them."""
     azimuth = projection.ray_angles()[1].rad2deg().numpy()
     wanted = np.arange(135, -180, -45)
     apart = (azimuth[:, None] - wanted + 180) % 360 - 180
@@ -154,7 +148,7 @@ def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
 
 
 def _borders(parts: NDArray[np.integer]) -> list[list[tuple[int, int]]]:
-    """Lines ``(x, y)`` along the sides of pixels that part others; none if there are too many."""
+    """Lines ``(x, y)`` between pixels of different parts; none if there are too many."""
     upright, level = parts[:, 1:] != parts[:, :-1], parts[1:] != parts[:-1]
     if level.mean() > _MOST_BORDERS:
         return []
@@ -163,7 +157,7 @@ def _borders(parts: NDArray[np.integer]) -> list[list[tuple[int, int]]]:
 
 
 def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
-    """The picture in grey with the colour of each pixel's part over it; what is kept has none."""
+    """The picture in grey, tinted by part except where it is ``kept``."""
     picture = (picture @ np.array(_GREY_SHARES))[..., None]
     over = np.array([to_rgb(colour) for colour in _part_colours(names)])[parts]
     share = np.array([0.0 if name == _KEPT else _TINT for name in names])[parts][..., None]

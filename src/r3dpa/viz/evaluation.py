@@ -1,4 +1,4 @@
-"""Figures of an evaluation: where samples and real scans differ, and what matches what.
+"""Figures of an evaluation: where samples and real scans differ, and which scans match.
 
 Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view. Shapes other than
 documented and histograms without counts raise a ``ValueError``.
@@ -41,11 +41,10 @@ def bev_histograms(
     x_m: tuple[float, float] = (-50.0, 50.0),
     y_m: tuple[float, float] = (-50.0, 50.0),
 ) -> Figure:
-    """Where the points of samples and of real scans lie seen from above, and the difference.
+    """Points of samples and of real scans seen from above, and the difference of their shares.
 
-    Forward is up and left is left. Counts are shown as shares of all counts of their histogram,
-    both on one logarithmic scale of four decades; shares below it have the lowest colour, empty
-    cells the dark background. The third panel shows samples - references, linear near 0.
+    Forward is up and left is left. Both share one logarithmic scale of four decades; empty cells
+    have the dark background. The difference is linear near 0.
 
     Args:
         samples: ``(X, Y)`` counts; index 0 is at the lower limit of x and of y.
@@ -107,21 +106,16 @@ def bev_histograms(
 def range_histogram(
     edges_m: Array, samples: Array, references: Array, halves: Array | None = None
 ) -> Figure:
-    """How many returns come from which range, and how far samples differ from real scans.
+    """Returns per metre of range, and the ratio of samples to real scans.
 
-    The band is the floor: between the smallest and the largest of parts of the real scans. Samples
-    inside the band differ no more than real scans do among themselves. A bin without any return of
-    the real scans has no ratio.
+    The band is the floor: the range of parts of the real scans. Bins without a real return have no
+    ratio.
 
     Args:
         edges_m: ``(K + 1,)`` ascending borders of the bins in metres.
         samples: ``(K,)`` counts.
         references: ``(K,)`` counts of real scans.
-        halves: ``(S, K)`` counts of parts of the real scans, such as the two halves; none for a
-            figure without the band.
-
-    Returns:
-        Figure of two panels: densities, and their ratio to the density of the real scans.
+        halves: ``(S, K)`` counts of parts of the real scans; None for a figure without the band.
     """
     edges = as_numpy(edges_m, ("K + 1",))
     if len(edges) < 2 or not (np.diff(edges) > 0).all():
@@ -173,16 +167,7 @@ def range_histogram(
 def matches_figure(
     best: Sequence[MatchedPair], worst: Sequence[MatchedPair], sensor: LidarSensor
 ) -> Figure:
-    """The best and the worst matches: each sample above the real scan that is nearest to it.
-
-    Args:
-        best: Pairs of small distance, the best first.
-        worst: Pairs of large distance, the worst first.
-        sensor: Gives the limits of the colour scale.
-
-    Returns:
-        Figure, 13 inches wide and about 1.9 inches high for each pair.
-    """
+    """The best and the worst matches: each sample above the nearest real scan."""
     pairs = [("best", pair) for pair in best] + [("worst", pair) for pair in worst]
     if not pairs:
         raise ValueError("got no pair to draw; give at least one of the best or the worst")
@@ -216,18 +201,10 @@ def save_figures(
     worst: Sequence[tuple[str, Array, Array]],
     sensor: LidarSensor,
 ) -> None:
-    """Writes ``birds_eye.png``, ``ranges.png`` and ``matches.png`` of an evaluation.
+    """Writes ``birds_eye.png``, ``ranges.png`` and ``matches.png`` of an evaluation to ``folder``.
 
-    Args:
-        folder: Where to.
-        cells: ``(X, Y)`` occupied cells of samples and of references.
-        limits_m: Of x and of y.
-        edges_m: Borders of the bins of ranges.
-        ranges: Returns by range of samples and of references.
-        halves: The same of parts of the references.
-        best: Fields of :class:`MatchedPair`, the best matches first.
-        worst: The same, the worst first.
-        sensor: Of the range images.
+    Arguments are those of :func:`bev_histograms` (``cells``, ``limits_m``), :func:`range_histogram`
+    (``edges_m``, ``ranges``, ``halves``) and fields of :class:`MatchedPair` (``best``, ``worst``).
     """
     save(bev_histograms(*cells, *limits_m), folder / "birds_eye.png")
     save(range_histogram(edges_m, *ranges, halves), folder / "ranges.png")
@@ -250,6 +227,6 @@ def _summed(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.
 
 
 def _largest_factor(drawn: NDArray[np.float64], real: NDArray[np.float64]) -> float:
-    """How far apart two densities are in the bins where both are."""
+    """Largest ratio of two densities over the bins where both are positive."""
     both = (drawn > 0) & (real > 0)
     return float(np.exp(np.abs(np.log(drawn[both] / real[both])).max(initial=0.0)))

@@ -31,10 +31,9 @@ FRAME = (255, 60, 60)  # a colour that the map does not hold
 class FeatureColours:
     """Principal components of one set of features as colours of any set of that width.
 
-    Rows of zeros are empty cells: they do not count for the components and are black. Of each
-    component the 1st to 99th percentile of the fitted rows becomes 0.15 to 1, and what lies beyond
-    takes the end colours; a component without variance is 0.575. The sign makes the largest
-    loading of a component positive.
+    Rows of zeros are empty cells: they are left out of the fit and drawn black. The 1st to 99th
+    percentile of each component becomes 0.15 to 1, clipped; a component without variance is 0.575.
+    The sign makes the largest loading of a component positive.
 
     Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
 
@@ -94,16 +93,10 @@ def pca_colours(features: Array) -> NDArray[np.float64]:
 def feature_grid_picture(
     grid: Array, grid_size: tuple[int, int], scale: int = 12, colours: FeatureColours | None = None
 ) -> Pixels:
-    """Feature grid as a picture: principal components as colours, empty cells black.
+    """Feature grid ``(N, D)`` as a picture: principal components as colours, empty cells black.
 
-    Args:
-        grid: ``(N, D)`` cells row by row, zeros where a cell is empty.
-        grid_size: Rows and columns of the grid, with product N.
-        scale: Side in pixels of the square drawn for one cell.
-        colours: Components of other features, such as those of the points; of the grid if None.
-
-    Returns:
-        ``(rows * scale, columns * scale, 3)`` uint8.
+    ``colours`` are the components of other features, such as those of the points. Returns
+    ``(rows * scale, columns * scale, 3)`` uint8.
     """
     _check_grid(grid, grid_size)
     colours = colours or FeatureColours.fit(grid)
@@ -113,18 +106,10 @@ def feature_grid_picture(
 def similarity_picture(
     grid: Array, grid_size: tuple[int, int], cell: tuple[int, int], scale: int = 12
 ) -> Pixels:
-    """Cosine between one cell of a feature grid and every other one; empty cells are black.
+    """Cosine of each cell of a feature grid ``(N, D)`` with one ``cell`` (row, column).
 
-    Cosine 1 is bright, 0 and below dark; the cell itself has a red frame.
-
-    Args:
-        grid: ``(N, D)`` cells row by row, zeros where a cell is empty.
-        grid_size: Rows and columns of the grid, with product N.
-        cell: Row and column of the cell that all others are compared with.
-        scale: Side in pixels of the square drawn for one cell.
-
-    Returns:
-        ``(rows * scale, columns * scale, 3)`` uint8.
+    Cosine 1 is bright, 0 and below dark, empty cells black; the cell itself has a red frame.
+    The result is ``(rows * scale, columns * scale, 3)`` uint8.
     """
     _check_grid(grid, grid_size)
     (row, column), (rows, columns) = cell, grid_size
@@ -157,21 +142,17 @@ def feature_figure(
 ) -> Figure:
     """Features of a scan on its points, on its range image and averaged over the grid.
 
-    All four pictures share the principal components of the points, so that one colour means one
-    feature in all of them; a cell that averages different features is duller than its points.
+    All pictures share the principal components of the points, so that one colour means one feature.
 
     Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
 
     Args:
         points: ``(P, 3+)`` x forward, y left, z up, metres.
         features: ``(P, F)`` of the points.
-        grid: ``(N, F)`` their means over the cells, row by row, zeros where a cell is empty.
+        grid: ``(N, F)`` means over the cells, row by row, zeros where a cell is empty.
         projection: Projection of the range image below the grid.
         grid_size: Rows and columns of the grid, with product N.
         extent_m: Half side of the square shown from above.
-
-    Returns:
-        Figure of 13 x 7.6 inches: from behind and from above, range image, grid.
     """
     colours = FeatureColours.fit(features)
     of_points = colours(features)
@@ -202,14 +183,8 @@ def feature_figure(
 def latents_picture(latents: Array, scale: int = 8) -> Pixels:
     """Principal components of the channels of latents ``(C, h, w)`` as colours.
 
-    Source: R3DPA (ICRA 2026), figure of the effect of end-to-end training on latents.
-
-    Args:
-        latents: Of one scene, raw or normalised.
-        scale: Side in pixels of the square drawn for one latent pixel.
-
-    Returns:
-        ``(h * scale, w * scale, 3)`` uint8.
+    Returns ``(h * scale, w * scale, 3)`` uint8. Source: R3DPA (ICRA 2026), figure of the effect of
+    end-to-end training on latents.
     """
     channels = as_numpy(latents, ("C", "h", "w"))
     count, *latent_size = channels.shape
@@ -218,7 +193,7 @@ def latents_picture(latents: Array, scale: int = 8) -> Pixels:
 
 
 def _checked_rows(features: Array) -> Rows:
-    """The features as float32, or float64 where they are wider than that, all finite."""
+    """The features as finite float32, or float64 where they are wider than that."""
     if isinstance(features, torch.Tensor):
         features = features.detach().cpu()
         features = (features if features.dtype == torch.float64 else features.float()).numpy()

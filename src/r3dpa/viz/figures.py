@@ -38,15 +38,7 @@ ERROR_MAP = bright_part("viridis", 0.0)
 
 
 def birds_eye_view(points: Array, extent_m: float = 50.0) -> Figure:
-    """Points ``(P, 3+)`` seen from above with axes in metres, ego vehicle and height scale.
-
-    Args:
-        points: x forward, y left, z up, metres.
-        extent_m: Half side of the square around the sensor that is shown.
-
-    Returns:
-        Figure of 7.4 x 6.4 inches.
-    """
+    """Points ``(P, 3+)`` in metres seen from above, up to ``extent_m`` to each side, with axes."""
     figure = Figure(figsize=(7.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
     draw_birds_eye(axes, points, extent_m)
@@ -60,15 +52,9 @@ def birds_eye_view(points: Array, extent_m: float = 50.0) -> Figure:
 def scenes_sheet(
     range_images_m: Sequence[Array], projection: Projection, extent_m: float = 50.0
 ) -> Figure:
-    """Contact sheet of scenes, one per row: range image, seen from above, seen in 3D.
+    """Contact sheet of range images ``(H, W)`` in metres, one scene per row.
 
-    Args:
-        range_images_m: Range images ``(H, W)`` in metres, at least one.
-        projection: Gives the points and the colour scale.
-        extent_m: Half side of the square shown from above.
-
-    Returns:
-        Figure, 17.5 inches wide and 1.85 inches high per scene.
+    Each row shows the range image, the points from above (``extent_m`` to each side) and in 3D.
     """
     count = len(range_images_m)
     if count == 0:
@@ -106,17 +92,14 @@ def reconstruction_figure(
     mean_absolute_error_m: float,
     valid_agreement: float,
 ) -> Figure:
-    """A range image, its reconstruction and the absolute error between the two.
+    """A range image, its reconstruction and the absolute error, each with its scale in metres.
 
     Args:
-        range_m: ``(H, W)`` range in metres; not above 0 without a return.
-        reconstruction_m: ``(H, W)`` reconstructed range, same convention.
+        range_m: ``(H, W)`` metres; not above 0 without a return.
+        reconstruction_m: ``(H, W)`` likewise.
         sensor: Gives the limits of the colour scale.
         mean_absolute_error_m: Over the pixels valid in both, for the title.
         valid_agreement: Share in [0, 1] of pixels valid in both or empty in both, for the title.
-
-    Returns:
-        Figure of three panels with colour bars in metres; errors above 2 m take the end colour.
     """
     before, after = as_numpy(range_m, ("H", "W")), as_numpy(reconstruction_m, ("H", "W"))
     if before.shape != after.shape:
@@ -151,15 +134,7 @@ def reconstruction_figure(
 
 
 def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
-    """Range images of scans, one below the other under their names, with the range scale.
-
-    Args:
-        scans: Points ``(P, 3+)`` in metres by name, at least one scan.
-        projection: Makes the range images; its sensor gives the limits of the colour scale.
-
-    Returns:
-        Figure, 13 inches wide and about 1.2 inches high per scan.
-    """
+    """Range images of scans ``(P, 3+)`` by name, one below the other, with the range scale."""
     figure, rows = _figure_of(scans, (13.0, 1.2 * len(scans) + 0.6), 1)
     for (name, points), axes in zip(scans.items(), rows, strict=True):
         xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
@@ -172,15 +147,7 @@ def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
 
 
 def birds_eye_sheet(scans: Mapping[str, Array], extent_m: float = 50.0) -> Figure:
-    """Scans seen from above, forward up, with their names, the ego vehicle and the height scale.
-
-    Args:
-        scans: Points ``(P, 3+)`` x forward, y left, z up in metres by name, at least one scan.
-        extent_m: Half side of the square around the sensor that is shown.
-
-    Returns:
-        Figure with up to four scans in a row; one scan is larger than each of several.
-    """
+    """Scans ``(P, 3+)`` by name seen from above, up to four in a row, with the height scale."""
     count = len(scans)
     columns = count if count <= 4 else min((4, 3), key=lambda width: -count % width)  # fewest gaps
     side_in = 7.0 if columns == 1 else 4.0
@@ -231,7 +198,7 @@ def _height_bar(figure: Figure, sensor: LidarSensor | None = None, **place: obje
 def _figure_of(
     scans: Mapping[str, Array], size_in: tuple[float, float], columns: int
 ) -> tuple[Figure, np.ndarray]:
-    """Figure with a cell without ticks for each scan, at least; cells row by row."""
+    """Figure with a cell without ticks for each scan; cells row by row."""
     if not scans:
         raise ValueError("got no scan to draw; give at least one")
     figure = Figure(figsize=size_in, dpi=110, layout="constrained")

@@ -1,4 +1,4 @@
-"""One self-contained HTML page that shows scans as point clouds to walk around in.
+"""One self-contained HTML page that shows scans as point clouds.
 
 The page is ``page.html`` with ``page_cloud.js`` (points to pixels) and ``page_viewer.js`` (panes,
 camera, legend); it loads nothing and needs no GPU. Letters: P points.
@@ -75,20 +75,20 @@ def scan_page(
     """HTML page with one scan at a time, turned, moved and coloured by the reader.
 
     Coordinates are rounded to steps of 5 mm (larger for a scan that reaches beyond 163 m),
-    intensities to 1/255 of their largest value. A scan of 120 000 points takes about half a
-    megabyte.
+    intensities to 1/255 of their maximum. A scan of 120 000 points takes half a megabyte.
 
     Args:
-        scans: Scans to leaf through, at least one.
+        scans: At least one.
         title: Title of the page.
-        semantics: Categories of the labels by number; a number without one is shown as it is.
+        semantics: Categories of the labels by number; other numbers are shown as such.
         origins: Categories of the origins by number, likewise.
         reference: Scan that stays beside the others, seen by the same camera.
         sensor: Gives the limits of the range colours; the default sensor if None.
 
     Raises:
-        ValueError: If there is no scan, or a scan has no point, another shape than above, values
-            that are not finite, or another number of labels or origins than of points.
+        ValueError: If there is no scan, or a scan is empty, of another shape than above, not
+        finite,
+            or has another number of labels or origins than of points.
     """
     if not scans:
         raise ValueError("scan_page got no scan; give at least one")
@@ -141,9 +141,10 @@ def scan_page(
 def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
     """Header and data of a scan as the page holds it.
 
-    The data are columns, one after the other, deflated (zlib) and in base64: x, y and z as int16
-    steps, each the difference from the point before (which wraps around); then, where known,
-    semantic and instance as uint16, intensity and origin as uint8. All are little-endian.
+    The data are little-endian columns, deflated (zlib), in base64: x, y and z as int16 steps, each
+    the
+    difference from the point before; then, where known, semantic and instance as uint16, intensity
+    and origin as uint8.
     """
     points = as_numpy(scan.points, ("P", "3 or 4"))
     count = len(points)
@@ -181,7 +182,7 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
 def _checked(
     scan: PageScan, what: str, values: NDArray[np.integer], largest: int
 ) -> NDArray[np.int64]:
-    """The numbers of each point, checked to be one for each and within 0 to ``largest``."""
+    """The numbers of the points, one for each and within 0 to ``largest``."""
     if values.shape != (len(scan.points),):
         raise ValueError(
             f"{scan.name}: {what} are {values.shape} but points {tuple(scan.points.shape)}; give "
@@ -210,10 +211,7 @@ def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) 
 def _category_rows(
     categories: Mapping[int, Category], used: Sequence[NDArray[np.integer]]
 ) -> list[tuple[int, str, str]]:
-    """Number, name and colour of the categories that occur, and of numbers without a category.
-
-    A category without a colour gets one of the palette that no other category has.
-    """
+    """Number, name and colour of the categories that occur; missing colours from the palette."""
     present = sorted({int(number) for values in used for number in np.unique(values)})
     taken = {category.colour for category in categories.values()}
     free = cycle([colour for colour in PALETTE if colour not in taken] or PALETTE)

@@ -1,16 +1,11 @@
 // The page around the point clouds: panes, camera, colours, legend and readout.
 (() => {
   "use strict";
-
   const page = JSON.parse(document.getElementById("page").textContent);
   const element = (id) => document.getElementById(id);
   const MODES = {
-    height: "Height",
-    range: "Range",
-    intensity: "Intensity",
-    semantic: "Label",
-    instance: "Instance",
-    origin: "Made by",
+    height: "Height", range: "Range", intensity: "Intensity",
+    semantic: "Label", instance: "Instance", origin: "Made by",
   };
   const VIEWS = {
     orbit: { target: [7, 0, -1], distance: 40, yaw: 0.5, pitch: 0.45, flat: false },
@@ -37,7 +32,7 @@
 
   const state = { scan: 0, mode: page.mode, size: 1.5, camera: { ...VIEWS.orbit }, view: "orbit" };
   let picked = null; // {pane, point, pinned}
-  let wanted = 0; // counts the scans asked for: an older one that arrives late is not shown
+  let wanted = 0; // number of requested scans: an older one that arrives late is not shown
 
   const clouds = new Map();
   function cloudOf(number) {
@@ -67,8 +62,7 @@
     }
 
     show(header, cloud) {
-      this.header = header;
-      this.cloud = cloud;
+      Object.assign(this, { header, cloud });
       this.colour();
     }
 
@@ -80,13 +74,13 @@
       const notes = [`${this.header.count.toLocaleString("en")} points`];
       const scans = element("scans").options;
       if (this === panes[0] && scans.length > 1) notes.unshift(`${state.scan + 1} of ${scans.length}`);
-      if (mode !== "height" && !this.cloud[mode]) notes.push("grey, as this scan does not tell it");
+      if (mode !== "height" && !this.cloud[mode]) notes.push("grey: not known for this scan");
       this.note.textContent = notes.join(" · ");
     }
 
     resize(ratio) {
-      const width = Math.max(1, Math.round(this.root.clientWidth * ratio));
-      const height = Math.max(1, Math.round(this.root.clientHeight * ratio));
+      const { clientWidth, clientHeight } = this.root;
+      const [width, height] = [clientWidth, clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
       this.ratio = ratio;
       if (this.frame && this.frame.width === width && this.frame.height === height) return;
       for (const canvas of [this.ground, this.canvas]) [canvas.width, canvas.height] = [width, height];
@@ -165,8 +159,8 @@
     describe(point) {
       const { cloud } = this;
       const [x, y, z] = this.position(point);
-      const rows = [["x, y, z", [x, y, z].map((v) => v.toFixed(2)).join("  ") + " m"]];
-      rows.push(["range", `${cloud.range[point].toFixed(2)} m`]);
+      const place = [x, y, z].map((v) => v.toFixed(2)).join("  ");
+      const rows = [["x, y, z", `${place} m`], ["range", `${cloud.range[point].toFixed(2)} m`]];
       if (cloud.intensity) rows.push(["intensity", cloud.intensity[point].toFixed(2)]);
       for (const mode of ["semantic", "origin"]) {
         if (cloud[mode]) rows.push([MODES[mode].toLowerCase(), names[mode].get(cloud[mode][point])]);
@@ -179,12 +173,12 @@
   const panes = [new Pane()];
   if (page.reference !== null) panes.push(new Pane());
 
-  let asked = false;
+  let scheduled = false;
   function redraw() {
-    if (asked) return;
-    asked = true;
+    if (scheduled) return;
+    scheduled = true;
     requestAnimationFrame(() => {
-      asked = false;
+      scheduled = false;
       for (const pane of panes) pane.draw();
     });
   }
@@ -195,8 +189,6 @@
     for (const pane of panes) pane.resize(ratio);
     redraw();
   }
-
-  // Scans, colours and legend
 
   async function showScan(number) {
     const ticket = ++wanted;
@@ -250,11 +242,7 @@
     const counts = Cloud.countValues(panes[0].cloud.instance);
     const rest = counts.get(0) || 0;
     counts.delete(0);
-    const row = (name, count, colour) => {
-      const made = entry(name, count, colour);
-      made.disabled = true;
-      return made;
-    };
+    const row = (...fields) => Object.assign(entry(...fields), { disabled: true });
     element("entries").replaceChildren(
       row(`${counts.size} instances`, panes[0].cloud.count - rest, Cloud.instanceColour(1)),
       row("no instance", rest, Cloud.instanceColour(0)));
@@ -298,8 +286,6 @@
     return made;
   }
 
-  // The point under the pointer
-
   function choose(choice, event) {
     picked = choice;
     const readout = element("readout");
@@ -318,8 +304,6 @@
     readout.style.left = `${Math.max(4, left)}px`;
     readout.style.top = `${Math.max(4, Math.min(event.clientY + 14, innerHeight - offsetHeight - 4))}px`;
   }
-
-  // Camera
 
   function setCamera(camera, view) {
     state.camera = camera;
@@ -419,8 +403,6 @@
       zoom(Math.exp(Math.min(120, Math.max(-120, event.deltaY * lines)) * 0.0015));
     }, { passive: false });
   }
-
-  // Controls
 
   function resizePoints(size) {
     state.size = Math.min(5, Math.max(0.5, size));

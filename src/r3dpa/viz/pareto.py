@@ -53,13 +53,10 @@ def pareto_figure(
         title: Above the picture.
         value_name: Label of the vertical axis, with unit.
         points: All ways to sample.
-        front: Those that the line joins, from the fastest on.
+        front: Points of the Pareto front, from the fastest on.
         levels: Horizontal lines by name, such as the error of bf16; at most three.
         limits: Seconds that NFE evaluations take at the peak of the device, by NFE.
         sentences: Under the picture: what each further second buys.
-
-    Returns:
-        Figure, 12 inches wide; its height follows from the sentences.
 
     Raises:
         ValueError: If there is no point, or a time or value is not above 0.
@@ -136,12 +133,6 @@ def discretisation_figure(
         panels: Points by title of the panel; their ``value`` is the error.
         references: Error of the converged reference by title; errors below ten times of it cannot
             be resolved.
-
-    Returns:
-        Figure with the panels side by side.
-
-    Raises:
-        ValueError: As :func:`pareto_figure`.
     """
     figure = Figure(figsize=(6.6 * len(panels) + 0.4, 5.6), dpi=110, layout="constrained")
     for axes, (title, points) in zip(
@@ -178,7 +169,7 @@ def _draw_orders(axes: Axes, points: Sequence[ParetoPoint], unsure: float) -> No
 
 
 def _styles(points: Sequence[ParetoPoint]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each solver, in the order in which they come."""
+    """Colour and marker of each solver, in order of appearance."""
     if not points:
         raise ValueError("no point to draw; give at least one way with a time and a value")
     for point in points:

@@ -35,16 +35,11 @@ HEIGHT_MAP = bright_part("viridis", 0.3)
 
 
 def range_image_picture(range_m: Array, sensor: LidarSensor, scale: int = 1) -> Pixels:
-    """Colours of a range image by the square root of the range, bright where near.
+    """Colours ``(H * scale, W * scale, 3)`` uint8 of a range image, bright where near.
 
-    Args:
-        range_m: ``(H, W)`` metres; not above 0 without a return (dark background). Ranges beyond
-            the limits of the sensor take the end colours.
-        sensor: Gives the limits of the colour scale.
-        scale: Side of the square drawn for one pixel.
-
-    Returns:
-        ``(H * scale, W * scale, 3)`` uint8.
+    ``range_m`` is ``(H, W)`` metres, not above 0 without a return (dark background). The scale is
+    the
+    square root of the range between the limits of the sensor.
     """
     ranges = as_numpy(range_m, ("H", "W"))
     picture = paint(ranges, RANGE_MAP, range_scale(sensor))
@@ -64,16 +59,13 @@ def encoded_picture(image: Array) -> Pixels:
 def birds_eye_picture(
     points: Array, extent_m: float = 50.0, pixels: int = 500, colours: Array | None = None
 ) -> Pixels:
-    """Points seen from above, forward up and left to the left; the highest point of a pixel shows.
+    """Points seen from above, forward up; the highest point of a pixel shows.
 
     Args:
         points: ``(P, 3+)`` x forward, y left, z up, metres.
         extent_m: Half side of the square around the sensor that is shown.
-        pixels: Side of the picture.
+        pixels: Side of the picture, ``(pixels, pixels, 3)`` uint8.
         colours: ``(P, 3)`` RGB in [0, 1] of the points, by default from their height.
-
-    Returns:
-        ``(pixels, pixels, 3)`` uint8.
     """
     xyz, rgb = _coloured_points(points, colours)
     row = np.floor((extent_m - xyz[:, 0]) / (2 * extent_m) * pixels)
