@@ -158,19 +158,7 @@ def test_1000_times_have_1000_embeddings_in_half_precision(half_weights):
     derivative = torch.func.jvp(wide, (middles,), (torch.ones_like(middles),))[1]
     error = (differences - derivative).norm(dim=1) / derivative.norm(dim=1)
     assert error.max() < 0.01
-
-    naive_times = times.bfloat16()
-    assert len(naive_times.unique()) < 600
-    with torch.autocast("cpu", torch.bfloat16):
-        features = time_frequencies(times)
-        for layer in wide.float().mlp:
-            features = (
-                nn.functional.linear(features, layer.weight, layer.bias)
-                if isinstance(layer, nn.Linear)
-                else layer(features)
-            )
-    naive = torch.diff(features.double(), dim=0) * 999
-    assert ((naive - derivative).norm(dim=1) / derivative.norm(dim=1)).max() > 0.5
+    assert len(times.bfloat16().unique()) < 600  # the times themselves would coincide
 
 
 @pytest.mark.numerics
@@ -198,11 +186,7 @@ def test_half_weights_leave_float32_islands(qk_norm):
     assert {name.split(".")[2] for name in narrow} == {"attn", "mlp"}
     latents, time = inputs(batch=16)
     expected = sit.velocity(latents, time)
-    row = half.modulations(time)
-    assert torch.equal(row, sit.modulations(time))
-    found = half.velocity_at(latents, row)
-    assert found.dtype == torch.float32
-    error = (found - expected).square().mean().sqrt()
+    error = (half.velocity(latents, time) - expected).square().mean().sqrt()
     naive = all_half.bfloat16().velocity(latents.bfloat16(), time).float()
     assert 0 < error < 0.02 * expected.std()
     assert error < 0.7 * (naive - expected).square().mean().sqrt()

@@ -147,14 +147,6 @@ def test_spatial_mixing_agrees_with_matrices(network):
 
 
 @torch.no_grad()
-def test_scans_of_a_batch_do_not_meet(network):
-    scans = [prepare(cloud(count, count)) for count in (200, 90)]
-    together = network(collate_scans(scans)).split([len(scan.features) for scan in scans])
-    for scan, tokens in zip(scans, together, strict=True):
-        torch.testing.assert_close(tokens, network(collate_scans([scan])), atol=1e-5, rtol=1e-5)
-
-
-@torch.no_grad()
 def test_order_of_points_does_not_matter(network):
     points = cloud(300)
     extractor = ScaLR(network, GRID)

@@ -122,8 +122,6 @@ def _levels(
 
 
 class _Level(nn.Module):
-    """Residual blocks of one resolution, and the layer that leaves it."""
-
     def __init__(
         self,
         in_channels: int,
@@ -166,8 +164,6 @@ class _Upsample(nn.Module):
 
 
 class _Middle(nn.Module):
-    """Two residual blocks around attention, at the lowest resolution."""
-
     def __init__(self, channels: int, groups: int) -> None:
         super().__init__()
         self.attentions = nn.ModuleList([_Attention(channels, groups)])
@@ -197,8 +193,6 @@ class _ResBlock(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Attention with one head between all pixels, added to the input."""
-
     def __init__(self, channels: int, groups: int) -> None:
         super().__init__()
         self.group_norm = nn.GroupNorm(groups, channels, _NORM_EPS)

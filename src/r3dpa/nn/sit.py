@@ -160,10 +160,7 @@ class SiT(VelocityNetwork):
         return [*self.blocks]
 
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Shifts, scales and gates ``(T, M)`` of times ``(T,)`` and classes ``(T,)``.
-
-        Six vectors of ``hidden_size`` for each block, then two for the output layer.
-        """
+        """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output."""
         return _rows([*self.blocks, self.final_layer], self._conditioning(time, labels))
 
     def halve_(self) -> Self:
@@ -216,7 +213,6 @@ class SiT(VelocityNetwork):
 
 
 def _rows(layers: Iterable[nn.Module], conditioning: Tensor) -> Tensor:
-    """Concatenated modulations of the layers."""
     rows = [layer.get_submodule("adaLN_modulation")(conditioning) for layer in layers]
     return torch.cat(rows, dim=1)
 

@@ -247,8 +247,6 @@ class _TimedResBlock(nn.Module):
 
 
 class _HeadsAttention(nn.Module):
-    """Multi-head attention between all pixels, added to the input."""
-
     def __init__(self, channels: int, head_channels: int) -> None:
         super().__init__()
         self.num_heads = channels // head_channels
@@ -285,8 +283,6 @@ class _DoubleSize(nn.Module):
 
 
 class _PositionBias(nn.Module):
-    """Learned bias on every latent pixel: the absolute position encoding."""
-
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         super().__init__()
         self.bias = nn.Parameter(torch.zeros(1, channels, *size))

@@ -281,8 +281,6 @@ def _up_level(
 
 
 class _Middle(nn.Sequential):
-    """Two residual blocks around attention, at the lowest resolution."""
-
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.block_1 = ResBlock(channels, channels)

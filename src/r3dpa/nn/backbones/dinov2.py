@@ -34,7 +34,7 @@ class DINOv2(nn.Module):
     2024); resizing and input size as in REPA (Yu et al. 2025) and REPA-E.
 
     Args:
-        weights: Released file. Default: random weights, with which no fit starts.
+        weights: Released file. Default: random weights, which `fit` refuses.
         dim: Token width D, a multiple of ``num_heads``.
         depth: Number of blocks.
         num_heads: Attention heads.

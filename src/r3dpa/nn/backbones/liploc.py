@@ -72,8 +72,7 @@ class LIPLoc(nn.Module):
             num_heads: Attention heads. Default: those of the released ViT of this width.
 
         Raises:
-            ValueError: If the file is missing or unreadable, holds no such encoder, or if a weight
-                of it is missing, left over or of another shape; the message names the file.
+            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         try:
             weights = {
@@ -150,7 +149,6 @@ def load_official(network: LIPLoc, weights: Mapping[str, Tensor]) -> None:
 
 
 def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:
-    """Sizes of the network with these weights, but for its number of heads."""
     patches, positions = weights.get("patch_embed.proj.weight"), weights.get("pos_embed")
     if patches is None or positions is None or patches.ndim != 4 or positions.ndim != 3:
         raise ValueError(

@@ -56,7 +56,6 @@ class Masking:
     max_hidden: float = 0.7
 
     def __post_init__(self) -> None:
-        """Check the share."""
         if not 0 <= self.max_hidden < 1:
             raise ValueError(f"max_hidden must be at least 0 and below 1, got {self.max_hidden}.")
 

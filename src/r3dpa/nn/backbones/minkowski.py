@@ -129,8 +129,7 @@ class MinkowskiNet(nn.Module):
                 weights are ignored.
 
         Raises:
-            ValueError: If the file is missing or unreadable, holds no such network, or if a
-                weight is missing, left over or of another shape; the message names the file.
+            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         path = Path(path)
         try:
@@ -214,7 +213,6 @@ def official_name(key: str) -> str:
 
 
 def _sizes(weights: Mapping[str, Tensor]) -> tuple[list[int], int, int]:
-    """Widths, input channels and classes of the network that has these weights."""
     stages = [f"stage{index + 1}.1.net.0.kernel" for index in range(_DEPTH)]
     ups = [f"up{index + 1}.0.net.0.kernel" for index in range(_DEPTH)]
     try:

@@ -143,9 +143,6 @@ class ScaLR(TokenFeatures):
         network: Trained network; its head is removed.
         grid: Preparation of scans, as in its training. Default: that of the release.
         workers: Threads of the neighbour search, -1 for all cores.
-
-    Raises:
-        ValueError: If ``network`` has other planes than ``grid``.
     """
 
     name = "scalr"
@@ -167,8 +164,7 @@ class ScaLR(TokenFeatures):
             workers: Threads of the neighbour search, -1 for all cores.
 
         Raises:
-            ValueError: If the file is missing or unreadable, holds no such network, or if a
-                weight is missing, left over or of another shape; the message names the file.
+            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         path, grid = Path(path), grid or ScanGrid()
         try:
@@ -181,11 +177,7 @@ class ScaLR(TokenFeatures):
 
 
 def load_official(network: WaffleIron, weights: Mapping[str, Tensor]) -> None:
-    """Loads every key of an official state dict of WaffleIron into a network with a head.
-
-    Raises:
-        ValueError: If a weight is missing, left over or of another shape, by official name.
-    """
+    """Loads every key of an official state dict of WaffleIron into a network with a head."""
     load_strictly(network, weights, official_name)
 
 
@@ -198,7 +190,6 @@ def official_name(key: str) -> str:
 
 
 def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
-    """Untrained network of the sizes that the weights have."""
     try:
         head_dim, width = weights["classif.weight"].shape[:2]
     except KeyError as error:
@@ -232,7 +223,7 @@ class WaffleIronS(TokenFeatures):
         workers: Threads of the neighbour search, -1 for all cores.
 
     Raises:
-        ValueError: If the file is missing, damaged or of something else, or ``dim`` too small.
+        ValueError: If the file cannot be read, or ``dim`` is below the width of the tokens.
     """
 
     mean: Tensor
@@ -268,14 +259,7 @@ class WaffleIronS(TokenFeatures):
 
 
 def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: ScanGrid) -> None:
-    """Writes the file that :class:`WaffleIronS` reads, atomically.
-
-    Args:
-        path: File to write.
-        network: Trained network.
-        norm: Statistics of its tokens.
-        grid: Preparation of scans in its training.
-    """
+    """Writes what :class:`WaffleIronS` reads; ``norm`` has the statistics of the tokens."""
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
     state |= {f"norm.{key}": value for key, value in norm.state_dict().items()}
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}

@@ -47,7 +47,7 @@ class RangeViT(nn.Module):
     4 for ``rangevit_wo_i`` and 5 for ``rangevit_w_i``, which also reads the intensity.
 
     Source: RangeViT (Ando et al., CVPR 2023) as ``eval/models/rangevit`` of valeoai/R3DPA uses it.
-    LiDAR-Diffusion's FRID has another network: its numbers do not compare.
+    LiDAR-Diffusion's FRID uses another network; its scores are not comparable.
 
     Args:
         sensor: Image size, field of view and range limits. Default: those of R3DPA.
@@ -135,8 +135,7 @@ class RangeViT(nn.Module):
             **sizes: ``trained_size`` and ``patch_size``, if not those of the release.
 
         Raises:
-            ValueError: If the file is missing or unreadable, or if a weight is missing, left over
-                or of another shape; the message names the file.
+            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         try:
             weights = read_state_dict(Path(path))

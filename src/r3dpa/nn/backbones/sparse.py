@@ -93,7 +93,6 @@ class Voxels:
         return cls(keys), rows
 
     def __len__(self) -> int:
-        """Number N of voxels."""
         return len(self.keys)
 
     @property

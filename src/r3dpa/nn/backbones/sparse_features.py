@@ -17,7 +17,7 @@ from r3dpa.nn.backbones.sparse import voxel_keys
 from r3dpa.nn.layers import at_least_float32
 
 VOXEL_M = 0.05
-#: Value of the fourth input channel, for which generated scans have no intensity.
+#: Fourth input channel, in place of the intensity, which generated scans lack.
 NO_INTENSITY = -1.0
 NUM_BINS = 16
 _RINGS_FROM_M, _RINGS_TO_M = 4.0, 56.0

@@ -44,7 +44,6 @@ class ScanGrid:
     intensity_std: float = 0.147190
 
     def __post_init__(self) -> None:
-        """Check that sizes are positive and that cells fill the field of view."""
         for name in ("cell_m", "voxel_m", "num_neighbors", "intensity_std"):
             if not np.all(np.greater(getattr(self, name), 0)):
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
