@@ -1,4 +1,4 @@
-"""Puts solids on a street by street coordinates, and lays its ground."""
+"""Solids and ground of one block, placed in street coordinates."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _SLAB_M = 1.0
 class Builder:
     """Collects the solids of one block, given in street coordinates.
 
-    ``details`` are solids that only scans from nearby have, ``puddles`` places where water stands
-    if the road is wet; instances are numbered from ``first_instance`` on.
+    ``details`` are solids that exist in scans from nearby only, ``puddles`` places of standing
+    water on a wet road; instances are numbered from ``first_instance`` on.
     """
 
     def __init__(self, course: Course, section: Section, first_instance: int) -> None:
@@ -37,7 +37,7 @@ class Builder:
         self._first_instance = first_instance
 
     def new_instance(self) -> int:
-        """A number that no other object of the block has."""
+        """Unique instance number within the block."""
         self.num_objects += 1
         return self._first_instance + self.num_objects - 1
 
@@ -78,7 +78,7 @@ class Builder:
     def body(
         self, body: Body, at: Place, yaw_rad: float, instance: int, speed_m_s: float = 0.0
     ) -> None:
-        """Add a vehicle or a person at (s, lateral), which moves the way it is turned."""
+        """Add a vehicle or a person at (s, lateral), which moves along its heading."""
         x, y, z = self.section.at(*at)
         z += self.course.surface_m(at[1])
         heading = self.section.heading_rad + yaw_rad
@@ -130,7 +130,7 @@ class Builder:
         )  # fmt: skip
 
     def puddle(self, draw: Generator, s: float, lateral: float) -> None:
-        """Add a place where water stands if the road is wet."""
+        """Add a place of standing water on a wet road."""
         x, y, _ = self.section.at(s, lateral)
         self.puddles.append(Puddle(x, y, draw.uniform(0.3, 1.6)))
 

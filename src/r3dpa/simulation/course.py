@@ -1,4 +1,4 @@
-"""The course of a drive: where the street runs, how it rises, and how the recording car moves."""
+"""Course of a drive: axis and slope of the street, motion of the recording car."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Wave = tuple[float, float, float]
 
 
 class Character(NamedTuple):
-    """What kind of place a drive leads through; pairs are intervals to draw from.
+    """Surroundings of a drive; pairs are intervals to draw from.
 
     ``lanes``: possible numbers of lanes ahead and towards us. ``districts``: weights of town,
     houses, green and yard. ``parked``: share of taken places. ``parking``, ``pavement``: chance.
@@ -121,7 +121,7 @@ class Section(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What stays the same along a drive; lengths in metres, angles in radians."""
+    """Constants of a drive; lengths in metres, angles in radians."""
 
     seed: int
     drive: int
@@ -175,7 +175,7 @@ class Course(NamedTuple):
         return math.copysign(kerb.rise, lateral)
 
     def _moving(self, scan: int) -> tuple[int, bool]:
-        """Scans before this one in which the car moved, and whether it stands in this one."""
+        """Number of earlier scans in which the car moved, and whether it waits in this one."""
         if not self.stop_scans or scan < self.stop_from:
             return scan, False
         stops, since = divmod(scan - self.stop_from, self.stop_every)
@@ -183,9 +183,9 @@ class Course(NamedTuple):
         return scan - stood, since < self.stop_scans
 
     def position(self, scan: int) -> float:
-        """Where along the axis the recording car is: 1.0 to 1.4 m further each scan, or waiting.
+        """Position of the recording car along the axis: 1.0 to 1.4 m further each scan, or waiting.
 
-        It waits for some scans now and then, as at traffic lights; braking is left out.
+        It sometimes waits for some scans, as at traffic lights; braking is not modelled.
         """
         moved, _ = self._moving(scan)
         phase = 2 * math.pi * moved / self.sway_period + self.sway_phase
@@ -275,7 +275,7 @@ def _sum(waves: tuple[Wave, ...], s: float) -> float:
 @lru_cache(maxsize=256)
 def _sections(course: Course, table: int) -> tuple[Section, ...]:
     """Sections of the blocks of one table; each begins where the one before ends."""
-    found: list[Section] = []
+    sections: list[Section] = []
     last = _sections(course, table - 1)[-1] if table else None
     first = table * _BLOCKS_PER_TABLE
     for block in range(first, first + _BLOCKS_PER_TABLE):
@@ -290,6 +290,6 @@ def _sections(course: Course, table: int) -> tuple[Section, ...]:
             cross = _LEVELLING * last.cross - corner * (last.slope + slope)
             end = last.on_chord(BLOCK_M, 0.0)
             section = Section(block, *end, heading, slope, cross, corner, after)
-        found.append(section)
+        sections.append(section)
         last = section
-    return tuple(found)
+    return tuple(sections)

@@ -1,4 +1,4 @@
-"""Random numbers by key: equal keys, equal draws, whatever else is drawn."""
+"""Random numbers by key: equal keys give equal draws."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def generator_for(*key: int | str) -> np.random.Generator:
 class Draws:
     """Random numbers of one effect in one scan, one per ray.
 
-    A counter-based generator (Philox) of its own per key; each call draws for all rays of the turn
-    and returns those asked for, so that a ray's number depends neither on which other rays are
-    touched nor on any other effect.
+    Each key has its own counter-based generator (Philox). A call draws for all rays of the turn and
+    returns the requested ones, so that the number of a ray depends neither on the selection of
+    rays nor on any other effect.
     """
 
     def __init__(self, num_rays: int, *key: int | str) -> None:

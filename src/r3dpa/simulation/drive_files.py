@@ -6,13 +6,13 @@
         timestamps.txt                  one line a scan, 10 Hz
         data/%010d.bin                  (P, 4) float32 x, y, z, intensity
         labels/%010d.label              (P,) uint32 semantic | instance << 16
-        origins/%010d.origin            (P,) uint8 what made each point, see ``Origin``
-        sim/%010d.json                  the scene in short, and what became of each effect
+        origins/%010d.origin            (P,) uint8 origin of each point, see ``Origin``
+        sim/%010d.json                  summary of the scene and of each effect
     data_poses/2013_05_28_drive_XXXX_sync/
         velodyne_to_world.txt           one line a scan: number, then (3, 4) row by row
 
 KITTI-360's own ``poses.txt``, of the same format, holds poses of its inertial unit, which is not
-simulated; hence the other name. Every file here follows from the request alone.
+simulated; hence the other name. Every file depends on the request only.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from r3dpa.io import atomic_path, delete_unfinished
 from r3dpa.simulation.scan import SimulatedScan
 from r3dpa.simulation.scene import Pose, Weather
 
-# In the order in which they are written: whoever finds the points of a scan finds all of it.
+# In the order of writing: a scan whose points exist is complete.
 _SUFFIXES = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
 _FIRST_SCAN = datetime(2013, 5, 28, 8, 46, 2)
 _SCAN_PERIOD = timedelta(seconds=0.1)
@@ -85,7 +85,7 @@ class DriveFiles:
             write(self._path(kind, number), contents[kind])
 
     def summaries(self, count: int) -> list[dict[str, Any]]:
-        """What ``sim/*.json`` says of the first ``count`` scans; a damaged file is named."""
+        """Contents of ``sim/*.json`` of the first ``count`` scans; errors name a damaged file."""
         return [self._summary(self._path("sim", number)) for number in range(count)]
 
     def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
@@ -162,7 +162,7 @@ def to_json(values: Any) -> bytes:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file whole, or leave it alone where it holds these bytes already."""
+    """Write a file atomically, unless it already holds these bytes."""
     if path.is_file() and path.read_bytes() == content:
         return
     with atomic_path(path) as temporary:

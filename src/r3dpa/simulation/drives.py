@@ -1,4 +1,4 @@
-"""Simulated data sets: which scans there are, who writes them, and what holds a set together.
+"""Simulated data sets: split into scans, worker processes, and the manifest.
 
 ::
 
@@ -6,8 +6,8 @@
     data_3d_raw/, data_poses/           the scans and their poses, see ``drive_files``
     report.json                         effects and costs, see ``report``
 
-All files but the report, which holds measured times, are the same bytes for equal requests,
-whatever the number of workers and however often a run was killed and started again.
+Except for the report, which holds measured times, equal requests give the same bytes, for any
+number of workers and after any number of interruptions.
 """
 
 from __future__ import annotations
@@ -63,11 +63,10 @@ def simulate(
 ) -> SimulationReport:
     """Write a simulated data set in the layout of KITTI-360, complete one, or add scans to one.
 
-    Each scan follows from the request and its number alone: the files are the same bytes for any
-    number of workers. A file appears under its name only when it is whole, so an interrupted call
-    is completed by the same call, which also deletes what killed runs left. A call for more scans
-    adds them and leaves those that exist as they are. A second call for the same folder waits
-    until the first has ended.
+    Each scan depends only on the request and its number: the files are the same bytes for any
+    number of workers. Files are written atomically, so an interrupted call is completed by the
+    same call, which also deletes the temporary files of killed runs. A call for more scans adds
+    them and keeps the existing ones. A second call for the same folder waits for the first.
 
     Args:
         out: Root folder of the data set; made if missing.
@@ -75,15 +74,14 @@ def simulate(
         seed: Seed of streets and instrument, 0 or greater.
         workers: Processes; more than one needs an importable main module, as ``spawn`` does.
         drives: Four-digit drives to write; by default all official training and validation
-            drives. Where there are drives of both splits, a fifth of the scans (at least one, if
-            there are two or more) goes to validation.
-        sensor: Instrument, or what ``load_sensor`` takes.
+            drives. With drives of both splits, a fifth of the scans (at least one, if there are
+            two or more) is for validation.
+        sensor: Instrument, or an argument of ``load_sensor``.
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
         weather: Of all scans; drawn for each stretch of street if None.
 
     Returns:
-        What the data set holds, effect by effect, and what the scans cost; also written to
-        ``report.json``.
+        Contents of the data set by effect, and simulation times; also written to ``report.json``.
 
     Raises:
         ValueError: If a value is out of range, an effect or a drive is unknown, a drive is named
@@ -113,7 +111,7 @@ def simulate(
         return _report(out, [one for drive in files for one in drive.summaries(files[drive])], [])
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out):
-        _check_folder(out, request)  # again: who held the lock may have written
+        _check_folder(out, request)  # again: another process may have written meanwhile
         write(out / _MANIFEST, to_json(request))
         tasks = []
         for drive, count in files.items():
@@ -175,7 +173,7 @@ def _share(scans: int, drives: list[str]) -> dict[str, int]:
 
 
 class _Task(NamedTuple):
-    """Scans of one drive for one worker to write."""
+    """Scans of one drive, written by one worker."""
 
     files: DriveFiles
     simulator: Simulator
@@ -232,7 +230,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Holds the folder's lock, which the system releases when the process dies."""
+    """Lock of the folder, which the system releases when the process dies."""
     with (out / _LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -267,7 +265,7 @@ def _run_all(tasks: list[_Task], workers: int) -> Iterator[list[dict[str, float]
 
 
 def _start_worker() -> None:
-    """A worker leaves an interrupt to its parent, and ends when that is killed."""
+    """Ignore interrupts, which the parent handles, and end when the parent is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -297,7 +295,7 @@ def _run(task: _Task) -> list[dict[str, float]]:
 def _finish(
     out: Path, files: Mapping[DriveFiles, int], timings: list[dict[str, float]]
 ) -> SimulationReport:
-    """Write what is about whole drives and the whole data set."""
+    """Write timestamps, poses and the report."""
     summaries = []
     for drive, count in files.items():
         of_drive = drive.summaries(count)

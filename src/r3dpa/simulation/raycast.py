@@ -21,7 +21,7 @@ _SLACK_RAD = 1e-3
 _SLACK_M = 1e-2
 # Secondary rays in one cone: more would widen it, fewer cost a cone each.
 _BLOCK_RAYS = 256
-# How single foliage draws are told apart from solid to solid; any odd numbers do.
+# Offsets of the foliage draws from solid to solid; any odd numbers do.
 _BEAM_STRIDE, _SHOT_STRIDE = 17, 641
 
 
@@ -120,7 +120,7 @@ def cast_single(
         distance = np.where(hollow[ray] == index, leave, distance)
         distance[~((distance > _START_M) & (distance < nearest[ray]))] = np.inf
         np.minimum.at(nearest, ray, distance)
-        # Backwards, so that of solids equally far the first one is left standing.
+        # Backwards, so that the first of several equally distant solids wins.
         hit = np.flatnonzero(distance == nearest[ray])[::-1]
         surface[ray[hit]] = index[hit]
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
@@ -182,7 +182,7 @@ def normals(
 
 
 def _draws_of(index: int, window: tuple[slice, slice], drawn: Floats) -> Floats:
-    """The window's draws for one solid: those of the turn, moved on from solid to solid."""
+    """Draws of a window for one solid: those of the turn, shifted from solid to solid."""
     num_beams, num_shots = drawn.shape
     beams = np.arange(window[0].start, window[0].stop) + _BEAM_STRIDE * index
     shots = np.arange(window[1].start, window[1].stop) + _SHOT_STRIDE * index
@@ -199,7 +199,7 @@ def _close_pairs(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rays and solids (each (K,)) whose upright bounding cylinders they cross.
 
-    ``group`` (M,) says which rays start near each other; of a ray the solids come in order.
+    Rays of one ``group`` (M,) start near each other; the solids of a ray are in order.
     """
     level_length = np.hypot(direction[0], direction[1])
     along = direction[:2] / level_length
@@ -214,7 +214,7 @@ def _close_pairs(
     reach_m = reach_m * level_length
     # Rays from one surface in similar directions make narrow blocks, which few solids come near.
     order = np.lexsort((np.arctan2(along[1], along[0]), group))
-    found = []
+    pairs = []
     for first in range(0, len(order), _BLOCK_RAYS):
         block = order[first : first + _BLOCK_RAYS]
         some = _near_block(centre[:2], radius, origin[:2, block], along[:, block])
@@ -223,10 +223,10 @@ def _close_pairs(
         close &= ahead >= -radius[some]
         close &= ahead <= reach_m[block, None] + radius[some]
         ray, index = np.nonzero(close)
-        found.append((block[ray], some[index], ahead[ray, index]))
-    if not found:
+        pairs.append((block[ray], some[index], ahead[ray, index]))
+    if not pairs:
         return order, order
-    ray, index, ahead_m = (np.concatenate(column) for column in zip(*found, strict=True))
+    ray, index, ahead_m = (np.concatenate(column) for column in zip(*pairs, strict=True))
     # Heights of the ray where it enters and leaves the circle, and of the solid.
     rise = (direction[2] / level_length)[ray]
     enter = origin[2, ray] + rise * (ahead_m - radius[index]).clip(min=0)
@@ -244,7 +244,7 @@ def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -
     apart_m = np.hypot(*(origin - middle[:, None])).max()
     axis = along.sum(axis=1)
     length = np.hypot(*axis)
-    if length < len(along[0]) / 2:  # the rays go every way
+    if length < len(along[0]) / 2:  # the directions are not similar
         return np.arange(len(radius))
     axis /= length
     spread_rad = np.arccos((axis @ along).min().clip(-1, 1)) + _SLACK_RAD
@@ -260,7 +260,7 @@ def _near_block(centre: Floats, radius: Floats, origin: Floats, along: Floats) -
 
 
 def _gather(solids: Solids, index: NDArray[np.integer]) -> _Solid:
-    # Taken from rows, so that every row of the result lies in one piece.
+    # Taken from rows, so that every row of the result is contiguous.
     matrix = np.ascontiguousarray(np.moveaxis(solids.matrix, 0, 2)).take(index, axis=2)
     offset = np.ascontiguousarray(solids.offset.T).take(index, axis=1)
     return _Solid(matrix, offset, bool(solids.grade.any()))

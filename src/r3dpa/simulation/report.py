@@ -1,4 +1,4 @@
-"""What a simulated data set holds, effect by effect, and what its scans cost."""
+"""Report on a simulated data set: effects and simulation times."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class EffectTotal(NamedTuple):
     not_called: int
     off: int
     why: str  # reason in the first scan in which it ran, or in the first scan of all
-    rays_per_scan: float  # that it touched, mean over all scans
+    rays_per_scan: float  # selected rays, mean over all scans
 
 
 @dataclass(frozen=True)
 class SimulationReport:
-    """What a data set holds, and what a call of ``simulate`` added to it."""
+    """Contents of a data set, and the scans added by a call of ``simulate``."""
 
     scans_per_drive: dict[str, int]  # by four-digit number
     num_written: int  # by this call; the others existed before
@@ -49,7 +49,7 @@ class SimulationReport:
         return sum(cost.share for name, cost in self.costs.items() if name != "total")
 
     def to_dict(self) -> dict[str, Any]:
-        """The data set as plain values; how many scans this call wrote is left out."""
+        """The report as plain values, without ``num_written``."""
         values = asdict(self)
         del values["num_written"]
         values["effects"] = {name: total._asdict() for name, total in self.effects.items()}
@@ -57,7 +57,6 @@ class SimulationReport:
         return values | {"accounted": self.accounted}
 
     def __str__(self) -> str:
-        """A line for each effect, each part and the total, and one with the counts."""
         header = ["effect", "ran", "not called", "off", "rays/scan", "ms/scan", "median", "share"]
         rows: list[list[str]] = []
         for name, total in self.effects.items():
@@ -94,7 +93,7 @@ class SimulationReport:
 def make_report(
     summaries: Sequence[Mapping[str, Any]], timings: Sequence[Mapping[str, float]]
 ) -> SimulationReport:
-    """Report on ``sim/*.json`` of all scans, and milliseconds of the scans that were written."""
+    """Report from ``sim/*.json`` of all scans and the milliseconds of the written ones."""
     effects = {
         name: _effect_total([summary["effects"][name] for summary in summaries])
         for name in summaries[0]["effects"]

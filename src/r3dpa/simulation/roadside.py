@@ -1,8 +1,8 @@
-"""What stands along a street: houses and gardens, trees and hedges, parked cars, lamps, signs.
+"""Roadside: houses and gardens, trees and hedges, parked cars, lamps, signs.
 
 A builder of a block side fills ``BLOCK_M`` metres of street from ``start`` on one ``side`` of the
 axis (1 left, -1 right), outwards from the lateral distance ``edge_m`` at which the plot begins.
-Leaves, blades and wire mesh are media that let some beams in, see ``Primitive``.
+Leaves, blades of grass and wire mesh are media, see ``Primitive``.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ def _tree(builder: Builder, draw: Generator, s: float, lateral: float, low: bool
 
 
 def _bush(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
-    """A bush that grows from the ground."""
     width, height = draw.uniform(0.9, 3.2), draw.uniform(0.8, 2.6)
     builder.solid(
         Shape.ELLIPSOID, (s, lateral), (width, width * draw.uniform(0.7, 1.4), height),
@@ -150,7 +149,7 @@ def _building(
 
 
 def _behind(builder: Builder, draw: Generator, start: float, lateral: float, woods: float) -> None:
-    """Whatever closes the view behind the plots: a wood or a building."""
+    """Background behind the plots: a wood or a building."""
     s = start + draw.uniform(0.3, 0.7) * BLOCK_M
     if draw.random() < woods:
         _wood(builder, draw, s, lateral)
@@ -251,7 +250,7 @@ _DISTRICTS = (_town, _houses, _green, _yard)
 
 
 def build_plots(builder: Builder, draw: Generator, side: float, district: Generator) -> None:
-    """What stands beside the street on one side of a block; ``district`` lasts longer."""
+    """Plots on one side of a block; ``district`` is drawn for several blocks."""
     start = builder.section.block * BLOCK_M
     kerb = builder.course.kerb(side)
     weights = builder.course.character.districts

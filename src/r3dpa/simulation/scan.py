@@ -20,7 +20,7 @@ from r3dpa.simulation.sensor import SpinningLidar, load_sensor
 from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Echoes, Origin, Sweep
 
-# Two echoes of one shot are told apart from here on.
+# Smallest distance of two echoes of one shot, metres.
 _SECOND_RETURN_M = 1.0
 # Powers, in units of the weakest that is detected, below which the intensity is 0 and from which on
 # it is not damped.
@@ -34,13 +34,13 @@ class EffectRecord:
     name: str
     status: Literal["ran", "not_called", "off"]
     reason: str
-    rays: int  # that it touched
-    ms: float  # milliseconds that it took, its predicate included
+    rays: int  # selected by the effect
+    ms: float  # milliseconds, with its condition
 
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """A scan, its labels, and how it came about.
+    """A scan, its labels, and a record of its effects.
 
     Args:
         points: ``(P, 4)`` float32, x forward, y left, z up in the sensor frame in metres, and the
@@ -51,7 +51,7 @@ class SimulatedScan:
         origins: ``(P,)`` uint8, the ``Origin`` of each point.
         effects: One record for each effect, in the order of ``EFFECTS``.
         parts_ms: Time of the other parts, milliseconds.
-        scene: What was scanned: solids, pose and motion of the sensor, weather.
+        scene: Solids, pose and motion of the sensor, weather.
     """
 
     points: NDArray[np.float32]
@@ -70,7 +70,7 @@ def effect_name(effect: Effect) -> str:
 def check_switches(switches: Mapping[str, str | bool]) -> dict[str, Switch]:
     """The switches that are not ``auto``, by effect name, sorted.
 
-    True and False, which YAML makes of a bare ``on`` and ``off``, mean the same as these words.
+    True and False, the YAML values of a bare ``on`` and ``off``, are accepted as well.
     """
     names = [effect_name(effect) for effect in EFFECTS]
     words: dict[str | bool, Switch] = {True: "on", False: "off", "on": "on", "off": "off"}
@@ -91,15 +91,15 @@ def simulate_scan(
     key: tuple[int | str, ...],
     switches: Mapping[str, str | bool] | None = None,
 ) -> SimulatedScan:
-    """Scan a scene.
+    """Simulate one scan of a scene.
 
     Args:
-        scene: What is scanned.
+        scene: Scene to scan.
         sensor: Instrument; its mount height is not used, the pose holds the height.
         key: Seed of the random draws, see ``generator_for``; the name of each effect is added, so
-            that no effect moves the draws of another.
-        switches: ``off`` leaves an effect out, ``on`` runs it whether the scene calls for it or
-            not, which then changes nothing; by default ``auto``.
+            that effects do not change the draws of each other.
+        switches: ``off`` omits an effect; ``on`` runs it even if the scene does not call for it,
+            which changes nothing; by default ``auto``.
     """
     checked = check_switches(switches or {})
     parts_ms: dict[str, float] = {}
@@ -122,8 +122,8 @@ class Simulator:
     Args:
         seed: Seed of street and instrument, 0 or greater.
         drive: Number of the drive; each leads through a street of its own.
-        weather: Weather of all scans, or the prior from which one is drawn every 100 scans.
-        sensor: Instrument, or what ``load_sensor`` takes.
+        weather: Weather of all scans, or the prior that is sampled every 100 scans.
+        sensor: Instrument, or an argument of ``load_sensor``.
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
 
     Raises:
@@ -212,7 +212,7 @@ def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDAr
 def _export(
     sweep: Sweep, echoes: Echoes, seen: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """Points along the rays as the instrument believes them: those of a sensor that stands."""
+    """Points along the rays of a sensor at rest, as the instrument stores them."""
     origin, direction = (array.reshape(3, -1)[:, seen] for array in sweep.sensor.rays)
     range_m, surface, made_by = echoes.range_m[seen], echoes.surface[seen], echoes.origin[seen]
     points = np.empty((len(seen), 4), dtype=np.float32)
@@ -226,8 +226,8 @@ def calibrated_intensity(
 ) -> NDArray[np.float32]:
     """Intensity as KITTI stores it: corrected for range, 0 to 0.99 in steps of 0.01.
 
-    The square root stands for the instrument's gain control, which lifts weak returns; the weakest
-    are reported with 0::
+    The square root models the gain control of the instrument, which amplifies weak returns; the
+    weakest are reported with 0::
 
         intensity = sqrt(power * range^2) * clip(ln(power / a) / ln(b / a), 0, 1)
         a = 6 min_power        b = 13 min_power

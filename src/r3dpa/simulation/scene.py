@@ -1,4 +1,4 @@
-"""What a scan is taken of: solids on the ground, weather, and how sensor and actors move.
+"""Scenes: solids on the ground, weather, and the motion of sensor and actors.
 
 A scene is a description; which effects it calls for is read from it (see ``effects``).
 """
@@ -55,7 +55,7 @@ class Semantic(IntEnum):
 
 
 class Material(IntEnum):
-    """What a surface is made of, as far as a laser beam of 905 nm can tell."""
+    """Material of a surface, in classes that differ at 905 nm."""
 
     ASPHALT = 0
     PAVING = 1
@@ -113,7 +113,6 @@ class Primitive:
     extinction_per_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         numbers = (*self.centre, *self.half_size, self.yaw_rad, *self.velocity_m_s, *self.grade)
         if not math.isfinite(sum(numbers)):
             raise ValueError(f"places, sizes, turns and speeds must be finite, got {self}")
@@ -132,7 +131,7 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the frame origin of the sensor is and how it is turned, in the world frame.
+    """Position and orientation of the sensor frame in the world frame.
 
     Applied to a vector of the sensor frame in the order roll (about x), pitch (about y, positive
     = nose down), heading (about z).
@@ -146,7 +145,6 @@ class Pose:
     roll_rad: float = 0.0  # right side down positive; both tilts together within 0.2
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self, "be finite", *(field.name for field in fields(self)))
         tilt_rad = math.hypot(self.pitch_rad, self.roll_rad)
         if tilt_rad > 0.2:
@@ -155,13 +153,12 @@ class Pose:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """How the sensor moves during the sweep."""
+    """Motion of the sensor during the sweep."""
 
     speed_m_s: float = 0.0  # along the heading
     yaw_rate_rad_s: float = 0.0  # counter-clockwise seen from above
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self, "be finite", "speed_m_s", "yaw_rate_rad_s")
 
 
@@ -189,7 +186,6 @@ class Weather:
     sun_azimuth_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.visibility_m >= 1:
             raise ValueError(
                 f"visibility_m must be 1 or greater (no fog is denser), got {self.visibility_m}"
@@ -202,11 +198,11 @@ class Weather:
 
 @dataclass(frozen=True)
 class WeatherPrior:
-    """Declared prior over the weather of a scene.
+    """Prior distribution of the weather of a scene.
 
-    What remains of the probability is fog, rain or snow, a third each. Visibility and rates are
-    drawn evenly on a logarithmic scale, the rest evenly. In rain the road is wet; a sun below the
-    horizon is night.
+    The remaining probability is fog, rain or snow, a third each. Visibility and rates are
+    log-uniform, the other values uniform. In rain the road is wet; a sun below the horizon is
+    night.
 
     Args:
         clear_dry: Probability of clear air and a dry road.
@@ -229,7 +225,6 @@ class WeatherPrior:
     clear_sky: float = 0.6
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self, "lie in [0, 1]", "clear_dry", "wet", "clear_sky")
         if self.clear_dry + self.wet > 1:
             raise ValueError(
@@ -245,7 +240,7 @@ class WeatherPrior:
                 )
 
     def draw(self, generator: np.random.Generator) -> Weather:
-        """One weather."""
+        """Sample the prior."""
         air, third, sky = generator.random(3)
         film_mm = generator.uniform(*self.water_film_mm)
         elevation_deg = generator.uniform(*self.sun_elevation_deg)
@@ -284,7 +279,7 @@ class Puddle(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """A scan's world."""
+    """The world of one scan."""
 
     primitives: tuple[Primitive, ...] = ()
     pose: Pose = Pose()  # of the sensor frame in the middle of the sweep
@@ -292,11 +287,10 @@ class Scene:
     weather: Weather = Weather()
     puddles: tuple[Puddle, ...] = ()  # where water stands on the ground, if the road is wet
     ego_body: tuple[Primitive, ...] = ()  # parts of the recording car in the sensor frame
-    ground_m: float = 0.0  # height of the level ground that lies under everything
+    ground_m: float = 0.0  # height of the level ground below all solids
     ground_reflectivity: float = 0.15  # of that ground: asphalt, labelled as road
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.ground_reflectivity <= 1:
             raise ValueError(f"reflectivity must lie in (0, 1], got {self.ground_reflectivity}")
         if not self.pose.z_m > self.ground_m:

@@ -1,4 +1,4 @@
-"""The spinning lidar that is simulated: its laser table, its limits and the rays of one turn."""
+"""Spinning lidars: laser table, limits, and the rays of one turn."""
 
 from __future__ import annotations
 
@@ -50,11 +50,10 @@ class Lasers:
     azimuth_offset_rad: tuple[float, ...]  # from the heading of the spinning head
     height_m: tuple[float, ...]  # optical centre above the frame origin
     lateral_m: tuple[float, ...]  # optical centre to the left of the beam
-    range_bias_m: tuple[float, ...]  # what the laser measures too much
+    range_bias_m: tuple[float, ...]  # excess of the measured range
     intensity_gain: tuple[float, ...]  # factor on its intensity
 
     def __post_init__(self) -> None:
-        """Check the values."""
         columns = {field.name: getattr(self, field.name) for field in fields(self)}
         lengths = {name: len(column) for name, column in columns.items()}
         if len(set(lengths.values())) > 1 or not self.inclination_rad:
@@ -89,7 +88,7 @@ class SpinningLidar:
     # Weakest power that is detected, m^-2: 10 % asphalt seen from 1.73 m vanishes at 50 m, see
     # ``effects.surface``.
     min_power: float = 1.43e-5
-    # Nearest range that is reported; the datasheet says 0.9 m, KITTI's scans hold nothing nearer.
+    # Smallest reported range, as in KITTI's scans; 0.9 m in the datasheet.
     min_range_m: float = 1.45
     max_range_m: float = 120.0
     divergence_rad: float = 2e-3  # full angle of the beam; 0 for a line
@@ -102,7 +101,6 @@ class SpinningLidar:
     return_mode: Literal["strongest", "dual"] = "strongest"  # or the two strongest of a shot
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.shots < 8:
             raise ValueError(f"shots must be at least 8 per turn, got {self.shots}")
         check_fields(
@@ -127,7 +125,7 @@ class SpinningLidar:
 
     @property
     def pulse_depth_m(self) -> float:
-        """Ranges that a pulse lights at a time: ``c * pulse_s / 2``."""
+        """Range interval illuminated by a pulse at a time: ``c * pulse_s / 2``."""
         return _LIGHT_M_S * self.pulse_s / 2
 
     @property
@@ -137,7 +135,7 @@ class SpinningLidar:
 
     @property
     def time_s(self) -> NDArray[np.float32]:
-        """When each shot is fired, ``(H, W)`` seconds from the middle of the sweep; read-only.
+        """Time of each shot, ``(H, W)`` seconds from the middle of the sweep; read-only.
 
         The head looks ahead in the middle of the sweep, turns counter-clockwise, and starts and
         ends looking backwards.
@@ -275,8 +273,8 @@ def _hdl64e_lasers(seed: int) -> Lasers:
 def _azimuth(lasers: Lasers, shots: int) -> NDArray[np.float64]:
     """Azimuth (H, W) of the beams.
 
-    A laser fires at head azimuth + offset, for every head azimuth of the turn; numbering the shots
-    by the azimuth of the beam leaves only the offset's rest within one step.
+    A laser fires at head azimuth + offset. Shots are numbered by the azimuth of the beam, so that
+    only the remainder of the offset within one step is left.
     """
     step = 2 * np.pi / shots
     return step * np.arange(shots) + (np.array(lasers.azimuth_offset_rad) % step)[:, None]

@@ -1,4 +1,4 @@
-"""Primitives as columns in the scene frame, and which rays of a turn can meet each of them.
+"""Primitives as columns in the scene frame, and the rays of a turn that can meet each.
 
 The *scene frame* is the sensor frame in the middle of the sweep, levelled by the pose's roll and
 pitch, so that z points straight up. Letters: N solids, H beams, W shots.
@@ -137,10 +137,10 @@ def pieces(index: int, windows: Windows, num_shots: int) -> list[tuple[slice, sl
     turn = first // num_shots * num_shots
     first, last = first - turn, last - turn
     beams = slice(*windows.beams[index])
-    found = [(beams, slice(first, min(last, num_shots)))]
+    parts = [(beams, slice(first, min(last, num_shots)))]
     if last > num_shots:
-        found.append((beams, slice(0, last - num_shots)))
-    return found
+        parts.append((beams, slice(0, last - num_shots)))
+    return parts
 
 
 class _Fan(NamedTuple):

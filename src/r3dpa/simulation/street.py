@@ -1,4 +1,4 @@
-"""Seeded endless streets: every block, actor and pose follows from (seed, drive, scan) alone."""
+"""Endless streets; every block, actor and pose is a function of (seed, drive, scan)."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class Street:
     Args:
         seed: Seed of the data set, 0 or greater.
         drive: Number of the drive, 0 or greater; each has a street of its own.
-        weather: Weather of all scans, or the prior from which one is drawn every 100 scans; None
-            for the default prior.
+        weather: Weather of all scans, or the prior that is sampled every 100 scans; None for the
+            default prior.
 
     """
 
@@ -68,7 +68,6 @@ class Street:
     weather: Weather | WeatherPrior | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self, "be 0 or greater", "seed", "drive")
 
     def scene(self, scan: int, sensor_height_m: float = 1.73) -> Scene:
@@ -121,7 +120,7 @@ class Street:
 
 @lru_cache(maxsize=256)
 def _block(seed: int, drive: int, block: int) -> Builder:
-    """What stands still in one block of 24 m, in world coordinates; not to be changed."""
+    """Static solids of one block of 24 m, in world coordinates; shared, do not modify."""
     course = course_of(seed, drive)
     first_instance = 1 + block % _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
     builder = Builder(course, course.section_of(block), first_instance)
@@ -142,7 +141,7 @@ def _block(seed: int, drive: int, block: int) -> Builder:
 
 
 def _pose(course: Course, scan: int, sensor_height_m: float) -> Pose:
-    """Where the sensor is: it follows the road, and the body of the car rocks a little."""
+    """Pose of the sensor: it follows the road, and the body of the car rocks a little."""
     s, lateral = course.position(scan), course.ego_lateral_m
     x, y, z = course.section(s).at(s, lateral)
     heading, _, slope = course.smooth(s)
@@ -207,7 +206,7 @@ def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
 
 @lru_cache(maxsize=1024)
 def _actor(seed: int, drive: int, stream: int, number: int) -> tuple[float, float, Body]:
-    """How far an actor is from its even place, along and across, and its body."""
+    """Offset of an actor from its regular place, along and across, and its body."""
     draw = generator_for(seed, "actor", drive, stream, number)
     kind = _streams(seed, drive)[stream].kind
     return draw.uniform(-0.3, 0.3), draw.normal(0.0, 0.08), kind(draw)

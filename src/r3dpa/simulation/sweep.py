@@ -1,4 +1,4 @@
-"""The state of one turn while it is simulated: rays, what they hit, what comes back.
+"""State of one simulated turn: rays, hits and echoes.
 
 Letters: R shots of the turn, beam after beam (R = H * W); M chosen rays.
 """
@@ -30,13 +30,13 @@ from r3dpa.simulation.solids import (
 #: Whether water can lie on each ``Material``: road, pavement, soil.
 IS_GROUND = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
 
-# Leaves are turned every way: mean of |cos| over a sphere.
+# Leaves have random orientation: mean of |cos| over a sphere.
 _FOLIAGE_COS = 0.5
 _BLOCK_RAYS = 16384
 
 
 class Origin(IntEnum):
-    """What made a point."""
+    """Origin of a point."""
 
     SURFACE = 0
     MIXED = 1
@@ -83,8 +83,8 @@ class Echoes:
 class Sweep:
     """One turn of the sensor in a scene; effects change it in place.
 
-    ``first`` is the strongest echo of each shot. It stays the first where the air weakens it below
-    the second: an instrument that records one echo knows of no other.
+    ``first`` is the strongest echo of each shot. It stays the first where the air attenuates it
+    below the second, so that single and dual return modes report the same first echo.
     """
 
     def __init__(self, scene: Scene, sensor: SpinningLidar) -> None:
@@ -113,7 +113,7 @@ class Sweep:
         return values.reshape(*values.shape[:-1], *self.shape)
 
     def cast(self) -> None:
-        """Find what the rays hit; every echo has power 1 until a surface gives it another."""
+        """Cast the rays; every echo has power 1 until an effect sets it."""
         depth, actor_time_s = (
             None if field is None else self.grid(field)
             for field in (self.optical_depth, self.actor_time_s)
@@ -145,7 +145,7 @@ class Sweep:
         return cosine
 
     def position(self, rays: RayIndex) -> Floats:
-        """Where rays meet the surface of their first echo, ``(3, M)`` in the scene frame."""
+        """Hit of the first echo of rays, ``(3, M)`` in the scene frame."""
         if isinstance(rays, slice):
             return self.start[:, rays] + self.first.range_m[rays] * self.direction[:, rays]
         # Much faster than indexing the second axis.
@@ -155,21 +155,21 @@ class Sweep:
         return towards
 
     def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
-        """For each solid the rays (M,) that can meet it, from its bounding box.
+        """Rays (M,) that can meet each solid, from its bounding box.
 
         ``actor_time_s``: ``(R,)`` when they meet moving ones; None in the middle of the sweep.
         """
-        found = [np.empty(0, dtype=np.int64)] * len(solids.shape)
-        if not found:
-            return found
+        near = [np.empty(0, dtype=np.int64)] * len(solids.shape)
+        if not near:
+            return near
         start, direction = self.grid(self.start), self.grid(self.direction)
         time_s = None if actor_time_s is None else self.grid(actor_time_s)
         windows = windows_of(solids, start, direction, self.sensor.max_range_m, time_s)
         every_ray = self.grid(np.arange(self.num_rays))
         for index in windows.order:
             parts = pieces(index, windows, self.shape[1])
-            found[index] = np.concatenate([every_ray[part].ravel() for part in parts])
-        return found
+            near[index] = np.concatenate([every_ray[part].ravel() for part in parts])
+        return near
 
     def all_near(self, solids: Solids, actor_time_s: Floats | None) -> NDArray[np.int64]:
         """Rays (M,) that can meet any of these solids, see ``rays_near``."""
@@ -208,7 +208,7 @@ class Sweep:
         return np.flatnonzero(IS_GROUND[self.material] & (self.first.surface >= GROUND))
 
     def of_material(self, material: Material) -> NDArray[np.int64]:
-        """Rays that hit a material of the scene; the recording car is matt, whatever it is of."""
+        """Rays that hit a material of the scene; the recording car counts as diffuse."""
         return np.flatnonzero((self.material == material) & (self.first.surface >= GROUND))
 
     def echoes(self) -> Iterator[Echoes]:
@@ -218,7 +218,7 @@ class Sweep:
             yield self.second
 
     def weakest_recorded(self) -> Floats:
-        """Power ``(R,)`` that an echo needs to be recorded beside those there are."""
+        """Power ``(R,)`` from which on a further echo is recorded."""
         if self.second is None:
             return self.first.power
         return np.minimum(self.first.power, self.second.power)
@@ -231,10 +231,10 @@ class Sweep:
         surface: NDArray[np.int32] | int,
         origin: NDArray[np.uint8] | int,
     ) -> None:
-        """Further echoes ``(M,)`` of different rays: a stronger one replaces the first.
+        """Add echoes ``(M,)`` of different rays: a stronger one replaces the first.
 
-        Of the echo that is left over and the second one, the stronger is the second. An echo of
-        power 0 is none.
+        The stronger of the remaining echo and the second one becomes the second. Echoes of power
+        0 are ignored.
         """
         offered = [
             np.broadcast_to(np.asarray(values), rays.shape)

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from r3dpa.simulation.scene import Material, Primitive, Semantic, Shape
 
 _PLATE_M = (0.02, 0.52, 0.12)
-# What is left of a pane or a mirror after all that goes through or away: dirt.
+# Diffuse reflectivity of panes and mirrors: dirt.
 DIRT = 0.0015
 _DARK, _SEATS = (0.0007, 0.02), (0.0004, 0.006)
 
@@ -20,7 +20,7 @@ _DARK, _SEATS = (0.0007, 0.02), (0.0004, 0.006)
 class Part(NamedTuple):
     """One solid of a body: centre and full size in metres, x forward, y left, z above the ground.
 
-    ``detail`` marks what is only worth its time near the sensor.
+    ``detail``: built near the sensor only.
     """
 
     centre: tuple[float, float, float]
@@ -63,8 +63,8 @@ def _pane(x: float, z: float, size: tuple[float, float, float], semantic: Semant
 def coat(draw: Generator) -> float:
     """Reflectivity of a coat of paint.
 
-    Under its clear coat a dark car sends hardly anything back to where it came from: at 5 m it
-    has an intensity of 0, at 15 m it is lost.
+    Under its clear coat a dark car returns little: at 5 m its intensity is 0, at 15 m it is not
+    detected.
     """
     if draw.random() < 0.45:
         return float(np.exp(draw.uniform(*np.log(_DARK))))
@@ -76,7 +76,7 @@ def _cabin(
 ) -> list[Part]:
     """A band of windows with seats behind it and a roof above.
 
-    Hardly anything comes back from inside: panes of vehicles absorb, seats are dark.
+    The inside returns little: panes of vehicles absorb, seats are dark.
     """
     seats_m = (0.9 * size[0], 0.9 * size[1], 0.95 * size[2])
     semantic, cloth = roof.semantic, float(np.exp(draw.uniform(*np.log(_SEATS))))
@@ -154,7 +154,7 @@ def bus(draw: Generator) -> Body:
 
 
 def vehicle(draw: Generator) -> Body:
-    """Whatever drives in a lane: mostly cars."""
+    """A vehicle of the traffic: mostly cars."""
     kind = draw.random()
     if kind < 0.76:
         return car(draw)
@@ -164,7 +164,7 @@ def vehicle(draw: Generator) -> Body:
 
 
 def parked_vehicle(draw: Generator) -> Body:
-    """What stands at a kerb: cars, sometimes a van."""
+    """A vehicle parked at a kerb: a car, sometimes a van."""
     return van(draw) if draw.random() < 0.08 else car(draw)
 
 
@@ -205,8 +205,8 @@ def person(draw: Generator) -> Body:
 def recording_car() -> tuple[Primitive, ...]:
     """Roof and rack of the recording car, a station wagon, in the frame of the sensor.
 
-    Source: boxes fitted to the shots that never return in scans of KITTI, whatever the scene:
-    5 % of all, in the lower 22 beams, mostly behind.
+    Source: boxes fitted to the shots without a return in all scans of KITTI: 5 % of all shots, in
+    the lower 22 beams, mostly behind.
     """
     look = (Semantic.EGO_VEHICLE, 0.1)
     parts = []

@@ -1,7 +1,7 @@
-"""What happens between the ray cast and the stored scan.
+"""Physical effects between the ray cast and the stored scan.
 
-Each effect is a frozen dataclass with its equation in the docstring. A scene is a description;
-each effect reads from it whether it is called for, picks its rays, and changes nothing else.
+Each effect is a frozen dataclass with its equation in the docstring. It decides from the scene
+whether it runs, selects its rays, and changes nothing else.
 """
 
 from r3dpa.simulation.effects.base import Effect

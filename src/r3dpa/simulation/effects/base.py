@@ -1,4 +1,4 @@
-"""What an effect is and when it runs."""
+"""Base class of the effects."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ Switch = Literal["auto", "on", "off"]
 
 
 class Effect(ABC):
-    """One physical effect: what calls for it, which rays it touches, what it does to them.
+    """One physical effect: the condition under which it runs, its rays, and the change to them.
 
-    ``apply`` computes from the scene and the sensor alone, so that an effect that is switched on
-    in a scene that does not call for it changes no bit of the scan.
+    ``apply`` depends on the scene and the sensor only: an effect that is switched on in a scene
+    that does not call for it changes no bit of the scan.
     """
 
     @abstractmethod
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Why the scene, or the instrument, calls for the effect; None if neither does."""
+        """Reason why the scene or the instrument calls for the effect; None if neither does."""
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """The rays that the effect may change, by default all; the others are left alone."""
+        """Rays that the effect may change, by default all."""
         return slice(None)
 
     @abstractmethod

@@ -1,6 +1,6 @@
-"""What a beam of finite width sees of an edge.
+"""Mixed pixels: beams of finite width at edges.
 
-Six points stand for the rim of the beam's footprint, on a ring of sqrt(2/3) of its radius. Letters:
+The rim of the beam's footprint is six points on a ring of sqrt(2/3) of its radius. Letters:
 M chosen rays, K pairs of a ray and a surface that its rim may meet.
 """
 
@@ -36,7 +36,7 @@ _SHARES = np.array([2, 1, 1, 1, 1, 1, 1], dtype=np.float32)[:, None] / 8
 
 
 class _Targets(NamedTuple):
-    """What the rims of M rays may meet: pairs, the first M of which are each ray's own surface."""
+    """Candidate pairs of ray and surface; the first M are each ray's own surface."""
 
     row: Indices  # (K,) number of the ray
     surface: Surfaces  # (K,)
@@ -56,24 +56,23 @@ class _Peak(NamedTuple):
 
 
 class MixedPixels(Effect):
-    """A beam that meets an edge with a part of its width sends back an echo of each side.
+    """Echoes of both sides of an edge, where a beam meets it with a part of its width.
 
-    A ray stands for the axis of a beam whose full angle is ``divergence_rad``. Where its footprint
-    reaches over the edge of a surface with another one more than 0.3 m behind it, or nothing, six
-    rays are cast around it, on a ring of sqrt(2/3) of the beam's radius. Of the beam's power the
-    axis stands for 1/4 and each of the ring for 1/8, which integrates over a uniform disk. A
-    surface that fills a share of the footprint returns that share of its power.
+    A ray is the axis of a beam whose full angle is ``divergence_rad``. Where its footprint reaches
+    over the edge of a surface with another one more than 0.3 m behind it, or nothing, six rays are
+    cast around it, on a ring of sqrt(2/3) of the beam's radius. The axis has the weight 1/4 and
+    each point of the ring 1/8, which integrates over a uniform disk. A surface that fills a share
+    of the footprint returns that share of its power.
 
     Echoes nearer to each other than ``pulse_depth_m`` (0.75 m at 5 ns) merge to one at their
-    energy-weighted range. The strongest becomes the first echo, the next is offered as second.
+    energy-weighted range. The strongest becomes the first echo, the next one the second.
     A pole of width w is met by ``(w + sqrt(2/3) * footprint) / pitch`` shots of a beam, some of
     them too weak to be detected.
 
     The ring is tested against the surfaces that the ray and its four neighbours meet, with the
-    power that these get, and against solids so thin that all rays may miss them. Ground ends
-    nowhere: it makes an edge only behind others. Leaves have no edge either, so they fill the
-    beam whose axis meets them and are not met by others. Rays that a pane or a mirror has sent
-    elsewhere keep their echo.
+    power of those echoes, and against solids so thin that all rays may miss them. Ground has no
+    edge of its own: it only appears behind others. Leaves have no edge either: they fill the beam
+    whose axis meets them and no other. Rays diverted by a pane or a mirror keep their echo.
 
     Real scans of an HDL-64E have returns between two smooth surfaces up to a gap of 0.75 to 0.9 m
     and few beyond, as a pulse of 5 to 6 ns gives.
@@ -83,24 +82,23 @@ class MixedPixels(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A beam that widens, and solids with edges."""
         if not sensor.divergence_rad or not scene.primitives:
             return None
         return f"beam of {1e3 * sensor.divergence_rad:g} mrad, {len(scene.primitives)} solids"
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those whose rim reaches over an edge, and those beside a thin solid."""
+        """Rays whose rim reaches over an edge, and rays beside a thin solid."""
         chosen = np.zeros(sweep.num_rays, dtype=bool)
         if sweep.sensor.divergence_rad and sweep.scene.primitives:
             chosen[_at_edges(sweep)] = True
             chosen[_beside_thin_solids(sweep)[0]] = True
-        found = np.flatnonzero(chosen)
-        origin, surface = sweep.first.origin[found], sweep.first.surface[found]
+        index = np.flatnonzero(chosen)
+        origin, surface = sweep.first.origin[index], sweep.first.surface[index]
         straight = (origin == Origin.SURFACE) | (origin == Origin.FOLIAGE)
-        return found[straight & (surface != EGO_BODY)]
+        return index[straight & (surface != EGO_BODY)]
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Look at each footprint and record its peaks."""
+        """Replace the echoes of each footprint by its peaks."""
         chosen = np.arange(sweep.num_rays)[rays]
         if not len(chosen):
             return
@@ -111,7 +109,7 @@ class MixedPixels(Effect):
         with np.errstate(invalid="ignore"):
             edge = (met != axis) & ~(np.abs(rim_m - axis_m) <= _EDGE_M)
         at = np.flatnonzero(edge.any(axis=0))
-        # What the axis meets is measured there: its own slope makes no edge.
+        # The hit of the axis is measured there: the surface's own slope makes no edge.
         range_m = np.vstack([axis_m, np.where(met == axis, axis_m, rim_m)])[:, at]
         met = np.vstack([axis, met])[:, at]
         first, second = _peaks(targets, met, range_m, sweep.sensor.pulse_depth_m)
@@ -161,7 +159,7 @@ def _targets_of(sweep: Sweep, rays: Indices) -> _Targets:
     ]
     bounds = np.cumsum([0, *(len(layer[0]) for layer in layers)])
     row, surface, seen_by = (np.concatenate(columns) for columns in zip(*layers, strict=True))
-    # Whatever has no end fills the beam of the ray whose axis meets it.
+    # Surfaces without an edge fill the beam of the ray whose axis meets them.
     range_m = np.repeat(own_m[row][None], len(_RING_LEFT), axis=0)
     tested = np.append(np.flatnonzero(ends), np.arange(len(rays), len(row)))
     range_m[:, tested] = _rim_ranges(sweep, rays[row[tested]], surface[tested])
@@ -268,7 +266,7 @@ def _record(
             old[rays[seen]] = none
     again = np.flatnonzero(next_one.power > 0)
     sweep.offer(rays[again], *columns(next_one, again))
-    # What is known of the surface goes with it.
+    # The properties of the surface change with it.
     hit = rays[seen]
     sweep.cos_incidence[hit] = targets.cosine[strongest.target[seen]]
     sweep.reflectivity[hit], sweep.material[hit] = sweep.look_of(first.surface[hit])
@@ -392,12 +390,12 @@ def _jumps(sweep: Sweep) -> tuple[Indices, Indices, Floats, Floats]:
             (np.diff(closed_m), rays, np.roll(rays, -1, axis=1), _RING_LEFT.max(), 0),
             (np.diff(range_m, axis=0), rays[:-1], rays[1:], 0, _RING_UP.min()),
         )
-    found = []
+    pairs = []
     for rise_m, here, there, left, up in sides:
         jump = np.abs(rise_m) > _EDGE_M
         rises, here, there = rise_m[jump] > 0, here[jump], there[jump]
         sign = np.where(rises, np.float32(1), np.float32(-1))
         near, far = np.where(rises, here, there), np.where(rises, there, here)
-        found.append((near, far, sign * left, sign * up))
-    near, far, left, up = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        pairs.append((near, far, sign * left, sign * up))
+    near, far, left, up = (np.concatenate(columns) for columns in zip(*pairs, strict=True))
     return near, far, left, up

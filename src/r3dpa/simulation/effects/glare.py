@@ -1,4 +1,4 @@
-"""What dazzles the receiver: the glare of a low sun, and sheeting beside a shot."""
+"""Glare of the receiver: a low sun, and sheeting beside a shot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _AIR_DEPTH = 0.1
 
 @dataclass(frozen=True)
 class SunGlare(Effect):
-    """Near the sun its light raises the detection threshold and makes returns of nothing.
+    """Sunlight raises the detection threshold near the sun and causes false returns.
 
     At the angle g from the sun, within 10 degrees of it, and the elevation e::
 
@@ -32,31 +32,30 @@ class SunGlare(Effect):
         min_power -> min_power * (1 + rise * glare)
         a return of noise with the probability noise * glare, at any range, of twice that power
 
-    The angle is scaled so that the effect ends at 10 degrees without a jump; the second factor,
-    what the air leaves of the sun's light, dims it towards the horizon. A sun that a solid hides
-    from the sensor does not glare.
+    The angle is scaled so that the effect ends at 10 degrees without a jump; the second factor is
+    the transmittance of the air, which falls towards the horizon. A sun that is hidden by a solid
+    has no effect.
 
-    Source: Kasten and Young 1989 for the air on the way.
+    Source: Kasten and Young 1989 for the air mass.
 
     Args:
-        rise: Rise of the threshold in the direction of a sun that no air dims.
-        noise: Probability of a return of noise there.
+        rise: Rise of the threshold in the direction of the sun without attenuation by air.
+        noise: Probability of a false return in that direction.
     """
 
     rise: float = 3.0
     noise: float = 1e-3
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A sun in a clear sky, near the highest beam or lower."""
         elevation_deg = scene.weather.sun_elevation_deg
         tilt_rad = math.hypot(scene.pose.pitch_rad, scene.pose.roll_rad)
         highest_deg = math.degrees(sensor.lasers.inclination_rad[0] + tilt_rad)
-        # The hundredth of a degree is for what float32 does to the rays.
+        # 0.01 degrees of slack for the rounding of the rays to float32.
         within = elevation_deg <= highest_deg + _SUN_REACH_DEG + 0.01
         return f"sun {elevation_deg:.1f} deg high" if _shines(scene.weather) and within else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those within 10 degrees of a sun that is seen."""
+        """Rays within 10 degrees of a visible sun."""
         if not _shines(sweep.scene.weather) or _is_hidden(sweep):
             return np.empty(0, dtype=np.int64)
         return np.flatnonzero(
@@ -64,7 +63,7 @@ class SunGlare(Effect):
         )
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Raise the thresholds and offer the noise."""
+        """Raise the thresholds and add the false returns."""
         indices = np.arange(sweep.num_rays)[rays]
         elevation_deg = sweep.scene.weather.sun_elevation_deg
         haze = 0.50572 * (elevation_deg + 6.07995) ** -1.6364
@@ -115,40 +114,39 @@ def _is_hidden(sweep: Sweep) -> bool:
 
 @dataclass(frozen=True)
 class Blooming(Effect):
-    """An echo of sheeting spills into shots that pass beside it: a halo at the same range.
+    """Halo of sheeting: its echo spills into neighbouring shots at the same range.
 
     A shot at the angle a from one that hits sheeting with power P receives::
 
-        with the chance  exp(-(a / halo)^2) * min(1, sqrt(P / P_sat))     an echo of  spill * P
+        with probability exp(-(a / halo)^2) * min(1, sqrt(P / P_sat))     an echo of  spill * P
 
-    out to 2.5 times the halo; of several such shots the likeliest counts. ``P_sat`` is the
-    strongest echo that a matt surface gives: that of a white one where the receiver first sees the
-    whole beam, ``1 / overlap_range_m^2``. Sheeting that is seen straight on stays above it out to
-    15 times that range (74 m), with a halo of one angle; beyond, and for weaker or tilted
-    sheeting, the halo thins with 1 / R.
+    out to 2.5 times the halo; of several such shots the most probable one is used. ``P_sat`` is the
+    strongest echo of a diffuse surface: a white one at the range where the receiver first sees the
+    whole beam, ``1 / overlap_range_m^2``. Sheeting at normal incidence exceeds it up to 15 times
+    that range (74 m), with a halo of constant angle; beyond, and for weaker or tilted sheeting,
+    the probability falls with 1 / R.
 
     Source: bright runs in 30 scans of KITTI's HDL-64E have one dimmer shot at the same range on
     either side (median at all ranges from 5 to 80 m; the mean falls beyond 45 m), of an intensity
-    of 0.45 to 0.8: these agree with the default halo and give the spill. The form is chosen.
+    of 0.45 to 0.8: these agree with the default halo and give the spill. The form is an assumption.
 
     Args:
-        halo_deg: Angle at which the chance has fallen to 1 / e, in (0, 5].
-        spill: Share of the power that a neighbouring shot receives.
+        halo_deg: Angle at which the probability has fallen to 1 / e, in (0, 5].
+        spill: Share of the power received by a neighbouring shot.
     """
 
     halo_deg: float = 0.2
     spill: float = 2e-3
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids of sheeting."""
         return sheets(scene)
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """The neighbours of those with an echo of sheeting."""
+        """Neighbours of the rays that hit sheeting."""
         return self._likeliest(sweep)[0]
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Draw which neighbours are dazzled and offer them the echo."""
+        """Draw the neighbours that receive the echo."""
         beside, source, chance = self._likeliest(sweep)
         dazzled = draws.uniform(beside) < chance
         beside, source = beside[dazzled], source[dazzled]
@@ -157,7 +155,7 @@ class Blooming(Effect):
         sweep.offer(beside, range_m, power, first.surface[source], Origin.BLOOMING)
 
     def _likeliest(self, sweep: Sweep) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-        """Rays beside sheeting, the ray that each is most likely dazzled with, and the chance."""
+        """Rays beside sheeting, the most probable source ray of each, and the probability."""
         is_sheet = sweep.of_surface(
             [p.material is Material.RETROREFLECTOR for p in sweep.scene.primitives], 0, bool
         )
@@ -182,7 +180,7 @@ class Blooming(Effect):
 def _pairs(
     rays: NDArray[np.int64], sweep: Sweep, reach_rad: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rays, and shots and beams around each that contain all within ``reach_rad``, as pairs."""
+    """Pairs of a ray and a neighbour; they contain all neighbours within ``reach_rad``."""
     num_beams, num_shots = sweep.shape
     lasers = np.array(sweep.sensor.lasers.inclination_rad)
     steepest = min(np.abs(lasers).max() + reach_rad, math.radians(85))

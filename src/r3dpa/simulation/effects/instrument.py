@@ -1,4 +1,4 @@
-"""What the instrument detects of the echoes, and how it measures them."""
+"""Detection and measurement of echoes by the instrument."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ class DualReturn(Effect):
 
     ::
 
-        second = the strongest echo but the first, where |range_second - range_first| > 1 m
+        second = the next strongest echo with |range_second - range_first| > 1 m
 
-    The second echoes are those that other effects find on the way: behind a pane, beside an edge,
-    behind a drop. An instrument in the mode "strongest" does not report them.
+    Second echoes come from other effects: behind a pane, beside an edge, behind a drop. An
+    instrument in the mode "strongest" does not report them.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """An instrument in dual mode."""
         return "instrument in dual mode" if sensor.return_mode == "dual" else None
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
@@ -46,12 +45,11 @@ class SoftRaydrop(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """An instrument whose threshold varies."""
         spread = sensor.threshold_spread
         return f"threshold varies by {spread:g} e-fold" if spread > 0 else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those with an echo near the threshold."""
+        """Rays with an echo near the threshold."""
         reach = np.exp(np.float32(MAX_SPREADS * sweep.sensor.threshold_spread))
         near = np.zeros(sweep.num_rays, dtype=bool)
         for echoes in sweep.echoes():
@@ -61,7 +59,6 @@ class SoftRaydrop(Effect):
         return np.flatnonzero(near)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Scale the thresholds of these rays."""
         drawn = draws.normal(rays).clip(-MAX_SPREADS, MAX_SPREADS)
         sweep.min_power[rays] *= np.exp(np.float32(sweep.sensor.threshold_spread) * drawn)
 
@@ -78,11 +75,10 @@ class DetectionLimit(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Every instrument has a limit."""
         return "base"
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Put undetected echoes at infinity."""
+        """Set the range of undetected echoes to infinity."""
         for echoes in sweep.echoes():
             range_m = echoes.range_m[rays]
             lost = echoes.power[rays] < sweep.min_power[rays]
@@ -91,7 +87,7 @@ class DetectionLimit(Effect):
 
 
 class RangeNoise(Effect):
-    """Ranges scatter, weak echoes more than strong ones, come in steps, and are never negative.
+    """Range noise, larger for weak echoes, and rounding to steps; ranges are never negative.
 
     ::
 
@@ -101,17 +97,14 @@ class RangeNoise(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """An instrument with noise or steps."""
         if not sensor.range_sigma_m and not sensor.weak_range_sigma_m and not sensor.range_step_m:
             return None
         return f"sigma {sensor.range_sigma_m:g} m, steps of {sensor.range_step_m:g} m"
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those with an echo."""
         return np.flatnonzero(np.isfinite(sweep.first.range_m))
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Add the noise and round."""
         sensor = sweep.sensor
         for echoes in sweep.echoes():
             drawn = draws.normal(rays)
@@ -128,18 +121,17 @@ class RangeNoise(Effect):
 
 
 class LaserCalibration(Effect):
-    """Each laser has its own range bias and gain.
+    """Range bias and gain of each laser.
 
     ::
 
         range -> range + bias        power -> power * gain^2
 
-    because the stored intensity is the root of the power. Both come after the noise: they are what
-    the calibration leaves in ranges that have been measured and rounded.
+    because the stored intensity is the root of the power. Both are applied after the noise: they
+    are the residual errors of calibration in ranges that have been measured and rounded.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A laser table with biases or gains."""
         biased = sum(bias != 0 for bias in sensor.lasers.range_bias_m)
         weighted = sum(gain != 1 for gain in sensor.lasers.intensity_gain)
         called = biased or weighted

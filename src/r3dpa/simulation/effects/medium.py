@@ -1,12 +1,12 @@
-"""Fog and spray: droplets too many to tell apart, and what all effects of the air share.
+"""Fog and spray: dense clouds of droplets; functions shared by all effects of the air.
 
-The receiver of a real instrument sees little of its beam close by. With the overlap ``xi`` of the
-two that grows as the square up to ``r0 = overlap_range_m``, the echo of a scatterer goes with::
+Beam and field of view of the receiver overlap only partly at short range. With an overlap
+``xi`` that grows as the square up to ``r0 = overlap_range_m``, the echo of a scatterer goes as::
 
     xi(r) / r^2 = min(1, (r / r0)^2) / r^2 = 1 / max(r, r0)^2
 
-Without it the nearest metres of fog would outshine every target. Soft echoes depend on ``r0`` and
-backscatter together only, so that ``r0`` also absorbs the factor of pi that lies between a
+Without it the nearest metres of fog would outshine every target. Soft echoes depend only on the
+combination of ``r0`` and backscatter, so that ``r0`` also absorbs the factor of pi between a
 backscatter coefficient and a diffuse reflectivity.
 """
 
@@ -38,8 +38,8 @@ _CLEARANCE_M = 0.2
 
 
 def attenuate(sweep: Sweep, extinction_per_m: float) -> None:
-    """Weaken every echo of the turn by its way there and back."""
-    # Not 0 in float32 either, which times an infinite range would be no number.
+    """Attenuate every echo of the turn along its path, both ways."""
+    # Above 0 in float32: 0 times an infinite range would be NaN.
     twice = np.float32(max(2 * extinction_per_m, 1e-30))
     for echoes in sweep.echoes():
         echoes.power *= np.exp(-twice * echoes.range_m)
@@ -51,25 +51,25 @@ def overlap_by_square(range_m: NDArray[np.floating], sensor: SpinningLidar) -> N
 
 
 def range_edges(sensor: SpinningLidar, step_m: float) -> NDArray[np.float64]:
-    """Ranges from the nearest to the farthest that is reported, in even steps of about a size."""
+    """Even steps of about ``step_m`` from the smallest to the largest reported range."""
     num = math.ceil((sensor.max_range_m - sensor.min_range_m) / step_m)
     return np.linspace(sensor.min_range_m, sensor.max_range_m, num + 1)
 
 
 def steps_before_target(sweep: Sweep, edges: NDArray[np.float64]) -> Floats:
-    """How many steps of ``edges`` (K,) lie before each ray's strongest echo, ``(R,)``."""
+    """Number of steps of ``edges`` (K,) before each ray's strongest echo, ``(R,)``."""
     target = np.minimum(sweep.first.range_m, np.float32(edges[-1]))
     steps = (target - np.float32(edges[0])) * np.float32(1 / (edges[1] - edges[0]))
     return steps.clip(0, len(edges) - 1)
 
 
 def all_rays(called: bool) -> RayIndex:
-    """All rays, or none."""
+    """Index of all rays, or of none."""
     return slice(None) if called else _NO_RAYS
 
 
 class Fog(Effect):
-    """Droplets too many to tell apart weaken every echo and make a soft one of their own.
+    """Fog attenuates every echo and adds a soft echo of its own.
 
     With the meteorological optical range MOR, the speed of light c and the pulse length tau::
 
@@ -79,26 +79,24 @@ class Fog(Effect):
                    pulse, s = r - c tau / 4 .. r + c tau / 4
 
     A ray's soft echo has the largest W before its target, and is kept if stronger than the hard
-    one. Its range is drawn with the density W before the target: fog is turbulent, and the peak of
-    a waveform that is nearly flat lies anywhere on it.
+    one. Its range is drawn with the density W before the target: fog is turbulent, and the
+    waveform is nearly flat, so its peak may lie anywhere.
 
-    Extinction at MOR 50 m leaves 2.75 % of the power of a target at 30 m. At every finite MOR some
-    echo is weakened, so every finite MOR calls for the effect.
+    Extinction at MOR 50 m leaves 2.75 % of the power of a target at 30 m. The effect runs at every
+    finite MOR.
 
     Source: Rasshofer et al. 2011 and Hahner et al., ICCV 2021, for both coefficients.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A finite visibility."""
         visibility_m = scene.weather.visibility_m
         return f"visibility of {visibility_m:g} m" if math.isfinite(visibility_m) else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """All, in fog."""
         return all_rays(math.isfinite(sweep.scene.weather.visibility_m))
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Weaken the echoes and offer the soft ones."""
+        """Attenuate the echoes and add the soft ones."""
         sensor, visibility_m = sweep.sensor, sweep.scene.weather.visibility_m
         extinction = math.log(20) / visibility_m
         attenuate(sweep, extinction)
@@ -119,7 +117,7 @@ class Fog(Effect):
 def soft_waveform(
     visibility_m: float, sensor: SpinningLidar
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reported ranges ``(K,)`` and the power ``(K,)`` that fog sends back from there, m^-2."""
+    """Reported ranges ``(K,)`` and power ``(K,)`` of the backscatter from there, m^-2."""
     extinction, half_pulse_m = math.log(20) / visibility_m, sensor.pulse_depth_m / 2
     edges = range_edges(sensor, _FOG_STEP_M)
     everywhere = np.arange(0.0, sensor.max_range_m + half_pulse_m + _FOG_STEP_M, _FOG_STEP_M)
@@ -132,17 +130,17 @@ def soft_waveform(
 
 @dataclass(frozen=True)
 class Spray(Effect):
-    """Fast vehicles on a wet road draw a plume of droplets behind them.
+    """Plumes of droplets behind fast vehicles on a wet road.
 
-    The plume is a box as wide as the vehicle and 1.8 m high from the road on that begins at its
-    rear and holds what was thrown up in the last 0.6 s, at most 12 m. With the speed v and the
-    depth w of the water, the air in it has the extinction::
+    The plume is a box from the rear of the vehicle, as wide as the vehicle, 1.8 m high from the
+    road, and as long as the path of the last 0.6 s, at most 12 m. With the speed v and the depth w
+    of the water, its extinction is::
 
         extinction = max_extinction * clip((v - 10 m/s) / 10 m/s, 0, 1) * clip(w / 1.2 mm, 0, 1)
 
-    Over the path L within the box, echoes from behind are weakened by exp(-2 extinction L), and a
-    soft echo as of fog (backscatter / extinction = 0.046 / ln 20) comes from its near side: at
-    the depth s with the density exp(-2 extinction s), of the power::
+    Over the path L within the box, echoes from behind are attenuated by exp(-2 extinction L), and
+    a soft echo as of fog (backscatter / extinction = 0.046 / ln 20) is added near its near side:
+    at the depth s with the density exp(-2 extinction s), of the power::
 
         backscatter * min(c tau / 2, L) * xi(r) / r^2
 
@@ -156,18 +154,17 @@ class Spray(Effect):
     max_extinction_per_m: float = 0.2
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A wet road with a fast vehicle on it."""
         film_mm = scene.weather.water_film_mm
         return f"fast vehicles on {film_mm:.2g} mm of water" if _plumes(scene) else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those whose window meets a plume."""
+        """Rays whose window meets a plume."""
         scene = sweep.scene
         boxes = solids_of(_plumes(scene), scene.pose, scene.ground_m)
         return sweep.all_near(boxes, sweep.time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Weaken the echoes from behind each plume and offer its own."""
+        """Attenuate the echoes from behind each plume and add its own."""
         sensor, scene, boxes = sweep.sensor, sweep.scene, _plumes(sweep.scene)
         solids = solids_of(boxes, scene.pose, scene.ground_m)
         drawn = draws.uniform(slice(None))
@@ -211,7 +208,7 @@ def _plumes(scene: Scene) -> tuple[Primitive, ...]:
 def _around(
     solids: Solids, index: int, sweep: Sweep, rays: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Floats]:
-    """Those rays that meet a box as seen from above, and where they start, seen from the box."""
+    """Rays that meet a box as seen from above, and their start relative to the box."""
     direction, shift = sweep.direction[:2, rays], solids.velocity[index][:, None]
     to_centre = solids.centre[index, :2, None] + shift * sweep.time_s[rays]
     to_centre -= sweep.start[:2, rays]

@@ -1,4 +1,4 @@
-"""Effects that move rays and solids while the head turns, and what stands in the way."""
+"""Motion of the sensor and of solids during the sweep; foliage and the recording car."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from r3dpa.simulation.sweep import Origin, Sweep
 
 
 class RollingShutter(Effect):
-    """The sensor drives on while it turns, and its points are not corrected for it.
+    """Distortion by the motion of the sensor during the sweep; the points are not corrected.
 
     At time t from the middle of the sweep, with speed v and yaw rate w, a shot starts and points::
 
         position = v / w * (sin(w t), 1 - cos(w t))        heading = w t
 
-    while the point is stored as if the sensor had stood still: at 50 km/h the two ends of the
+    while the point is stored as if the sensor had stood still. At 50 km/h the two ends of the
     sweep, which meet behind the car, differ by 1.39 m.
 
     Source: raw scans of KITTI-360 are not motion-compensated; its development kit "curls" them.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A moving or turning sensor."""
         motion = scene.motion
         if not motion.speed_m_s and not motion.yaw_rate_rad_s:
             return None
@@ -60,7 +59,7 @@ class RollingShutter(Effect):
 
 
 class MovingActors(Effect):
-    """A moving solid is met where it is when the shot is fired.
+    """Position of moving solids at the time of each shot.
 
     ::
 
@@ -70,50 +69,48 @@ class MovingActors(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """A solid that moves."""
         count = sum(any(p.velocity_m_s) for p in scene.primitives)
         return f"{count} moving solids" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those whose azimuth window meets a moving solid at any time of the sweep."""
+        """Rays whose azimuth window meets a moving solid at any time of the sweep."""
         return sweep.all_near(
             subset(sweep.solids, np.any(sweep.solids.velocity, axis=1)), sweep.time_s
         )
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Tell the ray cast when these rays are fired."""
+        """Set the firing time of these rays for the ray cast."""
         sweep.actor_time_s = np.zeros_like(sweep.time_s)
         sweep.actor_time_s[rays] = sweep.time_s[rays]
 
 
 class FoliageOcclusion(Effect):
-    """Crowns, meadows and wire mesh are media: a ray gets into them, and sometimes through them.
+    """Penetration of rays into media: crowns, meadows and wire mesh.
 
     With the extinction k per metre, the depth s at which a leaf, a blade or a wire is hit has the
     density::
 
         p(s) = k exp(-k s)        mean depth 1 / k
 
-    and a ray that leaves the solid first goes on. Successive solids are independent, as a process
-    without memory asks for.
+    and a ray that leaves the solid before that depth continues. Successive solids are independent:
+    the process has no memory.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids with an extinction."""
         count = sum(p.extinction_per_m > 0 for p in scene.primitives)
         return f"{count} solids of leaves, grass or mesh" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those whose window meets foliage, where it is when they are fired."""
+        """Rays whose window meets foliage at the time of the shot."""
         return sweep.all_near(subset(sweep.solids, sweep.solids.extinction > 0), sweep.actor_time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Draw for the ray cast how deep each ray gets."""
+        """Draw the optical depth of each ray for the ray cast."""
         sweep.optical_depth = draws.exponential(slice(None))
 
 
 class EgoOcclusion(Effect):
-    """The recording car hides what lies behind its roof; the mask is the same in every scan.
+    """Occlusion by the roof of the recording car; the mask is the same in every scan.
 
     ::
 
@@ -121,15 +118,13 @@ class EgoOcclusion(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Parts of the car in the scene."""
         return f"{len(scene.ego_body)} parts of the recording car" if scene.ego_body else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Rays that meet the car."""
         return _ego_mask(sweep.scene.ego_body, sweep.sensor).rays
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Put the car's surface before whatever the rays hit."""
+        """Replace farther hits by the surface of the car."""
         mask = _ego_mask(sweep.scene.ego_body, sweep.sensor)
         nearer = mask.range_m < sweep.first.range_m[mask.rays]
         hit = mask.rays[nearer]
@@ -143,7 +138,7 @@ class EgoOcclusion(Effect):
 
 
 class _EgoMask(NamedTuple):
-    """The M rays that meet the car, and what they meet; all arrays are ``(M,)``."""
+    """The M rays that meet the car, and their hits; all arrays are ``(M,)``."""
 
     rays: NDArray[np.int64]
     range_m: Floats
@@ -154,7 +149,6 @@ class _EgoMask(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMask:
-    """Made once per rig."""
     body = solids_of(ego_body, Pose(z_m=0.0), ground_m=-1e6)
     origin, direction = sensor.rays
     range_m, surface = cast(body, origin, direction, sensor.max_range_m)

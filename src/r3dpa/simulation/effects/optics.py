@@ -1,6 +1,6 @@
-"""Surfaces that let the beam through or throw it on: glass, polished metal, water.
+"""Transmission and mirror reflection: glass, polished metal, water.
 
-Secondary rays go one step: what they meet counts as matt, be it glass, metal or sheeting again.
+Secondary rays go one step: every surface that they meet is treated as diffuse.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
 from r3dpa.simulation.sweep import Origin, Sweep
 
-# A pane belongs to the wall that it is this close to.
-_FASTENED_M = 0.25
+# Largest distance of a pane from the wall that it belongs to.
+_ATTACHED_M = 0.25
 # Water stands only where the normal of the ground is this close to upright.
 _LEVEL_COS = 0.9
 
@@ -45,10 +45,10 @@ def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
 
 @dataclass(frozen=True)
 class Glass(Effect):
-    """Of a pane one sees the dirt, what is behind it, or what it mirrors; the strongest wins.
+    """Glass returns the strongest of three echoes: its dirt, the object behind, the mirror image.
 
-    A pane has two surfaces of reflectance F; light that runs to and fro between them included, it
-    lets through and mirrors::
+    A pane has two surfaces of reflectance F. With all reflections between them, its transmittance
+    and reflectance are::
 
         T = (1 - F) / (1 + F)        1 - T = 2 F / (1 + F)
 
@@ -59,10 +59,10 @@ class Glass(Effect):
         behind    T^2 * surface_power(object)              0.843 of it at normal incidence
         mirrored  (1 - T)^2 * surface_power(object)        at the first direction
 
-    A solid of glass that is nowhere thin is a hollow shell, such as a cabin: a ray that leaves it
-    again passes a second pane. A thin pane fastened to a closed solid of the same instance is a
-    window: through it the solid is seen from inside. The glint of a pane that faces the sensor to
-    within the beam's divergence is left out.
+    A thick solid of glass is a hollow shell, such as a cabin: a ray that leaves it passes a second
+    pane. A thin pane attached to a closed solid of the same instance is a window: through it the
+    solid is seen from inside. The glint of a pane that faces the sensor to within the beam's
+    divergence is not modelled.
 
     Args:
         index: Refractive index of the glass.
@@ -73,19 +73,17 @@ class Glass(Effect):
     pane_m: float = 0.1
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids of glass."""
         count = sum(p.material is Material.GLASS for p in scene.primitives)
         return f"{count} panes and cabins of glass" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those that hit glass."""
         return sweep.of_material(Material.GLASS)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Look behind the panes, then into the mirror."""
+        """Add the echoes from behind the panes, then the mirrored ones."""
         struck = _struck(sweep, rays)
         is_shell = 2 * sweep.solids.half_size[struck.surface].min(axis=1) >= self.pane_m
-        hollow = np.where(is_shell, NO_SURFACE, _fastened_to(sweep, struck.surface))
+        hollow = np.where(is_shell, NO_SURFACE, _attached_solid(sweep, struck.surface))
         passed = self._transmittance(_cosine(struck.direction, struck.normal))
         seen = _look(sweep, struck, struck.direction, hollow.astype(np.int32))
         two_way = passed * passed
@@ -115,14 +113,14 @@ class Glass(Effect):
 
 @dataclass(frozen=True)
 class PolishedMetal(Effect):
-    """Polished metal shows what it mirrors, at the first direction and the length of the path.
+    """Mirror images in polished metal, at the first direction and the length of the path.
 
     With the reflectance q, and ``surface_power`` along the whole path::
 
         mirrored  q^2 * surface_power(object)        direct  (1 - q) * (the metal's own echo)
 
-    so that the image of a point lies where a flat mirror shows it. Curved metal mirrors as the
-    plane that touches it; that it spreads the beam is left out.
+    so that the image of a point lies where a flat mirror shows it. Curved metal mirrors as its
+    tangent plane; the widening of the beam is not modelled.
 
     Args:
         reflectance: Share of the light that is mirrored, 0.9 for steel and aluminium at 905 nm.
@@ -131,16 +129,14 @@ class PolishedMetal(Effect):
     reflectance: float = 0.9
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids of polished metal."""
         count = sum(p.material is Material.POLISHED_METAL for p in scene.primitives)
         return f"{count} solids of polished metal" if count else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those that hit polished metal."""
         return sweep.of_material(Material.POLISHED_METAL)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Weaken the metal's own echo and offer the mirrored one."""
+        """Attenuate the metal's own echo and add the mirrored one."""
         sweep.first.power[rays] *= np.float32(1 - self.reflectance)
         struck = _struck(sweep, rays)
         _offer_mirrored(sweep, struck, np.full_like(struck.leg_m, self.reflectance))
@@ -148,17 +144,17 @@ class PolishedMetal(Effect):
 
 @dataclass(frozen=True)
 class WetGround(Effect):
-    """Water darkens the ground and mirrors the beam away, the more the flatter it comes in.
+    """Water darkens the ground, most at grazing incidence; puddles mirror.
 
-    A film that covers the share f of the ground lets the beam in and its echo out through one
-    surface of reflectance F each, and widens what comes out by n^2::
+    Beam and echo pass the surface of a film that covers the share f of the ground, of reflectance F
+    each time, and refraction spreads the echo by n^2::
 
         f = min(film / full film, 1)
         power -> power * (1 - f + f (1 - F)^2 / n^2)
 
     0.54 at normal incidence and 0.023 at 88 degrees. In a puddle f = 1, and there is a mirrored
-    echo of F^2 * ``surface_power(object)``, below the ground. A puddle has the size that the scene
-    gives it when the film is full; its area shrinks with the film, and is gone with it.
+    echo of F^2 * ``surface_power(object)``, below the ground. A puddle has its size of the scene at
+    the full film; its area is proportional to the film.
 
     Source: film model of Hahner et al. (LiDAR snowfall simulation, CVPR 2022), depth 1.2 mm.
 
@@ -171,16 +167,14 @@ class WetGround(Effect):
     full_film_mm: float = 1.2
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Water on the ground."""
         film_mm = scene.weather.water_film_mm
         return f"{film_mm:.2g} mm of water, {len(scene.puddles)} puddles" if film_mm > 0 else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those that hit the ground."""
         return sweep.on_ground()
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Weaken the echoes of the ground; offer what the puddles mirror."""
+        """Attenuate the echoes of the ground and add mirror images in puddles."""
         assert not isinstance(rays, slice)
         film = min(sweep.scene.weather.water_film_mm / self.full_film_mm, 1.0)
         cover = np.full(len(rays), film, dtype=np.float32)
@@ -197,7 +191,7 @@ class WetGround(Effect):
         _offer_mirrored(sweep, struck, reflectance[standing])
 
     def _in_puddles(self, sweep: Sweep, rays: NDArray[np.int64], film: float) -> NDArray[np.int64]:
-        """Which of the rays end in standing water."""
+        """Rays that end in standing water."""
         pose = sweep.scene.pose
         cosine, sine = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
         x, y, _ = sweep.position(rays)
@@ -206,12 +200,12 @@ class WetGround(Effect):
             east, north = puddle.x_m - pose.x_m, puddle.y_m - pose.y_m
             ahead, left = cosine * east + sine * north, cosine * north - sine * east
             inside |= (x - ahead) ** 2 + (y - left) ** 2 < film * puddle.radius_m**2
-        found = np.flatnonzero(inside)
-        return found[_struck(sweep, rays[found]).normal[2] > _LEVEL_COS]
+        wet = np.flatnonzero(inside)
+        return wet[_struck(sweep, rays[wet]).normal[2] > _LEVEL_COS]
 
 
 class _Struck(NamedTuple):
-    """Where and how rays strike the surfaces that they were cast on."""
+    """Hits of the rays on their surfaces."""
 
     rays: NDArray[np.int64]  # (M,)
     surface: NDArray[np.int32]  # (M,)
@@ -222,7 +216,7 @@ class _Struck(NamedTuple):
     normal: Floats  # (3, M)
 
     def only(self, chosen: NDArray[np.int64]) -> _Struck:
-        """Some of them."""
+        """A selection of the hits."""
         columns: list[Any] = [column[..., chosen] for column in self]
         return _Struck(*columns)
 
@@ -239,7 +233,7 @@ def _struck(sweep: Sweep, rays: RayIndex) -> _Struck:
 
 
 class _Seen(NamedTuple):
-    """What secondary rays meet, ``(M,)``; infinitely far and without power: nothing."""
+    """Hits of secondary rays, ``(M,)``; infinite distance and power 0 for a miss."""
 
     distance_m: Floats  # from where they start
     range_m: Floats  # of the whole path
@@ -248,7 +242,7 @@ class _Seen(NamedTuple):
 
 
 def _look(sweep: Sweep, struck: _Struck, direction: Floats, hollow: NDArray[np.int32]) -> _Seen:
-    """Follow the rays on from where they struck, see ``cast_single``."""
+    """Cast secondary rays from the hits, see ``cast_single``."""
     reach_m, solids = sweep.sensor.max_range_m - struck.leg_m, sweep.solids
     distance_m, surface = cast_single(
         solids, struck.at, direction, struck.time_s, reach_m, struck.surface, hollow
@@ -263,7 +257,7 @@ def _look(sweep: Sweep, struck: _Struck, direction: Floats, hollow: NDArray[np.i
 
 
 def _offer_mirrored(sweep: Sweep, struck: _Struck, reflectance: Floats) -> None:
-    """Offer what surfaces of this reflectance mirror, where a white object would win."""
+    """Add mirror images in surfaces of this reflectance, where a white object would be recorded."""
     best = (reflectance / struck.leg_m) ** 2
     chosen = np.flatnonzero(best > sweep.weakest_recorded()[struck.rays])
     struck, two_way = struck.only(chosen), reflectance[chosen] ** 2
@@ -273,26 +267,26 @@ def _offer_mirrored(sweep: Sweep, struck: _Struck, reflectance: Floats) -> None:
     sweep.offer(struck.rays, seen.range_m, two_way * seen.power, seen.surface, Origin.MIRROR)
 
 
-def _fastened_to(sweep: Sweep, panes: NDArray[np.int32]) -> NDArray[np.int64]:
-    """The closed solid of the same instance that each pane ``(M,)`` is fastened to, if any."""
+def _attached_solid(sweep: Sweep, panes: NDArray[np.int32]) -> NDArray[np.int64]:
+    """The closed solid of the same instance that each pane ``(M,)`` is attached to, if any."""
     solids, primitives = sweep.solids, sweep.scene.primitives
     instance = np.array([p.instance for p in primitives])
     closed = np.array([p.material is not Material.GLASS for p in primitives], dtype=bool)
     closed &= (instance > 0) & (solids.extinction == 0)
     different, back = np.unique(panes, return_inverse=True)
-    found = np.full(len(different), NO_SURFACE)
+    attached = np.full(len(different), NO_SURFACE)
     for row, pane in enumerate(different):
         mates = np.flatnonzero(closed & (instance == instance[pane]))
         if not len(mates):
             continue
-        # How far the middle of the pane is from the box around each of them.
+        # Distance of the middle of the pane from the bounding box of each.
         x, y, z = (solids.centre[pane] - solids.centre[mates]).T
         cosine, sine = solids.cos_yaw[mates], solids.sin_yaw[mates]
         turned = np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1)
         gap_m = np.hypot.reduce((np.abs(turned) - solids.half_size[mates]).clip(min=0), axis=1)
-        if gap_m.min() < _FASTENED_M:
-            found[row] = mates[gap_m.argmin()]
-    return found[back]
+        if gap_m.min() < _ATTACHED_M:
+            attached[row] = mates[gap_m.argmin()]
+    return attached[back]
 
 
 def _cosine(direction: Floats, normal: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Rain and snow: drops and flakes of which each may be seen alone."""
+"""Rain and snow: drops and flakes that may be detected singly."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ class DropTable(NamedTuple):
 
 @dataclass(frozen=True)
 class _Hydrometeors(Effect):
-    """Drops or flakes with an exponential distribution of sizes, each of which may be seen alone.
+    """Drops or flakes with an exponential size distribution, which may be detected singly.
 
     At the rate R in mm/h there are, per cubic metre and millimetre of diameter D::
 
         N(D) = N0 exp(-Lambda D)        N0 = n R^a        Lambda = l R^b
         extinction = integral of 2 (pi D^2 / 4) N(D) = 1e-6 pi N0 / Lambda^3   per metre
 
-    One of them within the beam, a cone of the diameter d = divergence * r, sends back::
+    The echo of one of them within the beam, a cone of the diameter d = divergence * r, is::
 
         power = reflectivity * min(D / d, 1)^2 * exp(-2 extinction r) * xi(r) / r^2
 
-    so that those above a power p before the range r are a Poisson process of the mean::
+    so that those above a power p before the range r are a Poisson process with the mean::
 
         M(p, r) = integral of N0 / Lambda exp(-Lambda D_p(s)) pi (d / 2)^2 ds,   up to r
 
     with D_p the diameter that gives p, without the ranges where even D = d falls short. The
     strongest one before a target at R then has the power p at which M(p, R) equals a draw of the
-    exponential distribution (none if M stays below it at the weakest power that can be detected),
-    and a range with the density dM/dp there: exact, with two draws per ray however many there are.
+    exponential distribution (none if M stays below it at the detection limit), and a range with
+    the density dM/dp there. This is exact and needs two draws per ray for any number of drops.
     """
 
     reflectivity: float
@@ -68,16 +68,14 @@ class _Hydrometeors(Effect):
     field: ClassVar[str]  # of Weather, its rate in mm/h
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Some of it falls."""
         rate = getattr(scene.weather, self.field)
         return f"{rate:g} mm/h of {self.origin.name.lower()}" if rate > 0 else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """All, while it falls."""
         return all_rays(getattr(sweep.scene.weather, self.field) > 0)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Weaken the echoes and offer the strongest drop or flake of each ray."""
+        """Attenuate the echoes and add the strongest drop or flake of each ray."""
         rate = getattr(sweep.scene.weather, self.field)
         attenuate(sweep, self.extinction_per_m(rate))
         table = self.drop_table(rate, sweep.sensor)
@@ -90,7 +88,7 @@ class _Hydrometeors(Effect):
         row = row.astype(np.intp).clip(max=_POWERS)
         before = steps_before_target(sweep, edges)
 
-        # Which rays have a drop that is stronger than their echo, and how strong it is.
+        # Rays with a drop that is stronger than their echo, and its power.
         drawn = draws.exponential(slice(None))
         chosen = np.flatnonzero(_between(expected, row, before) > drawn)
         drawn, row, before = drawn[chosen], row[chosen], before[chosen]
@@ -103,7 +101,7 @@ class _Hydrometeors(Effect):
         if not len(chosen):
             return
 
-        # Where it is: the drops of this row's powers, up to the target.
+        # Its range: the drops of this row's powers, up to the target.
         in_row = np.ascontiguousarray(expected[:-1] - expected[1:])
         level = draws.uniform(chosen) * _between(in_row, row, before)
         end = before.astype(np.intp) + 1
@@ -147,11 +145,11 @@ class _Hydrometeors(Effect):
 
 @dataclass(frozen=True)
 class Rain(_Hydrometeors):
-    """Rain weakens every echo, and a drop in the beam may outshine a weak target.
+    """Rain attenuates every echo, and a drop in the beam may outshine a weak target.
 
-    Equations: :class:`_Hydrometeors`. A sphere of the refractive index n = 1.33 sends back from
-    its front and, focused, from its rear ``F / 4 (1 + (1 - F)^2 (n / (2 - n))^2) = 0.024`` of what
-    a white disk does, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
+    Equations: :class:`_Hydrometeors`. A sphere of the refractive index n = 1.33 reflects from
+    its front and, focused, from its rear ``F / 4 (1 + (1 - F)^2 (n / (2 - n))^2) = 0.024`` of the
+    echo of a white disk, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
 
     Source: Marshall and Palmer 1948 for the sizes.
 
@@ -171,10 +169,10 @@ class Rain(_Hydrometeors):
 
 @dataclass(frozen=True)
 class Snow(_Hydrometeors):
-    """Snow weakens every echo, and flakes before weak targets are taken for them.
+    """Snow attenuates every echo, and flakes may outshine weak targets.
 
-    Equations: :class:`_Hydrometeors`. Diameters are those of the molten flakes. A flake is no
-    white disk (0.9): ice crystals send back 2 pi / S = 0.3 of that, with S = 20 sr their ratio of
+    Equations: :class:`_Hydrometeors`. Diameters are those of the molten flakes. Ice
+    crystals return 2 pi / S = 0.3 of the echo of a white disk, with S = 20 sr their ratio of
     extinction to backscatter. At 1 mm/h the extinction is 1.4e-3 per metre.
 
     Source: Gunn and Marshall 1958 for the sizes, with twice their number as in LISA (molten
@@ -207,7 +205,7 @@ def _last_where(
     low: NDArray[np.intp],
     high: NDArray[np.intp],
 ) -> NDArray[np.intp]:
-    """Last index (M,) in [low, high) where something holds that holds at low and then ceases."""
+    """Last index (M,) in [low, high) where a condition holds, which is true first, then false."""
     while (high - low > 1).any():
         middle = (low + high) // 2
         held = holds(middle)

@@ -1,4 +1,4 @@
-"""How strongly surfaces send the beam back: matt ones, and retro-reflecting sheeting."""
+"""Power returned by surfaces: diffuse reflection, texture, retro-reflecting sheeting."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SLOPE_SD_RAD[
 _VARIANCE = _SLOPE_SD_RAD**2
 _SMOOTH_PART = (1 - 0.5 * _VARIANCE / (_VARIANCE + 0.33)).astype(np.float32)
 _ROUGH_PART = (0.45 * _VARIANCE / (_VARIANCE + 0.09)).astype(np.float32)
-# How the coefficient of retroreflection falls with incidence, as a power of its cosine.
+# The coefficient of retroreflection falls with this power of the cosine of incidence.
 _FALL = 6
 
 
@@ -36,15 +36,15 @@ def surface_power(
 ) -> Floats:
     """Received over emitted power of a diffuse surface that is larger than the beam, m^-2.
 
-    Seen from where it is lit, a surface of facets whose slopes have the standard deviation s
-    returns (Oren and Nayar, SIGGRAPH 1994, in the direction of the light)::
+    A surface of facets whose slopes have the standard deviation s returns in the direction of the
+    light (Oren and Nayar, SIGGRAPH 1994)::
 
         power = reflectivity * (A cos(theta) + B sin(theta)^2) / range^2
         A = 1 - s^2 / 2 / (s^2 + 0.33)        B = 0.45 s^2 / (s^2 + 0.09)
 
     which is Lambert's law for s = 0. With s = 0.5, asphalt of reflectivity 0.1 that is seen from
-    1.73 m above has the power 1.43e-5 at 50 m. Lambert's law alone needs a limit of 1.38e-6 for
-    that, with which paint of 5 % would be seen at 100 m and nothing but the road ever vanished.
+    1.73 m above has the power 1.43e-5 at 50 m. With Lambert's law alone the detection limit would
+    have to be 1.38e-6 for the same range, and paint of 5 % would be detected at 100 m.
 
     All arguments have one shape; ``range_m`` of infinity gives 0.
     """
@@ -54,7 +54,7 @@ def surface_power(
 
 
 class DiffuseReflection(Effect):
-    """Surfaces are diffuse: their echo falls with the square of the range and with incidence.
+    """Diffuse reflection: echoes fall with the square of the range and with incidence.
 
     ::
 
@@ -64,11 +64,9 @@ class DiffuseReflection(Effect):
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Every scene has a ground."""
         return "base"
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Give every echo its power."""
         sweep.first.power[rays] *= surface_power(
             sweep.reflectivity[rays],
             sweep.cos_incidence[rays],
@@ -79,49 +77,48 @@ class DiffuseReflection(Effect):
 
 @dataclass(frozen=True)
 class SurfaceTexture(Effect):
-    """No surface is of one reflectivity: each shot meets a spot that is brighter or darker.
+    """Variation of the reflectivity within a surface, from shot to shot.
 
     With n drawn from the standard normal distribution::
 
         power -> power * exp(s n)
 
-    which leaves the median alone. Source: from shot to shot the logarithm of the intensity, the
+    which keeps the median. Source: from shot to shot the logarithm of the intensity, the
     root of the power, scatters by 0.15 to 0.23 on the ground and on smooth things and by 0.42 to
     0.45 in foliage, in all four drives of 30 scans of KITTI.
 
     Args:
         spread: s of all surfaces but leaves.
-        leaf_spread: s of leaves, which are turned every way.
+        leaf_spread: s of leaves, whose orientation is random.
     """
 
     spread: float = 0.36
     leaf_spread: float = 0.86
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Every scene has surfaces."""
         return "base"
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Scale the power of every echo."""
         spread = np.full(len(Material), self.spread, dtype=np.float32)
         spread[Material.FOLIAGE] = self.leaf_spread
         sweep.first.power[rays] *= np.exp(spread[sweep.material[rays]] * draws.normal(rays))
 
 
 def sheets(scene: Scene) -> str | None:
-    """How many solids of retro-reflecting sheeting there are; None without any."""
+    """Number of retro-reflecting sheets as a text; None without any."""
     count = sum(p.material is Material.RETROREFLECTOR for p in scene.primitives)
     return f"{count} retro-reflecting sheets" if count else None
 
 
 @dataclass(frozen=True)
 class RetroReflection(Effect):
-    """Sheeting sends the beam back to where it came from, hundreds of times what paint does.
+    """Retro-reflection of sheeting: hundreds of times the echo of paint.
 
-    The coefficient of retroreflection R_A is the intensity that an area of the sheet sends back,
-    over the illuminance across the beam and the area; that of a matt surface of reflectivity 1,
-    at normal incidence, is 1 / pi. It falls with the angle of incidence t about as cos(t)^6, from
-    70 at 5 degrees to 30 at 30 degrees and 10 at 40 degrees, so that beside its matt echo::
+    The coefficient of retroreflection R_A is the intensity returned by an area of the sheet,
+    divided by the illuminance across the beam and by the area; for a diffuse surface of
+    reflectivity 1 at normal incidence it is 1 / pi. It falls with the angle of incidence t about
+    as cos(t)^6, from 70 at 5 degrees to 30 at 30 degrees and 10 at 40 degrees, so that with the
+    diffuse echo::
 
         power -> power * (1 + pi R_A cos(t)^4 / reflectivity)
 
@@ -137,16 +134,13 @@ class RetroReflection(Effect):
     retroreflection: float = 70.0
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        """Solids of such sheeting."""
         return sheets(scene)
 
     def rays(self, sweep: Sweep) -> RayIndex:
-        """Those that hit sheeting."""
         return sweep.of_material(Material.RETROREFLECTOR)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Strengthen their echoes."""
-        # One power of the cosine is in the matt echo, another in the area that the beam lights.
+        # One power of the cosine is in the diffuse echo, another in the illuminated area.
         falling = sweep.cos_incidence[rays] ** (_FALL - 2)
         gain = np.float32(math.pi * self.retroreflection) * falling / sweep.reflectivity[rays]
         sweep.first.power[rays] *= 1 + gain
