@@ -11,7 +11,6 @@ from r3dpa.data import (
     Augmentation,
     CachedTensors,
     FeatureGrids,
-    LatentDataset,
     LidarDataModule,
     LidarDataset,
     StoreError,
@@ -175,8 +174,8 @@ def posteriors(tmp_path, scans):
     return CachedTensors(cache, scans), moments
 
 
-def test_posteriors_turn_with_the_scan(scans, posteriors):
-    sample = LatentDataset(scans, posteriors[0])[1]
+def test_posteriors_turn_with_the_scan(scans, projection, posteriors):
+    sample = LidarDataset(scans, projection, RangeCodec(), posteriors=posteriors[0])[1]
     seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample)
     assert torch.equal(seen["posterior_moments"], posteriors[1][1].roll(6, -1))
     assert (seen["index"], seen["name"]) == (1, scans[1].name)

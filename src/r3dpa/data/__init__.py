@@ -10,7 +10,6 @@ from r3dpa.data.augmentation import Augmentation, View
 from r3dpa.data.checks import CheckReport, check
 from r3dpa.data.datasets import (
     LatentBatch,
-    LatentDataset,
     LidarBatch,
     LidarDataset,
     PointDataset,
@@ -76,7 +75,6 @@ __all__ = [
     "ImageSource",
     "KITTI360DataModule",
     "LatentBatch",
-    "LatentDataset",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",

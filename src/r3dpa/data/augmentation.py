@@ -1,8 +1,7 @@
-"""Augmentation that a scan, its range image and its feature grid undergo together.
+"""Augmentation of a scan together with its range image and its feature grid.
 
-Mirroring left and right, and rotating about the vertical axis by whole grid columns, move whole
-pixels and whole cells: image and stored grid are reordered, nothing is projected or extracted
-again. Of any projection, for columns are the same in all.
+Mirroring left and right and rotating about the vertical axis by whole grid columns move whole
+pixels and cells: image and stored grid are reordered, nothing is projected or extracted again.
 Letters: H beams, W columns, h x w cells, D feature width, P points.
 """
 
@@ -17,18 +16,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r3dpa.data.datasets import LatentDataset, LidarDataset
+from r3dpa.data.datasets import LidarDataset
 
 _STREAM = 1  # separates these draws from those of the order, which have the same seed
 
 
 @dataclass(frozen=True)
 class View:
-    """A scan seen otherwise: mirrored or not, then rotated by whole grid columns.
+    """A scan mirrored or not, then rotated by whole grid columns.
 
     Args:
-        columns: Grid columns by which everything moves to the right, that is clockwise seen from
-            above, each ``2 * pi / grid_columns``.
+        columns: Grid columns, each ``2 * pi / grid_columns``, by which everything moves to the
+            right, that is clockwise seen from above.
         mirrored: Swap left and right, before the rotation.
         grid_columns: Columns w of the feature grid.
     """
@@ -38,7 +37,7 @@ class View:
     grid_columns: int
 
     def points(self, points: Tensor) -> Tensor:
-        """Points ``(P, 3 or more)`` seen this way, computed in float64; other columns stay.
+        """Transformed points ``(P, 3 or more)``, computed in float64; other columns stay.
 
         :meth:`image` equals projecting these, but for points at the border of two pixels: a pixel
         holds its left border only, which mirroring makes the right one.
@@ -53,22 +52,21 @@ class View:
         return result
 
     def image(self, image: Tensor) -> Tensor:
-        """Image ``(..., W)`` seen this way, W a multiple of w; exact."""
+        """Reordered image ``(..., W)``, W a multiple of w; exact."""
         return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
 
     def grid(self, grid: Tensor) -> Tensor:
-        """Feature grid ``(h * w, D)`` seen this way, see :meth:`Augmentation.check_extractor`."""
+        """Reordered feature grid ``(h * w, D)``, see :meth:`Augmentation.check_extractor`."""
         return self._reordered(grid.unflatten(0, (-1, self.grid_columns)), 1, 1).flatten(0, 1)
 
     def sample(self, sample: dict[str, Any]) -> dict[str, Any]:
-        """Training sample seen this way; index and name stay."""
-        seen = dict(sample)
-        for name in ("range_image", "valid_mask", "posterior_moments"):
-            if name in seen:
-                seen[name] = self.image(seen[name])
-        if "feature_grid" in seen:
-            seen["feature_grid"] = self.grid(seen["feature_grid"])
-        return seen
+        """Transformed training sample; index and name stay."""
+        result = dict(sample)
+        for name in result.keys() & {"range_image", "valid_mask", "posterior_moments"}:
+            result[name] = self.image(result[name])
+        if "feature_grid" in result:
+            result["feature_grid"] = self.grid(result["feature_grid"])
+        return result
 
     def _reordered(self, values: Tensor, axis: int, cell_columns: int) -> Tensor:
         if self.mirrored:
@@ -78,11 +76,10 @@ class View:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Which views of the training scans are drawn, anew for each scan and epoch.
+    """Views of the training scans, drawn anew for each scan and epoch.
 
     Args:
-        rotate: Rotate by a whole number of grid columns, each equally likely: with a grid of 8 x
-            64 to one of 64 headings, 5.6 degrees apart.
+        rotate: Rotate by a whole number of grid columns, each equally likely.
         flip: Mirror left and right in half of the cases.
         approximate_grids: Reorder also grids whose features do not follow the scan exactly, or
             are not known to.
@@ -105,10 +102,9 @@ class Augmentation:
         return View(columns if self.rotate else 0, self.flip and mirrored, grid_columns)
 
     def check_extractor(self, extractor: Any, grid_columns: int) -> None:
-        """Raise ``ValueError`` where stored grids, reordered, may not be those of the view.
+        """Raise ``ValueError`` where reordered grids may not be those of the view.
 
-        An extractor says by ``num_headings`` and ``mirror_invariant`` how its features follow the
-        scan, see :class:`r3dpa.data.Extractor`; unknown if None.
+        Judged by ``num_headings`` and ``mirror_invariant``, see :class:`r3dpa.data.Extractor`.
         """
         if self.approximate_grids:
             return
@@ -122,10 +118,9 @@ class Augmentation:
             name = "of an unknown extractor" if extractor is None else f"of {extractor.name!r}"
             raise ValueError(
                 f"augmentation.{options}: the features {name} are not known to "
-                f"{' or to '.join(what for _, what in wrong)}, so that reordered grids would not "
-                f"be those of the augmented scan. Switch {options} off, give an extractor whose "
-                "features do (GeometricFeatures does both), or set augmentation.approximate_grids: "
-                "true to train on the approximation."
+                f"{' or to '.join(what for _, what in wrong)}. Switch {options} off, use "
+                "GeometricFeatures, or train on the approximation with "
+                "augmentation.approximate_grids: true."
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:
@@ -143,27 +138,16 @@ class Augmentation:
         else:
             return
         raise ValueError(
-            f"augmentation.{reason}, so that cached latents would not be those of the augmented "
-            "scan. Switch it off, or encode in each step: model.init_args.cache_latents: false"
+            f"augmentation.{reason}. Switch it off, or encode in each step: "
+            "model.init_args.cache_latents: false"
         )
 
 
 class AugmentedDataset(Dataset[dict[str, Any]]):
-    """Training samples seen otherwise in each epoch.
-
-    Args:
-        dataset: The scans as they are.
-        augmentation: Which views are drawn.
-        seed: Seed of the draws.
-        grid_columns: Columns w of the feature grid, a divisor of W.
-    """
+    """Samples ``(epoch, index)`` of a dataset in the view drawn for them."""
 
     def __init__(
-        self,
-        dataset: LidarDataset | LatentDataset,
-        augmentation: Augmentation,
-        seed: int,
-        grid_columns: int,
+        self, dataset: LidarDataset, augmentation: Augmentation, seed: int, grid_columns: int
     ) -> None:
         self.dataset, self.augmentation = dataset, augmentation
         self.seed, self.grid_columns = seed, grid_columns
@@ -172,6 +156,5 @@ class AugmentedDataset(Dataset[dict[str, Any]]):
         return len(self.dataset)
 
     def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
-        epoch, index = key
-        view = self.augmentation.draw(self.seed, epoch, index, self.grid_columns)
-        return view.sample(self.dataset[index])
+        view = self.augmentation.draw(self.seed, *key, self.grid_columns)
+        return view.sample(self.dataset[key[1]])

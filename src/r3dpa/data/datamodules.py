@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
-from lightning.pytorch import LightningDataModule
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import (
-    LatentDataset,
     LidarDataset,
     range_image_cache,
     write_range_images,
@@ -27,7 +25,7 @@ from r3dpa.data.feature_grids import (
     default_features_dir,
     write_feature_grids,
 )
-from r3dpa.data.loaders import at_least, module_loader
+from r3dpa.data.loaders import LoaderModule, at_least, ready
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
@@ -51,10 +49,10 @@ _EMPTY_SPLIT = (
 )
 
 
-class LidarDataModule(LightningDataModule):
-    """Scans of a folder, file, glob, or list of these.
+class LidarDataModule(LoaderModule):
+    """Scans of a folder, file, glob, or list of these, as :class:`LidarBatch`.
 
-    Validation and test use the held-out scans, prediction all scans in order. Training scans alone
+    Validation and test use the held-out scans, prediction all scans in order. Only training scans
     are augmented, and not under ``overfit_batches``. Their order and augmentation depend on
     ``seed`` and the epoch alone; a resumed run goes on with the very next batch.
 
@@ -113,31 +111,19 @@ class LidarDataModule(LightningDataModule):
         augmentation: Augmentation = _AUGMENTATION,
         images_dir: str | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
         if projection not in ("spherical", "rings"):
             raise ValueError(f"projection must be 'spherical' or 'rings', got {projection!r}.")
-        at_least("batch_size", batch_size, 1)
-        at_least("num_workers", num_workers, 0)
-        at_least("seed", seed, 0)
-        at_least("val_every", val_every, 2)
-        at_least("limit", limit, 1)
-        self.scans = scans
-        self.sensor = sensor
-        self.projection_kind = projection
-        self.ring_inclinations_deg = ring_inclinations_deg
-        self.codec = codec
+        at_least(2, val_every=val_every)
+        at_least(1, limit=limit)
+        self.scans, self.sensor, self.codec = scans, sensor, codec
+        self.projection_kind, self.ring_inclinations_deg = projection, ring_inclinations_deg
         self.grid_size = (grid_size[0], grid_size[1])
         self.extractor = extractor
         self.features_dir = self._find_features_dir(features_dir)
-        self.batch_size = batch_size
-        self.num_workers = num_workers
-        self.seed = seed
-        self.val_every = val_every
-        self.val_drives = val_drives
-        self.limit = limit
-        self.augmentation = augmentation
-        self.images_dir = images_dir
+        self.val_every, self.val_drives, self.limit = val_every, val_drives, limit
+        self.augmentation, self.images_dir = augmentation, images_dir
         if self.features_dir is not None:
             augmentation.check_extractor(extractor, self.grid_size[1])
         self.train_set: LidarDataset | None = None
@@ -188,18 +174,22 @@ class LidarDataModule(LightningDataModule):
     def prepare_data(self) -> None:
         """Make the range images and, but to predict, the feature grids that are missing."""
         predicting = self.trainer is not None and self.trainer.predicting
+        extractor = None if predicting or self.features_dir is None else self.extractor
+        if self.images_dir is None and extractor is None:
+            return
+        train, val, projection = self._scans_and_projection()
         if self.images_dir is not None:
-            train, val, projection = self._scans_and_projection()
             num_made = write_range_images(
                 train + val, projection, self.codec, self.images_dir, workers=self.num_workers
             )
             rank_zero_info(f"range images: {num_made} made, in {self.images_dir}")
-        if self.extractor is None or self.features_dir is None or predicting:
-            return
-        train, val, projection = self._scans_and_projection()
-        extractor = cast(Extractor, self.extractor.eval())
+        if extractor is not None:
+            self._make_grids(train + val, cast(Extractor, extractor.eval()), projection)
+
+    def _make_grids(self, scans: list[Scan], extractor: Extractor, projection: Projection) -> None:
+        features_dir = cast(Path, self.features_dir)
         settings = GridSettings.of(extractor, projection, self.grid_size)
-        gigabytes = settings.store(self.features_dir).row.itemsize / 1e9
+        gigabytes = settings.store(features_dir).row.itemsize / 1e9
 
         def log(done: int, total: int) -> None:
             if done == 1 or done * 20 // total > (done - 1) * 20 // total:
@@ -207,28 +197,30 @@ class LidarDataModule(LightningDataModule):
                 rank_zero_info(f"feature grids: {done} of {total}, {size}")
 
         num_made = write_feature_grids(
-            train + val,
+            scans,
             extractor,
             projection,
             [self.grid_size],
-            self.features_dir,
+            features_dir,
             workers=self.num_workers,
             progress=log,
         )
-        num_kept = len(train) + len(val) - num_made
-        rank_zero_info(f"feature grids: {num_made} made, {num_kept} kept, in {self.features_dir}")
+        num_kept = len(scans) - num_made
+        rank_zero_info(f"feature grids: {num_made} made, {num_kept} kept, in {features_dir}")
 
     def setup(self, stage: str) -> None:
-        """Index the scans and open the feature grids, which ``"predict"`` needs not."""
+        """Index the scans and open the caches, of feature grids not to ``"predict"``."""
         self._posteriors = None  # of another fit, maybe with another VAE
         train, val, self.projection = self._scans_and_projection()
-        scans, grids = sorted(train + val), None
+        scans, grids, images = sorted(train + val), None, None
         if self.features_dir is not None and stage != "predict":
-            extractor = cast(Extractor | None, self.extractor)
             grids = FeatureGrids(
-                self.features_dir, scans, self.projection, self.grid_size, extractor
+                self.features_dir,
+                scans,
+                self.projection,
+                self.grid_size,
+                cast(Extractor | None, self.extractor),
             )
-        images = None
         if self.images_dir is not None:
             cache = range_image_cache(self.images_dir, self.projection, self.codec)
             images = CachedTensors(cache, scans)
@@ -248,24 +240,29 @@ class LidarDataModule(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
-        train_set = _ready(self.train_set)
-        if not len(train_set):
+        dataset = ready(self.train_set)
+        if not len(dataset):
             raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
-        dataset: LidarDataset | LatentDataset = train_set
         if self._posteriors is not None:
-            dataset = LatentDataset(train_set.scans, self._posteriors, train_set.grids)
+            dataset = LidarDataset(
+                dataset.scans,
+                dataset.projection,
+                dataset.codec,
+                dataset.grids,
+                posteriors=self._posteriors,
+            )
         if getattr(self.trainer, "overfit_batches", 0) > 0:
-            return module_loader(self, dataset, train=False)
-        drawn: Dataset[Any] = dataset
-        if self.augmentation.active:
-            drawn = AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
-        return module_loader(self, drawn, train=True, with_epoch=self.augmentation.active)
+            return self.loader(dataset, train=False)
+        if not self.augmentation.active:
+            return self.loader(dataset, train=True)
+        drawn = AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
+        return self.loader(drawn, train=True, with_epoch=True)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """Held-out scans in order, none twice; no loader in a fit where nothing is held out."""
-        dataset = _ready(self.val_set)
+        dataset = ready(self.val_set)
         if len(dataset):
-            return module_loader(self, dataset, train=False)
+            return self.loader(dataset, train=False)
         if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
             raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
         return []
@@ -276,7 +273,7 @@ class LidarDataModule(LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """All scans in order, none twice."""
-        return module_loader(self, _ready(self.all_set), train=False)
+        return self.loader(ready(self.all_set), train=False)
 
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
         if features_dir is not None:
@@ -294,19 +291,18 @@ class LidarDataModule(LightningDataModule):
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
-        projection = self._make_projection(train or val)
-        return evenly(train, self.limit), evenly(val, self.limit), projection
-
-    def _make_projection(self, scans: list[Scan]) -> Projection:
+        projection: Projection
         if self.projection_kind == "spherical":
-            return SphericalProjection(self.sensor)
-        if self.ring_inclinations_deg is not None:
-            return RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
-        points = (
-            torch.from_numpy(read_scan(scan.path, self.sensor)[:, :3])
-            for scan in scans[:_SCANS_TO_FIT]
-        )
-        return RingProjection.fit(points, self.sensor)
+            projection = SphericalProjection(self.sensor)
+        elif self.ring_inclinations_deg is not None:
+            projection = RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
+        else:
+            points = (
+                torch.from_numpy(read_scan(scan.path, self.sensor)[:, :3])
+                for scan in (train or val)[:_SCANS_TO_FIT]
+            )
+            projection = RingProjection.fit(points, self.sensor)
+        return evenly(train, self.limit), evenly(val, self.limit), projection
 
 
 class KITTI360DataModule(LidarDataModule):
@@ -359,11 +355,8 @@ class SimulatedDataModule(KITTI360DataModule):
         super().__init__(root, **kwargs)
         if num_scans < 2:
             raise ValueError(f"num_scans must be at least 2, one of them held out, got {num_scans}")
-        self.num_scans = num_scans
-        self.simulation_seed = simulation_seed
-        self.simulation_sensor = simulation_sensor
-        self.effects = effects
-        self.weather = weather
+        self.num_scans, self.simulation_seed = num_scans, simulation_seed
+        self.simulation_sensor, self.effects, self.weather = simulation_sensor, effects, weather
 
     def prepare_data(self) -> None:
         """Simulate the scans and make the feature grids that are missing."""
@@ -377,9 +370,3 @@ class SimulatedDataModule(KITTI360DataModule):
             weather=self.weather,
         )
         super().prepare_data()
-
-
-def _ready(dataset: LidarDataset | None) -> LidarDataset:
-    if dataset is None:
-        raise ValueError("Call prepare_data() and setup('fit') before asking for a loader.")
-    return dataset

@@ -1,4 +1,4 @@
-"""Scans as training samples: range images, cached latents, or points."""
+"""Scans as training samples: range images or cached latents, or points."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ class LidarBatch(TypedDict):
 
     ``range_image`` ``(B, 1, H, W)`` float32 in [-1, 1]; ``valid_mask`` ``(B, 1, H, W)`` bool, True
     where a pixel has a return; ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
-    where no grids are used; ``index`` ``(B,)`` int64 position in the data set; ``name`` list of B
-    scan names.
+    where no grids are used; ``index`` ``(B,)`` int64 position in the data set; ``name`` B strings.
     """
 
     range_image: Tensor
@@ -48,15 +47,15 @@ class LatentBatch(TypedDict):
 
 
 class LidarDataset(Dataset[dict[str, Any]]):
-    """Range image, mask and feature grid of each scan as it is; nothing random.
+    """Range image and mask, or cached posterior, and feature grid of each scan; nothing random.
 
     Args:
         scans: The scans, in the order of the indices.
         projection: Points to pixels; its sensor sets the image size and range limits.
         codec: Metres to [-1, 1].
-        grids: Feature grids of the scans, if any.
-        images: Range images of the scans, made with this projection and codec, if they are cached;
-            the scans themselves are then not read.
+        grids: Feature grids, if any.
+        images: Cached range images of this projection and codec, read in place of the scans.
+        posteriors: Moments ``(2C, h, w)`` of a frozen VAE, which replace image and mask.
     """
 
     def __init__(
@@ -66,25 +65,23 @@ class LidarDataset(Dataset[dict[str, Any]]):
         codec: RangeCodec,
         grids: CachedTensors[Scan] | None = None,
         images: CachedTensors[Scan] | None = None,
+        posteriors: CachedTensors[Scan] | None = None,
     ) -> None:
-        self.scans = list(scans)
-        self.projection = projection
-        self.codec = codec
-        self.grids = grids
-        self.images = images
+        self.scans, self.projection, self.codec = list(scans), projection, codec
+        self.grids, self.images, self.posteriors = grids, images, posteriors
 
     def __len__(self) -> int:
         return len(self.scans)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scan = self.scans[index]
-        image = self._project(scan) if self.images is None else self.images.read(scan)
-        sample = {
-            "range_image": image,
-            "valid_mask": self.codec.valid_mask(image),
-            "index": index,
-            "name": scan.name,
-        }
+        sample: dict[str, Any]
+        if self.posteriors is not None:
+            sample = {"posterior_moments": self.posteriors.read(scan)}
+        else:
+            image = self._project(scan) if self.images is None else self.images.read(scan)
+            sample = {"range_image": image, "valid_mask": self.codec.valid_mask(image)}
+        sample |= {"index": index, "name": scan.name}
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
@@ -100,47 +97,8 @@ class LidarDataset(Dataset[dict[str, Any]]):
         return self.codec.encode(range_m)[None]
 
 
-class LatentDataset(Dataset[dict[str, Any]]):
-    """Posterior of a frozen VAE and feature grid of each scan; range images are not read.
-
-    Args:
-        scans: The scans, in the order of the indices.
-        posteriors: Moments ``(2C, h, w)`` of the scans.
-        grids: Feature grids of the scans, if any.
-    """
-
-    def __init__(
-        self,
-        scans: Sequence[Scan],
-        posteriors: CachedTensors[Scan],
-        grids: CachedTensors[Scan] | None = None,
-    ) -> None:
-        self.scans, self.posteriors, self.grids = list(scans), posteriors, grids
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        scan = self.scans[index]
-        sample: dict[str, Any] = {
-            "posterior_moments": self.posteriors.read(scan),
-            "index": index,
-            "name": scan.name,
-        }
-        if self.grids is not None:
-            sample["feature_grid"] = self.grids.read(scan)
-        return sample
-
-
 class PointSample(NamedTuple):
-    """One scan for a network on points.
-
-    Attributes:
-        scan: Where it comes from.
-        key: Key of its rows in a store.
-        points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-        prepared: What the network's preparation returned for them.
-    """
+    """Scan, its key in a store, its points ``(P, 4)``, and the preparation of these."""
 
     scan: Scan
     key: ItemKey
@@ -149,12 +107,9 @@ class PointSample(NamedTuple):
 
 
 class PointDataset(Dataset[PointSample]):
-    """Points of each scan and their preparation for a network, done in loader processes.
+    """Points of each scan, prepared for a network by the loader processes.
 
-    Args:
-        scans: The scans, in the order of the indices.
-        sensor: At least one point of a scan must lie within its range limits.
-        prepare: Function of the points.
+    ``ScanError`` for a scan without a point within the range limits of ``sensor``.
     """
 
     def __init__(
@@ -173,13 +128,9 @@ class PointDataset(Dataset[PointSample]):
 
 
 class DrawnPoints(Dataset[Any]):
-    """Random preparation of the points of each scan: a function of seed, epoch and index alone.
+    """Random preparation of points, ``prepare(points, generator)``.
 
-    Args:
-        scans: The scans, in the order of the indices.
-        sensor: At least one point of a scan must lie within its range limits.
-        prepare: Function of the points ``(P, 4)`` and a generator.
-        seed: Seed of the draws.
+    An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
     """
 
     def __init__(
@@ -201,14 +152,14 @@ class DrawnPoints(Dataset[Any]):
 
 
 def list_collate(samples: Sequence[Any]) -> list[Any]:
-    """A batch of scans, which differ in length, as a list."""
+    """A batch as a list, for scans, which differ in length."""
     return list(samples)
 
 
 def range_image_cache(
     root: str | Path, projection: Projection, codec: RangeCodec
 ) -> TensorCache[Scan]:
-    """Place of the encoded range images ``(1, H, W)`` of a projection and codec."""
+    """Cache of the encoded range images ``(1, H, W)`` of a projection and codec."""
     settings = {"projection": projection_to_dict(projection), "codec": asdict(codec)}
     sensor = projection.sensor
     return TensorCache(Path(root), "range_images", settings, (1, sensor.beams, sensor.columns))
@@ -222,17 +173,13 @@ def write_range_images(
     *,
     workers: int = 0,
 ) -> int:
-    """Project the scans whose range images are missing; another process that does is waited for.
+    """Project the scans whose range images are missing below ``root``; returns their number.
 
-    Args:
-        scans: Scans, of any number of drives.
-        projection: Points to pixels.
-        codec: Metres to [-1, 1].
-        root: Folder of caches.
-        workers: Processes that project; 0 for none.
+    Waits for another process that fills the cache.
 
-    Returns:
-        Number of range images made. ``StoreError`` or ``ScanError`` names what cannot be used.
+    Raises:
+        StoreError: If the cache is damaged or cannot be written.
+        ScanError: If a scan cannot be used; names the file.
     """
     cache = range_image_cache(root, projection, codec)
     if not cache.missing(scans):

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
-from r3dpa.data.loaders import at_least, module_loader
+from r3dpa.data.loaders import LoaderModule, at_least, ready
 from r3dpa.data.store import CachedTensors
 
 
-class ImageDataModule(LightningDataModule):
-    """Square RGB images of a source, or what a VAE made of them, shuffled and resumable.
+class ImageDataModule(LoaderModule):
+    """Square RGB images of a source, or cached posteriors of them, shuffled and resumable.
 
     Args:
         source: Folder, tar shards or generator of images.
@@ -42,15 +41,11 @@ class ImageDataModule(LightningDataModule):
         mirrored: bool = False,
         prepare_data_per_node: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
-        at_least("image_size", image_size, 1)
-        at_least("batch_size", batch_size, 1)
-        at_least("num_workers", num_workers, 0)
-        at_least("seed", seed, 0)
-        at_least("val_every", val_every, 2)
-        self.source, self.image_size, self.batch_size = source, image_size, batch_size
-        self.num_workers, self.seed = num_workers, seed
+        at_least(1, image_size=image_size)
+        at_least(2, val_every=val_every)
+        self.source, self.image_size = source, image_size
         self.val_every, self.mirrored = val_every, mirrored
         self.train_set: ImageDataset | None = None
         self.val_set: ImageDataset | None = None
@@ -66,7 +61,7 @@ class ImageDataModule(LightningDataModule):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the pixels of an entry depend on beside the entry, as JSON values."""
+        """Settings that the pixels of an entry depend on, as JSON values."""
         kind = type(self.source).__qualname__
         return {"source": kind, "image_size": self.image_size, **self.source.settings()}
 
@@ -78,16 +73,10 @@ class ImageDataModule(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
-        return module_loader(self, _ready(self.train_set), train=True, kind="images")
+        return self.loader(ready(self.train_set), train=True, kind="images")
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out images in order, none twice."""
-        return module_loader(self, _ready(self.val_set), train=False, kind="held-out images")
+        return self.loader(ready(self.val_set), train=False, kind="held-out images")
 
     test_dataloader = val_dataloader
-
-
-def _ready(dataset: ImageDataset | None) -> ImageDataset:
-    if dataset is None:
-        raise ValueError("Call setup('fit') before asking for a loader.")
-    return dataset

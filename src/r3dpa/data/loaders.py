@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sized
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
+from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+T = TypeVar("T")
 
 
 class EpochSampler(DistributedSampler[Any]):
@@ -17,25 +20,19 @@ class EpochSampler(DistributedSampler[Any]):
     Position p of an epoch goes to process ``p % processes``, so that a batch over all processes
     holds the same samples whatever their number, as long as ``batch_size * processes`` is the
     same. The order is a function of (seed, epoch) alone; a rest smaller than the number of
-    processes is dropped. ``with_epoch`` asks the data set for ``(epoch, index)``.
+    processes is dropped. ``with_epoch`` yields ``(epoch, index)``.
 
     Attributes:
-        start: Samples of this process that the next pass skips; nothing of them is read.
+        start: Samples of this process that the next pass skips without reading them.
         epoch_shift: Added to the epoch that the trainer sets.
     """
 
     def __init__(
-        self,
-        dataset: Dataset[Any],
-        seed: int = 0,
-        num_replicas: int = 1,
-        rank: int = 0,
-        with_epoch: bool = False,
+        self, dataset: Dataset[Any], seed: int, num_replicas: int, rank: int, with_epoch: bool
     ) -> None:
         super().__init__(dataset, num_replicas, rank, shuffle=True, seed=seed, drop_last=True)
         self.with_epoch = with_epoch
-        self.start = 0
-        self.epoch_shift = 0
+        self.start = self.epoch_shift = 0
 
     def __iter__(self) -> Iterator[Any]:
         epoch = self.epoch + self.epoch_shift
@@ -48,10 +45,9 @@ class EpochSampler(DistributedSampler[Any]):
 class ResumableLoader(DataLoader[Any]):
     """Loader whose state is its place in the data: epoch, and samples of it handed out.
 
-    Lightning saves the state in every checkpoint and gives it back when a run is resumed; the
-    next batch is then the one that the interrupted run would have received, whatever loader
-    processes had prefetched. Built by :func:`training_loader`, since Lightning rebuilds loaders
-    from the arguments of ``DataLoader``.
+    Lightning saves the state in every checkpoint; the next batch of a resumed run is the one that
+    the interrupted run would have received, whatever loader processes had prefetched. Built by
+    :func:`training_loader`, since Lightning rebuilds loaders from the arguments of ``DataLoader``.
 
     Attributes:
         batches_per_epoch: Batches that the trainer takes of each epoch.
@@ -106,9 +102,9 @@ class ResumableLoader(DataLoader[Any]):
             )
         if samples % self._samples_per_batch:
             raise ValueError(
-                f"The checkpoint was saved after {samples} samples of an epoch, which is no "
-                f"multiple of this run's batch of {self._samples_per_batch} samples (batch_size x "
-                "processes): resume with the same total batch."
+                f"The checkpoint was saved after {samples} samples of an epoch, no multiple of "
+                f"this run's batch of {self._samples_per_batch} samples (batch_size x processes): "
+                "resume with the same total batch."
             )
         self._resume_at = (state_dict["epoch"], samples // self._samples_per_batch)
 
@@ -122,7 +118,6 @@ def training_loader(
     num_replicas: int = 1,
     rank: int = 0,
     limit_batches: float = 1.0,
-    pin_memory: bool = False,
     with_epoch: bool = False,
     collate_fn: Callable[[list[Any]], Any] | None = None,
     kind: str = "scans",
@@ -130,16 +125,15 @@ def training_loader(
     """Shuffled, resumable loader of full batches; draws nothing from the global random state.
 
     Args:
-        dataset: Map-style data set, a function of what it is asked for alone.
+        dataset: Map-style data set without random state of its own.
         batch_size: Samples per batch and process.
         num_workers: Loader processes; the order of the batches does not depend on it.
         seed: Seed of the order.
         num_replicas: Number of training processes.
         rank: This training process.
         limit_batches: ``limit_train_batches`` of the trainer.
-        pin_memory: Copy batches to page-locked memory for a GPU.
-        with_epoch: Ask the data set for ``(epoch, index)``.
-        collate_fn: Makes a batch of samples; that of ``DataLoader`` where None.
+        with_epoch: Index the data set with ``(epoch, index)``.
+        collate_fn: As for ``DataLoader``.
         kind: Of the samples, for the message.
 
     Raises:
@@ -157,7 +151,7 @@ def training_loader(
         sampler=EpochSampler(dataset, seed, num_replicas, rank, with_epoch),
         num_workers=num_workers,
         drop_last=True,
-        pin_memory=pin_memory,
+        pin_memory=torch.cuda.is_available(),
         collate_fn=collate_fn,
         persistent_workers=num_workers > 0,
         generator=torch.Generator(),  # the default one would draw from the global random state
@@ -167,60 +161,66 @@ def training_loader(
     return loader
 
 
-def at_least(name: str, value: int | None, least: int) -> None:
-    """Raise ``ValueError`` for an argument below its range; None passes."""
-    if value is not None and value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}.")
-
-
-def module_loader(
-    module: Any, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
+def ordered_loader(
+    dataset: Dataset[Any],
+    batch_size: int,
+    *,
+    num_workers: int = 0,
+    num_replicas: int = 1,
+    rank: int = 0,
+    collate_fn: Callable[[list[Any]], Any] | None = None,
+    kind: str = "scans",
 ) -> DataLoader[Any]:
-    """Loader of a data module for the processes of its trainer, if it has one.
-
-    Args:
-        module: Data module with ``batch_size``, ``num_workers``, ``seed`` and ``trainer``.
-        dataset: Samples.
-        train: Whether shuffled and resumable, see :func:`training_loader`, or in order.
-        kind: Of the samples, for messages.
-        options: ``collate_fn``; for training also ``with_epoch``.
-    """
-    trainer = module.trainer
-    replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
-    pinned = torch.cuda.is_available()
-    if train:
-        return training_loader(
-            dataset,
-            module.batch_size,
-            num_workers=module.num_workers,
-            seed=module.seed,
-            num_replicas=replicas,
-            rank=rank,
-            limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
-            pin_memory=pinned,
-            kind=kind,
-            **options,
-        )
-    return DataLoader(
-        dataset,
-        batch_size=module.batch_size,
-        sampler=ordered_sampler(dataset, replicas, rank, kind),
-        num_workers=module.num_workers,
-        pin_memory=pinned,
-        persistent_workers=module.num_workers > 0,
-        generator=torch.Generator(),  # the default would draw from the global random state
-        **options,
-    )
-
-
-def ordered_sampler(
-    dataset: Dataset[Any], num_replicas: int, rank: int, kind: str = "scans"
-) -> UnrepeatedDistributedSampler:
-    """All samples in order, none twice; Lightning's default pads the last batch with some again."""
+    """All samples in order, none twice; arguments and errors as for :func:`training_loader`."""
     num_samples = len(cast(Sized, dataset))
     if num_samples < num_replicas:
         raise ValueError(
             f"{num_samples} {kind} are fewer than the {num_replicas} processes, each of which "
             f"needs one: use more {kind} or fewer devices."
         )
-    return UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False)
+    return DataLoader(
+        dataset,
+        batch_size=batch_size,
+        # Lightning's default sampler pads the last batch with some samples again.
+        sampler=UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False),
+        num_workers=num_workers,
+        pin_memory=torch.cuda.is_available(),
+        collate_fn=collate_fn,
+        persistent_workers=num_workers > 0,
+        generator=torch.Generator(),  # the default one would draw from the global random state
+    )
+
+
+class LoaderModule(LightningDataModule):
+    """Settings of the loaders, and the loaders for the processes of the trainer."""
+
+    def __init__(self, batch_size: int, num_workers: int, seed: int) -> None:
+        super().__init__()
+        at_least(1, batch_size=batch_size)
+        at_least(0, num_workers=num_workers, seed=seed)
+        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+
+    def loader(self, dataset: Dataset[Any], train: bool, **options: Any) -> DataLoader[Any]:
+        """Loader with ``kind`` or ``collate_fn``; ``train`` for shuffled and resumable batches."""
+        options["num_workers"] = self.num_workers
+        if self.trainer is not None:
+            options |= {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
+        if not train:
+            return ordered_loader(dataset, self.batch_size, **options)
+        if self.trainer is not None:
+            options["limit_batches"] = self.trainer.limit_train_batches
+        return training_loader(dataset, self.batch_size, seed=self.seed, **options)
+
+
+def ready(dataset: T | None) -> T:
+    """A data set that ``setup`` has made; ``ValueError`` if it has not."""
+    if dataset is None:
+        raise ValueError("Call prepare_data() and setup('fit') before asking for a loader.")
+    return dataset
+
+
+def at_least(least: int, **values: int | None) -> None:
+    """Raise ``ValueError`` for a named argument below its range; None passes."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}.")
