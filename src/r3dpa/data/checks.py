@@ -1,4 +1,4 @@
-"""``r3dpa check``: what is wrong with a folder of scans."""
+"""Check of a folder of scans, for ``r3dpa check``."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from r3dpa.simulation import expected_scans
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of :func:`check`.
+    """Result of :func:`check`; ``str`` gives the text that the command prints.
 
     Args:
         root: The checked folder.
         num_scans: Scans by drive, bad ones included.
         bad: ``(file, reason)`` of every scan that cannot be used.
         missing: Folders that should exist or hold scans.
-        intensity: Least and largest intensity of the usable scans; None where there is none.
+        intensity: Smallest and largest intensity of the usable scans; None without any.
     """
 
     root: Path
@@ -63,18 +63,11 @@ class CheckReport:
 
 
 def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
-    """Read every scan of a data set or folder and report all that is wrong with it.
+    """Read every scan of a data set, folder or file, and report all that is wrong with it.
 
     A folder with ``data_3d_raw``, or without any scan, is compared with the KITTI-360 layout and
-    its nine LiDAR drives; a simulated one with its manifest. A terminal shows the progress.
-
-    Args:
-        path: Root of a data set, or any folder or file of scans.
-        sensor: Every scan must have a point within its range limits; default sensor if None.
-        workers: Threads that read.
-
-    Raises:
-        ValueError: If the manifest of a simulated data set cannot be understood.
+    its nine LiDAR drives; a simulated one with its manifest (``ValueError`` if that is damaged).
+    Every scan needs a point within the range limits of ``sensor``.
     """
     root = Path(path).absolute()
     sensor = sensor or LidarSensor()
@@ -104,7 +97,7 @@ def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8)
 def _compare_layout(
     root: Path, counts: dict[str, int]
 ) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Folders that a data set lacks, and drives that lack scans, with the reason."""
+    """Missing folders, and incomplete drives with the reason."""
     raw, simulated = root / RAW, expected_scans(root)
     if not root.exists():
         return [root], []

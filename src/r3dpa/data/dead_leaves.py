@@ -28,12 +28,10 @@ _PALETTE = 6  # colours that the shapes of an image vary
 class DeadLeaves(ImageSource):
     """The dead-leaves model of natural images, drawn when an image is read.
 
-    Discs and polygons lie on top of each other, their radii with density ``r^-3`` between
-    ``smallest`` and ``largest`` times the side of the image: edges, occlusion, T-junctions and a
-    power spectrum that falls as ``1 / f^2``. Each has a colour near one of a few of the image, a
-    gradient of light, and its part of a texture with spectrum ``1 / f``. No photograph, no
-    semantics: what a network learns from it is local image structure. An image is a function of
-    ``seed`` and its number alone.
+    Discs and polygons occlude each other, their radii with density ``r^-3`` between ``smallest``
+    and ``largest`` times the side of the image, so that the power spectrum falls as ``1 / f^2``.
+    Each has a colour near one of a palette, a gradient of light, and its part of a texture with
+    spectrum ``1 / f``. An image is a function of ``seed`` and its number alone.
 
     Source: Lee, Mumford and Huang, "Occlusion models for natural images" (IJCV 2001); as training
     data: Baradad et al., "Learning to see by looking at noise" (NeurIPS 2021).
@@ -43,9 +41,6 @@ class DeadLeaves(ImageSource):
         seed: Seed of all of them.
         smallest: Smallest radius in sides of the image.
         largest: Largest radius in sides of the image.
-
-    Raises:
-        ValueError: If an argument is out of its range.
     """
 
     num_images: int = 100_000
@@ -65,7 +60,7 @@ class DeadLeaves(ImageSource):
             )
 
     def entries(self) -> list[ImageEntry]:
-        """Numbers as names."""
+        """Entries named by their number."""
         place = Path("dead_leaves")
         return [ImageEntry(f"{index:09d}", place, 0) for index in range(self.num_images)]
 

@@ -32,17 +32,17 @@ _SETTINGS = "settings.json"
 class Extractor(Protocol):
     """Frozen network whose features of a scan are ``lift(point_features([prepare(points)])[0])``.
 
-    A last step that is linear belongs into ``lift((N, K)) -> (N, dim)``, which may be absent: it
-    commutes with the mean of a cell, so that cells are lifted instead of points. For augmentation,
-    ``num_headings`` may say that rotating a scan by multiples of ``2 * pi / num_headings`` leaves
-    the features of its points alone, and ``mirror_invariant`` that swapping left and right does.
+    A linear last step belongs into ``lift((N, K)) -> (N, dim)``, which may be absent: it commutes
+    with the mean of a cell, so that cells are lifted instead of points. For augmentation, optional
+    ``num_headings`` says that features are invariant to rotating a scan by multiples of
+    ``2 * pi / num_headings``, and ``mirror_invariant`` to swapping left and right.
 
     Attributes:
-        name: Short name, that of the default folder.
+        name: Short name, also of the default folder.
         dim: Width D of the features.
         settings: Whatever else determines the features, as JSON values; compared on opening.
-        prepare: Work on the CPU for the points ``(P, 4)`` x, y, z (metres), intensity of one scan,
-            done in loader processes: can be pickled and holds no weights.
+        prepare: CPU part for the points ``(P, 4)`` x, y, z (metres), intensity of one scan, run in
+            loader processes: can be pickled and holds no weights.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Extractor(Protocol):
     prepare: Callable[..., Any]
 
     def point_features(self, prepared: Sequence[Any]) -> list[Tensor]:
-        """``(P, K)`` of each scan that was prepared, on the device of the extractor."""
+        """``(P, K)`` of each prepared scan, on the device of the extractor."""
         ...
 
     def __call__(self, points: Tensor) -> Tensor:
@@ -61,19 +61,16 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class GridSettings:
-    """How the grids of one store were made.
+    """Settings of the grids of one store.
 
     Args:
-        projection: That of the range images, as plain values.
+        projection: Projection of the range images, as plain values.
         grid_size: Rows and columns (h, w).
-        extractor: ``name`` and ``settings`` of what made the features.
+        extractor: ``name`` and ``settings`` of the extractor.
         dim: Width D of the features.
         dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.store.Store`; an empty cell is
             zero in both.
         precision: Arithmetic that the extractor ran in, as Lightning names it.
-
-    Raises:
-        ValueError: If ``dtype`` is none of the two.
     """
 
     projection: dict[str, Any]
@@ -96,14 +93,14 @@ class GridSettings:
         dtype: Literal["float16", "int8"] = "float16",
         precision: str = "32-true",
     ) -> Self:
-        """Settings of the grids that an extractor would make; refuses a grid that does not fit."""
+        """Settings of an extractor; ``ValueError`` if the grid does not divide the image."""
         projection.sensor.cell_size(grid_size)
-        wanted = _wanted(projection, extractor)
         size = (grid_size[0], grid_size[1])
+        wanted = _wanted(projection, extractor)
         return cls(grid_size=size, dtype=dtype, precision=precision, **wanted)
 
     def store(self, features_dir: str | Path) -> Store[Scan]:
-        """The store of these grids, each ``(N, D)``."""
+        """Store of these grids, each ``(N, D)``."""
         return Store(
             folder=Path(features_dir) / f"{self.grid_size[0]}x{self.grid_size[1]}",
             settings=json.dumps(vars(self), indent=1),
@@ -119,23 +116,22 @@ class GridSettings:
         return self.store(features_dir).writer(shard)
 
     def check(self, features_dir: str | Path) -> None:
-        """Raise :class:`StoreError` where a folder holds grids of other settings or extractors."""
+        """Raise ``StoreError`` where a folder holds grids of other settings or extractors."""
         for size, stored in stored_settings(features_dir).items():
             same_size = size == self.grid_size
-            stored.compare(
-                {k: v for k, v in vars(self).items() if same_size or k in ("extractor", "dim")},
-                stored.store(features_dir).folder,
-            )
+            keys = [*vars(self)] if same_size else ["extractor", "dim"]
+            stored.compare({key: getattr(self, key) for key in keys}, Path(features_dir))
 
-    def compare(self, wanted: Mapping[str, Any], folder: Path) -> None:
-        """Raise :class:`StoreError`, with both values, where these stored grids are not those."""
+    def compare(self, wanted: Mapping[str, Any], features_dir: Path) -> None:
+        """Raise ``StoreError`` where these, the stored settings, differ from the wanted ones."""
         for key, value in wanted.items():
             if getattr(self, key) != value:
+                folder = self.store(features_dir).folder
                 raise _made_otherwise(key, getattr(self, key), value, folder)
 
 
 def _wanted(projection: Projection, extractor: Extractor | None) -> dict[str, Any]:
-    """Settings that a user of grids needs, as they come back from a file; any extractor if None."""
+    """Settings that a reader of grids needs, as JSON returns them; any extractor if None."""
     wanted: dict[str, Any] = {"projection": projection_to_dict(projection)}
     if extractor is not None:
         wanted["extractor"] = {"name": extractor.name, "settings": extractor.settings}
@@ -151,7 +147,7 @@ def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreEr
 
 
 def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSettings]:
-    """Settings of the stores of a folder by grid size; ``StoreError`` for a damaged file."""
+    """Settings of the stores of a folder by grid size; ``StoreError`` if damaged."""
     found = {}
     for path in sorted(Path(features_dir).glob(f"*/{_SETTINGS}")):
         try:
@@ -160,7 +156,7 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
             store = settings.store(features_dir)
             if path.parent != store.folder:
                 raise ValueError(f"it is of grid_size {list(settings.grid_size)}")
-            _ = store.row, settings.extractor["name"]  # can be made
+            _ = store.row, settings.extractor["name"]  # raise here if they are damaged
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise StoreError(
                 f"{path} is damaged ({error!r:.200}): delete {path.parent} and make its grids "
@@ -171,7 +167,7 @@ def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSetti
 
 
 def any_settings(features_dir: str | Path) -> GridSettings:
-    """Settings of the first grids of a folder, all of one extractor; ``StoreError`` if none."""
+    """Settings of any grids of a folder, all of one extractor; ``StoreError`` if none."""
     stored = stored_settings(features_dir)
     if not stored:
         raise StoreError(
@@ -185,13 +181,13 @@ class FeatureGrids(CachedTensors[Scan]):
 
     Args:
         features_dir: Folder of one extractor.
-        scans: Scans that will be asked for; each must have a grid.
-        projection: That of the range images.
+        scans: Scans, each of which must have a grid.
+        projection: Projection of the range images.
         grid_size: Rows and columns (h, w) of the grids.
-        extractor: The extractor that must have made them; any if None.
+        extractor: Must have made the grids; any if None.
 
     Raises:
-        StoreError: If a grid is missing or was made otherwise, or if the store is damaged.
+        StoreError: If a grid is missing or has other settings, or the store is damaged.
     """
 
     def __init__(
@@ -207,15 +203,14 @@ class FeatureGrids(CachedTensors[Scan]):
             sizes = ", ".join(str(list(other)) for other in stored)
             raise _made_otherwise("grid_size", sizes, list(size), Path(features_dir))
         settings = stored[size] if stored else any_settings(features_dir)
-        store = settings.store(features_dir)
-        settings.compare(_wanted(projection, extractor), store.folder)
-        super().__init__(store, scans)
+        settings.compare(_wanted(projection, extractor), Path(features_dir))
+        super().__init__(settings.store(features_dir), scans)
         self.dim = settings.dim
 
 
 @dataclass(frozen=True)
 class GridPlan:
-    """Grids to make: settings by size, scans that lack one (sorted), and disk space in bytes."""
+    """Grids to make: settings by size, scans that lack one (sorted), disk space in bytes."""
 
     features_dir: Path
     settings: Mapping[tuple[int, int], GridSettings]
@@ -239,14 +234,13 @@ def plan(
     dtype: Literal["float16", "int8"] = "float16",
     precision: str = "32-true",
 ) -> GridPlan:
-    """Find the grids that are missing, and refuse what cannot work before anything is written.
+    """Find the grids that are missing; arguments as for :func:`write_feature_grids`.
 
-    ``dtype`` and ``precision`` (as Lightning names it) need to be those of the store only where
-    grids are missing. Arguments: see :func:`write_feature_grids`.
+    ``dtype`` and ``precision`` (as Lightning names it) must be those of the store only where grids
+    are missing.
 
     Raises:
-        StoreError: If there are grids that were made with other settings, or the disk has not
-            enough space left.
+        StoreError: If there are grids of other settings, or too little disk space is left.
         ValueError: If there are no grid sizes, or one does not divide the range image.
     """
     if not grid_sizes:
@@ -256,7 +250,7 @@ def plan(
     for h, w in grid_sizes:
         own = GridSettings.of(extractor, projection, (h, w), dtype, precision)
         stored = stored_settings(features_dir).get((h, w), own)
-        stored.compare(_wanted(projection, extractor), stored.store(features_dir).folder)
+        stored.compare(_wanted(projection, extractor), features_dir)
         new = stored.store(features_dir).missing(scans)
         if new:
             own.check(features_dir)
@@ -270,14 +264,8 @@ def plan(
             f"{features_dir} has {free_bytes / 1e9:.1f} GB free: make space, give a features_dir "
             "on another disk, use dtype int8, or fewer scans (limit)."
         )
-    return GridPlan(
-        features_dir=features_dir,
-        settings=settings,
-        missing=sorted(missing),
-        num_kept=len(scans) - len(missing),
-        num_bytes=num_bytes,
-        free_bytes=free_bytes,
-    )
+    num_kept = len(scans) - len(missing)
+    return GridPlan(features_dir, settings, sorted(missing), num_kept, num_bytes, free_bytes)
 
 
 @torch.inference_mode()
@@ -287,17 +275,11 @@ def pooled_grids(
     projection: Projection,
     grid_sizes: Sequence[tuple[int, int]],
 ) -> dict[tuple[int, int], Tensor]:
-    """Feature grids of a batch of scans; the means and the linear step in float32 at least.
-
-    Args:
-        extractor: Frozen network, run where its tensors are.
-        samples: B scans, prepared for it.
-        projection: That of the range images.
-        grid_sizes: Rows and columns (h, w) of each grid.
+    """Feature grids of B prepared scans; the means and the linear step in float32 at least.
 
     Returns:
-        ``(B, N, D)`` float32 on the CPU for each grid size; empty cells are zero. ``StoreError``
-        names the scan whose features are not finite.
+        ``(B, N, D)`` float32 on the CPU for each grid size (h, w); empty cells are zero.
+        ``StoreError`` names the scan whose features are not finite.
     """
     features = extractor.point_features([sample.prepared for sample in samples])
     lift = getattr(extractor, "lift", torch.nn.Identity())
@@ -328,28 +310,25 @@ def write_feature_grids(
     dtype: Literal["float16", "int8"] = "float16",
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Make the grids that are missing for ``scans`` in this process; those that exist are kept.
+    """Make the missing grids of ``scans`` in this process; returns the number of scans.
 
-    Another process that makes grids in the folder is waited for. After an error or a kill, all but
-    the grids of the last batch are kept.
+    Waits for another process that writes to the folder. An error or a kill costs the grids of the
+    last batch only.
 
     Args:
         scans: Scans, of any number of drives.
         extractor: Frozen network, run where its tensors are.
-        projection: That of the range images.
+        projection: Projection of the range images.
         grid_sizes: Rows and columns (h, w) of each grid.
         features_dir: Folder of the extractor.
         workers: Processes that read and prepare the scans; 0 for none.
-        batch_size: Scans that the extractor is given at once.
-        dtype: How grids are stored, see :class:`r3dpa.data.store.Store`.
-        progress: Called after each scan with the number of scans done and the number to do.
-
-    Returns:
-        Number of scans whose grids were made.
+        batch_size: Scans per pass of the extractor.
+        dtype: Storage, see :class:`r3dpa.data.store.Store`.
+        progress: Called after each scan with the numbers of scans done and to do.
 
     Raises:
         StoreError: As :func:`plan`, or if ``features_dir`` cannot be written.
-        ScanError: If a scan cannot be used; the message names the file.
+        ScanError: If a scan cannot be used; names the file.
     """
     arguments = scans, extractor, projection, grid_sizes, features_dir, dtype
     if not plan(*arguments).missing:
@@ -381,11 +360,11 @@ def write_feature_grids(
 
 
 def features_lock(features_dir: str | Path) -> AbstractContextManager[None]:
-    """Lock of the one job that makes grids in a folder; another job waits for it."""
+    """Lock of the job that makes grids in a folder; waits for another one."""
     return store_lock(Path(features_dir), f"makes feature grids in {features_dir}")
 
 
 def _existing(folder: Path) -> Path:
-    """The folder itself or the first of its parents that exists."""
+    """The folder or its first existing parent."""
     folder = folder.absolute()
     return next(parent for parent in (folder, *folder.parents) if parent.exists())

@@ -33,7 +33,7 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 _DECODING_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 _IMAGES_TO_MEASURE = 10_000
 _BRIGHT = 128
-_MIRRORED = ".mirrored"  # end of the name of an entry that is seen from the other side
+_MIRRORED = ".mirrored"  # end of the name of a mirrored entry
 
 
 class ImageError(DataError):
@@ -45,7 +45,7 @@ class ImageBatch(TypedDict):
 
     ``image`` ``(B, 3, S, S)`` float32 red, green, blue in [-1, 1], absent where posteriors suffice;
     ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents,
-    where they are cached; ``index`` ``(B,)`` int64; ``name`` list of B names.
+    where they are cached; ``index`` ``(B,)`` int64; ``name`` B strings.
     """
 
     image: NotRequired[Tensor]
@@ -56,15 +56,9 @@ class ImageBatch(TypedDict):
 
 @dataclass(frozen=True)
 class ImageEntry:
-    """One image of a source.
+    """One image of a source, ``num_bytes`` from ``offset`` of ``path``; 0 if it is computed.
 
-    Args:
-        name: Unique within the source.
-        path: File or shard that holds it, for messages.
-        num_bytes: Size of the encoded image; 0 if it is computed.
-        offset: Where in ``path`` it starts.
-        mirrored: Whether left and right are exchanged.
-        mtime_ns: When ``path`` was changed last; 0 if the image is computed.
+    ``name`` is unique within the source; ``mtime_ns`` is the time of change of ``path``.
     """
 
     name: str
@@ -76,16 +70,16 @@ class ImageEntry:
 
     @property
     def cache_key(self) -> ItemKey:
-        """Name, size and time of change, which tell images of one name apart."""
+        """Name, size and time of change of the file."""
         return self.name, self.num_bytes, self.mtime_ns
 
     def mirror(self) -> ImageEntry:
-        """The same image, seen from the other side."""
+        """The same image with left and right exchanged."""
         return replace(self, name=self.name + _MIRRORED, mirrored=not self.mirrored)
 
 
 class ImageSource(ABC):
-    """Images by entry."""
+    """Source of square RGB images."""
 
     @abstractmethod
     def entries(self) -> list[ImageEntry]:
@@ -96,24 +90,22 @@ class ImageSource(ABC):
         """Square image ``(S, S, 3)`` of an entry, not mirrored; ``ImageError`` names a bad file."""
 
     def settings(self) -> dict[str, Any]:
-        """What the pixels depend on beside the entry, as JSON values."""
+        """Settings that the pixels depend on beside the entry, as JSON values."""
         return {}
 
 
 class ImageFolder(ImageSource):
     """Images below a folder, at any depth: ImageNet's ``<split>/<class>/<image>.JPEG`` or others.
 
-    Folders may be links; what is hidden (``.name``) is left out.
-
     Args:
-        root: The folder.
+        root: The folder; links are followed, hidden files (``.name``) left out.
     """
 
     def __init__(self, root: str) -> None:
         self.root = root
 
     def entries(self) -> list[ImageEntry]:
-        """All images below the folder, by their path relative to it."""
+        """All images, by their path relative to the folder."""
         root = Path(self.root)
         if not root.is_dir():
             raise ImageError(f"no folder {root}: give one that holds images.")
@@ -130,12 +122,11 @@ class ImageFolder(ImageSource):
 class TarImages(ImageSource):
     """Images of uncompressed tar files, as WebDataset writes them.
 
-    The headers of all shards are read once; an image is then one read at a known place, so that
-    shuffling needs no unpacking.
+    The headers of all shards are read once; an image is then one read at a known offset.
 
     Args:
-        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file. What is
-            hidden (``.name``) is left out, also in the shards.
+        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file. Hidden
+            files and members (``.name``) are left out.
     """
 
     def __init__(self, root: str) -> None:
@@ -165,7 +156,7 @@ class TarImages(ImageSource):
 
 
 def _files(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
-    """Files below a folder by the end of their name, also through links, but nothing hidden."""
+    """Files below a folder by their suffix, also through links, without hidden ones."""
     for folder, names, files in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
         # A link to a folder above leads to the same files again, without end.
@@ -240,8 +231,8 @@ def _decoded(entry: ImageEntry, name: str, size: int) -> NDArray[np.uint8]:
 def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """Largest centred square ``(S, S, 3)`` uint8 of an RGB image, resized.
 
-    While the shorter side is at least twice ``size`` it is halved by averaging 2 x 2 pixels, so
-    that the bicubic resizing after it does not alias.
+    While the shorter side is at least twice ``size`` it is halved by averaging 2 x 2 pixels; then
+    bicubic.
 
     Source: preprocessing of ADM (Dhariwal and Nichol, 2021), which REPA-E and R3DPA use.
     """
@@ -255,15 +246,7 @@ def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
 
 
 class ImageDataset(Dataset[dict[str, Any]]):
-    """Square images of some entries, or the cached posteriors of a VAE, or both.
-
-    Args:
-        source: Where the images come from.
-        entries: Those that are used, in the order of the indices.
-        size: Side S of the images.
-        posteriors: Cached moments of all entries, if any.
-        with_images: Whether the images are read.
-    """
+    """Square images of some entries of a source, or cached posteriors of a VAE, or both."""
 
     def __init__(
         self,
@@ -294,13 +277,9 @@ class ImageDataset(Dataset[dict[str, Any]]):
 
 
 def latent_statistics(posteriors: CachedTensors[ImageEntry]) -> tuple[Tensor, Tensor]:
-    """Mean and variance ``(C,)`` of the raw latents, samples of the posteriors.
+    """Mean and variance ``(C,)`` of the raw latents, samples of the posteriors ``(2C, h, w)``.
 
-    Args:
-        posteriors: Moments ``(2C, h, w)``; at most 10 000 of them, spread evenly, are read.
-
-    Raises:
-        StoreError: If an image was replaced since it was encoded.
+    At most 10 000 posteriors, spread evenly, are read.
     """
     chosen = evenly(posteriors.items, _IMAGES_TO_MEASURE)
     channels, rows, columns = posteriors.store.shape
@@ -313,17 +292,9 @@ def latent_statistics(posteriors: CachedTensors[ImageEntry]) -> tuple[Tensor, Te
 
 
 def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
-    """Mask from a picture: True where it is bright in any colour, and opaque.
+    """Mask ``(H, W)`` bool from a picture of H x W pixels: True where bright and opaque.
 
-    Args:
-        path: Picture of H x W pixels, one for each of the range image; PNG keeps them exact.
-        sensor: Size of the range image.
-
-    Returns:
-        ``(H, W)`` bool.
-
-    Raises:
-        ValueError: If the file is no picture of 8 bits a colour, or of another size; it is named.
+    ``ValueError`` if the file is no picture of 8 bits a colour, or of another size.
     """
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Labels of the points of a scan, whatever they come as: all as classes of KITTI-360.
+"""Labels of the points of a scan from three sources, as classes of KITTI-360.
 
 =====================================  ================================================
 scan                                   labels
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.data.scans import ScanError, read_beside
+from r3dpa.data.scans import ScanError, read_beside, read_bytes
 
 __all__ = ["CLASS_NAMES", "read_labels"]
 
@@ -36,32 +36,16 @@ CLASS_NAMES = {
     for place, name in enumerate(names.split(","))
 }
 _ID = {name: number for number, name in CLASS_NAMES.items()}
-# SemanticKITTI's own ids; those from 252 on are of things that move.
-_SEMANTIC_IDS = {
-    "car": (10, 252),
-    "bicycle": (11,),
-    "bus": (13, 257),
-    "motorcycle": (15,),
-    "train": (16, 256),
-    "truck": (18, 258),
-    "unknown vehicle": (20, 259),
-    "person": (30, 254),
-    "rider": (31, 32, 253, 255),
-    "road": (40, 60),
-    "parking": (44,),
-    "sidewalk": (48,),
-    "ground": (49,),
-    "building": (50,),
-    "fence": (51,),
-    "unknown construction": (52,),
-    "vegetation": (70, 71),
-    "terrain": (72,),
-    "pole": (80,),
-    "sign": (81,),
-    "unknown object": (99,),
-}
+# Ids of SemanticKITTI; those from 252 on are of things that move.
+_SEMANTIC_NAMES = """10 252 car; 11 bicycle; 13 257 bus; 15 motorcycle; 16 256 train; 18 258 truck;
+20 259 unknown vehicle; 30 254 person; 31 32 253 255 rider; 40 60 road; 44 parking; 48 sidewalk;
+49 ground; 50 building; 51 fence; 52 unknown construction; 70 71 vegetation; 72 terrain; 80 pole;
+81 sign; 99 unknown object"""
 _SEMANTIC_KITTI = {0: 0, 1: 0} | {
-    own: _ID[name] for name, numbers in _SEMANTIC_IDS.items() for own in numbers
+    int(word): _ID[" ".join(w for w in entry.split() if not w.isdigit())]
+    for entry in _SEMANTIC_NAMES.split(";")
+    for word in entry.split()
+    if word.isdigit()
 }
 _KITTI_BOXES = {
     "Car": _ID["car"],
@@ -76,9 +60,7 @@ _KITTI_BOXES = {
 
 
 def read_labels(scan: str | Path, points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Class and object of each point of a scan, from the files beside it.
-
-    Boxes label their own points alone: those of the road or of what nobody boxed stay without.
+    """Class and object of each point of a scan, from the files beside it; boxes label few points.
 
     Args:
         scan: The ``.bin`` file, in one of the layouts above.
@@ -89,8 +71,7 @@ def read_labels(scan: str | Path, points: NDArray[np.float32]) -> NDArray[np.int
         number of the object in the upper, 0 for none.
 
     Raises:
-        ScanError: If there are no labels, or a file of them is damaged or does not belong to the
-            scan; it is named.
+        ScanError: If there are no labels, or a file is damaged or of another scan.
     """
     scan = Path(scan)
     simulated = read_beside(scan, "labels")
@@ -110,7 +91,7 @@ def read_labels(scan: str | Path, points: NDArray[np.float32]) -> NDArray[np.int
 
 
 def _semantic_kitti(path: Path, num_points: int) -> NDArray[np.int64]:
-    data = _read(path)
+    data = read_bytes(path)
     if len(data) != 4 * num_points:
         raise ScanError(f"{path} holds {len(data) / 4:g} labels, but its scan {num_points} points")
     labels = np.frombuffer(data, dtype="<u4").astype(np.int64)
@@ -163,12 +144,5 @@ def _camera_of(path: Path) -> NDArray[np.float64]:
         ) from error
 
 
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ScanError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
 def _text(path: Path) -> str:
-    return _read(path).decode("utf-8", errors="replace")
+    return read_bytes(path).decode("utf-8", errors="replace")

@@ -1,4 +1,4 @@
-"""What objects look like to a feature extractor: one mean feature per class, from labelled scans.
+"""Mean feature of each class of objects, from labelled scans.
 
 Letters: P points, K values before the linear step, N = h * w cells, D feature width, C classes.
 """
@@ -31,14 +31,10 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class ObjectClass:
-    """What the feature of one class was made from.
+    """Statistics of one class, a name of :data:`r3dpa.data.labels.CLASS_NAMES`.
 
-    Args:
-        name: Of the class, one of :data:`r3dpa.data.labels.CLASS_NAMES`.
-        num_scans: Scans that show it.
-        num_cells: Cells of the feature grids that hold a point of it.
-        num_points: Points within the range limits.
-        spread: Mean of ``1 - cosine`` between the feature and those of the cells, in [0, 2].
+    ``num_cells`` are the feature-grid cells that hold a point of it, ``spread`` the mean of
+    ``1 - cosine`` between the feature and those of the cells, in [0, 2].
     """
 
     name: str
@@ -53,15 +49,11 @@ class ObjectLibrary:
     """Mean features of classes, to guide a generator towards them.
 
     Args:
-        features: ``(C, D)`` float32.
-        classes: What each row was made from.
-        extractor: ``name`` and ``settings`` of what made the features.
-        projection: That of the range images, as plain values.
+        features: ``(C, D)`` float32, finite.
+        classes: Class of each row, no two alike.
+        extractor: ``name`` and ``settings`` of the extractor.
+        projection: Projection of the range images, as plain values.
         grid_size: Rows and columns (h, w) of the cells.
-
-    Raises:
-        ValueError: If the rows and the classes do not fit each other, a class is named twice, or a
-            feature is not finite.
     """
 
     features: Tensor
@@ -82,7 +74,7 @@ class ObjectLibrary:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the classes."""
+        """Class names."""
         return tuple(entry.name for entry in self.classes)
 
     @property
@@ -91,7 +83,7 @@ class ObjectLibrary:
         return str(self.extractor["name"])
 
     def feature(self, name: str) -> Tensor:
-        """Mean feature ``(D,)`` of a class; ``ValueError`` lists those that there are."""
+        """Mean feature ``(D,)`` of a class; ``ValueError`` lists the known ones."""
         if name not in self.names:
             raise ValueError(
                 f"there is no {name!r} among the objects; there are {', '.join(self.names)}"
@@ -99,12 +91,7 @@ class ObjectLibrary:
         return self.features[self.names.index(name)]
 
     def check_source(self, source: str | None, dim: int) -> None:
-        """Raise ``ValueError`` where a network was aligned with another source or width.
-
-        Args:
-            source: Feature source that the checkpoint records, None for none.
-            dim: Width of its projected features.
-        """
+        """Raise ``ValueError`` where a network was aligned with another source or width."""
         own = self.features.shape[1]
         if source != self.source or dim != own:
             raise ValueError(
@@ -114,7 +101,7 @@ class ObjectLibrary:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write everything to one ``.safetensors`` file, atomically."""
+        """Write a ``.safetensors`` file, atomically."""
         card = {
             "version": _VERSION,
             "classes": [asdict(entry) for entry in self.classes],
@@ -147,7 +134,7 @@ class ObjectLibrary:
 
 
 class _Part(NamedTuple):
-    """Sums over the cells of one class in one scan, weighted by the class's share of each cell."""
+    """Sums over the cells of one class in one scan, weighted with its share of each cell."""
 
     features: Tensor
     directions: Tensor
@@ -166,30 +153,27 @@ def object_library(
 ) -> ObjectLibrary:
     """Mean feature of each class over the cells of labelled scans.
 
-    In a cell, the features of the class's own points are averaged. Of these means, each counts by
-    the share of the cell's points that are of the class::
+    In a cell, the features of the class's own points are averaged; the means are weighted with the
+    share of the cell's points that are of the class::
 
         feature = sum_cells share * mean / sum_cells share
 
-    so that a cell full of an object counts once whether it holds ten points or a hundred, and the
-    rim of an object, where its features depend on what is behind it, counts little.
+    so that a cell full of an object counts once, however many points it holds, and the rim of an
+    object, where its features depend on what is behind it, counts little.
 
     Source: R3DPA (ICRA 2026) averages the points of the class in a single scan.
 
     Args:
         scans: Scans with labels, see :func:`r3dpa.data.labels.read_labels`.
         extractor: Frozen network, run where its tensors are.
-        projection: That of the range images.
+        projection: Projection of the range images.
         grid_size: Rows and columns (h, w) of the cells.
-        classes: Names of the classes; all that the scans show where None.
-
-    Returns:
-        The library, its classes in the order given, or by id.
+        classes: Class names, in the order of the result; by id all that the scans show where None.
 
     Raises:
         ScanError: If a scan or its labels cannot be used; names the file.
-        ValueError: If a class is unknown, named twice or not in the scans, there is nothing
-            labelled, the grid does not divide the range image, or a feature is not finite.
+        ValueError: If a class is unknown, named twice or not in the scans, the grid does not divide
+            the range image, or a feature is not finite.
     """
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     wanted = _wanted(classes)
@@ -242,7 +226,7 @@ def object_library(
 
 
 def _mean(name: str, parts: list[_Part]) -> tuple[Tensor, ObjectClass]:
-    """Feature ``(D,)`` of a class and what it was made from."""
+    """Feature ``(D,)`` and statistics of a class."""
     features = torch.stack([part.features for part in parts]).cumsum(0)[-1]
     directions = torch.stack([part.directions for part in parts]).cumsum(0)[-1]
     weight = sum(part.weight for part in parts)

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,23 +43,15 @@ from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_r
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
 T = TypeVar("T")
+Arrays = Iterator[tuple[str, np.ndarray]]  # name within the file and cloud (P, ...) or (C, H, W)
 SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth"]
-SUFFIXES: dict[SampleFormat, tuple[str, ...]] = {
-    "bin_xyz": (".bin",),
-    "bin": (".bin",),  # the later one is meant where no format is given
-    "ply": (".ply",),
-    "txt": (".txt",),
-    "npz": (".npz",),
-    "npy": (".npy",),
-    "pth": (".pth", ".pt"),
-}
 READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
 _LENGTH_TOLERANCE = 0.02
 
 
 class SampleError(ScanError):
-    """A sample that cannot be judged; the message names the file and the reason."""
+    """A sample that cannot be used; the message names the file and the reason."""
 
 
 class Sample(NamedTuple):
@@ -70,8 +61,7 @@ class Sample(NamedTuple):
         name: Unique within the samples.
         points: ``(P, 3)`` or ``(P, 4)`` float32 x, y, z in metres and, where the file holds it,
             intensity; P >= 1, all within the sensor's range limits.
-        range_m: ``(H, W)`` metres, ``EMPTY_RANGE_M`` without a return; None where the file holds
-            points alone.
+        range_m: ``(H, W)`` metres, ``EMPTY_RANGE_M`` without a return; None for clouds.
         intensity: ``(H, W)``, 0 without a return; None where the file holds none, or no image.
     """
 
@@ -151,8 +141,8 @@ def read_samples(
         format: See the table of this module; found from the content where None. In a folder, the
             files to read.
         unprojection: Which point of a pixel its ray passes, for images without points.
-        skip_bad: Leave bad samples out; they are in ``bad`` of the result, and a warning counts
-            them. Else the first one stops.
+        skip_bad: Leave bad samples out; ``bad`` of the result lists them, and a warning counts
+            them. Otherwise the first one is an error.
 
     Raises:
         SampleError: If nothing is found, or a folder holds several formats; while iterating, if a
@@ -169,44 +159,38 @@ def _find(
     """Names and paths of the sample files of a folder, and their format where it is given."""
     if not folder.is_dir():
         raise SampleError(f"{folder}: there is no such file or folder")
-    files = [
-        file
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and not any(p.startswith(".") for p in file.relative_to(folder).parts)
-    ]
-    format_of = {suffix: name for name in SUFFIXES for suffix in SUFFIXES[name]}
-    counts = Counter(format_of[f.suffix.lower()] for f in files if f.suffix.lower() in format_of)
     if wanted is None:
-        if (folder / "numpy" / "img.npz").is_file():
-            return [("", folder / "numpy" / "img.npz")], "npz"
-        if (folder / "scenes.npz").is_file() and (folder / "metadata.json").is_file():
-            return [("", folder / "scenes.npz")], "npz"
-        if (folder / "bin").is_dir() and (folder / "metadata.json").is_file():
+        ours = (folder / "metadata.json").is_file()
+        for place, known in (("numpy/img.npz", True), ("scenes.npz", ours)):
+            if known and (folder / place).is_file():
+                return [("", folder / place)], "npz"
+        if ours and (folder / "bin").is_dir():
             return _find(folder / "bin", "bin")
-        if (folder / "data_3d_raw").is_dir():
-            counts = Counter({"bin": counts["bin"]})  # beside them KITTI-360 has time stamps
-        if len(counts) > 1:
-            found = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
-            raise SampleError(
-                f"{folder}: holds several formats ({found}), perhaps each scene more than once; "
-                "give the format to read, or one of its sub-folders"
-            )
-    chosen = wanted or next(iter(counts), None)
-    suffixes = SUFFIXES[chosen] if chosen else ()
-    named = [
-        (file.relative_to(folder).with_suffix("").as_posix(), file)
-        for file in files
-        if file.suffix.lower() in suffixes
-    ]
-    if not named:
-        kind = f"file with {' or '.join(suffixes)}" if wanted else "samples"
+    files: dict[SampleFormat, list[Path]] = {}
+    for file in sorted(folder.rglob("*")):
+        hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+        if file.suffix.lower() in _FORMAT_OF and file.is_file() and not hidden:
+            files.setdefault(_FORMAT_OF[file.suffix.lower()], []).append(file)
+    if (folder / "data_3d_raw").is_dir():  # beside the scans KITTI-360 has time stamps
+        files = {"bin": files.get("bin", [])} if wanted is None else files
+    if wanted is None and len(files) > 1:
+        found = ", ".join(f"{len(files[name])} {name}" for name in sorted(files))
+        raise SampleError(
+            f"{folder}: holds several formats ({found}), perhaps each scene more than once; "
+            "give the format to read, or one of its sub-folders"
+        )
+    chosen = wanted or next(iter(files), None)
+    paths = files.get("bin" if chosen == "bin_xyz" else chosen, []) if chosen else []
+    if not paths:
+        suffixes = " or ".join(_READERS[wanted][0]) if wanted else ""
+        kind = f"file with {suffixes}" if wanted else "samples"
         raise SampleError(f"{folder}: holds no {kind}; what can be read: {READABLE}")
-    if suffixes == (".bin",):
+    if chosen in ("bin", "bin_xyz"):
         try:
-            named = [(scan.name, scan.path) for scan in find_scans(folder)]
+            return [(scan.name, scan.path) for scan in find_scans(folder)], wanted
         except ValueError as error:
             raise SampleError(error) from error
-    return named, wanted
+    return [(p.relative_to(folder).with_suffix("").as_posix(), p) for p in paths], wanted
 
 
 def _format_of(file: Path) -> SampleFormat:
@@ -216,54 +200,54 @@ def _format_of(file: Path) -> SampleFormat:
     suffix = file.suffix.lower()
     if not head:
         raise SampleError(f"{file}: is empty")
-    if suffix == ".bin":
-        return "bin"
-    if head.startswith(b"\x93NUMPY"):
-        return "npy"
-    if head.startswith(b"ply"):
-        return "ply"
-    if suffix in SUFFIXES["pth"]:
-        return "pth"
-    if head.startswith(b"PK"):
-        return "npz"
-    if head[:1].isdigit() or head[:1] in b"+-. ":
-        return "txt"
+    kinds: dict[SampleFormat, bool] = {
+        "bin": suffix == ".bin",
+        "npy": head.startswith(b"\x93NUMPY"),
+        "ply": head.startswith(b"ply"),
+        "pth": suffix in (".pth", ".pt"),
+        "npz": head.startswith(b"PK"),
+        "txt": head[:1].isdigit() or head[:1] in b"+-. ",
+    }
+    for kind, fits in kinds.items():
+        if fits:
+            return kind
     raise SampleError(
         f"{file}: starts with {head[:16]!r}, which is no known format; what can be read: {READABLE}"
     )
 
 
-def _arrays_of(file: Path, given: SampleFormat | None) -> Iterator[tuple[str, np.ndarray]]:
-    """Name within the file, if it holds many, and cloud ``(P, ...)`` or image ``(C, H, W)``."""
-    kind = given or _format_of(file)
-    if kind == "bin":
-        yield "", read_scan(file)
-    elif kind == "bin_xyz":
-        data = file.read_bytes()
-        if len(data) % 12:
-            raise SampleError(f"{file}: has {len(data)} bytes, not a multiple of 12 (x, y, z)")
-        yield "", np.frombuffer(data, "<f4").reshape(-1, 3)
-    elif kind == "ply":
-        yield "", read_ply(file)
-    elif kind == "txt":
-        try:
-            rows = np.loadtxt(file, dtype=np.float32, ndmin=2)
-        except (ValueError, UnicodeDecodeError) as error:
-            raise SampleError(f"{file}: is not text rows of numbers ({error})") from error
-        yield "", rows[:, :3] if rows.shape[1] == 6 else rows  # without colours
-    elif kind == "npy":
-        with file.open("rb") as stream:
-            yield from _parts(ArrayReader(stream, file.stat().st_size, str(file)))
-    elif kind == "npz":
-        for number, (key, reader) in enumerate(npz_members(file)):
-            unnamed = key == "arr_0" and number == 0  # NumPy's name where none is given
-            for part, array in _parts(reader):
-                yield "/".join(filter(None, ("" if unnamed else key, part))), array
-    else:
-        yield from _tensors(file)
+def _arrays_of(file: Path, given: SampleFormat | None) -> Arrays:
+    yield from _READERS[given or _format_of(file)][1](file)
 
 
-def _parts(reader: ArrayReader) -> Iterator[tuple[str, np.ndarray]]:
+def _xyz_rows(file: Path) -> Arrays:
+    data = file.read_bytes()
+    if len(data) % 12:
+        raise SampleError(f"{file}: has {len(data)} bytes, not a multiple of 12 (x, y, z)")
+    yield "", np.frombuffer(data, "<f4").reshape(-1, 3)
+
+
+def _text_rows(file: Path) -> Arrays:
+    try:
+        rows = np.loadtxt(file, dtype=np.float32, ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise SampleError(f"{file}: is not text rows of numbers ({error})") from error
+    yield "", rows[:, :3] if rows.shape[1] == 6 else rows  # without colours
+
+
+def _npy_parts(file: Path) -> Arrays:
+    with file.open("rb") as stream:
+        yield from _parts(ArrayReader(stream, file.stat().st_size, str(file)))
+
+
+def _npz_parts(file: Path) -> Arrays:
+    for number, (key, reader) in enumerate(npz_members(file)):
+        unnamed = key == "arr_0" and number == 0  # NumPy's name where none is given
+        for part, array in _parts(reader):
+            yield "/".join(filter(None, ("" if unnamed else key, part))), array
+
+
+def _parts(reader: ArrayReader) -> Arrays:
     """A cloud, or each cloud or image of a stack; images without a channel axis are ranges."""
     if reader.dtype.kind != "f":
         raise SampleError(f"{reader.where}: holds {reader.dtype} numbers; metres must be floats")
@@ -280,7 +264,7 @@ def _parts(reader: ArrayReader) -> Iterator[tuple[str, np.ndarray]]:
         yield f"{index:06d}", part if clouds or part.ndim == 3 else part[None]
 
 
-def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+def _tensors(file: Path) -> Arrays:
     """Images or a cloud of a file of ``torch.save``; stacks stay on disk until they are read."""
     try:
         mapped = zipfile.is_zipfile(file)  # not before torch 1.6
@@ -289,10 +273,9 @@ def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
         raise SampleError(
             f"{file}: cannot be read as tensors alone ({first_line(error)})"
         ) from error
+    parts = [content]
     if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
         parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
-    else:
-        parts = [content]
     if not all(isinstance(part, Tensor) and part.is_floating_point() for part in parts):
         found = f"keys {', '.join(map(str, content))}" if isinstance(content, dict) else "no tensor"
         raise SampleError(
@@ -310,6 +293,20 @@ def _tensors(file: Path) -> Iterator[tuple[str, np.ndarray]]:
         yield f"{index:06d}", torch.cat(images).detach().float().numpy()
 
 
+_READERS: dict[SampleFormat, tuple[tuple[str, ...], Callable[[Path], Arrays]]] = {
+    "bin": ((".bin",), lambda file: iter([("", read_scan(file))])),
+    "bin_xyz": ((".bin",), _xyz_rows),
+    "ply": ((".ply",), lambda file: iter([("", read_ply(file))])),
+    "txt": ((".txt",), _text_rows),
+    "npz": ((".npz",), _npz_parts),
+    "npy": ((".npy",), _npy_parts),
+    "pth": ((".pth", ".pt"), _tensors),
+}
+_FORMAT_OF: dict[str, SampleFormat] = {
+    suffix: name for name in reversed(_READERS) for suffix in _READERS[name][0]
+}
+
+
 def _sample(name: str, where: str, array: np.ndarray, sensor: LidarSensor, corner: bool) -> Sample:
     """Sample of a cloud ``(P, ...)`` or an image ``(C, H, W)``; ``where`` is for messages."""
     values = torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
@@ -320,8 +317,7 @@ def _sample(name: str, where: str, array: np.ndarray, sensor: LidarSensor, corne
         raise SampleError(f"{where}: has rows of {values.shape[1]} numbers; needs 3 or 4 (x, y, z)")
     if not len(values):
         raise SampleError(f"{where}: is an empty cloud")
-    bad = int((~values.isfinite().all(dim=1)).sum())
-    if bad:
+    if bad := int((~values.isfinite().all(dim=1)).sum()):
         raise SampleError(f"{where}: has NaN or infinite values in {bad} of {len(values)} points")
     kept = in_range(values[:, :3], sensor)
     if not kept.any():
@@ -344,8 +340,7 @@ def _image_sample(
             "z without or with intensity"
         )
     distance = image[0]
-    if not distance.isfinite().all():
-        bad = int((~distance.isfinite()).sum())
+    if bad := int((~distance.isfinite()).sum()):
         raise SampleError(f"{where}: has NaN or infinite ranges in {bad} pixels")
     valid = (distance > sensor.range_min_m) & (distance < sensor.range_max_m)
     if not valid.any():
@@ -363,8 +358,7 @@ def _image_sample(
     else:
         points = image[1:4, valid].T
         error = (torch.linalg.vector_norm(points, dim=1) - distance[valid]).abs()
-        wrong = int((~(error <= _LENGTH_TOLERANCE * distance[valid])).sum())  # NaN too
-        if wrong:
+        if wrong := int((~(error <= _LENGTH_TOLERANCE * distance[valid])).sum()):  # NaN too
             raise SampleError(
                 f"{where}: channel 0 is not the length of channels 1 to 3 in {wrong} of "
                 f"{len(points)} pixels; their order must be range, x, y, z, in metres"

@@ -17,7 +17,7 @@ from typing import IO, Literal, TypeVar
 import numpy as np
 import torch
 
-from r3dpa.data.store import DataError, ItemKey, item_key
+from r3dpa.data.store import DataError, ItemKey
 from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, refuse_name
 from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name
@@ -32,20 +32,10 @@ KITTI360_DRIVES: dict[Split, tuple[str, ...]] = {
 RAW = "data_3d_raw"
 VELODYNE = Path("velodyne_points") / "data"
 _BYTES_PER_POINT = 16
-_PLY_NAMES = {
-    "i1": "char int8",
-    "u1": "uchar uint8",
-    "<i2": "short int16",
-    "<u2": "ushort uint16",
-    "<i4": "int int32",
-    "<u4": "uint uint32",
-    "<f4": "float float32",
-    "<f8": "double float64",
-}
-_PLY_TYPES = {name: code for code, names in _PLY_NAMES.items() for name in names.split()}
-_FIVE_COLUMNS = (
-    "its values are those of 5 columns, as nuScenes has them (x, y, z, intensity 0..255, ring): "
-    "save the first 4 as float32, the intensity divided by 255"
+_PLY_NAMES = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
+_PLY_NAMES += ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+_PLY_TYPES = dict(
+    zip(_PLY_NAMES, ["i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"] * 2, strict=True)
 )
 #: Raised for archives that are damaged, or packed or encrypted in a way that is not read.
 ARCHIVE_ERRORS = (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError)
@@ -76,20 +66,21 @@ class Scan:
 
     @property
     def cache_key(self) -> ItemKey:
-        """Name, size and time of change of the file, see :func:`r3dpa.data.store.item_key`."""
+        """Name, size and time of change of the file."""
         try:
-            return item_key(self.name, self.path.stat())
+            about = self.path.stat()
         except OSError as error:
-            raise ScanError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+            raise _unreadable(self.path, error) from error
+        return self.name, about.st_size, about.st_mtime_ns
 
 
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
-    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), the Velodyne scans alone. Links
+    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
-    to the given folder, or to the common parent of the files of a glob or list, without the fixed
-    folders of the KITTI-360 layout.
+    to the given folder, or to the common parent of a glob or list, without the fixed folders of
+    the KITTI-360 layout.
 
     Raises:
         ValueError: If nothing is found, or one file is named twice.
@@ -105,7 +96,8 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     twice = [str(file) for file, count in Counter(files).items() if count > 1]
     if twice:
         raise ValueError(f"Scans given twice: {', '.join(twice[:5])}. Name every file once.")
-    root = Path(entries[0]).absolute() if single else _common_parent(files)
+    parent = os.path.commonpath([file.parent for file in files])
+    root = Path(entries[0] if single else parent).absolute()
     return sorted(Scan(_drive_name(file.parent, root), file.stem, file) for file in files)
 
 
@@ -140,15 +132,26 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
 
     Raises:
         ScanError: If the file is unreadable, empty, of another layout, holds NaN or infinite
-            values, or has no point within the range limits of the sensor, where one is given; the
-            message names the file.
+            values, or has no point within the range limits of ``sensor``; names the file.
     """
     path = Path(path)
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if not data:
         raise ScanError(f"{path}: is empty")
-    if wrong := _wrong_layout(data):
-        raise ScanError(f"{path}: {wrong}")
+    whole = len(data) % _BYTES_PER_POINT == 0
+    if len(data) % 20 == 0:
+        # Where the size fits both, the values decide: an intensity is never negative.
+        values = np.frombuffer(data, dtype="<f4")
+        four = whole and not (values[3::4] < 0).any()
+        if not four and (values[3::5] >= 0).all():
+            raise ScanError(
+                f"{path}: has {len(data)} bytes, and its values are those of 5 columns, as "
+                "nuScenes has them (x, y, z, intensity 0..255, ring): save the first 4 as float32, "
+                "the intensity divided by 255"
+            )
+    if not whole:
+        expected = "a multiple of 16 (x, y, z, intensity as float32)"
+        raise ScanError(f"{path}: has {len(data)} bytes, not {expected}")
     points = np.frombuffer(data, dtype="<f4").reshape(-1, 4).copy()
     bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
     if bad:
@@ -158,22 +161,8 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     return points
 
 
-def _wrong_layout(data: bytes) -> str | None:
-    """Why bytes are not rows of 4 float32; None if they are."""
-    whole = len(data) % _BYTES_PER_POINT == 0
-    if len(data) % 20 == 0:
-        # Where the size fits both, the values decide: an intensity is never negative.
-        values = np.frombuffer(data, dtype="<f4")
-        four = whole and not (values[3::4] < 0).any()
-        if not four and (values[3::5] >= 0).all():
-            return f"has {len(data)} bytes, and {_FIVE_COLUMNS}"
-    if whole:
-        return None
-    return f"has {len(data)} bytes, not a multiple of 16 (x, y, z, intensity as float32)"
-
-
 def out_of_range(path: Path, sensor: LidarSensor) -> ScanError:
-    """Error of a scan none of whose points lies within the range limits."""
+    """Error of a scan without a point within the range limits."""
     limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
     return ScanError(f"{path}: has no point within the sensor's range {limits}")
 
@@ -187,14 +176,14 @@ def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndar
             ``"origins"``: uint8, see :class:`r3dpa.simulation.Origin`.
 
     Raises:
-        ScanError: If the file is unreadable or of another length than the scan; it is named.
+        ScanError: If the file is unreadable or of another length than the scan.
     """
     scan = Path(scan)
     suffix, dtype = {"labels": (".label", "<u4"), "origins": (".origin", "u1")}[kind]
     path = scan.parents[1] / kind / f"{scan.stem}{suffix}"
     if scan.parts[-3:-1] != ("velodyne_points", "data") or not path.exists():
         return None
-    data, num_points = _read_bytes(path), scan.stat().st_size // _BYTES_PER_POINT
+    data, num_points = read_bytes(path), scan.stat().st_size // _BYTES_PER_POINT
     if len(data) != num_points * np.dtype(dtype).itemsize:
         raise ScanError(
             f"{path} holds {len(data) / np.dtype(dtype).itemsize:g} numbers but {scan} "
@@ -206,7 +195,7 @@ def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndar
 def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
     """Write ``(P, 3)`` or ``(P, 4)`` x, y, z (metres), intensity (else 0) as KITTI ``.bin``.
 
-    Atomic; raises ``ValueError`` for another shape, NaN or infinite values.
+    Atomic; ``ValueError`` for another shape, NaN or infinite values.
     """
     rows = _rows(points)
     if rows.shape[1] == 3:
@@ -218,7 +207,7 @@ def write_bin(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
 def write_ply(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
     """Write ``(P, 3)`` or ``(P, 4)`` x, y, z (metres), intensity as binary ``.ply``.
 
-    Atomic; raises ``ValueError`` for another shape, NaN or infinite values.
+    Atomic; ``ValueError`` for another shape, NaN or infinite values.
     """
     rows = _rows(points)
     names = ("x", "y", "z", "intensity")[: rows.shape[1]]
@@ -233,10 +222,10 @@ def read_ply(path: str | Path) -> np.ndarray:
 
     Raises:
         ScanError: If the file is unreadable, has another format, other elements than ``vertex``, or
-            lacks x, y or z; the message names the file.
+            lacks x, y or z.
     """
     path = Path(path)
-    head, separator, body = _read_bytes(path).partition(b"end_header\n")
+    head, separator, body = read_bytes(path).partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").split("\n")
     if not separator or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
         raise ScanError(f"{path}: is not a binary little-endian .ply file")
@@ -271,10 +260,8 @@ def write_npz(
 ) -> None:
     """Write many scans to one compressed ``.npz`` file, atomically and one after the other.
 
-    Args:
-        path: File to write.
-        scans: Points ``(P, 3)`` or ``(P, 4)`` by name, or pairs of name and points, which need not
-            be in memory together; ``ValueError`` for another shape, NaN or infinite values.
+    ``scans`` are points ``(P, 3)`` or ``(P, 4)`` by name, or pairs of name and points, which need
+    not be in memory together; ``ValueError`` for another shape, NaN or infinite values.
     """
     pairs = scans.items() if isinstance(scans, Mapping) else scans
     with (
@@ -294,10 +281,8 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
 class ArrayReader:
     """Array in NumPy's format, read whole or row by row; objects are refused.
 
-    Args:
-        stream: Positioned at the start of the array.
-        size: Bytes that the stream holds, so that a few cannot ask for much memory.
-        where: For the :class:`ScanError` of a damaged array.
+    ``size`` is that of the stream in bytes, so that a few cannot ask for much memory; ``where``
+    stands in the :class:`ScanError` of a damaged array.
     """
 
     def __init__(self, stream: IO[bytes], size: int, where: str) -> None:
@@ -321,7 +306,7 @@ class ArrayReader:
             )
 
     def whole(self) -> np.ndarray:
-        """The array."""
+        """The whole array."""
         return self._next(self.shape, "F" if self._fortran else "C")
 
     def rows(self) -> Iterator[np.ndarray]:
@@ -343,10 +328,7 @@ class ArrayReader:
 
 
 def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
-    """Name and reader of each array of a ``.npz`` file, each to be read before the next.
-
-    Names that lead out of a folder, and damaged archives, are a :class:`ScanError`.
-    """
+    """Name and reader of each array of a ``.npz`` file, each to be read before the next."""
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
@@ -367,7 +349,7 @@ def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
 
 
 def scan_files(entry: str | Path) -> Iterator[Path]:
-    """Files of a folder, file or glob that are scans."""
+    """Scan files of a folder, file or glob."""
     path = Path(entry)
     if (path / RAW).is_dir():
         for drive in (path / RAW).iterdir():
@@ -399,15 +381,16 @@ def _is_scan(file: Path) -> bool:
     return file.suffix == ".bin" and not file.name.startswith(".")
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """Content of a file; ``ScanError`` if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise ScanError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise _unreadable(path, error) from error
 
 
-def _common_parent(files: list[Path]) -> Path:
-    return Path(os.path.commonpath([file.parent for file in files]))
+def _unreadable(path: Path, error: OSError) -> ScanError:
+    return ScanError(f"{path}: cannot be read ({error.strerror or error})")
 
 
 def _drive_name(folder: Path, root: Path) -> str:

@@ -1,4 +1,4 @@
-"""Generated scenes as files, written while the next ones are drawn."""
+"""Writer of generated scenes, which runs beside the generator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from io import SEEK_END, FileIO
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -32,7 +31,7 @@ SceneFormat = Literal["bin", "ply", "npz"]
 SCENE_FORMATS: tuple[SceneFormat, ...] = ("bin", "ply", "npz")
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
-#: What ``r3dpa sample`` and the edits write beside their metadata; the commands draw the pictures.
+#: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
     *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
     *("before.npy", "mask.png", "edit.png", "edit.html"),
@@ -41,7 +40,7 @@ _MOST_WAITING = 2
 
 
 class SceneWriter:
-    """Writes scenes in order, in one thread, and goes on where an interrupted run has stopped.
+    """Writes scenes in order, in a thread, and completes an interrupted run.
 
     ===================== =====================================================================
     ``range_m.npy``       ``(num, H, W)`` float32 metres, -1 without a return
@@ -58,18 +57,18 @@ class SceneWriter:
     Args:
         out: Folder; one process at a time writes to it.
         num: Number of scenes.
-        projection: Of the range images.
+        projection: Projection of the range images.
         formats: Of :data:`SCENE_FORMATS`.
-        request: All that decides about the scenes, as JSON knows it.
+        request: All settings that determine the scenes, as JSON values.
         overwrite: Start anew in a folder that holds scenes, finished or not.
 
     Attributes:
-        num_done: Scenes written so far, by interrupted runs of the same request too.
-        evaluations: Network evaluations that these took, of all scenes together.
+        num_done: Scenes written so far, also by interrupted runs of the same request.
+        evaluations: Network evaluations of all these scenes together.
 
     Raises:
         ValueError: If a format is unknown, another process writes to ``out``, or it holds scenes,
-            unfinished ones of another request, or damaged ones.
+            or unfinished ones of another request.
         OSError: If ``out`` cannot be written.
     """
 
@@ -110,12 +109,7 @@ class SceneWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         with self._alone:
             self._thread.shutdown()
             self._file.close()
@@ -134,15 +128,15 @@ class SceneWriter:
         return self.out / "range_m.npy"
 
     def put(self, range_m: Tensor, nfe: int = 0) -> None:
-        """Takes the next scenes and returns at once, unless two batches wait already.
+        """Queue the next scenes; waits only while two batches are queued already.
 
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
-            nfe: Network evaluations that each of them took.
+            nfe: Network evaluations of each of them.
 
         Raises:
-            ValueError: If a scene that was put before holds NaN.
-            OSError: If a scene that was put before could not be written.
+            ValueError: If a queued scene holds NaN.
+            OSError: If a queued scene could not be written.
         """
         while len(self._waiting) >= _MOST_WAITING:
             self._waiting.popleft().result()
@@ -155,7 +149,7 @@ class SceneWriter:
         self._waiting.append(self._thread.submit(self._write, range_m, nfe, ready))
 
     def close(self) -> None:
-        """Waits until all scenes are written, and gives ``range_m.npy`` its name."""
+        """Wait until all scenes are written, and give ``range_m.npy`` its name."""
         while self._waiting:
             self._waiting.popleft().result()
         self._thread.shutdown()
@@ -166,7 +160,7 @@ class SceneWriter:
         self._unfinished.replace(self.range_path)
 
     def finish(self, metadata: dict[str, Any]) -> None:
-        """Writes ``metadata.json``, with which the folder is complete."""
+        """Write ``metadata.json``, which marks the folder as complete."""
         with atomic_path(self.out / "metadata.json") as temporary:
             temporary.write_text(json.dumps(metadata, indent=2) + "\n")
         self._state.unlink()
@@ -181,16 +175,13 @@ class SceneWriter:
             raise ValueError(
                 f"{self._state}: is damaged ({error!r}); give --overwrite true to start anew"
             ) from error
-        differing = [
-            key for key in {**found, **self._request} if found.get(key) != self._request.get(key)
-        ]
-        if differing and num_done:
-            key = differing[0]
-            raise ValueError(
-                f"{self.out} holds {num_done} scenes of an unfinished run with {key} "
-                f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
-                "--overwrite true starts anew"
-            )
+        for key in {**found, **self._request} if num_done else ():
+            if found.get(key) != self._request.get(key):
+                raise ValueError(
+                    f"{self.out} holds {num_done} scenes of an unfinished run with {key} "
+                    f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
+                    "--overwrite true starts anew"
+                )
         if num_done and not self._unfinished.exists():  # stopped between the two last files
             if not self.range_path.exists():
                 raise ValueError(self._lost(num_done, "is gone"))
@@ -204,7 +195,7 @@ class SceneWriter:
         )
 
     def _clear(self) -> None:
-        """Removes what earlier runs of the same command wrote, and nothing else."""
+        """Remove the output of earlier runs, and nothing else."""
         metadata = self.out / "metadata.json"
         written = [self.out / name for name in _WRITTEN]
         if not metadata.exists() and not self._state.exists():
@@ -214,7 +205,7 @@ class SceneWriter:
                         f"{path} is in the way and no scenes of this command lie in {self.out}; "
                         "give another --out"
                     )
-        # From here on the folder is known as ours, should this be interrupted.
+        # Marks the folder as ours, should this be interrupted.
         self.out.mkdir(parents=True, exist_ok=True)
         self._save_state(0, 0)
         metadata.unlink(missing_ok=True)
@@ -225,7 +216,7 @@ class SceneWriter:
                 path.unlink(missing_ok=True)
 
     def _open(self) -> FileIO:
-        """File of the range images, behind those that are written."""
+        """File of the range images, positioned after those that are written."""
         sensor = self._projection.sensor
         shape = (self.num, sensor.beams, sensor.columns)
         file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
@@ -240,7 +231,7 @@ class SceneWriter:
         return file
 
     def _write(self, range_m: Tensor, nfe: int, ready: torch.cuda.Event | None) -> None:
-        """Writes one batch; none after one that failed, whose error the next call tells."""
+        """Write one batch; none after one that failed, whose error the next call raises."""
         if self._failed:
             return
         self._failed = True

@@ -6,10 +6,10 @@ A store is a folder::
     shard_00000.rows     rows of fixed size
     shard_00000.jsonl    journal: {"scan": name, "bytes": size, "mtime_ns": time, "row": i} per row
 
-A line of the journal is written when its row is on disk, so that a process killed at any moment
+A line of the journal is written after its row is on disk, so that a process killed at any moment
 leaves no wrong row: rows without a line and a torn last line do not count. Every writer makes a
-shard of its own. A row belongs to the name, size and time of change of its file; rows of journals
-without times, as older versions wrote them, to name and size.
+shard of its own. A row belongs to the name, size and time of change of its file; in older journals,
+which have no times, to name and size.
 """
 
 from __future__ import annotations
@@ -34,21 +34,16 @@ from torch import Tensor
 
 from r3dpa.io import atomic_path, only_writer, refuse_name
 
-__all__ = ["CachedTensors", "Store", "StoreError", "StoreWriter", "TensorCache", "item_key"]
+__all__ = ["CachedTensors", "Store", "StoreError", "StoreWriter", "TensorCache"]
 
 ItemKey = tuple[str, int, int]
-"""Name, size in bytes and time of change (ns) of the file that a row was made from."""
+"""Name, size in bytes and time of change (ns) of the file that a row is made from."""
 _VERSION = 1  # to be raised when the same settings give other numbers
 _LARGEST_CODE = 127
 
 
-def item_key(name: str, about: os.stat_result) -> ItemKey:
-    """Key of an item in a file: a file written anew has another time, if not another size."""
-    return name, about.st_size, about.st_mtime_ns
-
-
 class DataError(ValueError):
-    """A file that cannot be used; in one line, also when a loader process raised it."""
+    """A file that cannot be used; a one-line message, also from a loader process."""
 
     def __init__(self, message: object) -> None:
         text = str(message)
@@ -58,23 +53,20 @@ class DataError(ValueError):
 
 
 class StoreError(DataError):
-    """A row that is missing, or a store that is damaged or cannot be written; says the remedy."""
+    """A row that is missing, or a store that is damaged or cannot be written."""
 
 
 class Cacheable(Protocol):
-    """Scan or image that a row is made of."""
+    """Scan or image that a row is made of; ``name`` is unique, ``path`` stands in messages."""
 
     @property
-    def name(self) -> str:
-        """Unique within the data set."""
+    def name(self) -> str: ...
 
     @property
-    def path(self) -> Path:
-        """File that holds it, for messages."""
+    def path(self) -> Path: ...
 
     @property
-    def cache_key(self) -> ItemKey:
-        """See :func:`item_key`."""
+    def cache_key(self) -> ItemKey: ...
 
 
 Item = TypeVar("Item", bound=Cacheable)
@@ -104,7 +96,7 @@ class Store(Generic[Item]):
 
     @cached_property
     def row(self) -> np.dtype[Any]:
-        """NumPy type of a row: ``values``, or ``scale`` and ``codes``."""
+        """Layout of a row: ``values``, or ``scale`` and ``codes``."""
         if self.dtype == "int8":
             return np.dtype([("scale", "<f4", self.shape[:-1]), ("codes", "i1", self.shape)])
         kind = {"float16": "<f2", "float32": "<f4"}[self.dtype]
@@ -119,20 +111,20 @@ class Store(Generic[Item]):
         return found
 
     def missing(self, items: Sequence[Item]) -> list[Item]:
-        """Those of the items that have no row; ``StoreError`` if a journal is damaged."""
+        """Items without a row; ``StoreError`` if a journal is damaged."""
         places = self.places()
         return [item for item in items if find_place(places, item.cache_key) is None]
 
     def lock(self) -> AbstractContextManager[None]:
-        """Lets one process at a time fill the store; another one waits."""
+        """Lock of the process that fills the store; waits for another one."""
         return store_lock(self.folder, f"fills {self.folder}")
 
     def writer(self, shard: int = 0) -> StoreWriter:
-        """Appends to a new shard, the first free one from this number on."""
+        """Writer of a new shard, the first free one from this number on."""
         return StoreWriter(self, shard)
 
     def pack(self, tensors: Tensor) -> bytes:
-        """Rows of tensors ``(B, *shape)``."""
+        """Bytes of the rows of tensors ``(B, *shape)``."""
         values = tensors.float().cpu().numpy()
         rows = np.empty(len(values), self.row)
         if self.dtype == "int8":
@@ -147,7 +139,7 @@ class Store(Generic[Item]):
         return rows.tobytes()
 
     def unpack(self, data: mmap.mmap, start: int) -> Tensor:
-        """Tensor of the row that starts at a byte, a copy in float32."""
+        """Float32 copy of the row that starts at a byte."""
 
         def field(name: str) -> Tensor:
             fields = self.row.fields
@@ -193,7 +185,7 @@ class Store(Generic[Item]):
 
 
 def store_lock(folder: Path, what: str) -> AbstractContextManager[None]:
-    """Lock of a folder of rows, made if missing; another process that holds it is waited for."""
+    """Lock of a folder of rows, made if missing; waits for another process that holds it."""
     with _writing("rows", folder):
         folder.mkdir(parents=True, exist_ok=True)
     return only_writer(folder / ".lock", what, wait=True)
@@ -201,7 +193,6 @@ def store_lock(folder: Path, what: str) -> AbstractContextManager[None]:
 
 @contextmanager
 def _writing(what: str, folder: Path) -> Iterator[None]:
-    """Turns errors of the system into one that names the folder and the remedy."""
     try:
         yield
     except OSError as error:
@@ -212,20 +203,15 @@ def _writing(what: str, folder: Path) -> Iterator[None]:
 
 
 def find_place(places: Mapping[ItemKey, tuple[int, int]], key: ItemKey) -> tuple[int, int] | None:
-    """Shard and row of a key, also of one whose time of change an older version did not store."""
+    """Shard and row of a key, or of its name and size in journals without times."""
     return places.get(key) or places.get((*key[:2], 0))
 
 
 class TensorCache(Store[Item]):
     """Store whose folder ``root/<name>_<hash>`` follows from its settings.
 
-    Other settings find another folder, never a wrong row; unused folders may be deleted.
-
-    Args:
-        root: Folder of caches.
-        name: Kind, the first part of the folder's name.
-        settings: All that the tensors depend on beside the item, as JSON values.
-        shape: Shape of each tensor, kept in float32.
+    ``settings`` are all that the float32 tensors of ``shape`` depend on beside the item, as JSON
+    values: other settings find another folder, never a wrong row. Unused folders may be deleted.
     """
 
     def __init__(
@@ -240,8 +226,7 @@ class TensorCache(Store[Item]):
 class StoreWriter:
     """Appends rows to a shard of its own, the first free one from ``shard`` on; a context manager.
 
-    Raises:
-        StoreError: If the store is damaged or cannot be written.
+    ``StoreError`` if the store is damaged or cannot be written.
     """
 
     def __init__(self, store: Store[Any], shard: int = 0) -> None:
@@ -255,15 +240,14 @@ class StoreWriter:
                 temporary.write_text(store.settings)
 
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
-        """Append the rows of those keys that the store lacks; afterwards they are on the disk.
+        """Append the rows of those keys that the store lacks; on return they are on the disk.
 
         Args:
             keys: B keys, taken before the files were read.
             tensors: ``(B, *shape)`` on any device.
 
         Raises:
-            StoreError: If the disk is full or cannot be written, or a tensor is not finite; names
-                the folder or the item.
+            StoreError: If the disk cannot be written, or a tensor is not finite.
             ValueError: If the shapes do not fit each other or the store.
         """
         expected = (len(keys), *self._store.shape)
@@ -276,8 +260,7 @@ class StoreWriter:
         for key, finite in zip(new, kept.isfinite().flatten(1).all(dim=1).tolist(), strict=True):
             if not finite:
                 raise StoreError(
-                    f"{self._store.what} of {key[0]} are not finite; look at the file (`r3dpa "
-                    "check` for scans), and leave it out"
+                    f"{self._store.what} of {key[0]} are not finite; leave this file out"
                 )
         lines = [
             json.dumps({"scan": name, "bytes": size, "mtime_ns": time, "row": row}) + "\n"
@@ -296,7 +279,7 @@ class StoreWriter:
         self._known |= dict.fromkeys(new, (self._shard, 0))
 
     def close(self) -> None:
-        """Close the files; rows that are added later go to another shard."""
+        """Close the files; rows added later go to another shard."""
         for file in self._files or ():
             file.close()
         self._files, self._num_rows = None, 0
@@ -322,18 +305,9 @@ class StoreWriter:
 
 
 class CachedTensors(Generic[Item]):
-    """Rows of a store by item; safe to hand to loader processes.
+    """Rows of a store by item, each of which must be there; safe to hand to loader processes.
 
-    Args:
-        store: Where they are.
-        items: Items that will be asked for.
-
-    Attributes:
-        store: As given.
-        items: As given.
-
-    Raises:
-        StoreError: If a row is missing, or the store is damaged.
+    ``StoreError`` if a row is missing, or the store is damaged.
     """
 
     def __init__(self, store: Store[Item], items: Sequence[Item]) -> None:
@@ -342,18 +316,16 @@ class CachedTensors(Generic[Item]):
         self._places = {key: at for key, at in store.places().items() if key[0] in names}
         self._maps: dict[int, mmap.mmap] = {}
         if missing := names.keys() - {key[0] for key in self._places}:
-            raise missing_rows(store, [names[name] for name in sorted(missing)])
+            raise self._missing([names[name] for name in sorted(missing)])
 
     def read(self, item: Item) -> Tensor:
-        """Tensor ``shape`` of one item, float32, a copy.
+        """Float32 copy ``shape`` of the row of one item.
 
-        Raises:
-            StoreError: If the item was not given to the constructor, its file was replaced since
-                the row was made, or the store was damaged.
+        ``StoreError`` if its file was replaced since the row was made, or the store was damaged.
         """
         place = find_place(self._places, item.cache_key)
         if place is None and item.name not in {key[0] for key in self._places}:
-            raise missing_rows(self.store, [item])
+            raise self._missing([item])
         if place is None:
             raise StoreError(
                 f"{item.path} was replaced, or copied without its time of change, after its row in "
@@ -385,21 +357,19 @@ class CachedTensors(Generic[Item]):
         what = f"{rows} {what} since its journal was read"
         return self.store.damaged(rows.with_suffix(".jsonl"), what)
 
+    def _missing(self, items: Sequence[Cacheable]) -> StoreError:
+        more = f" and {len(items) - 1} more" if len(items) > 1 else ""
+        return StoreError(
+            f"No {self.store.what} of {items[0].path}{more} in {self.store.folder}: make what is "
+            f"missing {self.store.remedy}"
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_maps": {}}
 
 
-def missing_rows(store: Store[Any], items: Sequence[Cacheable]) -> StoreError:
-    """Error that names the first of the items that have no row."""
-    more = f" and {len(items) - 1} more" if len(items) > 1 else ""
-    return StoreError(
-        f"No {store.what} of {items[0].path}{more} in {store.folder}: make what is missing "
-        f"{store.remedy}"
-    )
-
-
 def append(file: FileIO, data: bytes) -> None:
-    """Write all of the data to a file without a buffer, which may take it in parts."""
+    """Write all data to an unbuffered file, which may take it in parts."""
     left = memoryview(data)
     while left:
         left = left[file.write(left) :]
