@@ -38,12 +38,8 @@ UNPICKLING_ERRORS = (*_DAMAGED, *_BAD_VALUES, *_SYSTEM)
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
 
-    A reader sees the old file or the complete new one, with the usual permissions; the bytes are
-    on the disk before the name. Missing parent folders are made; after an error the temporary file,
-    which is hidden and has the same suffix, is removed.
-
-    Raises:
-        OSError: If the file cannot be written; names ``path`` and the reason.
+    A reader sees the old file or the complete new one; the bytes are flushed before the renaming.
+    Makes missing parent folders. ``OSError`` names ``path`` if it cannot be written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +63,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _fsync(path: Path) -> None:
-    """Wait until what was written to a file or folder is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -76,17 +71,16 @@ def _fsync(path: Path) -> None:
 
 
 def delete_unfinished(folder: Path) -> None:
-    """Remove the temporary files of killed writers below a folder that nobody writes to now."""
+    """Remove temporary files of killed writers below a folder."""
     for path in list(folder.rglob(".*.partial.*")):
         path.unlink(missing_ok=True)
 
 
 @contextmanager
 def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
-    """Hold a hidden lock file, which the system releases when the process ends.
+    """Hold a lock file, which the system releases when the process ends.
 
-    While another process holds it, one that does not ``wait`` gets a ``ValueError`` that says what
-    the other one does: ``what``.
+    While another process holds it: waits, or raises a ``ValueError`` with ``what`` that one does.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     held: AbstractContextManager[Any]
@@ -96,8 +90,7 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
     except Timeout as error:
         if not wait:
             raise ValueError(
-                f"another process ({lock.read_text()}) {what}: wait for it to end, or give another "
-                "folder"
+                f"another process ({lock.read_text()}) {what}: wait for it, or give another folder"
             ) from error
         _log.warning("waiting for another process that %s", what)
         held = FileLock(lock).acquire()
@@ -114,14 +107,13 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
 
 
 def _error_number(error: BaseException | None, temporary: str) -> int | None:
-    """Number of the system error that kept a file from being written; None for other errors."""
+    """``errno`` of a failed write to a file; None for other errors."""
     while error is not None:
         if isinstance(error, OSError) and error.filename in (None, temporary):
             return error.errno
         # safetensors, written in Rust, has the number in its text; torch.save in the error before
-        told = re.search(r"\(os error (\d+)\)", str(error))
-        if told is not None:
-            return int(told[1])
+        if number := re.search(r"\(os error (\d+)\)", str(error)):
+            return int(number[1])
         error = error.__context__
     return None
 
@@ -132,10 +124,7 @@ def first_line(error: BaseException) -> str:
 
 
 def refuse_name(name: object) -> str | None:
-    """Why a name from a file must not become part of a path; None if it may.
-
-    Allowed are relative names in the notation ``folder/name`` of any depth.
-    """
+    """Reason why a name from a file must not become part of a path; None for ``a/b/c``."""
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= 1024:
         return f"must be printable text of 1 to 1024 characters, got {name!r:.80}"
     outside = name.startswith("/") or "\\" in name or re.match("[A-Za-z]:", name)
@@ -145,7 +134,7 @@ def refuse_name(name: object) -> str | None:
 
 
 def usable_device(name: str) -> str:
-    """A device by name, the GPU or else the CPU for ``auto``; ``ValueError`` if there is none."""
+    """Name of a device that works, GPU before CPU for ``auto``; ``ValueError`` otherwise."""
     import torch
 
     if name == "auto":
@@ -181,13 +170,9 @@ def machine() -> dict[str, Any]:
 
 
 def versions(*packages: ModuleType) -> dict[str, str | None]:
-    """Versions of this code, with its commit, of Python, and of some packages."""
-    return {
-        "r3dpa": __version__,
-        "commit": source_commit(),
-        "python": platform.python_version(),
-        **{package.__name__: package.__version__ for package in packages},
-    }
+    """Versions of r3dpa, with its commit, of Python, and of some packages."""
+    own = {"r3dpa": __version__, "commit": source_commit(), "python": platform.python_version()}
+    return own | {package.__name__: package.__version__ for package in packages}
 
 
 def command() -> str:

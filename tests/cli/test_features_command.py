@@ -20,8 +20,8 @@ import torch
 import yaml
 
 from r3dpa.cli import main
-from r3dpa.data import FeatureGrids, features_lock, find_scans
-from r3dpa.data.feature_grids import any_settings
+from r3dpa.data import FeatureGrids, find_scans
+from r3dpa.data.feature_grids import any_settings, features_lock
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.nn.backbones import WaffleIron
 from r3dpa.nn.backbones.point_features import official_name

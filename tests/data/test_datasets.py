@@ -18,9 +18,8 @@ from r3dpa.data import (
     View,
     datasets,
     find_scans,
-    range_image_cache,
-    write_range_images,
 )
+from r3dpa.data.datasets import range_image_cache, write_range_images
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection

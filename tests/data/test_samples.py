@@ -241,7 +241,7 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
         torch.save([Payload()], file)
     else:
         {"npy": np.save, "npz": np.savez}[suffix](file, objects)
-    reason = {"pcd": "starts with", "pth": "cannot be read as tensors alone"}
+    reason = {"pcd": "no known format", "pth": "cannot be read as tensors alone"}
     with pytest.raises(SampleError, match=f"evil.{suffix}.*{reason.get(suffix, 'not unpickled')}"):
         list(read_samples(file, SENSOR))
     assert capsys.readouterr().out == ""
@@ -290,7 +290,7 @@ def flipped(path):
 BAD = {
     "empty file": (bytes_file("a.txt", b""), r"a\.txt: is empty"),
     "empty bin": (bytes_file("a.bin", b""), r"a\.bin: is empty"),
-    "other text": (bytes_file("a.txt", b"model: r3dpa\n"), r"a\.txt: starts with b'model: r3dpa"),
+    "other text": (bytes_file("a.txt", b"model: r3dpa\n"), r"a\.txt: is not text rows"),
     "ragged text": (bytes_file("a.txt", b"1 2 3\n4 5\n"), r"a\.txt: is not text rows"),
     "narrow text": (bytes_file("a.txt", b"9 2\n4 5\n"), r"a\.txt: has rows of 2 numbers; needs 3"),
     "NaN": (bytes_file("a.txt", b"9 2 nan\n4 5 6\n"), r"a\.txt: has NaN or inf.* 1 of 2 points"),
@@ -343,7 +343,7 @@ def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
 
 def test_another_format_is_named(tmp_path):
     bytes_file("a.pcd", b"# .PCD v0.7\nVERSION 0.7")(tmp_path)
-    with pytest.raises(SampleError, match=r"a\.pcd: starts with b'# .PCD"):
+    with pytest.raises(SampleError, match=r"a\.pcd: is of no known format; what can be read"):
         list(read_samples(tmp_path / "a.pcd", SENSOR))
 
 

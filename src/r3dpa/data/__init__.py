@@ -7,30 +7,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from r3dpa.data.augmentation import Augmentation, View
-from r3dpa.data.checks import CheckReport, check
+from r3dpa.data.checks import check
 from r3dpa.data.datasets import (
     LatentBatch,
     LidarBatch,
     LidarDataset,
     PointDataset,
     PointSample,
-    list_collate,
-    range_image_cache,
-    write_range_images,
 )
 from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
-    GridPlan,
     GridSettings,
-    default_features_dir,
-    features_lock,
     pooled_grids,
     write_feature_grids,
 )
-from r3dpa.data.images import ImageFolder, ImageSource, TarImages
-from r3dpa.data.samples import Sample, SampleError, Samples, read_samples
+from r3dpa.data.images import ImageFolder, TarImages
+from r3dpa.data.samples import SampleError, Samples, read_samples
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     Scan,
@@ -64,15 +58,12 @@ __all__ = [
     "KITTI360_DRIVES",
     "Augmentation",
     "CachedTensors",
-    "CheckReport",
     "DeadLeaves",
     "Extractor",
     "FeatureGrids",
-    "GridPlan",
     "GridSettings",
     "ImageDataModule",
     "ImageFolder",
-    "ImageSource",
     "KITTI360DataModule",
     "LatentBatch",
     "LidarBatch",
@@ -81,7 +72,6 @@ __all__ = [
     "PointDataModule",
     "PointDataset",
     "PointSample",
-    "Sample",
     "SampleError",
     "Samples",
     "Scan",
@@ -93,13 +83,9 @@ __all__ = [
     "TensorCache",
     "View",
     "check",
-    "default_features_dir",
-    "features_lock",
     "find_scans",
     "kitti360_scans",
-    "list_collate",
     "pooled_grids",
-    "range_image_cache",
     "read_beside",
     "read_npz",
     "read_ply",
@@ -109,7 +95,6 @@ __all__ = [
     "write_feature_grids",
     "write_npz",
     "write_ply",
-    "write_range_images",
 ]
 
 

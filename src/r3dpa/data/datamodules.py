@@ -20,9 +20,9 @@ from r3dpa.data.datasets import (
 from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
-    GridSettings,
     any_settings,
     default_features_dir,
+    plan,
     write_feature_grids,
 )
 from r3dpa.data.loaders import LoaderModule, at_least, ready
@@ -187,26 +187,14 @@ class LidarDataModule(LoaderModule):
             self._make_grids(train + val, cast(Extractor, extractor.eval()), projection)
 
     def _make_grids(self, scans: list[Scan], extractor: Extractor, projection: Projection) -> None:
-        features_dir = cast(Path, self.features_dir)
-        settings = GridSettings.of(extractor, projection, self.grid_size)
-        gigabytes = settings.store(features_dir).row.itemsize / 1e9
-
-        def log(done: int, total: int) -> None:
-            if done == 1 or done * 20 // total > (done - 1) * 20 // total:
-                size = f"{done * gigabytes:.3g} of {total * gigabytes:.3g} GB"
-                rank_zero_info(f"feature grids: {done} of {total}, {size}")
-
-        num_made = write_feature_grids(
-            scans,
-            extractor,
-            projection,
-            [self.grid_size],
-            features_dir,
-            workers=self.num_workers,
-            progress=log,
+        arguments = scans, extractor, projection, [self.grid_size], cast(Path, self.features_dir)
+        todo = plan(*arguments)
+        rank_zero_info(
+            f"feature grids: {len(todo.missing)} to make, {todo.num_bytes / 1e9:.3g} GB, "
+            f"{todo.num_kept} kept, in {self.features_dir}"
         )
-        num_kept = len(scans) - num_made
-        rank_zero_info(f"feature grids: {num_made} made, {num_kept} kept, in {features_dir}")
+        num_made = write_feature_grids(*arguments, workers=self.num_workers)
+        rank_zero_info(f"feature grids: {num_made} made")
 
     def setup(self, stage: str) -> None:
         """Index the scans and open the caches, of feature grids not to ``"predict"``."""

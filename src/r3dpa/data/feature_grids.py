@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol, Self
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
+from tqdm import tqdm
 
 from r3dpa.data.datasets import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import Scan
@@ -308,7 +309,6 @@ def write_feature_grids(
     workers: int = 0,
     batch_size: int = 1,
     dtype: Literal["float16", "int8"] = "float16",
-    progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Make the missing grids of ``scans`` in this process; returns the number of scans.
 
@@ -324,7 +324,6 @@ def write_feature_grids(
         workers: Processes that read and prepare the scans; 0 for none.
         batch_size: Scans per pass of the extractor.
         dtype: Storage, see :class:`r3dpa.data.store.Store`.
-        progress: Called after each scan with the numbers of scans done and to do.
 
     Raises:
         StoreError: As :func:`plan`, or if ``features_dir`` cannot be written.
@@ -342,21 +341,16 @@ def write_feature_grids(
             num_workers=workers,
             generator=torch.Generator(),  # the default draws from the global random state
         )
-        done = 0
         with ExitStack() as stack:
             writers = {
                 size: stack.enter_context(settings.writer(features_dir))
                 for size, settings in todo.settings.items()
             }
-            for samples in loader:
+            for samples in tqdm(loader, desc="feature grids", disable=None):
                 grids = pooled_grids(extractor, samples, projection, grid_sizes)
                 for size, writer in writers.items():
                     writer.add([sample.key for sample in samples], grids[size])
-                for _ in samples:
-                    done += 1
-                    if progress is not None:
-                        progress(done, len(todo.missing))
-    return done
+    return len(todo.missing)
 
 
 def features_lock(features_dir: str | Path) -> AbstractContextManager[None]:

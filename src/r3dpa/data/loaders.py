@@ -124,20 +124,9 @@ def training_loader(
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches; draws nothing from the global random state.
 
-    Args:
-        dataset: Map-style data set without random state of its own.
-        batch_size: Samples per batch and process.
-        num_workers: Loader processes; the order of the batches does not depend on it.
-        seed: Seed of the order.
-        num_replicas: Number of training processes.
-        rank: This training process.
-        limit_batches: ``limit_train_batches`` of the trainer.
-        with_epoch: Index the data set with ``(epoch, index)``.
-        collate_fn: As for ``DataLoader``.
-        kind: Of the samples, for the message.
-
-    Raises:
-        ValueError: If the data set is smaller than one batch over all processes.
+    ``batch_size`` is per process, ``limit_batches`` is ``limit_train_batches`` of the trainer,
+    ``with_epoch`` indexes the data set with ``(epoch, index)``. ``ValueError`` if the data set is
+    smaller than one batch over all processes.
     """
     num_samples = len(cast(Sized, dataset))
     if num_samples < batch_size * num_replicas:
@@ -161,36 +150,6 @@ def training_loader(
     return loader
 
 
-def ordered_loader(
-    dataset: Dataset[Any],
-    batch_size: int,
-    *,
-    num_workers: int = 0,
-    num_replicas: int = 1,
-    rank: int = 0,
-    collate_fn: Callable[[list[Any]], Any] | None = None,
-    kind: str = "scans",
-) -> DataLoader[Any]:
-    """All samples in order, none twice; arguments and errors as for :func:`training_loader`."""
-    num_samples = len(cast(Sized, dataset))
-    if num_samples < num_replicas:
-        raise ValueError(
-            f"{num_samples} {kind} are fewer than the {num_replicas} processes, each of which "
-            f"needs one: use more {kind} or fewer devices."
-        )
-    return DataLoader(
-        dataset,
-        batch_size=batch_size,
-        # Lightning's default sampler pads the last batch with some samples again.
-        sampler=UnrepeatedDistributedSampler(dataset, num_replicas, rank, shuffle=False),
-        num_workers=num_workers,
-        pin_memory=torch.cuda.is_available(),
-        collate_fn=collate_fn,
-        persistent_workers=num_workers > 0,
-        generator=torch.Generator(),  # the default one would draw from the global random state
-    )
-
-
 class LoaderModule(LightningDataModule):
     """Settings of the loaders, and the loaders for the processes of the trainer."""
 
@@ -200,16 +159,41 @@ class LoaderModule(LightningDataModule):
         at_least(0, num_workers=num_workers, seed=seed)
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
 
-    def loader(self, dataset: Dataset[Any], train: bool, **options: Any) -> DataLoader[Any]:
-        """Loader with ``kind`` or ``collate_fn``; ``train`` for shuffled and resumable batches."""
-        options["num_workers"] = self.num_workers
-        if self.trainer is not None:
-            options |= {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
-        if not train:
-            return ordered_loader(dataset, self.batch_size, **options)
-        if self.trainer is not None:
-            options["limit_batches"] = self.trainer.limit_train_batches
-        return training_loader(dataset, self.batch_size, seed=self.seed, **options)
+    def loader(
+        self, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
+    ) -> DataLoader[Any]:
+        """Loader as :func:`training_loader`, or of all samples in order, none twice."""
+        trainer = self.trainer
+        replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
+        if train:
+            return training_loader(
+                dataset,
+                self.batch_size,
+                num_workers=self.num_workers,
+                seed=self.seed,
+                num_replicas=replicas,
+                rank=rank,
+                limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
+                kind=kind,
+                **options,
+            )
+        num_samples = len(cast(Sized, dataset))
+        if num_samples < replicas:
+            raise ValueError(
+                f"{num_samples} {kind} are fewer than the {replicas} processes, each of which "
+                f"needs one: use more {kind} or fewer devices."
+            )
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            # Lightning's default sampler pads the last batch with some samples again.
+            sampler=UnrepeatedDistributedSampler(dataset, replicas, rank, shuffle=False),
+            num_workers=self.num_workers,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+            generator=torch.Generator(),  # the default one would draw from the global random state
+            **options,
+        )
 
 
 def ready(dataset: T | None) -> T:

@@ -163,12 +163,8 @@ def object_library(
 
     Source: R3DPA (ICRA 2026) averages the points of the class in a single scan.
 
-    Args:
-        scans: Scans with labels, see :func:`r3dpa.data.labels.read_labels`.
-        extractor: Frozen network, run where its tensors are.
-        projection: Projection of the range images.
-        grid_size: Rows and columns (h, w) of the cells.
-        classes: Class names, in the order of the result; by id all that the scans show where None.
+    ``grid_size`` are the rows and columns (h, w) of the cells. The result has the ``classes`` in
+    this order, or by id all that the labelled scans show.
 
     Raises:
         ScanError: If a scan or its labels cannot be used; names the file.

@@ -57,12 +57,9 @@ class SampleError(ScanError):
 class Sample(NamedTuple):
     """One scene of a generator.
 
-    Args:
-        name: Unique within the samples.
-        points: ``(P, 3)`` or ``(P, 4)`` float32 x, y, z in metres and, where the file holds it,
-            intensity; P >= 1, all within the sensor's range limits.
-        range_m: ``(H, W)`` metres, ``EMPTY_RANGE_M`` without a return; None for clouds.
-        intensity: ``(H, W)``, 0 without a return; None where the file holds none, or no image.
+    ``points`` ``(P, 3)`` or ``(P, 4)`` float32 x, y, z in metres and, where the file holds it,
+    intensity, P >= 1, all within the range limits; of images also ``range_m`` ``(H, W)`` metres,
+    ``EMPTY_RANGE_M`` without a return, and ``intensity`` ``(H, W)``, 0 without a return.
     """
 
     name: str
@@ -75,9 +72,7 @@ class Sample(NamedTuple):
 class Samples:
     """Samples that are read while they are iterated over, see :func:`read_samples`.
 
-    Attributes:
-        num_read: Usable samples of the current or last iteration.
-        bad: Messages of those that were left out.
+    ``num_read`` counts the usable ones of the last iteration, ``bad`` holds messages of the others.
     """
 
     files: list[tuple[str, Path]]
@@ -136,13 +131,11 @@ def read_samples(
     several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
 
     Args:
-        path: File or folder. Files of a folder are read in the order of their names.
+        path: File or folder, whose files are read in the order of their names.
         sensor: Image size and range limits of the samples.
-        format: See the table of this module; found from the content where None. In a folder, the
-            files to read.
+        format: See the table of this module; that of the suffix where None.
         unprojection: Which point of a pixel its ray passes, for images without points.
-        skip_bad: Leave bad samples out; ``bad`` of the result lists them, and a warning counts
-            them. Otherwise the first one is an error.
+        skip_bad: Leave bad samples out, list them in ``bad`` and warn of them.
 
     Raises:
         SampleError: If nothing is found, or a folder holds several formats; while iterating, if a
@@ -193,31 +186,13 @@ def _find(
     return [(p.relative_to(folder).with_suffix("").as_posix(), p) for p in paths], wanted
 
 
-def _format_of(file: Path) -> SampleFormat:
-    """Format of a file by its first bytes; ``.bin`` by its name, since it has no head."""
-    with file.open("rb") as stream:
-        head = stream.read(128)
-    suffix = file.suffix.lower()
-    if not head:
-        raise SampleError(f"{file}: is empty")
-    kinds: dict[SampleFormat, bool] = {
-        "bin": suffix == ".bin",
-        "npy": head.startswith(b"\x93NUMPY"),
-        "ply": head.startswith(b"ply"),
-        "pth": suffix in (".pth", ".pt"),
-        "npz": head.startswith(b"PK"),
-        "txt": head[:1].isdigit() or head[:1] in b"+-. ",
-    }
-    for kind, fits in kinds.items():
-        if fits:
-            return kind
-    raise SampleError(
-        f"{file}: starts with {head[:16]!r}, which is no known format; what can be read: {READABLE}"
-    )
-
-
 def _arrays_of(file: Path, given: SampleFormat | None) -> Arrays:
-    yield from _READERS[given or _format_of(file)][1](file)
+    kind = given or _FORMAT_OF.get(file.suffix.lower())
+    if kind is None:
+        raise SampleError(f"{file}: is of no known format; what can be read: {READABLE}")
+    if not file.stat().st_size:
+        raise SampleError(f"{file}: is empty")
+    yield from _READERS[kind][1](file)
 
 
 def _xyz_rows(file: Path) -> Arrays:

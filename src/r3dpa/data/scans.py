@@ -47,12 +47,10 @@ class ScanError(DataError):
 
 @dataclass(frozen=True, order=True, slots=True)
 class Scan:
-    """One sensor sweep in a file.
+    """One sensor sweep in a ``.bin`` file.
 
-    Args:
-        drive: Name of the recording: the KITTI-360 drive, or the folder relative to the root.
-        frame: File name without its suffix.
-        path: The ``.bin`` file.
+    ``drive`` is the KITTI-360 drive, or the folder relative to the root; ``frame`` the file name
+    without its suffix.
     """
 
     drive: str
@@ -130,9 +128,8 @@ def evenly(items: Sequence[T], num: int | None) -> list[T]:
 def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray:
     """Points ``(P, 4)`` of one KITTI ``.bin`` scan: float32 x, y, z (metres), intensity 0..1.
 
-    Raises:
-        ScanError: If the file is unreadable, empty, of another layout, holds NaN or infinite
-            values, or has no point within the range limits of ``sensor``; names the file.
+    ``ScanError`` names a file that is unreadable, empty, of another layout, holds NaN or infinite
+    values, or has no point within the range limits of ``sensor``.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -170,13 +167,9 @@ def out_of_range(path: Path, sensor: LidarSensor) -> ScanError:
 def read_beside(scan: str | Path, kind: Literal["labels", "origins"]) -> np.ndarray | None:
     """Label or origin ``(P,)`` of each point of a simulated scan; None where there is no such file.
 
-    Args:
-        scan: The scan's ``data/<frame>.bin``.
-        kind: ``"labels"``: uint32, KITTI-360 class in the lower 16 bits and instance in the upper;
-            ``"origins"``: uint8, see :class:`r3dpa.simulation.Origin`.
-
-    Raises:
-        ScanError: If the file is unreadable or of another length than the scan.
+    Labels are uint32, KITTI-360 class in the lower 16 bits and instance in the upper; origins
+    uint8, see :class:`r3dpa.simulation.Origin`. ``ScanError`` if the file is of another length
+    than the scan.
     """
     scan = Path(scan)
     suffix, dtype = {"labels": (".label", "<u4"), "origins": (".origin", "u1")}[kind]
@@ -220,9 +213,7 @@ def write_ply(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
 def read_ply(path: str | Path) -> np.ndarray:
     """Points ``(P, 3)``, or ``(P, 4)`` with intensity, of a binary little-endian ``.ply`` file.
 
-    Raises:
-        ScanError: If the file is unreadable, has another format, other elements than ``vertex``, or
-            lacks x, y or z.
+    ``ScanError`` for another format, other elements than ``vertex``, or no x, y or z.
     """
     path = Path(path)
     head, separator, body = read_bytes(path).partition(b"end_header\n")

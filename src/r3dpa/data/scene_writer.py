@@ -133,10 +133,6 @@ class SceneWriter:
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
             nfe: Network evaluations of each of them.
-
-        Raises:
-            ValueError: If a queued scene holds NaN.
-            OSError: If a queued scene could not be written.
         """
         while len(self._waiting) >= _MOST_WAITING:
             self._waiting.popleft().result()

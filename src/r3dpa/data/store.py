@@ -74,17 +74,17 @@ Item = TypeVar("Item", bound=Cacheable)
 
 @dataclass(frozen=True)
 class Store(Generic[Item]):
-    """Place of one tensor per item.
+    """Store of one tensor of ``shape`` per item.
 
     Args:
-        folder: Where it lies.
+        folder: Its folder.
         settings: All that the tensors depend on beside the item, as JSON text.
         shape: Shape of each tensor.
-        dtype: How it is stored. ``"float16"``: larger values are clamped; ``"int8"``: codes
-            -127..127 and a float32 scale per row of the last axis, its largest magnitude / 127, so
-            that a value is off by at most half the scale.
-        what: Of the rows, for messages.
-        remedy: For messages: how rows are made again.
+        dtype: ``"float16"`` clamps larger values; ``"int8"`` holds codes -127..127 and a float32
+            scale per row of the last axis, its largest magnitude / 127, so that a value is off by
+            at most half the scale.
+        what: Name of the rows, for messages.
+        remedy: How rows are made again, for messages.
     """
 
     folder: Path
@@ -240,15 +240,10 @@ class StoreWriter:
                 temporary.write_text(store.settings)
 
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
-        """Append the rows of those keys that the store lacks; on return they are on the disk.
+        """Append rows ``(B, *shape)`` of those keys that the store lacks, and flush them to disk.
 
-        Args:
-            keys: B keys, taken before the files were read.
-            tensors: ``(B, *shape)`` on any device.
-
-        Raises:
-            StoreError: If the disk cannot be written, or a tensor is not finite.
-            ValueError: If the shapes do not fit each other or the store.
+        The B keys are taken before the files are read. ``StoreError`` if the disk cannot be
+        written, or a tensor is not finite; ``ValueError`` for another shape.
         """
         expected = (len(keys), *self._store.shape)
         if tuple(tensors.shape) != expected:
