@@ -50,7 +50,7 @@ def test_a_second_writer_is_refused_until_the_first_ends_or_is_killed(tmp_path):
     child = multiprocessing.get_context("fork").Process(target=hold)
     child.start()
     ready.wait()
-    message = rf"another process \({child.pid} on .*\) writes: wait for it to end"
+    message = rf"another process \({child.pid} on .*\) writes: wait for it"
     with pytest.raises(ValueError, match=message), only_writer(lock, "writes"):
         pass
     child.kill()

@@ -177,7 +177,7 @@ class TestTwo:
             status, seen = ended(fit_words(scans_folder, run_dir, *more))
             assert status == 1
             assert f"another process ({first.pid} on " in seen
-            assert f"runs r3dpa fit in {run_dir}: wait for it to end" in seen
+            assert f"runs r3dpa fit in {run_dir}: wait for it" in seen
         (tmp_path / "go").touch()
         assert first.end()[0] == 0
         assert_same_training(run_dir, undisturbed)

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from r3dpa.data.images import ImageEntry, ImageSource
 
-__all__ = ["DeadLeaves", "dead_leaves"]
-
 _VERSION = 1  # to be raised when other pixels come out of the same settings
 _OVERSAMPLING = 2  # samples per pixel and axis, averaged: edges are no staircases
 _COVERED = 0.99  # share of an image at which the rest is left to the background
@@ -85,7 +83,9 @@ def dead_leaves(
     Shapes are drawn from the front to the back, each where nothing is drawn yet.
     """
     side = size * _OVERSAMPLING
-    palette = _colours(generator, _PALETTE)
+    # Lightness varies more than hue, as in nature.
+    lightness = generator.uniform(0.1, 0.9, (_PALETTE, 1))
+    palette = (lightness + generator.normal(0, 0.1, (_PALETTE, 3))).astype(np.float32)
     texture = _texture(generator, side)
     image = np.empty((side, side, 3), np.float32)
     image[:] = palette[0] + 0.1 * texture[..., None]
@@ -105,31 +105,18 @@ def dead_leaves(
         columns = np.arange(first[1], last[1], dtype=np.float32)[None] - np.float32(centre[1])
         drawn = _inside(generator, rows, columns, radius) & free[box]
         count = int(drawn.sum())
-        colour, slope, roughness = _surface(generator, palette)
+        colour = palette[generator.integers(_PALETTE)] + generator.normal(0, 0.05, 3)
+        slope = generator.normal(0, 0.06, 2).astype(np.float32)
+        roughness = float(generator.exponential(0.06))
         light = slope[0] * rows / radius + slope[1] * columns / radius
         shade = light + roughness * texture[box]
-        image[box][drawn] = colour + shade[drawn][:, None]
+        image[box][drawn] = colour.astype(np.float32) + shade[drawn][:, None]
         free[box][drawn] = False
         num_free -= count
         if num_free <= enough:
             break
     pixels = image.reshape(size, _OVERSAMPLING, size, _OVERSAMPLING, 3).mean(axis=(1, 3))
     return np.clip(255.0 * pixels + 0.5, 0, 255).astype(np.uint8)
-
-
-def _colours(generator: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """``(count, 3)`` colours whose lightness varies more than their hue, as in nature."""
-    lightness = generator.uniform(0.1, 0.9, (count, 1))
-    return (lightness + generator.normal(0, 0.1, (count, 3))).astype(np.float32)
-
-
-def _surface(
-    generator: np.random.Generator, palette: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-    """Colour, light along rows and columns, and strength of the texture of one shape."""
-    colour = palette[generator.integers(len(palette))] + generator.normal(0, 0.05, 3)
-    slope = generator.normal(0, 0.06, 2)
-    return colour.astype(np.float32), slope.astype(np.float32), float(generator.exponential(0.06))
 
 
 def _inside(

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from r3dpa.data.scans import ScanError, read_beside, read_bytes
 
-__all__ = ["CLASS_NAMES", "read_labels"]
-
 _NAMES = {
     6: "ground,road,sidewalk,parking,rail track,building,wall,fence,guard rail,bridge,tunnel",
     17: "pole,polegroup,traffic light,sign,vegetation,terrain",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from operator import add
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -22,8 +23,6 @@ from r3dpa.data.labels import CLASS_NAMES, read_labels
 from r3dpa.data.scans import Scan, read_scan
 from r3dpa.geometry import Projection, in_range, projection_to_dict
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
-
-__all__ = ["ObjectClass", "ObjectLibrary", "object_library"]
 
 _CARD = "r3dpa_objects"
 _VERSION = 1
@@ -134,11 +133,12 @@ class ObjectLibrary:
 
 
 class _Part(NamedTuple):
-    """Sums over the cells of one class in one scan, weighted with its share of each cell."""
+    """Sums over the cells of one class, weighted with its share of each cell."""
 
     features: Tensor
     directions: Tensor
     weight: float
+    num_scans: int
     num_cells: int
     num_points: int
 
@@ -174,7 +174,7 @@ def object_library(
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     wanted = _wanted(classes)
     lift = getattr(extractor, "lift", torch.nn.Identity())
-    found: dict[str, list[_Part]] = {name: [] for name in wanted}
+    found: dict[str, _Part] = {}
     shown: set[int] = set()
     for scan in scans:
         whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
@@ -202,16 +202,16 @@ def object_library(
                 )
             shares = counts / totals[cells].double()
             directions = shares @ F.normalize(lifted, dim=1)
-            part = _Part(shares @ lifted, directions, shares.sum().item(), len(cells), len(own))
-            found[name].append(part)
-    missing = [name for name, parts in found.items() if not parts]
-    if len(missing) == len(found) or (classes is not None and missing):
+            part = _Part(shares @ lifted, directions, shares.sum().item(), 1, len(cells), len(own))
+            found[name] = _Part(*map(add, found[name], part)) if name in found else part
+    missing = [name for name in wanted if name not in found]
+    if not found or (classes is not None and missing):
         seen = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
         raise ValueError(
             f"the scans have no labelled point of {', '.join(missing)} within range; they show "
             f"{seen or 'no class at all'}. Give more scans or other classes"
         )
-    results = [_mean(name, parts) for name, parts in found.items() if parts]
+    results = [_mean(name, found[name]) for name in wanted if name in found]
     return ObjectLibrary(
         torch.stack([feature for feature, _ in results]),
         tuple(entry for _, entry in results),
@@ -221,16 +221,12 @@ def object_library(
     )
 
 
-def _mean(name: str, parts: list[_Part]) -> tuple[Tensor, ObjectClass]:
+def _mean(name: str, sums: _Part) -> tuple[Tensor, ObjectClass]:
     """Feature ``(D,)`` and statistics of a class."""
-    features = torch.stack([part.features for part in parts]).cumsum(0)[-1]
-    directions = torch.stack([part.directions for part in parts]).cumsum(0)[-1]
-    weight = sum(part.weight for part in parts)
-    mean = features / weight
-    cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
-    num_cells = sum(part.num_cells for part in parts)
-    num_points = sum(part.num_points for part in parts)
-    return mean.float(), ObjectClass(name, len(parts), num_cells, num_points, max(0.0, 1 - cosine))
+    mean = sums.features / sums.weight
+    cosine = (F.normalize(mean, dim=0) @ sums.directions / sums.weight).item()
+    counts = sums.num_scans, sums.num_cells, sums.num_points
+    return mean.float(), ObjectClass(name, *counts, max(0.0, 1 - cosine))
 
 
 def _wanted(classes: Sequence[str] | None) -> dict[str, int]:

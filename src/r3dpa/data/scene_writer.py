@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from io import SEEK_END, FileIO
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -23,13 +23,9 @@ from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
 from r3dpa.io import atomic_path, delete_unfinished, only_writer
 
-__all__ = ["SCENE_FORMATS", "SceneFormat", "SceneWriter"]
-
 _log = logging.getLogger(__name__)
 
-SceneFormat = Literal["bin", "ply", "npz"]
-SCENE_FORMATS: tuple[SceneFormat, ...] = ("bin", "ply", "npz")
-
+SCENE_FORMATS = ("bin", "ply", "npz")
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (

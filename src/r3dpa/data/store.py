@@ -34,8 +34,6 @@ from torch import Tensor
 
 from r3dpa.io import atomic_path, only_writer, refuse_name
 
-__all__ = ["CachedTensors", "Store", "StoreError", "StoreWriter", "TensorCache"]
-
 ItemKey = tuple[str, int, int]
 """Name, size in bytes and time of change (ns) of the file that a row is made from."""
 _VERSION = 1  # to be raised when the same settings give other numbers
@@ -60,13 +58,13 @@ class Cacheable(Protocol):
     """Scan or image that a row is made of; ``name`` is unique, ``path`` stands in messages."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str: ...  # noqa: D102
 
     @property
-    def path(self) -> Path: ...
+    def path(self) -> Path: ...  # noqa: D102
 
     @property
-    def cache_key(self) -> ItemKey: ...
+    def cache_key(self) -> ItemKey: ...  # noqa: D102
 
 
 Item = TypeVar("Item", bound=Cacheable)
