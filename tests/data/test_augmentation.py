@@ -111,27 +111,6 @@ def assert_same_features(actual, expected, source):
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_rotating_a_scan_by_8_grid_columns_rolls_its_geometric_grid_by_8(
-    source, extractor, request
-):
-    turn = -2 * np.pi * 8 / 64  # clockwise, as the columns run
-    rotation = torch.eye(4, dtype=torch.float64)
-    rotation[:2, :2] = torch.tensor([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    for points in map(far_from_borders, request.getfixturevalue(source)):
-        rotated = (points.double() @ rotation.T).float()
-        rolled = grid_of(points, extractor).unflatten(0, GRID).roll(8, dims=1)
-        assert_same_features(grid_of(rotated, extractor).unflatten(0, GRID), rolled, source)
-
-
-@pytest.mark.parametrize("source", SOURCES)
-def test_flipping_a_scan_flips_its_geometric_grid(source, extractor, request):
-    for points in map(far_from_borders, request.getfixturevalue(source)):
-        mirrored = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
-        flipped = grid_of(points, extractor).unflatten(0, GRID).flip(1)
-        assert_same_features(grid_of(mirrored, extractor).unflatten(0, GRID), flipped, source)
-
-
-@pytest.mark.parametrize("source", SOURCES)
 def test_a_view_of_a_grid_equals_extracting_from_the_view(source, extractor, request):
     view = View(8, True, 64)  # both: mirrored first
     for points in map(far_from_borders, request.getfixturevalue(source)):

@@ -230,16 +230,6 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
     assert module.train_set[0]["feature_grid"].shape == (8, 4)
 
 
-def test_replaced_scan_is_named_in_training(tmp_path, data, scaled_points):
-    module = data(extractor=scaled_points())
-    module.prepare_data()
-    module.setup("fit")
-    path = tmp_path / "scans/0000000004.bin"
-    path.write_bytes(path.read_bytes()[:-16])
-    with pytest.raises(StoreError, match=r"0000000004\.bin was replaced"):
-        [module.all_set[index] for index in range(11)]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

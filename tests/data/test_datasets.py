@@ -153,17 +153,6 @@ def test_a_replaced_scan_of_the_same_size_is_noticed_and_made_again(tmp_path, sc
     assert torch.equal(again.read(scans[1]), expected)
 
 
-def test_rotating_a_cached_image_is_projecting_the_rotated_scan(tmp_path, scans, projection):
-    """By 3 of 8 grid columns, each of 4 pixels."""
-    codec, view = RangeCodec(), View(columns=3, mirrored=False, grid_columns=8)
-    write_range_images(scans, projection, codec, tmp_path)
-    images = CachedTensors(range_image_cache(tmp_path, projection, codec), scans)
-    plain = LidarDataset(scans, projection, codec)[0]["range_image"]
-    seen = view.sample(LidarDataset(scans, projection, codec, images=images)[0])
-    assert torch.equal(seen["range_image"], plain.roll(12, -1))
-    assert torch.equal(seen["valid_mask"], codec.valid_mask(plain.roll(12, -1)))
-
-
 @pytest.fixture
 def posteriors(tmp_path, scans):
     cache = TensorCache(tmp_path / "c", "posterior", {"vae": "abc"}, (4, 2, 16))

@@ -180,13 +180,6 @@ def test_splits_mirrors_and_range(folder):
     torch.testing.assert_close(plain["image"], expected)
 
 
-@pytest.mark.parametrize("per_node", [False, True])
-def test_which_processes_share_a_disk(folder, per_node):
-    source = ImageFolder(str(folder))
-    assert ImageDataModule(source).prepare_data_per_node is False
-    assert ImageDataModule(source, prepare_data_per_node=per_node).prepare_data_per_node is per_node
-
-
 def test_fewer_images_than_processes_are_refused(folder):
     module = ImageDataModule(ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4)
     module.setup("fit")

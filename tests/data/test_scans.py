@@ -146,21 +146,6 @@ def test_ply_of_other_programs(tmp_path):
         read_ply(tmp_path / "c.ply")
 
 
-def test_interrupted_write_leaves_the_old_file(tmp_path):
-    file = tmp_path / "a.bin"
-    write_bin(file, POINTS)
-
-    def interrupted_write():
-        with atomic_path(file) as temporary:
-            temporary.write_bytes(b"half")
-            raise RuntimeError("interrupted")
-
-    with pytest.raises(RuntimeError, match="interrupted"):
-        interrupted_write()
-    assert np.array_equal(read_scan(file), POINTS)
-    assert list(tmp_path.iterdir()) == [file]
-
-
 def test_killed_writer_leaves_no_scan(tmp_path, make_scans):
     """A kill leaves the temporary file, which no search takes for a scan."""
     raw = tmp_path / "data_3d_raw" / KITTI360_DRIVES["train"][0] / "velodyne_points/data"

@@ -163,9 +163,9 @@ def test_an_error_of_the_thread_is_told_beside_another_one(tmp_path, caplog):
     with pytest.raises(RuntimeError, match="out of memory"):
         draw(RuntimeError("out of memory"))
     assert "scene 000000" in caplog.text
-    assert "NaN" in caplog.text
-    with pytest.raises(ValueError, match="holds NaN"):
+    with pytest.raises(ValueError, match=r"scene 000000 .* holds NaN: the networks diverged"):
         draw()  # the block ends, and nobody asks for the result
+    assert not (tmp_path / "metadata.json").exists()
 
 
 def test_another_request_is_refused_until_it_may_start_anew(tmp_path):
@@ -229,10 +229,10 @@ def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
         assert open_writer.num_done == 3
 
 
-def test_200_scenes_are_never_in_memory_together(tmp_path):
+def test_40_scenes_are_never_in_memory_together(tmp_path):
     batches, most = weakref.WeakSet(), 0
-    with writer(tmp_path, 200, formats=("bin", "npz")) as open_writer:
-        for first in range(0, 200, 2):
+    with writer(tmp_path, 40, formats=("bin", "npz")) as open_writer:
+        for first in range(0, 40, 2):
             batch = scenes(2, seed=first)
             batches.add(batch)
             open_writer.put(batch)
@@ -241,7 +241,7 @@ def test_200_scenes_are_never_in_memory_together(tmp_path):
         open_writer.close()
         open_writer.finish({})
     assert most <= 4  # three and the one that is being handed over
-    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 200
+    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 40
 
 
 def test_files_of_somebody_else_are_never_removed(tmp_path):
@@ -252,13 +252,3 @@ def test_files_of_somebody_else_are_never_removed(tmp_path):
         with pytest.raises(ValueError, match="is in the way and no scenes of this command"):
             writer(tmp_path, 2, overwrite=overwrite)
     assert theirs.read_bytes() == b"a scan"
-
-
-def test_a_scene_that_is_not_finite_is_named(tmp_path):
-    broken = scenes(2)
-    broken[1] = torch.nan
-    with writer(tmp_path, 2) as open_writer:
-        open_writer.put(broken)
-        with pytest.raises(ValueError, match=r"scene 000001 .* holds NaN: the networks diverged"):
-            open_writer.close()
-    assert not (tmp_path / "metadata.json").exists()

@@ -16,7 +16,6 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data import CachedTensors, Store, StoreError, TensorCache, store
-from r3dpa.data.store import StoreWriter
 
 SHAPE = (8, 4)
 
@@ -372,21 +371,6 @@ def test_what_a_reader_sees_of_a_growing_store_is_right(halves):
     assert child.exitcode == 0
     assert counts == sorted(counts)
     assert_holds(halves, items(0, 200))
-
-
-def test_processes_write_at_once(halves):
-    def share(place):
-        with StoreWriter(halves, place) as writer:
-            for item in items(0, 40)[place::2]:
-                add(writer, [item])
-
-    context = multiprocessing.get_context("fork")
-    children = [context.Process(target=share, args=[place]) for place in (0, 1)]
-    for child in children:
-        child.start()
-    for child in children:
-        child.join()
-    assert_holds(halves, items(0, 40))
 
 
 @pytest.mark.parametrize("dtype", ["float16", "int8", "float32"])
