@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from r3dpa.metrics import results as results_module
-from r3dpa.metrics.result_table import EvaluationTable, Mark, latex_text
+from r3dpa.metrics.result_table import EvaluationTable, Mark, _latex
 from r3dpa.metrics.results import Evaluation, MetricResult, published_evaluations
 
 ABOUT = {
@@ -55,18 +55,10 @@ def places(table, metric="M"):
         ("name", ""),
         ("value", float("nan")),
         ("value", float("inf")),
-        ("value", "7.1"),
-        ("value", True),
         ("interval", (2.0, 1.0)),
         ("interval", (1.0,)),
-        ("interval", (None, 1.0)),
-        ("interval", 3.0),
         ("floor", -1.0),
         ("direction", "up"),
-        ("scale", -1.5),
-        ("num_samples", 0),
-        ("num_references", 2.0),
-        ("note", None),
     ],
 )
 def test_a_wrong_field_is_named(key, bad):
@@ -75,12 +67,9 @@ def test_a_wrong_field_is_named(key, bad):
 
 
 def test_a_value_that_is_none_needs_a_reason():
-    with pytest.raises(ValueError, match="say in the note"):
+    with pytest.raises(ValueError, match="reason in the note"):
         MetricResult("FRID", None)
     assert MetricResult("FRID", None, note="fewer samples than features").value is None
-
-
-def test_an_interval_may_lie_beside_the_value():
     assert MetricResult("FRID", 1.0, interval=(0.2, 0.8)).half_width == pytest.approx(0.3)
 
 
@@ -96,12 +85,9 @@ def test_a_difference_below_the_larger_floor_is_a_tie():
     assert a.ties_with(MetricResult("M", 3.0, floor=2.0))
     assert MetricResult("M", 3.0, floor=2.0).ties_with(a)
     assert not a.ties_with(MetricResult("M", 3.0, floor=1.9))
-
-
-def test_without_interval_and_floor_only_equal_values_tie():
-    a = MetricResult("M", 1.0)
-    assert a.ties_with(MetricResult("M", 1.0))
-    assert not a.ties_with(MetricResult("M", 1.0 + 1e-12))
+    without = MetricResult("M", 1.0)
+    assert without.ties_with(without)
+    assert not without.ties_with(MetricResult("M", 1.0 + 1e-12))
 
 
 # JSON
@@ -133,15 +119,11 @@ def without(mapping, key):
     ("change", "message"),
     [
         (lambda s: without(s, "label"), r"evaluation lacks the keys \['label'\]"),
-        (lambda s: s | {"metrics": []}, r"unknown keys \['metrics'\]"),
         (lambda s: s | {"rows": [without(s["rows"][0], "floor")]}, r"row 0 lacks.*'floor'"),
         (lambda s: s | {"rows": [s["rows"][0] | {"std": 1}]}, r"row 0 .*unknown keys \['std'\]"),
         (lambda s: s | {"rows": s["rows"] * 2}, r"more than one row for \['FRID'\]"),
-        (lambda s: s | {"rows": {}}, "rows is"),
         (lambda s: s | {"rows": [3]}, "row 0 is 3"),
         (lambda s: s | {"about": without(s["about"], "seed")}, r"about lacks the keys \['seed'\]"),
-        (lambda s: s | {"about": s["about"] | {"sed": 0}}, r"unknown keys \['sed'\]"),
-        (lambda s: s | {"about": s["about"] | {"published": "no"}}, "published is 'no'"),
         (lambda s: s | {"label": " "}, "label"),
         (lambda s: [s], "evaluation is"),
     ],
@@ -151,17 +133,14 @@ def test_a_file_with_a_wrong_key_is_refused_by_name(tmp_path, change, message):
     path.write_text(json.dumps(change(stored())))
     with pytest.raises(ValueError, match=rf"wrong\.json holds no evaluation: .*{message}"):
         Evaluation.load(path)
-
-
-def test_a_file_cut_short_is_refused_by_name(tmp_path):
-    (tmp_path / "cut.json").write_text(json.dumps(stored())[:-20])
-    with pytest.raises(ValueError, match=r"cut\.json holds no evaluation"):
-        Evaluation.load(tmp_path / "cut.json")
+    path.write_text(json.dumps(stored())[:-20])
+    with pytest.raises(ValueError, match=r"wrong\.json holds no evaluation"):
+        Evaluation.load(path)
 
 
 @pytest.mark.parametrize("bad", [Path("x"), float("nan")])
 def test_what_json_cannot_hold_is_refused_at_once(bad):
-    with pytest.raises(ValueError, match="ours: about: extra is not for JSON"):
+    with pytest.raises(ValueError, match="ours: about is not for JSON"):
         evaluation("ours", extra={"value": bad})
 
 
@@ -310,17 +289,15 @@ def test_latex_of_texts_that_are_commands_is_well_formed():
     assert check_tabular(table.latex()) == (3, 5)
 
 
-def test_every_character_that_latex_reads_is_escaped():
-    assert latex_text(r"a\b") == r"a\textbackslash{}b"
-    assert latex_text("&%$#_{}") == r"\&\%\$\#\_\{\}"
-    assert latex_text("~^<>") == (r"\textasciitilde{}\textasciicircum{}\textless{}\textgreater{}")
-
-
 def test_a_label_is_no_option_of_the_line_break_before_it():
     rows = [evaluation(label, MetricResult("M", 1.0)) for label in ("a", "[2]", "*")]
     lines = EvaluationTable(rows).latex().splitlines()
     assert not [line for line in lines if line.startswith(("[", "*"))]
-    assert latex_text("[*|") == r"{[}{*}\textbar{}"
+    assert _latex(r"a\b~^<>") == (
+        r"a\textbackslash{}b\textasciitilde{}\textasciicircum{}\textless{}\textgreater{}"
+    )
+    assert _latex("&%$#_{}") == r"\&\%\$\#\_\{\}"
+    assert _latex("[*|") == r"{[}{*}\textbar{}"
 
 
 def test_markdown_cells_stay_in_their_column():
@@ -351,9 +328,6 @@ def test_the_suffix_gives_the_format(table, tmp_path):
         assert (tmp_path / f"table.{suffix}").read_text(encoding="utf-8") == text
     with pytest.raises(ValueError, match=r"table\.html.*\.txt, \.md, \.tex, \.csv"):
         table.save(tmp_path / "table.html")
-
-
-def test_small_values_keep_two_digits():
     assert "0.0012" in str(one_metric([0.00123]))
     assert "0.00 " not in str(one_metric([0.00123]))
 

@@ -21,13 +21,7 @@ from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.run import evaluation_of, settled, stage_folder, state_of
 from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import (
-    About,
-    Evaluation,
-    MetricResult,
-    published_evaluations,
-    published_scales,
-)
+from r3dpa.metrics.results import About, Evaluation, published_evaluation
 from r3dpa.metrics.scene_features import SPACES
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
@@ -266,18 +260,12 @@ def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
 
 def _published(table: Table) -> list[Evaluation]:
     """The rows as the paper printed them; KITTI-360, other networks and other data than here."""
-    scales = published_scales()
     source = f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}"
-    about: About = {**published_evaluations("train-val")[0].about, "source": source}
-    about |= {"solver": None, "steps": None, "extra": {}}
-    rows = {
-        row.label: tuple(
-            MetricResult(name, float(f"{printed}e{scales[name]}"), scale=scales[name])
-            for name, printed in row.published.items()
-        )
+    return [
+        published_evaluation(row.label, row.published, "KITTI-360, train-val", source)
         for row in table.rows
-    }
-    return [Evaluation(label, values, about) for label, values in rows.items() if values]
+        if row.published
+    ]
 
 
 def log_rows(

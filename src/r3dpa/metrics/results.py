@@ -1,7 +1,7 @@
-"""Results of an evaluation: numbers with intervals and floors, and where they come from.
+"""Results of evaluations: numbers with intervals and floors, and their provenance.
 
-A value is kept as it was computed; a power of ten belongs to the printed column only, so that
-JSD = 0.0567 is stored and 5.67 is printed below 10^-2.
+Values are stored as computed; a power of ten applies to the printed column only: JSD = 0.0567 is
+stored, and 5.67 is printed below 10^-2.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from r3dpa.io import atomic_path, text_table
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
 
-_SHOWN_BAD = 20  # samples that could not be used, in print
+_SHOWN_BAD = 20  # samples left out that are printed
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,19 @@ class MetricResult:
 
     Args:
         name: Of the metric, as in the head of a column.
-        value: In ``unit``; None where it cannot be told, which ``note`` then explains.
-        interval: Ends of the 95 % interval: how far the value spreads from one set of this many
-            scenes to the next. It is for the value expected of this many, which few scenes raise
-            above that of infinitely many; only an extrapolated value is for the latter.
-        floor: Value that real scans reach against real scans.
+        value: In ``unit``; None if unknown, with the reason in ``note``.
+        interval: Ends of the 95 % interval: the spread of the value over sets of this many scenes.
+            Not corrected for the bias of few scenes, except for extrapolated values.
+        floor: Value of real scans against real scans.
         direction: Which values are better.
         unit: Of value, interval and floor; empty for a plain number.
         scale: Power of ten of the printed column.
         num_samples: Generated scans that were used, None if unknown.
         num_references: Real scans that were used, None if unknown.
-        note: What a reader must know of this number; may be empty.
+        note: Remark for the reader; may be empty.
 
     Raises:
-        ValueError: If a field is not as above; the error names metric and field.
+        ValueError: If a field is not as above; names metric and field.
     """
 
     name: str
@@ -57,37 +56,29 @@ class MetricResult:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Checks the fields, since results also come from files."""
-        ends: Any = () if self.interval is None else self.interval
-        pair = isinstance(ends, tuple | list) and len(ends) in (0, 2) and all(map(_is_finite, ends))
-        counts = {key: getattr(self, key) for key in ("num_samples", "num_references")}
-        checks: dict[str, tuple[Any, str]] = {
-            "name": (isinstance(self.name, str) and self.name, "give the name of the metric"),
-            "unit": (isinstance(self.unit, str), "give a text"),
-            "note": (isinstance(self.note, str), "give a text"),
-            "interval": (
-                pair and (self.interval is None or ends) and list(ends) == sorted(ends),
-                "give two finite numbers, the lower end first, or None",
-            ),
+        ends = self.interval
+        pair = isinstance(ends, tuple | list) and len(ends) == 2 and all(map(_is_finite, ends))
+        checks = {
+            "name": (isinstance(self.name, str) and self.name, "a text"),
             "value": (
                 _is_finite(self.value) or (self.value is None and self.note),
-                "give a finite number, or None and say in the note why there is none",
+                "a finite number, or None with the reason in the note",
+            ),
+            "interval": (
+                ends is None or (pair and ends[0] <= ends[1]),
+                "two finite numbers, the lower end first, or None",
             ),
             "floor": (
                 self.floor is None or (_is_finite(self.floor) and self.floor >= 0),
-                "give the distance of real scans from real scans, or None",
+                "0 or more",
             ),
-            "direction": (self.direction in get_args(Direction), "give lower or higher"),
-            "scale": (type(self.scale) is int, "give the power of ten as a whole number"),
+            "direction": (self.direction in get_args(Direction), "lower or higher"),
         }
-        for key, count in counts.items():
-            valid = count is None or (type(count) is int and count >= 1)
-            checks[key] = (valid, "give a count of at least 1, or None if it is unknown")
-        for key, (ok, advice) in checks.items():
-            if not ok:
+        for key, (valid, advice) in checks.items():
+            if not valid:
                 given = getattr(self, key)
-                raise ValueError(f"metric {self.name!r}: {key} is {given!r}; {advice}")
-        object.__setattr__(self, "interval", tuple(ends) or None)
+                raise ValueError(f"metric {self.name!r}: {key} is {given!r}; give {advice}")
+        object.__setattr__(self, "interval", None if ends is None else tuple(ends))
 
     @property
     def half_width(self) -> float:
@@ -95,32 +86,26 @@ class MetricResult:
         return 0.0 if self.interval is None else (self.interval[1] - self.interval[0]) / 2
 
     def ties_with(self, other: MetricResult) -> bool:
-        """Whether the two values cannot be told apart.
+        """Whether two values differ by no more than their floors or their intervals.
 
-        They cannot if they differ by no more than real scans differ from real scans, or by no more
-        than their intervals allow::
+        The half widths of independent values add in squares, and unknown ones count as 0::
 
             |a - b| <= max(floor_a, floor_b, sqrt(half_width_a^2 + half_width_b^2))
-
-        The half widths of independent values add in squares. What is not known counts as 0: two
-        values without interval and floor tie only if they are equal.
         """
         if self.value is None or other.value is None:
             raise ValueError(f"{self.name}: a value that is None ties with nothing; leave it out")
         allowed = math.hypot(self.half_width, other.half_width)
-        allowed = max(allowed, self.floor or 0.0, other.floor or 0.0)
-        return abs(self.value - other.value) <= allowed
+        return abs(self.value - other.value) <= max(allowed, self.floor or 0.0, other.floor or 0.0)
 
 
 class About(TypedDict):
-    """Where the numbers of an evaluation come from; None for what is unknown or does not apply.
+    """Provenance of the numbers of an evaluation; None for what is unknown or does not apply.
 
-    ``backbones`` has the card of each feature network (layer, hash of the weights, preprocessing),
-    ``reference`` split, count and hash of the names of the real scans, ``precision`` the number
-    format of the samples, ``commit`` the version of the code that computed the numbers,
-    ``feature_source`` what the generator was aligned to, ``source`` the files of the samples or
-    the line of the publication, and ``extra`` anything else. ``bad_samples`` in ``extra`` lists
-    the samples that were left out, each with the reason.
+    ``backbones`` has the card of each feature network, ``reference`` split, count and hash of the
+    names of the real scans, ``precision`` the number format of the samples, ``commit`` the version
+    of the code, ``feature_source`` the features the generator was aligned to, ``source`` the
+    files of the samples or the line of the publication, and ``extra`` anything else, such as
+    ``bad_samples``: those left out, each with the reason.
     """
 
     backbones: dict[str, dict[str, Any]]
@@ -156,25 +141,18 @@ class Evaluation:
     about: About
 
     def __post_init__(self) -> None:
-        """Checks label, rows and about, and copies the latter two."""
         if not isinstance(self.label, str) or not self.label.strip():
             raise ValueError(f"label of an evaluation is {self.label!r}; give a text")
-        object.__setattr__(self, "rows", tuple(self.rows))
         names = [row.name for row in self.rows]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
+        if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"{self.label}: more than one row for {twice}; give one per metric")
         _check_keys(self.about, About.__annotations__, f"{self.label}: about")
-        if not isinstance(self.about["published"], bool):
-            raise ValueError(
-                f"{self.label}: about: published is {self.about['published']!r}; give true or false"
-            )
-        for key, value in self.about.items():
-            try:
-                json.dumps(value, allow_nan=False)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{self.label}: about: {key} is not for JSON: {error}") from None
-        object.__setattr__(self, "about", json.loads(json.dumps(self.about)))
+        try:
+            about = json.loads(json.dumps(self.about, allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.label}: about is not for JSON: {error}") from None
+        object.__setattr__(self, "rows", tuple(self.rows))
+        object.__setattr__(self, "about", about)
 
     @property
     def published(self) -> bool:
@@ -182,19 +160,20 @@ class Evaluation:
         return self.about["published"]
 
     @property
+    def name(self) -> str:
+        """Label in tables."""
+        return self.label + " (published)" * self.published
+
+    @property
     def bad_samples(self) -> list[str]:
-        """Name and reason of each sample that could not be used and was left out."""
+        """Name and reason of each sample that was left out."""
         return self.about["extra"].get("bad_samples", [])
 
     def row(self, name: str) -> MetricResult | None:
-        """Result of a metric; None where this evaluation has no such row or no value."""
+        """Result of a metric; None without such a row or without a value."""
         return next((r for r in self.rows if r.name == name and r.value is not None), None)
 
     def __str__(self) -> str:
-        """Verdict, rows with interval, floor, counts and notes, and where the numbers come from.
-
-        Of many samples that were left out, the first are listed; the stored file has all.
-        """
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
         table = text_table(map(_cells, self.rows), heads, align="lrrrlrrl")
         extra = dict(self.about["extra"])
@@ -221,100 +200,117 @@ class Evaluation:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote."""
+        """Reads what ``save`` wrote; a ``ValueError`` names the file and the fault."""
         try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except ValueError as error:
+            stored = json.loads(Path(path).read_text(encoding="utf-8"))
+            _check_keys(stored, [field.name for field in fields(cls)], "evaluation")
+            for number, row in enumerate(stored["rows"]):
+                _check_keys(row, [f.name for f in fields(MetricResult)], f"row {number}")
+            rows = tuple(MetricResult(**row) for row in stored["rows"])
+            return cls(stored["label"], rows, stored["about"])
+        except (TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no evaluation: {error}") from error
-
-    @classmethod
-    def from_dict(cls, stored: Any) -> Self:
-        """Evaluation from what JSON gave; see ``load`` for the errors."""
-        _check_keys(stored, (field.name for field in fields(cls)), "evaluation")
-        if not isinstance(stored["rows"], list):
-            raise ValueError(f"evaluation: rows is {stored['rows']!r}; give a list")
-        keys = [field.name for field in fields(MetricResult)]
-        for number, row in enumerate(stored["rows"]):
-            _check_keys(row, keys, f"evaluation: row {number}")
-        rows = tuple(MetricResult(**row) for row in stored["rows"])
-        return cls(stored["label"], rows, stored["about"])
 
 
 @cache
 def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
-    """Rows of the main table of the paper, for comparison only.
+    """Rows of the main table of the paper, without intervals and floors.
 
-    MMD was computed against validation scans alone and belongs to ``"val-only"``. The table gives
-    neither intervals nor floors, nor the number of references of the other metrics.
+    MMD was computed against validation scans alone and belongs to ``"val-only"``.
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
     if split not in get_args(Split):
         raise ValueError(f"split is {split!r}; the paper has {', '.join(get_args(Split))}")
     table = _published_table()
-    return tuple(_published(method, table, split) for method in table["methods"])
-
-
-def published_scales() -> dict[str, int]:
-    """Power of ten of the printed column of each metric of the paper."""
-    scales: dict[str, int] = _published_table()["scales"]
-    return scales
-
-
-@cache
-def _published_table() -> dict[str, Any]:
-    text = files(__package__).joinpath("published.json").read_text(encoding="utf-8")
-    table: dict[str, Any] = json.loads(text)
-    return table
-
-
-def _published(method: Mapping[str, Any], table: Mapping[str, Any], split: Split) -> Evaluation:
-    rows = [
-        MetricResult(
-            name,
-            float(f"{printed}e{table['scales'][name]}"),  # decimal shift, free of rounding
-            scale=table["scales"][name],
-            num_samples=table["num_mmd_samples"] if name == "MMD" else method["num_samples"],
-            num_references=table["num_mmd_references"] if name == "MMD" else None,
+    found = []
+    for method in table["methods"]:
+        counts = dict.fromkeys(method[split], (method["num_samples"], None))
+        counts["MMD"] = (table["num_mmd_samples"], table["num_mmd_references"])
+        evaluation = published_evaluation(
+            method["label"],
+            method[split],
+            f"KITTI-360, {split}",
+            f"{table['source']}, line {method['line']}",
+            counts,
         )
-        for name, printed in method[split].items()
-    ]
+        about = evaluation.about
+        about |= {"solver": method["solver"], "steps": method["steps"]}
+        about["extra"] = {"venue": method["venue"]}
+        found.append(evaluation)
+    return tuple(found)
+
+
+def published_evaluation(
+    label: str,
+    printed: Mapping[str, float],
+    reference: str,
+    source: str,
+    counts: Mapping[str, tuple[int | None, int | None]] | None = None,
+) -> Evaluation:
+    """Evaluation of numbers as the paper printed them, with counts of scenes by metric."""
+    scales = published_scales()
+    rows = []
+    for name, number in printed.items():
+        num_samples, num_references = (counts or {}).get(name, (None, None))
+        value = float(f"{number}e{scales[name]}")  # decimal shift, free of rounding
+        rows.append(
+            MetricResult(
+                name,
+                value,
+                scale=scales[name],
+                num_samples=num_samples,
+                num_references=num_references,
+            )
+        )
     about: About = {
         "backbones": {},
         "protocol": {"name": "published"},
-        "reference": f"KITTI-360, {split}",
-        "solver": method["solver"],
-        "steps": method["steps"],
+        "reference": reference,
+        "solver": None,
+        "steps": None,
         "seed": None,
         "precision": None,
         "commit": None,
         "feature_source": None,
         "published": True,
-        "source": f"{table['source']}, line {method['line']}",
-        "extra": {"venue": method["venue"]},
+        "source": source,
+        "extra": {},
     }
-    return Evaluation(method["label"], tuple(rows), about)
+    return Evaluation(label, tuple(rows), about)
 
 
-def printed(value: float, scale: int = 0) -> str:
-    """A number below the head of a column of a power of ten: two decimals, more if it is small."""
+def published_scales() -> dict[str, int]:
+    """Power of ten of the printed column of each metric of the paper."""
+    return dict(_published_table()["scales"])
+
+
+@cache
+def _published_table() -> Any:
+    return json.loads(files(__package__).joinpath("published.json").read_text(encoding="utf-8"))
+
+
+def printed(value: float | None, scale: int = 0) -> str:
+    """A number in a column of a power of ten: two decimals, more if it is small."""
+    if value is None:
+        return "-"
     number = value / 10.0**scale
     return f"{number:.2g}" if 0 < abs(number) < 0.1 else f"{number:.2f}"
 
 
 def _cells(row: MetricResult) -> tuple[str, ...]:
-    def number(value: float | None) -> str:
-        return "-" if value is None else printed(value, row.scale)
-
-    def count(value: int | None) -> str:
-        return "-" if value is None else f"{value:,}"
-
-    ends = "-" if row.interval is None else ", ".join(map(number, row.interval)).join("[]")
-    scale = f" x1e{row.scale}" if row.scale else ""
-    unit = f" ({row.unit})" if row.unit else ""
-    counts = (count(row.num_samples), count(row.num_references))
-    values = (number(row.value), ends, number(row.floor))
-    return (f"{row.name}{scale}{unit}", *values, row.direction, *counts, row.note)
+    ends = [printed(end, row.scale) for end in row.interval or ()]
+    counts = ["-" if n is None else f"{n:,}" for n in (row.num_samples, row.num_references)]
+    name = row.name + (f" x1e{row.scale}" if row.scale else "")
+    return (
+        f"{name} ({row.unit})" if row.unit else name,
+        printed(row.value, row.scale),
+        ", ".join(ends).join("[]") if ends else "-",
+        printed(row.floor, row.scale),
+        row.direction,
+        *counts,
+        row.note,
+    )
 
 
 def _is_finite(number: Any) -> bool:
