@@ -16,8 +16,7 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.protocol import PUBLISHED
-from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import lip_loc_space, range_vit_space, voxel_space
 from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.minkowski import MinkowskiNet

@@ -12,13 +12,13 @@ from r3dpa.cli import main
 from r3dpa.data import scans
 from r3dpa.data.scans import write_bin, write_npz
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.metrics import protocol
+from r3dpa.metrics import scene as protocol
 from r3dpa.metrics.bootstrap import Resampling
-from r3dpa.metrics.official_statistics import compare, reference_spaces
-from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
+from r3dpa.metrics.evaluation import evaluate as evaluate_scenes
+from r3dpa.metrics.evaluation import reference_spaces
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -274,8 +274,8 @@ def test_generated_scenes_need_no_files(reference_file, tmp_path):
     statistics = ReferenceStatistics.load(reference_file)
     options = {"allow_few": True, "resampling": Resampling(0, 40)}
     spaces = reference_spaces(statistics, None, None, None, "cpu")
-    found, _ = compare(made, statistics, spaces, label="memory", **options)
-    rows = {row.name: row.value for row in found.rows}
+    found = evaluate_scenes(made, statistics, spaces, label="memory", **options)
+    rows = {row.name: row.value for row in found.evaluation.rows}
     write_npz(tmp_path / "made.npz", {str(i): p for i, p in enumerate(clouds(1, 10))})
     path = tmp_path / "made.npz"
     evaluate("--samples", path, "--reference", reference_file, "--allow_few", "--out", tmp_path)

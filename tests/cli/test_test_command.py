@@ -15,9 +15,9 @@ import pytest
 from r3dpa.callbacks import SceneScorer, scene_scoring
 from r3dpa.cli import main
 from r3dpa.generation import SceneGenerator
-from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 

@@ -36,8 +36,8 @@ from r3dpa.data.objects import ObjectClass, ObjectLibrary
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
 from r3dpa.metrics.official_statistics import OfficialStatistics
-from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.scene import PROTOCOLS
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.simulation import expected_scans
 from r3dpa.simulation.drive_files import DriveFiles

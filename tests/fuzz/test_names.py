@@ -15,8 +15,8 @@ from r3dpa.data import Store, read_samples
 from r3dpa.data.scans import read_npz
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
-from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.scene import PROTOCOLS
 from r3dpa.simulation import expected_scans
 
 BAD = ["../../x", "/etc/x", "a/../../x", "a/./x", "a//x", "..", ".", "", "C:x", "c:\\x", "a\\..\\x"]

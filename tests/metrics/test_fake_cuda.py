@@ -26,7 +26,7 @@ from r3dpa.metrics.feature_distances import (
     PolynomialMMD,
     PrecisionRecall,
 )
-from r3dpa.metrics.protocol import DEFAULT
+from r3dpa.metrics.scene import DEFAULT
 
 PROTOCOL = replace(DEFAULT, sensor=LidarSensor(beams=8, columns=32), voxel_m=1.0)
 KINDS = {

@@ -31,8 +31,7 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.protocol import DEFAULT
-from r3dpa.metrics.scene import EvaluationScene, usable_scenes
+from r3dpa.metrics.scene import DEFAULT, EvaluationScene, usable_scenes
 from r3dpa.metrics.scene_features import scene_features
 from r3dpa.nn.backbones.sparse_features import pool_voxels
 

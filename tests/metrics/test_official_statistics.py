@@ -10,16 +10,12 @@ import torch
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin
 from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.evaluation import evaluate
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching
-from r3dpa.metrics.official_statistics import (
-    OfficialStatistics,
-    evaluate_official,
-    is_official,
-)
-from r3dpa.metrics.protocol import PUBLISHED
+from r3dpa.metrics.official_statistics import OfficialStatistics, is_official
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 
@@ -95,9 +91,11 @@ class TestEvaluateOfficial:
             "MMD": minimum_matching(*cells, grid).mmd_squared_normalised,
             "FRID": frechet_distance_of(*map(features, seen)),
         }
-        found = evaluate_official(
+        found = evaluate(
             scenes(1, 5), OfficialStatistics.load(file), [FRID], label="made", resampling=WITHOUT
         )
+        assert found.figure_data() is None
+        found = found.evaluation
         assert [row.name for row in found.rows] == ["JSD", "TV", "MMD", "FRID"]
         for row in found.rows:
             assert row.value == pytest.approx(expected[row.name], rel=1e-6), row.name
@@ -111,9 +109,9 @@ class TestEvaluateOfficial:
     def test_what_the_file_lacks_is_left_out_and_said(self, tmp_path):
         part = {"all": {"rangevit_wo_i": CONTENT["all"]["rangevit_wo_i"]}}
         statistics = OfficialStatistics.load(write(tmp_path / "s.npy", part))
-        found = evaluate_official(
+        found = evaluate(
             scenes(1, 6), statistics, [FRID], label="made", resampling=Resampling(num_resamples=40)
-        )
+        ).evaluation
         assert [row.name for row in found.rows] == ["FRID"]
         assert found.rows[0].interval[0] < found.rows[0].interval[1]
         for name in ("JSD", "TV", "MMD"):
@@ -124,13 +122,13 @@ class TestEvaluateOfficial:
     def test_few_scenes_and_other_spaces_are_refused(self, file):
         statistics = OfficialStatistics.load(file)
         with pytest.raises(ValueError, match="3 generated scenes for the 3 features of FRID"):
-            evaluate_official(scenes(1, 3), statistics, [FRID], label="made")
+            evaluate(scenes(1, 3), statistics, [FRID], label="made")
         toy = replace(FRID, name="fgeo")
         with pytest.raises(ValueError, match=r"no moments of fgeo .*only of rangevit_wo_i"):
-            evaluate_official(scenes(1, 3), statistics, [toy], label="made")
+            evaluate(scenes(1, 3), statistics, [toy], label="made")
         intense = replace(FRID, card={"in_channels": 5})
         with pytest.raises(ValueError, match=r"no moments of frid \(rangevit_w_i\)"):
-            evaluate_official(scenes(1, 3), statistics, [intense], label="made")
+            evaluate(scenes(1, 3), statistics, [intense], label="made")
         with pytest.raises(ValueError, match=r"val.rangevit_wo_i.mu: has 3 numbers.*4 features"):
             statistics.of_space(replace(FRID, dim=4))
 
@@ -179,9 +177,12 @@ class TestLoad:
         ("value", "message"),
         [
             ({"test": {}}, "no split val or all, its fields are test"),
-            ({"val": {}}, "field val: holds no statistics, only nothing"),
-            ({"val": [1]}, "field val: is a list"),
-            (changed("rangevit_wo_i", {"mu": np.zeros(3)}), "val.rangevit_wo_i.sigma: is missing"),
+            ({"val": {}}, "field val: holds no statistics"),
+            ({"val": [1]}, "holds no split val, its fields are val"),
+            (
+                changed("rangevit_wo_i", {"mu": np.zeros(3)}),
+                "wo_i.sigma: needs an array",
+            ),
             (
                 changed("rangevit_wo_i", {"mu": np.zeros(3), "sigma": np.eye(4)}),
                 r"rangevit_wo_i.sigma: has shape \(4, 4\), but mu has 3",
@@ -194,7 +195,10 @@ class TestLoad:
                 changed("rangevit_wo_i", {"mu": np.full(2, np.nan), "sigma": np.eye(2)}),
                 "rangevit_wo_i.mu: holds NaN",
             ),
-            (changed("dataset_bev_hist", np.ones((200, 200))), r"bev_hist: has shape \(200, 200\)"),
+            (
+                changed("dataset_bev_hist", np.ones((200, 200))),
+                r"hist: needs .*got \(200, 200\)",
+            ),
             (changed("dataset_bev_hist", np.zeros((2000, 2000))), "bev_hist: .*not all 0"),
             (changed("dataset_bev_hist", "x"), "bev_hist: needs an array of numbers"),
             (changed("valset_voxelized_bev", {"points": []}), "voxelized_bev.points: needs a list"),

@@ -8,14 +8,12 @@ from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.feature_distances import metrics_of
-from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.reference import (
     ReferenceStatistics,
-    check_spaces,
     resume_or_start,
     split_halves,
 )
-from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -191,12 +189,14 @@ def test_scans_must_come_as_announced():
 
 
 def test_other_features_are_refused():
-    stored = empty().spaces
-    check_spaces(stored, [TOY])
+    stored = empty()
+    stored.check_spaces([TOY])
+    with pytest.raises(ValueError, match="holds 0 of 11 scans"):
+        stored.check([TOY])
     with pytest.raises(ValueError, match="no features of fgeo, only of toy"):
-        check_spaces(stored, [replace(TOY, name="fgeo")])
+        stored.check_spaces([replace(TOY, name="fgeo")])
     with pytest.raises(ValueError, match="toy is not that of the reference: weights x not abc"):
-        check_spaces(stored, [replace(TOY, card={**CARD, "weights": "x"})])
+        stored.check_spaces([replace(TOY, card={**CARD, "weights": "x"})])
 
 
 def test_files_of_something_else_are_named(tmp_path):

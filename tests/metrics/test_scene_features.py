@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.protocol import DEFAULT, PUBLISHED, Protocol
-from r3dpa.metrics.scene import EvaluationScene, through_sensor
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol, through_sensor
 from r3dpa.metrics.scene_features import (
     SceneFeatures,
     lip_loc_space,

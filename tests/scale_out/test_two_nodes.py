@@ -17,8 +17,8 @@ from cluster import PYTHON, Node, child_of, finish, two_nodes
 
 from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
-from r3dpa.metrics.protocol import DEFAULT
 from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import DEFAULT
 
 pytestmark = [pytest.mark.slow, pytest.mark.ddp]
 

@@ -23,18 +23,19 @@ from r3dpa.data.scans import read_scan
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit
-from r3dpa.metrics.evaluation import TooFewScenesError, check_counts, feature_spaces
-from r3dpa.metrics.official_statistics import (
+from r3dpa.metrics.evaluation import (
     AnyReference,
-    compare,
+    TooFewScenesError,
+    check_counts,
+    evaluate,
+    feature_spaces,
     load_reference,
     reference_spaces,
 )
-from r3dpa.metrics.protocol import PROTOCOLS
 from r3dpa.metrics.reference import ReferenceStatistics, cached_reference
 from r3dpa.metrics.result_table import report, save_reports
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
 from r3dpa.viz.evaluation import save_figures
@@ -160,7 +161,7 @@ class SceneScorer(L.Callback):
 
             statistics = cached_reference(statistics, scans_from, spaces, path)
         try:
-            evaluation, comparison = compare(
+            comparison = evaluate(
                 self._sampled(pl_module, folder, statistics),
                 statistics,
                 spaces,
@@ -176,9 +177,10 @@ class SceneScorer(L.Callback):
             trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
             return
         shutil.rmtree(_parts(folder))
+        evaluation = comparison.evaluation
         save_reports(evaluation, statistics.about.get("split"), folder)
-        if comparison is not None:
-            save_figures(folder, **comparison.figure_data())
+        if figures := comparison.figure_data():
+            save_figures(folder, **figures)
         trainer.print(report(evaluation, statistics.about.get("split")))
         _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
 

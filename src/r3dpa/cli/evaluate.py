@@ -56,9 +56,8 @@ def reference(
     from r3dpa.data.scans import evenly, read_scan
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
-    from r3dpa.metrics.protocol import PROTOCOLS
     from r3dpa.metrics.reference import ReferenceStatistics, complete_reference
-    from r3dpa.metrics.scene import EvaluationScene
+    from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
     if out.exists():
@@ -124,19 +123,19 @@ def evaluate(
 
     from r3dpa.data.samples import read_samples
     from r3dpa.io import source_commit
-    from r3dpa.metrics.official_statistics import compare, load_reference, reference_spaces
+    from r3dpa.metrics import evaluation as metrics
     from r3dpa.metrics.result_table import report, save_reports
     from r3dpa.viz.evaluation import save_figures
 
     check_folder(out)
     made_with = _made_with(samples)
-    statistics = load_reference(reference, split)
-    found = reference_spaces(statistics, spaces, ckpt, protocol, device)
+    statistics = metrics.load_reference(reference, split)
+    found = metrics.reference_spaces(statistics, spaces, ckpt, protocol, device)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
     )
-    evaluation, comparison = compare(
+    comparison = metrics.evaluate(
         tqdm(_scenes(files), "samples", disable=None),
         statistics,
         found,
@@ -148,14 +147,15 @@ def evaluate(
         skip_bad=skip_bad,
         option=_OPTION,
     )
+    evaluation = comparison.evaluation
     if files.bad:  # the reader refused these, so that they never became scenes
         bad = {"bad_samples": [*files.bad, *evaluation.bad_samples]}
         about: Any = {**evaluation.about, "extra": {**evaluation.about["extra"], **bad}}
         evaluation = replace(evaluation, about=about)
     if out is not None:
         save_reports(evaluation, statistics.about.get("split"), out)
-        if comparison is not None:
-            save_figures(out, **comparison.figure_data())
+        if figures := comparison.figure_data():
+            save_figures(out, **figures)
     return report(evaluation, statistics.about.get("split"))
 
 

@@ -6,7 +6,7 @@ from r3dpa.metrics.distances import (
     MinimumMatchingDistance,
     RangeHistogramDistance,
 )
-from r3dpa.metrics.evaluation import Comparison, evaluate, feature_spaces
+from r3dpa.metrics.evaluation import Comparison, evaluate, feature_spaces, scene_distance
 from r3dpa.metrics.feature_distances import (
     FrechetDistance,
     FrechetInfinity,
@@ -33,7 +33,6 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.protocol import DEFAULT, PUBLISHED, Protocol
 from r3dpa.metrics.realism import (
     MEASURES,
     Measure,
@@ -45,7 +44,7 @@ from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.result_table import EvaluationTable
 from r3dpa.metrics.results import Evaluation, MetricResult, published_evaluations
 from r3dpa.metrics.scan_statistics import ScanStatistics, scan_statistics
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol
 from r3dpa.metrics.scene_features import SceneFeatures, scene_features
 
 __all__ = [
@@ -91,6 +90,7 @@ __all__ = [
     "published_evaluations",
     "realism_table",
     "scan_statistics",
+    "scene_distance",
     "scene_features",
     "scene_metrics",
     "squared_mmd",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -27,13 +27,13 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.results import MetricResult
+from r3dpa.metrics.scene import Protocol
 
 #: Width of the bins of ranges, metres.
 RANGE_BIN_M = 0.1
 SIDES = ("real", "generated")
-#: Generated scenes and real scans; None where their number is not known.
+#: Generated scenes and real scans; None if unknown.
 Counts = tuple[int, int | None]
 
 #: Powers of ten that the published table prints its columns in.
@@ -52,20 +52,23 @@ class SceneMetric(Metric):
     is_differentiable = False
     higher_is_better = False
     full_state_update = False
-    #: Names and empty values of the states that are lists of tensors.
-    _lists: ClassVar[dict[str, Tensor]]
     real_count: Tensor
     generated_count: Tensor
 
     def __init__(self, max_real: int | None = None, max_generated: int | None = None) -> None:
         super().__init__()
         self.limits = {"real": max_real, "generated": max_generated}
-        self._empty: dict[str, Tensor] = {}
+        self._empty: dict[str, Tensor] = {}  # rows of the states that are lists of tensors
         self._add_states("count", torch.zeros((), dtype=torch.int64))
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distances as rows of a table, with intervals; of this process alone."""
         raise NotImplementedError
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether the real side is known."""
+        return self.count("real") > 0
 
     def count(self, side: str) -> int:
         """Scenes seen."""
@@ -95,6 +98,12 @@ class SceneMetric(Metric):
         """Indices of up to ``limit`` kept scenes: those whose names have the lowest hashes."""
         return self._joined(f"{side}_order")[:, 0].argsort(stable=True)[:limit].sort().values
 
+    def load_kept(self, side: str, chosen: Sequence[tuple[str, int]], values: Tensor) -> None:
+        """Sets the scenes that are kept from their names, places and values in a file."""
+        order = [(_rank(scene), place) for scene, place in chosen]
+        setattr(self, f"{side}_order", [torch.tensor(order, dtype=torch.int64).view(-1, 2)])
+        setattr(self, f"{side}_values", [values])
+
     def _add_states(self, name: str, default: Tensor, reduction: Any = "sum") -> None:
         for side in SIDES:
             self.add_state(f"{side}_{name}", default.clone(), dist_reduce_fx=reduction)
@@ -116,7 +125,7 @@ class SceneMetric(Metric):
         super()._sync_dist(*args, **kwargs)
 
     def _keep(self, side: str, values: Tensor, names: Sequence[str] | None) -> None:
-        """Counts ``(B, ...)`` values in."""
+        """Adds ``(B, ...)`` values to the count and to the kept ones."""
         ranks = [0] * len(values) if names is None else [_rank(scene) for scene in names]
         count = getattr(self, f"{side}_count")
         places = count + torch.arange(len(values), device=self.device)
@@ -137,12 +146,6 @@ class SceneMetric(Metric):
         setattr(self, f"{side}_order", [order.index_select(0, kept)])
         setattr(self, f"{side}_values", [values.index_select(0, kept)])
 
-    def load_kept(self, side: str, chosen: Sequence[tuple[str, int]], values: Tensor) -> None:
-        """Sets the scenes that are kept from their names, places and values in a file."""
-        order = [(_rank(scene), place) for scene, place in chosen]
-        setattr(self, f"{side}_order", [torch.tensor(order, dtype=torch.int64).view(-1, 2)])
-        setattr(self, f"{side}_values", [values])
-
     def _need_both(self) -> None:
         for side in SIDES:
             if not self.count(side):
@@ -159,9 +162,15 @@ class _Histograms(SceneMetric):
 
     def __init__(self, num_bins: int, num_groups: int, dtype: torch.dtype) -> None:
         super().__init__()
-        self.add_state("real_bins", torch.zeros(num_bins, dtype=dtype), dist_reduce_fx="sum")
-        groups = torch.zeros(num_groups, num_bins, dtype=dtype)
-        self.add_state("generated_bins", groups, dist_reduce_fx="sum")
+        for name, shape in (("real_bins", (num_bins,)), ("generated_bins", (num_groups, num_bins))):
+            self.add_state(name, torch.zeros(shape, dtype=dtype), dist_reduce_fx="sum")
+            # One number in place of up to 256 MB of zeros that torchmetrics would keep for reset.
+            self._defaults[name] = torch.zeros((), dtype=dtype).expand(shape)
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether the histogram of the real scans is known."""
+        return bool(self.real_bins.any())
 
     def _groups(self, real: bool, num: int) -> tuple[Tensor, Tensor]:
         """Histograms ``(groups, bins)`` of a side, and the group ``(num,)`` of each new scene."""
@@ -196,7 +205,7 @@ class BEVHistogramDistance(_Histograms):
     """JSD, TV and their relatives of how many clouds occupy each cell seen from above.
 
     Args:
-        grid: Cells; the default is that of the published numbers.
+        grid: Cells; default: those of the published numbers.
         num_groups: Groups of generated scenes that the bootstrap resamples.
     """
 
@@ -279,8 +288,12 @@ class MinimumMatchingDistance(SceneMetric):
 
     Args:
         protocol: Cells, sensor, and which point of a pixel stands for it.
-        max_real: Real scans that are kept; all where None.
-        max_generated: Generated scenes that are kept.
+        max_real: Real scans that are kept; default: all.
+        max_generated: Generated scenes that are kept; default: all.
+
+    Attributes:
+        reference_cells: Occupied cells ``(n,)`` of real scans without images, as in the official
+            statistics file; the 3D distance is then left out.
     """
 
     def __init__(
@@ -288,7 +301,13 @@ class MinimumMatchingDistance(SceneMetric):
     ) -> None:
         super().__init__(max_real, max_generated)
         self.protocol = protocol
+        self.reference_cells: list[Tensor] = []
         self._add_kept(torch.zeros(0, protocol.sensor.beams, protocol.sensor.columns))
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether real scans or their cells are known."""
+        return bool(self.reference_cells) or super().has_reference
 
     def update(self, range_m: Tensor, real: bool, names: Sequence[str] | None = None) -> None:
         """Add range images ``(B, H, W)``; of the named ones those with the lowest hashes stay."""
@@ -299,16 +318,13 @@ class MinimumMatchingDistance(SceneMetric):
         projection, corner = self.protocol.projection, self.protocol.corner
         return [points_of(image, projection, corner) for image in images]
 
-    def cells(self, side: str) -> tuple[list[Tensor], float]:
-        """Occupied cells of the kept scenes, and the share of their points beyond the grid."""
-        grid, clouds = self.protocol.grid, self.clouds(self.kept(side)[1])
-        beyond = sum(int((~grid.inside(cloud)).sum()) for cloud in clouds)
-        return [grid.cells(c) for c in clouds], beyond / max(sum(map(len, clouds)), 1)
-
     def matching(self) -> tuple[Matching, dict[str, float]]:
         """Nearest generated scene of each real one, and the shares of points beyond the grid."""
+        if self.reference_cells:
+            samples, _ = self._cells("generated")
+            return minimum_matching(self.reference_cells, samples, self.protocol.grid), {}
         self._need_both()
-        (references, beyond_real), (samples, beyond) = map(self.cells, SIDES)
+        (references, beyond_real), (samples, beyond) = map(self._cells, SIDES)
         shares = {"real": beyond_real, "generated": beyond}
         return minimum_matching(references, samples, self.protocol.grid), shares
 
@@ -316,32 +332,36 @@ class MinimumMatchingDistance(SceneMetric):
         """The published number, in square metres too, and ``*_outside_share`` of the points."""
         matching, shares = self.matching()
         grid, value = self.protocol.grid, matching.mmd_squared_normalised
-        return {
+        values = {
             "mmd_squared_normalised": value,
             "mmd_m2": value * (grid.shape[0] * grid.cell_m) ** 2,
             "chamfer_m2": self._chamfer(matching).mean().item(),
-            **{f"{side}_outside_share": share for side, share in shares.items()},
         }
+        return values | {f"{side}_outside_share": share for side, share in shares.items()}
 
     def results(
         self, resampling: Resampling, known: tuple[Matching, dict[str, float]] | None = None
     ) -> list[MetricResult]:
         """MMD and CD; intervals are over the real scans. ``known`` is of :meth:`matching`."""
         matching, shares = known or self.matching()
-        real, made = (f"{shares[side]:.2%}" for side in SIDES)
-        note = f"{made} of the points, {real} of the real ones, lie beyond the grid"
-        kept = len(self.kept("generated")[0])
+        kept, note = len(self.kept("generated")[0]), ""
+        if any(shares.values()):
+            real, made = (f"{shares[side]:.2%}" for side in SIDES)
+            note = f"{made} of the points, {real} of the real ones, lie beyond the grid"
 
         def row(name: str, values: Tensor, unit: str = "", note: str = "") -> MetricResult:
             ends, value = resampling.of_mean(values), values.mean().item()
             counts = (kept, len(values))
             return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
 
-        told = note if any(shares.values()) else ""
-        return [
-            row("MMD", matching.squared_normalised, note=told),
-            row("CD 3D", self._chamfer(matching), "m2"),
-        ]
+        mmd = row("MMD", matching.squared_normalised, note=note)
+        return [mmd] if self.reference_cells else [mmd, row("CD 3D", self._chamfer(matching), "m2")]
+
+    def _cells(self, side: str) -> tuple[list[Tensor], float]:
+        """Occupied cells of the kept scenes, and the share of their points beyond the grid."""
+        grid, clouds = self.protocol.grid, self.clouds(self.kept(side)[1])
+        beyond = sum(int((~grid.inside(cloud)).sum()) for cloud in clouds)
+        return [grid.cells(c) for c in clouds], beyond / max(sum(map(len, clouds)), 1)
 
     def _chamfer(self, matching: Matching) -> Tensor:
         nearest = matching.nearest[:_CHAMFER_PAIRS]
@@ -364,7 +384,7 @@ def distance_row(
     unit: str = "",
     note: str = "",
 ) -> MetricResult:
-    """A distance, where lower is better."""
+    """Row of a distance, where lower is better."""
     return MetricResult(
         name,
         value,

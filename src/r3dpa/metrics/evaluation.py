@@ -1,16 +1,16 @@
-"""How near generated scenes are to real ones: all metrics with intervals, floors and a verdict."""
+"""Distances of generated scenes from real ones, with intervals, floors and a verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torchmetrics import MetricCollection
 
-from r3dpa.io import usable_device
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
 from r3dpa.metrics.feature_distances import (
@@ -21,11 +21,18 @@ from r3dpa.metrics.feature_distances import (
     with_features,
 )
 from r3dpa.metrics.functional_bev import Matching
-from r3dpa.metrics.protocol import Protocol
-from r3dpa.metrics.reference import ReferenceStatistics, check_spaces
+from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics, is_official
+from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import About, Evaluation, MetricResult
-from r3dpa.metrics.scene import EvaluationScene, usable_scenes
-from r3dpa.metrics.scene_features import SceneFeatures, scene_features
+from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
+from r3dpa.metrics.scene_features import (
+    FREE_SPACES,
+    SceneFeatures,
+    feature_spaces,
+    scene_features,
+)
+
+AnyReference = ReferenceStatistics | OfficialStatistics
 
 _GROUPS = 16  # of the bootstrap of histograms
 _BATCH = 8
@@ -34,6 +41,14 @@ _SHOWN_MATCHES = 3
 _SHARES = ("precision", "recall")
 _NEAR, _POOR = 1.5, 0.5  # times the floor; times the share that real scans reach
 _ALIKE = 0.6  # ratio of the numbers of returns below which scenes are of another sensor
+_ROWS = {
+    "JSD": "cells",
+    "TV": "cells",
+    "W1 range": "ranges",
+    "MMD": "matching",
+    "CD 3D": "matching",
+}
+_KINDS = {"": "frechet", "inf": "inf", "KID": "kid"}  # of a feature space; others are shares
 #: How a caller in Python sets an option that allows something.
 PYTHON_OPTION = "{}=True"
 
@@ -44,53 +59,53 @@ class TooFewScenesError(ValueError):
 
 @dataclass(frozen=True)
 class Comparison:
-    """An evaluation, and the data that its figures are drawn from.
+    """An evaluation, and the data of its figures.
 
     Args:
         evaluation: All numbers.
         metrics: Of :func:`scene_metrics`, with the real and the generated scenes.
         reference: Real scans.
-        matching: Of the real scans whose images are kept to the generated scenes.
+        matching: Of the real scans whose images or cells are kept to the generated scenes.
         names: Of all generated scenes.
     """
 
     evaluation: Evaluation
     metrics: MetricCollection
-    reference: ReferenceStatistics
-    matching: Matching
+    reference: AnyReference
+    matching: Matching | None
     names: list[str]
 
-    def figure_data(self) -> dict[str, Any]:
-        """Arguments of :func:`r3dpa.viz.evaluation.save_figures`."""
+    def figure_data(self) -> dict[str, Any] | None:
+        """Arguments of :func:`r3dpa.viz.evaluation.save_figures`; None without real scans."""
+        if isinstance(self.reference, OfficialStatistics) or self.matching is None:
+            return None
         metrics: dict[str, Any] = metrics_of(self.metrics)
         protocol, ranges = self.reference.protocol, metrics["ranges"]
         cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
         halves: list[Any] = [metrics_of(half)["ranges"] for half in self.reference.halves]
-        order = self.matching.squared_normalised.argsort().tolist()
+        places, samples = metrics["matching"].kept("generated")
+        scans = metrics["matching"].kept("real")[1]
+        pairs = []
+        for index in self.matching.squared_normalised.argsort().tolist():
+            nearest = int(self.matching.nearest[index])
+            pair = f"{self.names[places[nearest]]} and {self.reference.kept_images[index]}"
+            title = f"{pair}: {self.matching.squared_normalised[index]:.3g}"
+            pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
         return {
             "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
             "limits_m": (protocol.grid.x_m, protocol.grid.y_m),
             "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
             "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
             "halves": torch.stack([h.real_bins for h in halves if h.count("real")]).numpy(),
-            "best": [self._pair(index) for index in order[:_SHOWN_MATCHES]],
-            "worst": [self._pair(index) for index in order[::-1][:_SHOWN_MATCHES]],
+            "best": pairs[:_SHOWN_MATCHES],
+            "worst": pairs[::-1][:_SHOWN_MATCHES],
             "sensor": protocol.sensor,
         }
-
-    def _pair(self, index: int) -> tuple[str, Any, Any]:
-        """Title and range images of a real scan and the sample that is nearest to it."""
-        metric = cast(MinimumMatchingDistance, metrics_of(self.metrics)["matching"])
-        (places, samples), (_, scans) = metric.kept("generated"), metric.kept("real")
-        nearest = int(self.matching.nearest[index])
-        pair = f"{self.names[places[nearest]]} and {self.reference.kept_images[index]}"
-        title = f"{pair}: {self.matching.squared_normalised[index]:.3g}"
-        return title, samples[nearest].numpy(), scans[index].numpy()
 
 
 def evaluate(
     scenes: Iterable[EvaluationScene],
-    reference: ReferenceStatistics,
+    reference: AnyReference,
     spaces: Sequence[SceneFeatures],
     *,
     label: str,
@@ -105,22 +120,26 @@ def evaluate(
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
 
-    Real and generated scenes take one way, :func:`r3dpa.metrics.scene.through_sensor`. The same
-    scenes in the same order give the same numbers.
+    Real and generated scenes are prepared alike by :func:`r3dpa.metrics.scene.through_sensor`, and
+    the same scenes in the same order give the same numbers.
 
-    The floor of a distance is that between the halves of the reference: other drives where there
-    are several. It is taken at as many scenes as are evaluated, or at as many as a half keeps; the
-    note of the row says so where these are fewer. Precision and its relatives are no distances:
-    what the halves reach is in their notes.
+    The floor of a distance is that between the halves of the reference: other drives if there are
+    several. It is computed with as many scenes as are evaluated, or as many as a half keeps; the
+    note of the row says so if these are fewer. For precision and its relatives the note has what
+    the halves reach.
+
+    Official statistics give the Fréchet distances and, if the file has what they need, JSD, TV and
+    MMD, without floors; ``left_out`` of ``extra`` lists the other rows. They do not name their
+    weights: the caller must know that those of ``spaces`` are the same.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
         reference: Complete statistics of the real scans.
         spaces: Feature spaces, each one of the reference.
         label: Of the generator or run.
-        source: Where the scenes come from.
-        made_with: What is known of their making: ``solver``, ``steps``, ``seed``, ``precision``,
-            ``feature_source``; anything else JSON can hold is kept, too.
+        source: Origin of the scenes.
+        made_with: Provenance: ``solver``, ``steps``, ``seed``, ``precision``, ``feature_source``,
+            and anything else that JSON can hold.
         commit: Version of the code.
         allow_few: Accept fewer scenes than features.
         skip_bad: Leave out scenes that are empty, hold NaN or have another size; the result lists
@@ -136,62 +155,102 @@ def evaluate(
             holds NaN or has another size: it is named.
     """
     resampling = resampling or Resampling()
-    reference.check_complete()
-    check_spaces(reference.spaces, spaces)
+    reference.check(spaces)
     protocol = reference.protocol
-    metrics = empty_metrics(protocol, spaces)
-    bad: list[str] | None = [] if skip_bad else None
-    names, more = gather(metrics, scenes, spaces, protocol, batch_size, bad, option)
-    counts = {"generated scenes": len(names), "real scans": reference.count()}
-    check_counts(counts, spaces, allow_few, option, bad or ())
-    reference.fill(metrics)
-
-    by_name = metrics_of(metrics)
-    match = cast(MinimumMatchingDistance, by_name["matching"])
-    known = match.matching()
-    rows: list[MetricResult] = []
-    for metric in by_name.values():
-        rows += match.results(resampling, known) if metric is match else metric.results(resampling)
-    floors = floors_of(reference, spaces, len(names), len(match.kept("generated")[0]), resampling)
-    about = about_generated(len(names), more, spaces, reference, made_with, commit, source)
-    extra = about["extra"] | {"verdict": verdict(rows, floors), "bootstrap": vars(resampling)}
-    if warning := _other_sensor(match):
-        extra["warning"] = warning
-    if bad:
-        extra["bad_samples"] = bad
-    about["extra"] = extra
-    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    return Comparison(evaluation, metrics, reference, known[0], names)
-
-
-def empty_metrics(protocol: Protocol, spaces: Sequence[SceneFeatures]) -> MetricCollection:
-    """Metrics of an evaluation under a protocol."""
-    return scene_metrics(
+    metrics = scene_metrics(
         protocol,
         {space.name: (space.label, space.dim) for space in spaces},
         num_groups=_GROUPS,
         max_rows=(None, protocol.num_samples),
         max_images=(None, protocol.num_mmd_samples),
     )
-
-
-def gather(
-    metrics: MetricCollection,
-    scenes: Iterable[EvaluationScene],
-    spaces: Sequence[SceneFeatures],
-    protocol: Protocol,
-    batch_size: int = _BATCH,
-    bad: list[str] | None = None,
-    option: str = PYTHON_OPTION,
-) -> tuple[list[str], bool]:
-    """Updates metrics with generated scenes."""
-    stream, names = iter(scenes), []
+    bad: list[str] | None = [] if skip_bad else None
     advice = f". {option.format('skip_bad')} leaves such scenes out, and lists them"
+    stream, names = iter(scenes), []
     counted = islice(usable_scenes(stream, protocol, bad, advice), protocol.num_samples)
     for batch, features in with_features(counted, spaces, batch_size):
         update_with(metrics, batch, features, real=False)
         names += [scene.name for scene in batch]
-    return names, next(stream, None) is not None
+    more = next(stream, None) is not None
+
+    counts = {"generated scenes": len(names)}
+    if isinstance(reference, ReferenceStatistics):
+        counts["real scans"] = reference.count()
+        reference.fill(metrics)
+    else:
+        reference.fill(metrics, spaces)
+    check_counts(counts, spaces, allow_few, option, bad or ())
+    by_name = metrics_of(metrics)
+    match = cast(MinimumMatchingDistance, by_name["matching"])
+    known = match.matching() if match.has_reference else None
+    rows: list[MetricResult] = []
+    for metric in by_name.values():
+        if metric is match and known:
+            rows += match.results(resampling, known)
+        elif metric.has_reference:
+            rows += metric.results(resampling)
+    about = _about(len(names), more, spaces, reference, made_with, commit, source)
+    extra = about["extra"]
+    floors: dict[str, MetricResult] = {}
+    if isinstance(reference, OfficialStatistics):
+        extra["left_out"] = reference.left_out
+    else:
+        num_images = len(match.kept("generated")[0])
+        floors = _floors(reference, spaces, len(names), num_images, resampling)
+        extra["verdict"] = _verdict(rows, floors)
+    extra["bootstrap"] = dict(vars(resampling))
+    if warning := _other_sensor(match):
+        extra["warning"] = warning
+    if bad:
+        extra["bad_samples"] = bad
+    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
+    return Comparison(evaluation, metrics, reference, known[0] if known else None, names)
+
+
+def scene_distance(
+    name: str,
+    real: Iterable[Sequence[Any]],
+    generated: Iterable[Sequence[Any]],
+    protocol: Protocol = DEFAULT,
+    ckpt: str | Path | None = None,
+    device: str = "cpu",
+) -> float:
+    """One metric between two sets of scenes, without a reference file, intervals and floors.
+
+    Args:
+        name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; a feature space,
+            such as ``FWID``, for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
+        real: Scenes as ``(name, points)``, or what :func:`r3dpa.data.samples.read_samples` gives.
+        generated: The same.
+        protocol: Preparation of the scenes.
+        ckpt: Official weights of the feature space.
+        device: Of its network.
+
+    Raises:
+        ValueError: If there is no such metric, there are too few scenes, or one cannot be used.
+
+    Example:
+        >>> cloud = torch.tensor([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+        >>> scene_distance("JSD", [("real", cloud)], [("made", cloud), ("again", cloud)])
+        0.0
+    """
+    space, _, kind = name.partition(" ")
+    spaces = [] if name in _ROWS else [scene_features(space.lower(), ckpt, protocol, device)]
+    cards = {space.name: (space.label, space.dim) for space in spaces}
+    limits = (protocol.num_mmd_references, protocol.num_mmd_samples)
+    metrics = scene_metrics(protocol, cards, max_images=limits)
+    for scenes, is_real in ((real, True), (generated, False)):
+        usable = usable_scenes((EvaluationScene(*scene) for scene in scenes), protocol)
+        for batch, features in with_features(usable, spaces):
+            update_with(metrics, batch, features, is_real)
+    metric = metrics_of(metrics)[_ROWS.get(name) or f"{space.lower()}_{_KINDS.get(kind, 'shares')}"]
+    rows = {row.name: row for row in metric.results(Resampling(num_resamples=0))}
+    if name not in rows:
+        raise ValueError(f"there is no metric {name!r}; of {space} there are {', '.join(rows)}")
+    value = rows[name].value
+    if value is None:
+        raise ValueError(f"{name}: {rows[name].note}")
+    return value
 
 
 def check_counts(
@@ -227,21 +286,63 @@ def check_counts(
         )
 
 
-def about_generated(
+def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
+    """Complete reference of either kind; ``split`` is of the official file alone.
+
+    Raises:
+        ValueError: If the file is missing, damaged, of something else or not complete, or has no
+            such split.
+    """
+    if is_official(path):
+        return OfficialStatistics.load(path, split)
+    if split is not None:
+        raise ValueError(
+            f"{path}: is no official statistics file, so the split {split} does not apply to it; "
+            "leave it out"
+        )
+    statistics = ReferenceStatistics.load(path)
+    statistics.check()
+    return statistics
+
+
+def reference_spaces(
+    statistics: AnyReference,
+    names: Sequence[str] | None,
+    ckpt: Mapping[str, Any] | None,
+    protocol: str | None,
+    device: str,
+) -> list[SceneFeatures]:
+    """Feature spaces of a comparison; default: those of the reference that have what they need.
+
+    Raises:
+        ValueError: If the reference is of another protocol or lacks a space, or as
+            :func:`feature_spaces`.
+    """
+    setting = statistics.protocol
+    if protocol is not None and protocol != setting.name:
+        raise ValueError(
+            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
+            f"with `r3dpa reference --protocol {protocol}`, or ask for no protocol"
+        )
+    if names is None:
+        names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
+    spaces = feature_spaces(names, ckpt, setting, device)
+    statistics.check(spaces)
+    return spaces
+
+
+def _about(
     count: int,
     more: bool,
     spaces: Sequence[SceneFeatures],
-    reference: Any,
+    reference: AnyReference,
     made_with: Mapping[str, Any] | None,
     commit: str | None,
     source: str,
 ) -> About:
-    """Where the numbers of an evaluation come from."""
     extra, protocol = dict(made_with or {}), reference.protocol
-    known = {
-        key: extra.pop(key, None)
-        for key in ("solver", "steps", "seed", "precision", "feature_source")
-    }
+    known = ("solver", "steps", "seed", "precision", "feature_source")
+    given = {key: extra.pop(key, None) for key in known}
     if more:
         extra["scenes"] = f"only the first {count} were used, as many as the protocol counts"
     elif count < protocol.num_samples:
@@ -250,7 +351,7 @@ def about_generated(
         "backbones": {space.label: dict(space.card) for space in spaces},
         "protocol": protocol.to_dict(),
         "reference": reference.describe(),
-        **known,
+        **given,
         "commit": commit,
         "published": False,
         "source": source,
@@ -259,7 +360,7 @@ def about_generated(
     return cast(About, about)
 
 
-def floors_of(
+def _floors(
     reference: ReferenceStatistics,
     spaces: Sequence[SceneFeatures],
     num_samples: int,
@@ -269,7 +370,6 @@ def floors_of(
     """Rows of the first half of the reference as if it were generated, against the second."""
     if min(reference.count(0), reference.count(1)) < 2:
         return {}
-    without = replace(resampling, num_resamples=0)
     held: dict[str, Any] = metrics_of(reference.halves[0])
     names = [space.name for space in spaces]
     metrics = reference.metrics(names, max_images=(None, num_images))
@@ -290,14 +390,13 @@ def floors_of(
         rows = cast(FeatureMetric, held[f"{name}_frechet"]).rows("real")
         chosen = torch.randperm(len(rows), generator=resampling.generator())[:num_samples]
         own[f"{name}_frechet"].update(rows[chosen], real=False)
-    rows_by_name: dict[str, MetricResult] = {}
-    for metric in metrics_of(metrics).values():
-        rows_by_name |= {row.name: row for row in metric.results(without)}
-    return rows_by_name
+    without = replace(resampling, num_resamples=0)
+    found = [row for metric in metrics_of(metrics).values() for row in metric.results(without)]
+    return {row.name: row for row in found}
 
 
-def verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) -> str:
-    """One line: which distances are near their floor, and whether the scenes are realistic."""
+def _verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) -> str:
+    """Which distances are near their floor, and whether the scenes are realistic, in one line."""
     near, far, poor = [], [], []
     for row in rows:
         floor = floors.get(row.name)
@@ -321,7 +420,9 @@ def verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) ->
 
 
 def _other_sensor(match: MinimumMatchingDistance) -> str:
-    """A warning where scenes and real scans differ in their number of returns by much."""
+    """A warning if scenes and real scans differ in their number of returns by much."""
+    if not match.count("real"):
+        return ""
     made, real = (
         int((match.kept(side)[1] > 0).sum(dim=(1, 2)).median()) for side in ("generated", "real")
     )
@@ -347,27 +448,3 @@ def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> Metric
         text += f", rather {'high' if fewer else 'low'}: the value is of {row.num_samples} scenes"
     note = "; ".join(filter(None, [row.note, text]))
     return replace(row, floor=max(floor.value, 0.0), note=note)
-
-
-def feature_spaces(
-    names: Sequence[str],
-    ckpt: Mapping[str, Any] | None,
-    protocol: Protocol,
-    device: str,
-) -> list[SceneFeatures]:
-    """Feature spaces by name.
-
-    Raises:
-        ValueError: If a name occurs twice, a file belongs to none of them, or as
-            :func:`scene_features`.
-    """
-    if len(set(names)) < len(names):
-        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
-    unused = [name for name in ckpt or {} if name not in names]
-    if unused:
-        raise ValueError(
-            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
-            f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
-        )
-    device = usable_device(device)
-    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]

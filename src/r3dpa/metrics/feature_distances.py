@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MetricCollection
 
-from r3dpa.metrics.bootstrap import Ends, Resampling
+from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     SIDES,
     BEVHistogramDistance,
@@ -32,9 +32,8 @@ from r3dpa.metrics.functional import (
     precision_recall,
     shared_balls,
 )
-from r3dpa.metrics.protocol import Protocol
 from r3dpa.metrics.results import MetricResult
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.metrics.scene import EvaluationScene, Protocol
 from r3dpa.metrics.scene_features import SceneFeatures
 
 _KID_SUBSETS, _KID_SUBSET_SIZE = 100, 1000
@@ -48,9 +47,9 @@ class FeatureMetric(SceneMetric):
     Args:
         num_features: Feature width F.
         label: Of the feature space, in results.
-        space: Which features are taken where ``update`` gets those of several spaces.
-        max_real: Real scans whose features are kept; all where None.
-        max_generated: Generated scenes whose features are kept.
+        space: Key of the features if ``update`` gets those of several spaces.
+        max_real: Real scans whose features are kept; default: all.
+        max_generated: Generated scenes whose features are kept; default: all.
     """
 
     real_moments: Tensor
@@ -77,8 +76,6 @@ class FeatureMetric(SceneMetric):
         names: Sequence[str] | None = None,
     ) -> None:
         """Add ``(N, F)`` features, or such by space; NaN or another width is a ``ValueError``."""
-        if real and getattr(self, "reference_mean", None) is not None:
-            raise ValueError("real features given beside a reference; build the metric without it")
         side = SIDES[not real]
         values = (features if isinstance(features, Tensor) else features[self.space]).detach()
         if values.ndim != 2 or values.shape[1] != self.num_features:
@@ -107,16 +104,15 @@ class FeatureMetric(SceneMetric):
 class FrechetDistance(FeatureMetric):
     """Fréchet distance between real and generated features: FRID, FLD, FSVD, FPVD.
 
-    The metric knows no network: give it the features of one extractor. Processes with unequal
-    batches give what one process would.
-
     Args:
         args: Of :class:`FeatureMetric`, ``num_features`` first.
-        allow_few_samples: Accept fewer than F + 1 samples, where the covariance is singular and
-            the distance mostly tells how many samples there were.
-        reference: Mean ``(F,)`` and covariance ``(F, F)`` of the real features, where only these
-            are known, as in the official statistics file; real features are then refused.
+        allow_few_samples: Accept fewer than F + 1 samples, with a singular covariance: the
+            distance then mostly depends on how many there are.
         options: Of :class:`FeatureMetric`.
+
+    Attributes:
+        reference: Mean ``(F,)`` and covariance ``(F, F)`` in place of real features, as in the
+            official statistics file.
 
     Raises:
         ValueError: By ``compute``, if there are fewer than F + 1 samples.
@@ -130,28 +126,22 @@ class FrechetDistance(FeatureMetric):
         18.0
     """
 
-    reference_mean: Tensor | None
-    reference_covariance: Tensor | None
-
-    def __init__(
-        self,
-        *args: Any,
-        allow_few_samples: bool = False,
-        reference: tuple[Tensor, Tensor] | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, allow_few_samples: bool = False, **options: Any) -> None:
         super().__init__(*args, **options)
         self.allow_few_samples = allow_few_samples
-        mean, covariance = reference if reference is not None else (None, None)
-        self.register_buffer("reference_mean", mean, persistent=False)
-        self.register_buffer("reference_covariance", covariance, persistent=False)
+        self.reference: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether real features or their moments are known."""
+        return self.reference is not None or super().has_reference
 
     def compute(self) -> Tensor:
         """Distance ``()`` float64 of everything seen so far, by all processes."""
         for side in SIDES:
             count, needed = self.moments(side).count, self.num_features + 1
             needed = 2 if self.allow_few_samples else needed
-            if count < needed and (side == "generated" or self.reference_mean is None):
+            if count < needed and (side == "generated" or self.reference is None):
                 raise ValueError(
                     f"{side}: {int(count)} samples for {self.num_features} features, at least "
                     f"{needed} are needed; give more, or allow_few_samples=True for a smoke test"
@@ -172,11 +162,8 @@ class FrechetDistance(FeatureMetric):
         return [distance_row(self.label, self.label, value, counts, interval=ends, note=note)]
 
     def _distance(self, generated: Moments) -> Tensor:
-        if self.reference_mean is not None and self.reference_covariance is not None:
-            mean, covariance = self.reference_mean, self.reference_covariance
-        else:
-            real = self.moments("real")
-            mean, covariance = real.mean, real.covariance("real features")
+        real = self.moments("real")
+        mean, covariance = self.reference or (real.mean, real.covariance("real features"))
         return frechet_distance(
             mean, covariance, generated.mean, generated.covariance("generated features")
         )
@@ -218,7 +205,7 @@ class PolynomialMMD(FeatureMetric):
         return {"kid_mean": mean, "kid_std": std}
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The mean with the spread of the subsets, which is wider than needed."""
+        """The mean with the spread of the subsets, wider than a 95 % interval."""
         counts, name = (len(self.rows("generated")), len(self.rows("real"))), f"{self.label} KID"
         if min(counts) < 4:
             return [distance_row(name, "", None, counts, note="needs 4 scenes of both kinds")]
@@ -236,8 +223,8 @@ class PolynomialMMD(FeatureMetric):
 class PrecisionRecall(FeatureMetric):
     """Precision, recall, density and coverage, see :func:`precision_recall`.
 
-    ``results`` has bootstrap intervals over the scenes that a share is the mean of (real ones for
-    recall and coverage), with the balls left as they are.
+    The bootstrap of ``results`` resamples the scenes that a share is the mean of (real ones for
+    recall and coverage), not the balls.
     """
 
     higher_is_better = True
@@ -250,28 +237,26 @@ class PrecisionRecall(FeatureMetric):
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The four shares."""
         real, generated = self._rows()
-        few = min(len(real), len(generated)) <= self.num_neighbors
         values: dict[str, Tensor | None] = dict.fromkeys(
             ("precision", "recall", "density", "coverage")
         )
-        if not few:
+        if min(len(real), len(generated)) > self.num_neighbors:
             balls = shared_balls(real, generated, self.num_neighbors)
-            shares = (balls.precise, balls.recalled, balls.density, balls.covered)
-            values = {k: v.double() for k, v in zip(values, shares, strict=True)}
-
-        def row(name: str, by_scene: Tensor | None) -> MetricResult:
-            ends: Ends | None = None if by_scene is None else resampling.of_mean(by_scene)
-            return MetricResult(
+            values["precision"], values["recall"] = balls.precise.double(), balls.recalled.double()
+            values["density"], values["coverage"] = balls.density, balls.covered.double()
+        few = f"needs {self.num_neighbors + 1} scenes of both kinds"
+        return [
+            MetricResult(
                 f"{self.label} {name}",
                 None if by_scene is None else by_scene.mean().item(),
-                interval=ends,
+                interval=None if by_scene is None else resampling.of_mean(by_scene),
                 direction="higher",
                 num_samples=len(generated),
                 num_references=len(real),
-                note=f"needs {self.num_neighbors + 1} scenes of both kinds" if few else "",
+                note=few if by_scene is None else "",
             )
-
-        return [row(name, by_scene) for name, by_scene in values.items()]
+            for name, by_scene in values.items()
+        ]
 
 
 _OF_SPACE = {
@@ -311,7 +296,7 @@ def scene_metrics(
 
 
 def metrics_of(metrics: MetricCollection) -> dict[str, SceneMetric]:
-    """The metrics by name in their order, those of a feature space with the states they share."""
+    """The metrics by name; those of a feature space share their states."""
     found: dict[str, Any] = dict(metrics.items(keep_base=True, copy_state=False))
     return {name: found[name] for group in metrics.compute_groups.values() for name in group}
 
@@ -322,7 +307,7 @@ def update_with(
     features: Mapping[str, Tensor],
     real: bool,
 ) -> None:
-    """Counts scenes in."""
+    """Adds scenes to metrics of :func:`scene_metrics`."""
     if scenes:
         metrics.update(
             clouds=[scene.points for scene in scenes],
@@ -336,7 +321,7 @@ def update_with(
 def with_features(
     scenes: Iterable[EvaluationScene], spaces: Sequence[SceneFeatures], batch_size: int = _BATCH
 ) -> Iterator[tuple[list[EvaluationScene], dict[str, Tensor]]]:
-    """Batches of scenes and their features by space: what :func:`update_with` takes."""
+    """Batches of scenes with their features by space, for :func:`update_with`."""
     stream = iter(scenes)
     while batch := list(islice(stream, batch_size)):
         yield batch, {space.name: space(batch) for space in spaces}

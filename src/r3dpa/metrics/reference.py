@@ -1,4 +1,4 @@
-"""Reference of an evaluation: statistics of real scans, computed once and kept in one file."""
+"""Statistics of real scans, computed once and kept in one file."""
 
 from __future__ import annotations
 
@@ -19,21 +19,18 @@ from torchmetrics import MetricCollection
 from tqdm import tqdm
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
-from r3dpa.metrics.distances import BEVHistogramDistance, MinimumMatchingDistance
 from r3dpa.metrics.feature_distances import (
-    FeatureMetric,
     metrics_of,
     scene_metrics,
     update_with,
     with_features,
 )
-from r3dpa.metrics.protocol import Protocol
-from r3dpa.metrics.scene import EvaluationScene, usable_scenes
+from r3dpa.metrics.scene import EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 2
-_EVERY = 2000  # scans between two savings of an unfinished reference
+_EVERY = 2000  # scans between two saves of an unfinished reference
 _BATCH = 8
 
 _log = logging.getLogger(__name__)
@@ -42,14 +39,12 @@ _log = logging.getLogger(__name__)
 class ReferenceStatistics:
     """Statistics of real scans, in two halves whose distance is the floor of every metric.
 
-    The halves are of different drives where there are several (see :func:`split_halves`), since
-    neighbouring scans of a drive are alike.
+    The halves are of different drives if there are several, see :func:`split_halves`.
 
     Attributes:
-        halves: Metrics of :func:`scene_metrics` that hold the real scans of a half. Features of up
-            to ``num_samples`` scans and images of up to ``num_mmd_references`` are kept, half of
-            them in each, or more in one where the other has fewer scans.
-        num_done: Scans counted in so far; all of them once complete.
+        halves: Metrics of :func:`scene_metrics` with the real scans of each half. Together they
+            keep features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
+        num_done: Scans added so far.
 
     Raises:
         ValueError: If there are fewer than two scans, or a name occurs twice.
@@ -71,8 +66,8 @@ class ReferenceStatistics:
         self.protocol, self.spaces, self.about = protocol, spaces, about
         self.names, self._half_of = tuple(names), split_halves(names)
         self.num_done = 0
-        in_first = sum(half == 0 for half in self._half_of.values())
-        sizes = (in_first, len(names) - in_first)
+        second = sum(self._half_of.values())
+        sizes = (len(names) - second, second)
         rows, images = (
             _kept_of_halves(limit, sizes)
             for limit in (protocol.num_samples, protocol.num_mmd_references)
@@ -89,8 +84,8 @@ class ReferenceStatistics:
         names: Sequence[str],
         about: dict[str, Any],
     ) -> Self:
-        """Empty statistics of these scans; the arguments are those of the class."""
-        return cls(protocol, {space.name: space_card(space) for space in spaces}, names, about)
+        """Empty statistics of these scans."""
+        return cls(protocol, {space.name: _card(space) for space in spaces}, names, about)
 
     def metrics(self, spaces: Iterable[str] | None = None, **options: Any) -> MetricCollection:
         """Empty metrics of the protocol and of some or all feature spaces."""
@@ -99,7 +94,7 @@ class ReferenceStatistics:
         return scene_metrics(self.protocol, cards, **options)
 
     def fill(self, metrics: MetricCollection, *halves: int) -> None:
-        """Gives metrics the real scans of both halves, or of one."""
+        """Sets the real side of metrics to the scans of both halves, or of one."""
         parts = [metrics_of(self.halves[i]) for i in halves or (0, 1)]
         for name, metric in metrics_of(metrics).items():
             metric.adopt_real(*(part[name] for part in parts))
@@ -127,13 +122,35 @@ class ReferenceStatistics:
         """Whether every scan was counted in."""
         return self.num_done == len(self.names)
 
-    def check_complete(self) -> None:
-        """Raises a ``ValueError`` where scans are missing."""
+    def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
+        """A ``ValueError`` if scans are missing, or as :meth:`check_spaces`."""
         if not self.complete:
             raise ValueError(
                 f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
                 "command to complete it"
             )
+        self.check_spaces(spaces)
+
+    def check_spaces(self, spaces: Sequence[SceneFeatures]) -> None:
+        """Refuses spaces that the statistics lack or that were made with something else.
+
+        Raises:
+            ValueError: Naming the space and the fields that differ.
+        """
+        for space in spaces:
+            if space.name not in self.spaces:
+                raise ValueError(
+                    f"the reference has no features of {space.name}, only of "
+                    f"{', '.join(self.spaces) or 'none'}: choose among these, or compute it again"
+                )
+            theirs, own = self.spaces[space.name], _card(space)
+            differing = [key for key in {**theirs, **own} if theirs.get(key) != own.get(key)]
+            if differing:
+                given = ", ".join(f"{k} {own.get(k)} not {theirs.get(k)}" for k in differing)
+                raise ValueError(
+                    f"{space.name} is not that of the reference: {given}. Give the same weights "
+                    "and protocol, or compute the reference again"
+                )
 
     def describe(self) -> str:
         """Split, count and hash of the names, in one line."""
@@ -149,15 +166,12 @@ class ReferenceStatistics:
         every: int = _EVERY,
         batch_size: int = _BATCH,
     ) -> None:
-        """Count in all scans that are missing.
-
-        Interrupted and resumed, the statistics are the same to the last bit.
+        """Add the scans that are missing; interruptions change no bit of the result.
 
         Args:
             scenes: The scans ``names[num_done:]``, in that order.
             spaces: Those that the statistics were prepared for.
-            partial: File to save to after every ``every`` scans and on a ``KeyboardInterrupt``, so
-                that the work can be resumed.
+            partial: File to save to every ``every`` scans and on a ``KeyboardInterrupt``.
             every: Rounded up to whole batches.
             batch_size: Scans per pass of a network.
 
@@ -165,9 +179,9 @@ class ReferenceStatistics:
             ValueError: If a scan is not the next one, there are too few, or one cannot be used;
                 the message names it.
         """
-        check_spaces(self.spaces, spaces)
+        self.check_spaces(spaces)
         every = -(-every // batch_size) * batch_size
-        whole = True  # no batch is counted in by a part
+        whole = True  # never saved in the middle of a batch
         try:
             batches = with_features(usable_scenes(scenes, self.protocol), spaces, batch_size)
             for batch, features in batches:
@@ -202,21 +216,21 @@ class ReferenceStatistics:
         chosen = []
         for index, part in enumerate(self.halves):
             names = self.names_of_half(index)
-            metrics = metrics_of(part)
+            metrics: dict[str, Any] = metrics_of(part)
             places: dict[str, list[int]] = {"rows": [], "images": []}
             for space in self.spaces:
-                metric = cast(FeatureMetric, metrics[f"{space}_frechet"])
+                metric = metrics[f"{space}_frechet"]
                 kept, rows = metric.kept("real")
                 places["rows"] = kept.tolist()
                 tensors[f"{index}.moments.{space}"] = metric.real_moments
                 tensors[f"{index}.features.{space}"] = rows
-            kept, images = cast(MinimumMatchingDistance, metrics["matching"]).kept("real")
+            kept, images = metrics["matching"].kept("real")
             places["images"], tensors[f"{index}.images"] = kept.tolist(), images
-            cells = cast(BEVHistogramDistance, metrics["cells"]).real_bins
+            cells = metrics["cells"].real_bins
             occupied = cells.nonzero()[:, 0]
             tensors[f"{index}.cells"] = occupied.int()
             tensors[f"{index}.cell_counts"] = cells[occupied]
-            tensors[f"{index}.ranges"] = cast(Any, metrics["ranges"]).real_bins[None]
+            tensors[f"{index}.ranges"] = metrics["ranges"].real_bins[None]
             chosen.append({key: [(names[i], i) for i in of] for key, of in places.items()})
         card = {
             "version": _VERSION,
@@ -292,7 +306,7 @@ def complete_reference(
     out: Path,
     every: int = _EVERY,
 ) -> ReferenceStatistics:
-    """Statistics of scans as a file; goes on where an interrupted call has stopped.
+    """Statistics of scans as a file; resumes an interrupted call.
 
     Raises:
         ValueError: If the unfinished file is of another job, another process computes ``out``, or
@@ -319,7 +333,7 @@ def cached_reference(
     spaces: Sequence[SceneFeatures],
     out: Path,
 ) -> ReferenceStatistics:
-    """The same, but read from ``out`` where that file is of the same job; replaced where not."""
+    """The same, but read from ``out`` if that file is of the same job, and else replacing it."""
     for path in (out, _partial(out)):
         try:
             found = resume_or_start(job, path)
@@ -333,7 +347,7 @@ def cached_reference(
 
 
 def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
-    """What an interrupted job has saved, or the empty statistics where there is nothing.
+    """Statistics that an interrupted job has saved, or the empty ones without a file.
 
     Raises:
         ValueError: If the file is of another job.
@@ -350,39 +364,15 @@ def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceS
     return stored
 
 
-def space_card(space: SceneFeatures) -> dict[str, Any]:
-    """Card of a space with its width and label."""
+def _card(space: SceneFeatures) -> dict[str, Any]:
     return {**space.card, "dim": space.dim, "label": space.label}
 
 
-def check_spaces(stored: dict[str, dict[str, Any]], spaces: Sequence[SceneFeatures]) -> None:
-    """Refuses spaces that a reference lacks or that were made with something else.
-
-    Raises:
-        ValueError: Naming the space and the fields that differ.
-    """
-    for space in spaces:
-        if space.name not in stored:
-            raise ValueError(
-                f"the reference has no features of {space.name}, only of "
-                f"{', '.join(stored) or 'none'}: choose among these, or compute it again"
-            )
-        theirs, own = stored[space.name], space_card(space)
-        differing = [key for key in {**theirs, **own} if theirs.get(key) != own.get(key)]
-        if differing:
-            given = ", ".join(f"{key} {own.get(key)} not {theirs.get(key)}" for key in differing)
-            raise ValueError(
-                f"{space.name} is not that of the reference: {given}. Give the same weights and "
-                "protocol, or compute the reference again"
-            )
-
-
 def split_halves(names: Sequence[str]) -> dict[str, int]:
-    """Half, 0 or 1, of each scan: whole drives, as long as no half has over two thirds of them all.
+    """Half, 0 or 1, of each scan: whole drives, which a name has before its last ``/``.
 
-    The drive of a scan is what its name has before the last ``/``. Drives go to the smaller half,
-    the largest first. A single drive, or one with over two thirds of all scans, is divided: its
-    start makes one half, and its end goes to the other, so that both have equally many.
+    Neighbouring scans of a drive are alike. Drives go to the smaller half, the largest first; a
+    drive with over two thirds of all scans is divided so that both halves have equally many.
     """
     drives: dict[str, list[str]] = {}
     for name in sorted(names):
@@ -399,7 +389,7 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
 
 
 def _kept_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
-    """Scans that each half of so many keeps: half the limit, and what the other half lacks."""
+    """Limits of the halves: half the limit, and the scans that the other half lacks."""
     first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
     return first, min(sizes[1], limit - first)
 

@@ -1,15 +1,110 @@
-"""One scene of an evaluation, real or generated, and the one way that all of them take."""
+"""Protocol of an evaluation, and its scenes as the sensor of the protocol sees them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import torch
 from torch import Tensor
 
-from r3dpa.geometry import EMPTY_RANGE_M, in_range, points_of, range_image
-from r3dpa.metrics.protocol import Protocol
+from r3dpa.geometry import (
+    EMPTY_RANGE_M,
+    LidarSensor,
+    SphericalProjection,
+    in_range,
+    points_of,
+    range_image,
+)
+from r3dpa.metrics.functional_bev import MAX_SIDE, BEVGrid
+
+Unprojection = Literal["corner", "centre"]
+LIPLocCast = Literal["wrap", "clip"]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Preparation and number of the scenes that are compared.
+
+    Source: ``evaluate.py`` of valeoai/R3DPA and its paper (ICRA 2026).
+
+    Args:
+        name: Name in results.
+        unprojection: Point that stands for a pixel: its upper left corner or its centre.
+        liploc_cast: Treatment of values beyond 8 bits in FLD's picture: ``wrap`` modulo 256, which
+            makes empty pixels nearly white, or ``clip``, which makes them black.
+        voxel_m: Edge of the voxels of FSVD and FPVD and of the cells of JSD, TV and MMD, metres.
+        num_samples: Generated scenes that count.
+        num_mmd_samples: Of these, for MMD.
+        num_mmd_references: Real scans for MMD.
+        sensor: Image size, field of view and range limits of all scenes.
+
+    Raises:
+        ValueError: If a field is not as above.
+    """
+
+    name: str
+    unprojection: Unprojection
+    liploc_cast: LIPLocCast
+    voxel_m: float = 0.05
+    num_samples: int = 10_000
+    num_mmd_samples: int = 2000
+    num_mmd_references: int = 1000
+    sensor: LidarSensor = LidarSensor()
+
+    def __post_init__(self) -> None:
+        for key, kinds in (("unprojection", Unprojection), ("liploc_cast", LIPLocCast)):
+            if getattr(self, key) not in get_args(kinds):
+                given = getattr(self, key)
+                raise ValueError(f"{key} must be one of {', '.join(get_args(kinds))}, got {given}")
+        for key in ("voxel_m", "num_samples", "num_mmd_samples", "num_mmd_references"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be above 0, got {getattr(self, key)}")
+        side, (low, high) = max(self.grid.shape), self.grid.x_m
+        if side > MAX_SIDE:  # here, and not by MMD at the end of an evaluation
+            raise ValueError(
+                f"voxel_m = {self.voxel_m} makes a grid of {side} cells along a side, but MMD can "
+                f"match {MAX_SIDE}; give at least {(high - low) / MAX_SIDE:.4f}"
+            )
+
+    @property
+    def corner(self) -> bool:
+        """Whether pixels stand for their corners."""
+        return self.unprojection == "corner"
+
+    @property
+    def projection(self) -> SphericalProjection:
+        """Points to pixels and back."""
+        return SphericalProjection(self.sensor)
+
+    @property
+    def grid(self) -> BEVGrid:
+        """Cells seen from above."""
+        return BEVGrid(cell_m=self.voxel_m)
+
+    def with_sensor(self, sensor: LidarSensor) -> Self:
+        """The same protocol for another sensor."""
+        return replace(self, sensor=sensor)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and strings."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Inverse of :meth:`to_dict`; a ``ValueError`` for missing, unknown or wrong entries."""
+        try:
+            return cls(**{**values, "sensor": LidarSensor(**values["sensor"])})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"not a protocol: {values!r} ({error!r})") from error
+
+
+#: Protocol of the published numbers.
+PUBLISHED = Protocol("published", "corner", "wrap")
+#: Points at pixel centres, and black pixels without a return.
+DEFAULT = Protocol("default", "centre", "clip")
+PROTOCOLS = {protocol.name: protocol for protocol in (DEFAULT, PUBLISHED)}
 
 
 class EvaluationScene(NamedTuple):
@@ -19,10 +114,10 @@ class EvaluationScene(NamedTuple):
 
     Args:
         name: Unique within its set; ``drive/frame`` for a scan of a recording.
-        points: ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and, where known, intensity. None where
-            there is a range image.
-        range_m: ``(H, W)`` metres, not above 0 without a return. None where there are points.
-        intensity: ``(H, W)`` beside ``range_m``, None where unknown.
+        points: ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and, if known, intensity; None beside a
+            range image.
+        range_m: ``(H, W)`` metres, not above 0 without a return; None beside points.
+        intensity: ``(H, W)`` beside ``range_m``, None if unknown.
     """
 
     name: str
@@ -35,16 +130,11 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
     """The scene as the sensor of the protocol would have seen it.
 
     Every scene becomes a range image, and its points are those of the pixels: a real scan loses
-    the returns behind others and its points move onto rays, as those of generated images are from
-    the start. Where there is a range image, it is taken as it is and points beside it are not
-    used. Else the points are projected; points that already stand for pixels keep them if they lie
-    on centres, but not on corners, where rounding may move them next door (give the images then).
+    hidden returns and its points move onto rays, as those of generated images do. A range image is
+    taken as it is, without any points beside it. Points on pixel centres keep their pixels; points
+    on corners may move next door by rounding (give the images then).
 
     Source: the official ``evaluate.py`` of valeoai/R3DPA passes real scans through range images.
-
-    Args:
-        scene: Points, or a range image of the sensor's size.
-        protocol: Its sensor, and which point of a pixel stands for it.
 
     Returns:
         The scene with all fields: points ``(P, 3)`` and range ``(H, W)`` float32 on the CPU,
@@ -105,10 +195,11 @@ def usable_scenes(
     bad: list[str] | None = None,
     advice: str = "",
 ) -> Iterator[EvaluationScene]:
-    """Scenes through the sensor, as long as every metric can use them.
+    """Scenes through the sensor that every metric can use; the others' faults go to ``bad``.
 
     Raises:
-        ValueError: As :func:`through_sensor`, or if nothing lies on the grid seen from above.
+        ValueError: Without ``bad``, as :func:`through_sensor`, or if nothing lies on the grid seen
+            from above.
     """
     for scene in scenes:
         try:

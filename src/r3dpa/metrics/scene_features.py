@@ -16,7 +16,7 @@ Distances in the last two have no published numbers; they need no download.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.metrics.protocol import DEFAULT, Protocol
-from r3dpa.metrics.scene import EvaluationScene
+from r3dpa.io import usable_device
+from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
 from r3dpa.nn.backbones.geometric import CENTRES
 from r3dpa.nn.backbones.liploc import GREY_LEVELS_PER_M, LIPLoc
@@ -116,6 +116,27 @@ def scene_features(
         return lip_loc_space(LIPLoc.from_checkpoint(ckpt).to(device), protocol)
     network = (SPVCNN if name == "fpvd" else MinkowskiNet).from_checkpoint(ckpt)
     return voxel_space(network.to(device), protocol)
+
+
+def feature_spaces(
+    names: Sequence[str], ckpt: Mapping[str, Any] | None, protocol: Protocol, device: str
+) -> list[SceneFeatures]:
+    """Feature spaces by name.
+
+    Raises:
+        ValueError: If a name occurs twice, a file belongs to none of them, or as
+            :func:`scene_features`.
+    """
+    if len(set(names)) < len(names):
+        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
+    unused = [name for name in ckpt or {} if name not in names]
+    if unused:
+        raise ValueError(
+            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
+            f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
+        )
+    device = usable_device(device)
+    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
 
 
 def range_vit_space(network: RangeViT) -> SceneFeatures:
