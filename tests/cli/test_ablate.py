@@ -122,8 +122,8 @@ class TestContentOfAStage:
         weights.write_bytes(b"one")
         first = plan_of("demo", rgb_weights=weights)
         assert all(stage.on_scans for stage in first.stages)
-        start = rows_of(first)["table_2", "2_rgb"].stages[0][-1].starts
-        assert start["model.init_args.rgb_weights"] == weights
+        config = rows_of(first)["table_2", "2_rgb"].stages[0][-1].config
+        assert config["model"]["init_args"]["rgb_weights"] == str(weights)
         weights.write_bytes(b"other")
         second = plan_of("demo", rgb_weights=weights)
         both = [rows_of(plan) for plan in (first, second)]

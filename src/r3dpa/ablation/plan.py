@@ -103,6 +103,10 @@ def with_value(config: Mapping[str, Any], key: str, value: Any) -> dict[str, Any
     return merged(config, value)
 
 
+def _with_item(config: Mapping[str, Any], item: tuple[str, Any]) -> dict[str, Any]:
+    return with_value(config, *item)
+
+
 class Scale(NamedTuple):
     """Data and scorer of all stages; experiments as in the file, and their merged ``config``."""
 
@@ -116,21 +120,20 @@ class Scale(NamedTuple):
 class Stage(NamedTuple):
     """A training run, shared by all rows in which its configuration is the same.
 
-    ``config`` is for ``r3dpa fit``, without folders, devices and loggers; ``starts`` has the stage
-    or file of weights whose checkpoint a configuration key gets. ``name``, also of its folder, is
-    the experiment and a hash of the configuration, of the files named in it and of ``starts``.
+    ``config`` is for ``r3dpa fit``, without devices and loggers, and holds the checkpoints of the
+    stages before. ``name``, also of the folder, is the experiment and a hash of the configuration
+    and of the files of weights in it.
     """
 
     experiment: str
     config: dict[str, Any]
-    starts: dict[str, Stage | Path]
     on_scans: bool
     name: str
 
     @property
     def before(self) -> tuple[str, ...]:
         """Names of the stages that must be run first."""
-        return tuple(start.name for start in self.starts.values() if isinstance(start, Stage))
+        return tuple(re.findall(r"{out}/stages/([^/]+)/", json.dumps(self.config)))
 
 
 class Row(NamedTuple):
@@ -264,54 +267,48 @@ def _stages(
     given: Iterable[Any], path: Path, scale: Scale, seed: int, prior: Path | None
 ) -> list[Stage]:
     """Stages of a row, each after those that its experiment needs at this scale."""
-    known: dict[str, Stage | Path] = {}
+    weights: dict[str, str] = {}  # by the names in this row
     chain: dict[str, Stage] = {}
 
-    def add(experiment: str, starts: dict[str, Stage | Path], change: Any, place: str) -> Stage:
+    def add(experiment: str, starts: dict[str, str], change: Any, place: str) -> str:
+        """Adds a stage; returns its checkpoint."""
         if experiment not in scale.experiments:
             raise ValueError(
                 f"{place}: the scale {scale.name} has no experiment {experiment!r}; give one of "
                 f"{', '.join(scale.experiments)}"
             )
         own = scale.experiments[experiment]
-        for key, before in own.get("start", {}).items():
-            starts = {key: add(before, {}, {}, place), **starts}
-        config = own["config"]
-        for key in _SEED_KEYS if own.get("seeded", True) else ():
-            config = with_value(config, key, seed)
-        config = merged(config, change)
-        name = f"{experiment}-{_identity(config, starts)}"
-        return chain.setdefault(
-            name, Stage(experiment, config, starts, own.get("scans", True), name)
-        )
+        values = dict.fromkeys(_SEED_KEYS if own.get("seeded", True) else (), seed)
+        config = merged(reduce(_with_item, values.items(), own["config"]), change)
+        needed = {key: add(before, {}, {}, place) for key, before in own.get("start", {}).items()}
+        config = reduce(_with_item, (needed | starts).items(), config)
+        trained = {key: value for key, value in config.items() if key != "scorer"}
+        files = [_digest(path) for path in _weights_in(trained) if path.is_file()]
+        text = json.dumps([trained, *files], sort_keys=True)
+        name = f"{experiment}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+        chain.setdefault(name, Stage(experiment, config, own.get("scans", True), name))
+        return f"{{out}}/stages/{name}/checkpoints/last.ckpt"
 
     for number, raw in enumerate(given):
         place = f"{path}: stages[{number}]"
         stage = _keys(raw, place, ("name", "experiment"), ("start", "set"))
         starts = stage.get("start", {})
-        if lost := [before for before in starts.values() if before not in known]:
+        if lost := [before for before in starts.values() if before not in weights]:
             raise ValueError(f"{place}: start: no stage before it is called {lost[0]!r}")
         if stage["experiment"] == _PRIOR and prior is not None:
-            known[stage["name"]] = prior
+            weights[stage["name"]] = str(prior)
             continue
-        begun = {key: known[before] for key, before in starts.items()}
-        known[stage["name"]] = add(stage["experiment"], begun, stage.get("set", {}), place)
+        begun = {key: weights[before] for key, before in starts.items()}
+        weights[stage["name"]] = add(stage["experiment"], begun, stage.get("set", {}), place)
     if not chain:
         raise ValueError(f"{path}: has no stage to train")
     return list(chain.values())
 
 
-def _identity(config: Mapping[str, Any], starts: Mapping[str, Stage | Path]) -> str:
-    """Hash of what a training depends on."""
-    before = {k: s.name if isinstance(s, Stage) else _digest(s) for k, s in starts.items()}
-    trained = {key: value for key, value in config.items() if key != "scorer"}
-    files = [_digest(path) for path in _weights_in(trained) if path.is_file()]
-    text = json.dumps([trained, before, *files], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:10]
-
-
 def _weights_in(config: Any) -> list[Path]:
-    return [Path(name) for name in _WEIGHTS.findall(json.dumps(config))]
+    """Files of weights from elsewhere."""
+    found = _WEIGHTS.findall(json.dumps(config))
+    return [Path(name) for name in found if not name.startswith("{out}")]
 
 
 def _digest(path: Path) -> str:

@@ -222,7 +222,12 @@ def _jobs(plan: Plan, out: Path, devices: int, online: bool) -> list[Job]:
     for stage in plan.tested:
         folder = stage_folder(out, stage)
         words = ["test", "--config", str(folder / "stage.yaml"), "--run_dir", str(folder)]
-        words += ["--ckpt_path", str(_checkpoint(folder)), "--scorer.reference", str(reference)]
+        words += [
+            "--ckpt_path",
+            str(folder / "checkpoints/last.ckpt"),
+            "--scorer.reference",
+            str(reference),
+        ]
         words += ["--trainer.logger", "false", "--trainer.devices", "1"]
         content = json.dumps([scans, stage.config.get("scorer")], sort_keys=True)
         needs, makes = (stage.name, "reference"), evaluation_of(out, stage)
@@ -235,9 +240,6 @@ def _jobs(plan: Plan, out: Path, devices: int, online: bool) -> list[Job]:
 def settled(stage: Stage, out: Path, devices: int = 1, online: bool = False) -> dict[str, Any]:
     """Configuration of a stage with folders, devices and loggers."""
     config = _placed(stage.config, out)
-    for key, start in stage.starts.items():
-        path = _checkpoint(stage_folder(out, start)) if isinstance(start, Stage) else start
-        config = with_value(config, key, str(path))
     batch = config["data"]["init_args"]["batch_size"]
     if batch % devices:
         raise ValueError(
@@ -256,10 +258,6 @@ def settled(stage: Stage, out: Path, devices: int = 1, online: bool = False) -> 
     trainer = {"devices": devices, "enable_progress_bar": False, "logger": listed}
     config = with_value(config, "data.init_args.batch_size", batch // devices)
     return with_value(config, "trainer", trainer)
-
-
-def _checkpoint(folder: Path) -> Path:
-    return folder / "checkpoints" / "last.ckpt"
 
 
 def _placed(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
