@@ -27,12 +27,9 @@ from r3dpa.simulation import expected_scans
 class CheckReport:
     """Result of :func:`check`; ``str`` gives the text that the command prints.
 
-    Args:
-        root: The checked folder.
-        num_scans: Scans by drive, bad ones included.
-        bad: ``(file, reason)`` of every scan that cannot be used.
-        missing: Folders that should exist or hold scans.
-        intensity: Smallest and largest intensity of the usable scans; None without any.
+    ``num_scans`` counts by drive, bad ones included; ``bad`` holds ``(file, reason)`` of unusable
+    scans, ``missing`` folders that should exist or hold scans; ``intensity`` the smallest and
+    largest intensity of the usable scans.
     """
 
     root: Path

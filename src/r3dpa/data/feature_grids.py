@@ -64,14 +64,9 @@ class Extractor(Protocol):
 class GridSettings:
     """Settings of the grids of one store.
 
-    Args:
-        projection: Projection of the range images, as plain values.
-        grid_size: Rows and columns (h, w).
-        extractor: ``name`` and ``settings`` of the extractor.
-        dim: Width D of the features.
-        dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.store.Store`; an empty cell is
-            zero in both.
-        precision: Arithmetic that the extractor ran in, as Lightning names it.
+    ``projection`` and ``extractor`` (its name and settings) are plain values, ``grid_size`` (h, w),
+    ``dim`` the width D; ``dtype`` see :class:`r3dpa.data.store.Store`, an empty cell is zero in
+    both; ``precision`` is that of the extractor, as Lightning names it.
     """
 
     projection: dict[str, Any]
@@ -178,17 +173,10 @@ def any_settings(features_dir: str | Path) -> GridSettings:
 
 
 class FeatureGrids(CachedTensors[Scan]):
-    """Grids ``(N, D)`` of one size, cells row by row; ``dim`` is D. Safe for loader processes.
+    """Grids ``(N, D)`` of one size (h, w), cells row by row; ``dim`` is D.
 
-    Args:
-        features_dir: Folder of one extractor.
-        scans: Scans, each of which must have a grid.
-        projection: Projection of the range images.
-        grid_size: Rows and columns (h, w) of the grids.
-        extractor: Must have made the grids; any if None.
-
-    Raises:
-        StoreError: If a grid is missing or has other settings, or the store is damaged.
+    ``StoreError`` if the grid of one of ``scans`` is missing, was made with another projection or
+    extractor (any if None), or the store is damaged.
     """
 
     def __init__(
@@ -237,12 +225,9 @@ def plan(
 ) -> GridPlan:
     """Find the grids that are missing; arguments as for :func:`write_feature_grids`.
 
-    ``dtype`` and ``precision`` (as Lightning names it) must be those of the store only where grids
-    are missing.
-
-    Raises:
-        StoreError: If there are grids of other settings, or too little disk space is left.
-        ValueError: If there are no grid sizes, or one does not divide the range image.
+    ``dtype`` and ``precision`` must be those of the store only where grids are missing.
+    ``StoreError`` if there are grids of other settings, or too little disk space is left;
+    ``ValueError`` if there are no grid sizes, or one does not divide the range image.
     """
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
@@ -315,19 +300,9 @@ def write_feature_grids(
     Waits for another process that writes to the folder. An error or a kill costs the grids of the
     last batch only.
 
-    Args:
-        scans: Scans, of any number of drives.
-        extractor: Frozen network, run where its tensors are.
-        projection: Projection of the range images.
-        grid_sizes: Rows and columns (h, w) of each grid.
-        features_dir: Folder of the extractor.
-        workers: Processes that read and prepare the scans; 0 for none.
-        batch_size: Scans per pass of the extractor.
-        dtype: Storage, see :class:`r3dpa.data.store.Store`.
-
-    Raises:
-        StoreError: As :func:`plan`, or if ``features_dir`` cannot be written.
-        ScanError: If a scan cannot be used; names the file.
+    ``extractor`` runs where its tensors are, on ``batch_size`` scans at once; ``grid_sizes`` are
+    rows and columns (h, w); ``workers`` processes read and prepare the scans, 0 for none.
+    ``StoreError`` as for :func:`plan`, ``ScanError`` for a scan that cannot be used.
     """
     arguments = scans, extractor, projection, grid_sizes, features_dir, dtype
     if not plan(*arguments).missing:

@@ -45,14 +45,9 @@ class ObjectClass:
 
 @dataclass(frozen=True)
 class ObjectLibrary:
-    """Mean features of classes, to guide a generator towards them.
+    """Mean features ``(C, D)`` float32 of different classes, to guide a generator towards them.
 
-    Args:
-        features: ``(C, D)`` float32, finite.
-        classes: Class of each row, no two alike.
-        extractor: ``name`` and ``settings`` of the extractor.
-        projection: Projection of the range images, as plain values.
-        grid_size: Rows and columns (h, w) of the cells.
+    ``extractor`` (its name and settings) and ``projection`` are plain values; ``grid_size`` (h, w).
     """
 
     features: Tensor
@@ -166,10 +161,8 @@ def object_library(
     ``grid_size`` are the rows and columns (h, w) of the cells. The result has the ``classes`` in
     this order, or by id all that the labelled scans show.
 
-    Raises:
-        ScanError: If a scan or its labels cannot be used; names the file.
-        ValueError: If a class is unknown, named twice or not in the scans, the grid does not divide
-            the range image, or a feature is not finite.
+    ``ScanError`` if a scan or its labels cannot be used; ``ValueError`` if a class is unknown,
+    named twice or not shown, the grid does not divide the image, or a feature is not finite.
     """
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     wanted = _wanted(classes)

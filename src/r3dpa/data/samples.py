@@ -126,8 +126,8 @@ def read_samples(
 ) -> Samples:
     """Samples of a file, or of all files of one format in a folder and its sub-folders.
 
-    Points and pixels outside the sensor's range limits are left out. Never more than one sample is
-    in memory. The folders that ``r3dpa sample`` and the official R3DPA write hold each scene
+    Points and pixels outside the range limits are left out. Never more than one sample is in
+    memory. The folders that ``r3dpa sample`` and the official R3DPA write hold each scene
     several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
 
     Args:

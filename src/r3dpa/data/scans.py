@@ -77,11 +77,8 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
 
     In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
-    to the given folder, or to the common parent of a glob or list, without the fixed folders of
-    the KITTI-360 layout.
-
-    Raises:
-        ValueError: If nothing is found, or one file is named twice.
+    to the given folder, or to the common parent of a glob or list. ``ValueError`` if nothing is
+    found, or one file is named twice.
     """
     entries = [source] if isinstance(source, str | Path) else list(source)
     single = len(entries) == 1 and Path(entries[0]).is_dir()
@@ -102,8 +99,7 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
 def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     """Scans of one split of a data set in the KITTI-360 layout, sorted by drive and frame.
 
-    Drives that are absent are skipped (``r3dpa check`` names them); ``ValueError`` if both splits
-    are empty, see :data:`KITTI360_DRIVES`.
+    Absent drives are skipped; ``ValueError`` if both splits are empty.
     """
     raw = Path(root).absolute() / RAW
     scans = {
@@ -112,9 +108,8 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     }
     if not any(scans.values()):
         raise ValueError(
-            f"No scan of the {split} split in {root}, nor of the other one: expected {RAW}/<drive>"
-            f"/{VELODYNE}/*.bin for a drive of {', '.join(KITTI360_DRIVES[split])}. `r3dpa check "
-            f"{root}` names what is missing; use LidarDataModule for scans in other folders."
+            f"No scan of the {split} split in {root}, nor of the other one: `r3dpa check {root}` "
+            "names what is missing; use LidarDataModule for scans in other folders."
         )
     return sorted(scans[split])
 

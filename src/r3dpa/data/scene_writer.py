@@ -48,7 +48,8 @@ class SceneWriter:
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
     request and the number of scenes written. At most three batches are in memory. An error of the
     thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block; where
-    that ends with another error, it is logged.
+    that ends with another error, it is logged. ``ValueError`` if a format is unknown, another
+    process writes to ``out``, or it holds scenes, or unfinished ones of another request.
 
     Args:
         out: Folder; one process at a time writes to it.
@@ -61,11 +62,6 @@ class SceneWriter:
     Attributes:
         num_done: Scenes written so far, also by interrupted runs of the same request.
         evaluations: Network evaluations of all these scenes together.
-
-    Raises:
-        ValueError: If a format is unknown, another process writes to ``out``, or it holds scenes,
-            or unfinished ones of another request.
-        OSError: If ``out`` cannot be written.
     """
 
     def __init__(

@@ -6,10 +6,9 @@ A store is a folder::
     shard_00000.rows     rows of fixed size
     shard_00000.jsonl    journal: {"scan": name, "bytes": size, "mtime_ns": time, "row": i} per row
 
-A line of the journal is written after its row is on disk, so that a process killed at any moment
-leaves no wrong row: rows without a line and a torn last line do not count. Every writer makes a
-shard of its own. A row belongs to the name, size and time of change of its file; in older journals,
-which have no times, to name and size.
+A line of the journal is written after its row is on disk; rows without a line and a torn last line
+do not count. Every writer makes a shard of its own. A row belongs to the name, size and time of
+change of its file; in older journals, which have no times, to name and size.
 """
 
 from __future__ import annotations
@@ -208,8 +207,7 @@ def find_place(places: Mapping[ItemKey, tuple[int, int]], key: ItemKey) -> tuple
 class TensorCache(Store[Item]):
     """Store whose folder ``root/<name>_<hash>`` follows from its settings.
 
-    ``settings`` are all that the float32 tensors of ``shape`` depend on beside the item, as JSON
-    values: other settings find another folder, never a wrong row. Unused folders may be deleted.
+    ``settings`` are all that the float32 tensors depend on beside the item, as JSON values.
     """
 
     def __init__(
