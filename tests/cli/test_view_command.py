@@ -138,14 +138,14 @@ def test_refuses_what_it_cannot_show(tmp_path):
         view(tmp_path / "notes.txt", out=tmp_path / "out", num=8, reference=None)
     with pytest.raises(ValueError, match="No scan found"):
         view(tmp_path / "absent", out=tmp_path / "out", num=8, reference=None)
-    with pytest.raises(ValueError, match="num must be 1 or greater, got 0"):
+    with pytest.raises(ValueError, match="num must be at least 1, got 0"):
         view(tmp_path, out=tmp_path / "out", num=0, reference=None)
 
 
 def test_a_npz_file_of_something_else_is_named(tmp_path):
     path = tmp_path / "some.npz"
     path.write_bytes(b"")
-    with pytest.raises(ValueError, match=r"some\.npz: is no \.npz file of scans"):
+    with pytest.raises(ValueError, match=r"some\.npz: is damaged or no \.npz file of scans"):
         view(path, out=tmp_path / "out", num=8, reference=None)
     np.savez(path, counts=np.zeros(3))
     with pytest.raises(ValueError, match=r"some\.npz: counts must be points .*, got shape \(3,\)"):

@@ -34,7 +34,7 @@ COMMANDS = {
         "stages:run", "sample scenes and compare them with real scans", own_parser=True
     ),
     "predict": Command("stages:run", "reconstruct scans with a checkpoint", own_parser=True),
-    "data simulate": Command("data:simulate", "write simulated scans", resumable=True),
+    "data simulate": Command("simulate:simulate", "write simulated scans", resumable=True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data view": Command("view:view", "draw scans: pictures and a page with point clouds"),
     "data features": Command(

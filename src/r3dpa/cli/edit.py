@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
-
-MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
-if MYPY:
-    from r3dpa.editing import EditResult
 
 __all__ = ["EditJob", "complete", "inpaint", "interpolate", "mix", "vary"]
 
@@ -74,10 +71,8 @@ def inpaint(
 
     Args:
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
-        box: Azimuth from and to (counted to the left) and inclination from and to, degrees, such
-            as ``-10 10 -20 0``.
-        box3d: Centre x y z, length, width, height in metres and yaw in degrees, in the frame of
-            the sensor, such as ``12 3 -0.9 4.2 1.8 1.6 30``.
+        box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
+        box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees).
         mask: Picture with one pixel for each of the range image, bright where it is to change.
         objects: File of ``r3dpa objects``, made with the feature source of the checkpoint.
         object: Class of that file.
@@ -88,18 +83,14 @@ def inpaint(
         strength: Guidance in velocities, 0 to 1; default: 0.5.
         window: First and last guided time; 0 data, 1 noise; default: all.
         start: First time of the edit; below 1 keeps some of the original part.
-        dilation: Rings of tokens around the part that are generated anew too, before the pixels
-            outside are restored.
+        dilation: Rings of tokens around the part to generate too; pixels outside are restored.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    import numpy as np
-
+    arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession, Parts
-    from r3dpa.data.images import read_mask
     from r3dpa.data.objects import ObjectLibrary
-    from r3dpa.geometry.regions import angle_box, check_mask
-    from r3dpa.geometry.regions import box3d as solid_box
+    from r3dpa.geometry import regions
 
     guided = objects is not None or features_from is not None
     if sum(region is not None for region in (box, box3d, mask)) != 1:
@@ -108,20 +99,18 @@ def inpaint(
         raise ValueError("--objects FILE and --object NAME go together; `r3dpa objects` writes one")
     if objects is not None and features_from is not None:
         raise ValueError("give --object or --features_from, not both")
-    sources = (label is not None) + (features_box3d is not None)
-    if sources != (features_from is not None):
+    if (label is not None) + (features_box3d is not None) != (features_from is not None):
         raise ValueError("--features_from needs one of --label and --features_box3d")
     if not guided and (strength, window) != (None, None):
         raise ValueError("--strength and --window need --object or --features_from")
     session = EditSession(EditJob(**options), num, strength, window)
     source = session.read(scan)
     if mask is not None:
-        region = check_mask(read_mask(mask, session.sensor), str(mask))
+        region = session.read_mask(mask)
     elif box is not None:
-        region = angle_box(session.projection, *box)
-    else:
-        assert box3d is not None
-        region = solid_box(session.projection, box3d[:3], box3d[3:6], box3d[6])
+        region = regions.angle_box(session.projection, *box)
+    elif box3d is not None:
+        region = regions.box3d(session.projection, box3d[:3], box3d[3:6], box3d[6])
     feature = None
     if objects is not None and object is not None:
         library = ObjectLibrary.load(objects)
@@ -131,34 +120,10 @@ def inpaint(
         feature = session.feature_of_class(features_from, label, features_ckpt)
     elif features_from is not None and features_box3d is not None:
         feature = session.feature_in_box(features_from, features_box3d, features_ckpt)
-    about = {
-        "scans": {"scan": str(scan)},
-        "box": box,
-        "box3d": box3d,
-        "mask": mask,
-        "objects": objects,
-        "object": object,
-        "label": label,
-        "features_from": features_from,
-        "features_box3d": features_box3d,
-        "start": start,
-        "dilation": dilation,
-        "guided": guided,
-    }
-
-    def run() -> EditResult:
-        return session.editor.inpaint(
-            source.range_m,
-            region,
-            num,
-            session.job.seed,
-            feature=feature,
-            start=start,
-            dilation=dilation,
-        )
-
-    parts = Parts(region.numpy().astype(np.uint8), ("kept", object or label or "generated anew"))
-    return session.write("inpaint", about, {f"scan {scan.stem}": source.range_m}, run, parts)
+    run = partial(session.editor.inpaint, source.range_m, region, num, session.job.seed)
+    run = partial(run, feature=feature, start=start, dilation=dilation)
+    parts = Parts(region, ("kept", object or label or "generated anew"))
+    return session.write("inpaint", arguments, {f"scan {scan.stem}": source}, run, parts, guided)
 
 
 def mix(
@@ -195,13 +160,12 @@ def mix(
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
-    import numpy as np
+    arguments = dict(locals())
     import torch
     import torch.nn.functional as F
 
     from r3dpa.cli.edit_session import EditSession, Parts
-    from r3dpa.data.images import read_mask
-    from r3dpa.geometry.regions import check_mask, mask_of_tokens, sector_weights
+    from r3dpa.geometry.regions import mask_of_tokens, sector_weights
 
     if (left is None) != (right is None) or (left is None) == (layout is None):
         raise ValueError("give --left and --right, or a --layout of sectors and scans")
@@ -215,48 +179,31 @@ def mix(
     if len(paths) < 2:
         raise ValueError(f"there is nothing to mix: give two scans or more, got {paths}")
     session = EditSession(EditJob(**options), num, strength, window)
-    grid_size = session.grid_size
+    grid_size, sensor = session.grid_size, session.sensor
     if mask is not None:
-        share = check_mask(read_mask(mask, session.sensor), str(mask)).float()
-        cell = session.sensor.cell_size(grid_size)
-        right_share = F.avg_pool2d(share[None, None], cell).flatten()
+        share = session.read_mask(mask).float()[None, None]
+        right_share = F.avg_pool2d(share, sensor.cell_size(grid_size)).flatten()
         weights = torch.stack([1 - right_share, right_share])
     else:
         numbered = [(azimuth, paths.index(path)) for azimuth, path in sectors]
         weights = sector_weights(numbered, grid_size, blend)
-    scans = [session.read(path) for path in paths]
+    scans = {f"{number}: {path.stem}": session.read(path) for number, path in enumerate(paths)}
     extractor = session.extractor(features_ckpt)
-    grids = [session.grid(scan, extractor) for scan in scans]
-    size = (session.sensor.beams, session.sensor.columns)
-    numbers = mask_of_tokens(weights.argmax(dim=0), grid_size, size).numpy().astype(np.uint8)
-    names = [f"{number}: {path.stem}" for number, path in enumerate(paths)]
-    about = {
-        "scans": dict(zip(names, map(str, paths), strict=True)),
-        "layout": [[azimuth, str(path)] for azimuth, path in sectors],
-        "blend": blend,
-        "mask": mask,
-        "guided": True,
-    }
-
-    def run() -> EditResult:
-        return session.editor.mix(grids, weights, num, session.job.seed)
-
-    before = {name: scan.range_m for name, scan in zip(names, scans, strict=True)}
-    return session.write("mix", about, before, run, Parts(numbers, names))
+    grids = [session.grid(scan, extractor) for scan in scans.values()]
+    numbers = mask_of_tokens(weights.argmax(dim=0), grid_size, (sensor.beams, sensor.columns))
+    run = partial(session.editor.mix, grids, weights, num, session.job.seed)
+    return session.write("mix", arguments, scans, run, Parts(numbers, list(scans)), guided=True)
 
 
 def _sectors(layout: list[str]) -> list[tuple[float, Path]]:
     """Pairs of azimuth and scan from the words of ``--layout``."""
     try:
-        azimuths = [float(word) for word in layout[::2]]
-    except ValueError:
-        azimuths = []
-    if not azimuths or len(layout) % 2:
+        return [(float(a), Path(path)) for a, path in zip(layout[::2], layout[1::2], strict=True)]
+    except ValueError as error:
         raise ValueError(
             f"--layout {' '.join(layout)}: give pairs of azimuth and scan, such as 0 a.bin 120 "
             "b.bin"
-        )
-    return list(zip(azimuths, map(Path, layout[1::2]), strict=True))
+        ) from error
 
 
 def complete(
@@ -283,21 +230,19 @@ def complete(
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
         beams: Rows of the range image to keep, such as ``0 4 8``.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
-        other_sensor: Keep what another sensor would see: its number of beams, and lowest and
-            highest inclination in degrees, such as ``32 -25 3``.
+        other_sensor: Keep what another sensor would see: beams, lowest and highest inclination in
+            degrees, such as ``32 -25 3``.
         mask: Picture with one pixel for each of the range image, bright where it is missing.
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
+    arguments = dict(locals())
     from dataclasses import replace
-    from functools import partial
 
-    import numpy as np
     import torch
 
     from r3dpa.cli.edit_session import EditSession, Parts, held_out_errors
-    from r3dpa.data.images import read_mask
     from r3dpa.geometry import SphericalProjection, regions
 
     session = EditSession(EditJob(**options), num)
@@ -321,8 +266,8 @@ def complete(
         )
         masks.append(regions.sensor_pair(projection, SphericalProjection(sensor)))
     if mask is not None:
-        masks.append(regions.check_mask(read_mask(mask, session.sensor), str(mask)))
-    source = session.read(scan, masks, empty_beams)
+        masks.append(session.read_mask(mask))
+    source = session.read(scan, check=False)
     if empty_beams:
         empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
         masks.append(empty.expand_as(source.range_m))
@@ -332,26 +277,17 @@ def complete(
             "--other_sensor or --mask"
         )
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
-    about = {
-        "scans": {"scan": str(scan)},
-        "sector": sector,
-        "keep_every": keep_every,
-        "beams": beams,
-        "empty_beams": empty_beams,
-        "other_sensor": other_sensor,
-        "mask": mask,
-        "start": start,
-        "guided": False,
-    }
-
-    def run() -> EditResult:
-        return session.editor.complete(source.range_m, missing, num, session.job.seed, start=start)
-
-    known = torch.where(missing, -1.0, source.range_m)
-    before = {f"scan {scan.stem}": source.range_m, "known part": known}
-    parts = Parts(missing.numpy().astype(np.uint8), ("kept", "missing"))
-    measure = partial(held_out_errors, range_m=source.range_m, missing=missing)
-    return session.write("complete", about, before, run, parts, measure)
+    session.check(source, missing)
+    known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
+    run = partial(session.editor.complete, source.range_m, missing, num, session.job.seed)
+    return session.write(
+        "complete",
+        arguments,
+        {f"scan {scan.stem}": source, "known part": known},
+        partial(run, start=start),
+        Parts(missing, ("kept", "missing")),
+        measure=partial(held_out_errors, range_m=source.range_m, missing=missing),
+    )
 
 
 def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str:
@@ -363,17 +299,14 @@ def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
     """
+    arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
 
     session = EditSession(EditJob(**options), num)
     session.settings.times(start)
     source = session.read(scan)
-    about = {"scans": {"scan": str(scan)}, "start": start, "guided": False}
-
-    def run() -> EditResult:
-        return session.editor.vary(source.range_m, num, session.job.seed, start=start)
-
-    return session.write("vary", about, {f"scan {scan.stem}": source.range_m}, run)
+    run = partial(session.editor.vary, source.range_m, num, session.job.seed, start=start)
+    return session.write("vary", arguments, {f"scan {scan.stem}": source}, run)
 
 
 def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> str:
@@ -385,20 +318,13 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
         frames: Number of scenes, both ends among them.
         **options: See :class:`EditJob`.
     """
+    arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
 
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
     session = EditSession(EditJob(**options), frames)
-    scans = [session.read(path) for path in (left, right)]
-    names = [f"left: {left.stem}", f"right: {right.stem}"]
-    about = {
-        "scans": dict(zip(names, (str(left), str(right)), strict=True)),
-        "guided": False,
-    }
-
-    def run() -> EditResult:
-        return session.editor.interpolate(scans[0].range_m, scans[1].range_m, frames)
-
-    before = {name: scan.range_m for name, scan in zip(names, scans, strict=True)}
-    return session.write("interpolate", about, before, run)
+    scans = {f"{n}: {p.stem}": session.read(p) for n, p in (("left", left), ("right", right))}
+    first, last = (scan.range_m for scan in scans.values())
+    run = partial(session.editor.interpolate, first, last, frames)
+    return session.write("interpolate", arguments, scans, run)

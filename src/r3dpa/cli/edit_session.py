@@ -5,6 +5,7 @@ Letters: B scenes, H beams, W columns, N tokens, F feature width, P points.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,38 +16,30 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-import r3dpa
 from r3dpa import viz
-from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.parser import check_folder
-from r3dpa.cli.sample import draw_scene, written
-from r3dpa.data import (
-    Extractor,
-    PointSample,
-    Scan,
-    ScanError,
-    pooled_grids,
-    read_npz,
-    read_ply,
-    read_scan,
-)
+from r3dpa.checkpoints import Checkpoint, read_checkpoint
+from r3dpa.cli.parser import check_folder, check_least
+from r3dpa.cli.scene_files import draw_scene, provenance, read_clouds
+from r3dpa.data import Extractor, PointSample, Scan, ScanError, pooled_grids
+from r3dpa.data.images import read_mask
 from r3dpa.data.objects import object_library
+from r3dpa.data.scans import out_of_range
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
 from r3dpa.flow.solvers import evaluations
-from r3dpa.geometry import LidarSensor, in_range, range_image
+from r3dpa.geometry import in_range, range_image
 from r3dpa.geometry.gaps import check_view, filled, range_error_m
-from r3dpa.io import atomic_path, source_commit, usable_device
+from r3dpa.geometry.regions import check_mask
+from r3dpa.io import atomic_path, usable_device
 from r3dpa.nn.backbones import feature_source
 
 if TYPE_CHECKING:
     from r3dpa.cli.edit import EditJob
 
-__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors", "without_features"]
+__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors", "source_of"]
 
 _SHOWN = 8  # results on the sheet and the page
 
@@ -62,7 +55,7 @@ class ScanView(NamedTuple):
 class Parts(NamedTuple):
     """Part ``(H, W)`` of the range image that each pixel belongs to, and names of the parts."""
 
-    numbers: NDArray[np.uint8]
+    numbers: Tensor
     names: Sequence[str]
 
 
@@ -87,12 +80,8 @@ class EditSession:
         strength: float | None = None,
         window: tuple[float, float] | None = None,
     ) -> None:
-        if num < 1:
-            raise ValueError(f"num must be at least 1, got {num}")
-        if job.seed < 0 or job.pictures < 0:
-            raise ValueError(
-                f"seed and pictures must be at least 0, got {job.seed} and {job.pictures}"
-            )
+        check_least(1, num=num)
+        check_least(0, seed=job.seed, pictures=job.pictures)
         check_folder(job.out)
         given: dict[str, Any] = {"strength": strength, "window": window}
         given = {name: value for name, value in given.items() if value is not None}
@@ -108,46 +97,49 @@ class EditSession:
             batch_size=job.batch_size,
         )
         generator = self.editor.generator
-        self.geometry = generator.geometry
-        self.projection = self.geometry.projection
+        self.geometry, self.projection = generator.geometry, generator.geometry.projection
         self.sensor = self.projection.sensor
         self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
 
     @property
     def feature_name(self) -> str:
-        """Feature source of the checkpoint.
+        """Feature source of the checkpoint; ``ValueError`` if it has none."""
+        return source_of(self.checkpoint)
 
-        Raises:
-            ValueError: If it has none.
-        """
-        if self.checkpoint.feature_source is None:
-            raise ValueError(without_features(self.job.ckpt))
-        return self.checkpoint.feature_source
-
-    def read(
-        self, path: Path, missing: Sequence[Tensor] = (), empty_beams: bool = False
-    ) -> ScanView:
-        """A scan that fills the field of view outside the ``missing`` masks ``(H, W)``.
-
-        Args:
-            path: ``.bin``, ``.ply``, or ``.npz`` of one scan.
-            missing: Masks of pixels that may be empty.
-            empty_beams: Rows without a return may be empty, too.
+    def read(self, path: Path, check: bool = True) -> ScanView:
+        """A scan; it must fill the field of view if ``check`` is set.
 
         Raises:
             ScanError: If the file cannot be used; names it.
         """
-        points = torch.from_numpy(_points(path, self.sensor))
+        clouds = read_clouds(path)
+        if len(clouds) > 1:
+            raise ScanError(
+                f"{path}: holds {len(clouds)} scans ({', '.join(list(clouds)[:3])}); give a file "
+                "of one"
+            )
+        (cloud,) = clouds.values()
+        points = torch.zeros(len(cloud), 4)  # intensity 0 if the file has none
+        points[:, : cloud.shape[1]] = torch.from_numpy(cloud.copy())
+        if not points.isfinite().all():
+            raise ScanError(f"{path}: has NaN or infinite values")
+        if not in_range(points[:, :3], self.sensor).any():
+            raise out_of_range(path, self.sensor)
+        scan = ScanView(path, points, range_image(points[:, :3], self.projection)[0])
+        if check:
+            self.check(scan)
+        return scan
+
+    def check(self, scan: ScanView, missing: Tensor | None = None) -> None:
+        """Refuses a scan that does not fill the field of view outside ``missing`` ``(H, W)``."""
         try:
-            range_m, _ = range_image(points[:, :3], self.projection)
-            gaps = [*missing]
-            if empty_beams:
-                gaps.append(~(range_m > 0).any(dim=1, keepdim=True).expand_as(range_m))
-            absent = torch.stack(gaps).any(dim=0) if gaps else None
-            check_view(points[:, :3], range_m, self.projection, absent)
+            check_view(scan.points[:, :3], scan.range_m, self.projection, missing)
         except ValueError as error:
-            raise ScanError(f"{path}: {error}") from error
-        return ScanView(path, points, range_m)
+            raise ScanError(f"{scan.path}: {error}") from error
+
+    def read_mask(self, path: Path) -> Tensor:
+        """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""
+        return check_mask(read_mask(path, self.sensor), str(path))
 
     def extractor(self, ckpt: Path | None) -> Extractor:
         """The feature source that the checkpoint was aligned with."""
@@ -156,8 +148,8 @@ class EditSession:
 
     def grid(self, scan: ScanView, extractor: Extractor) -> Tensor:
         """Feature grid ``(N, F)`` of a scan, as ``r3dpa features`` writes it."""
-        prepared = extractor.prepare(scan.points)
         file = Scan(scan.path.parent.name, scan.path.stem, scan.path)
+        prepared = extractor.prepare(scan.points)
         sample = PointSample(file, file.cache_key, scan.points, prepared)
         grids = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
         return grids[self.grid_size][0].clone()
@@ -174,11 +166,10 @@ class EditSession:
         if min(box[3:6]) <= 0:
             raise ValueError(f"features_box3d needs a size above 0 on every axis, got {list(box)}")
         points = self.read(path).points
-        offset = points[:, :3] - torch.tensor(box[:3])
+        x, y, z = (points[:, :3] - torch.tensor(box[:3])).unbind(1)
         yaw = torch.tensor(box[6]).deg2rad()
-        along = offset[:, 0] * yaw.cos() + offset[:, 1] * yaw.sin()
-        across = offset[:, 1] * yaw.cos() - offset[:, 0] * yaw.sin()
-        distance = torch.stack([along, across, offset[:, 2]], dim=1).abs()
+        along, across = x * yaw.cos() + y * yaw.sin(), y * yaw.cos() - x * yaw.sin()
+        distance = torch.stack([along, across, z], dim=1).abs()
         inside = (distance <= torch.tensor(box[3:6]) / 2).all(dim=1)
         inside &= in_range(points[:, :3], self.sensor)
         if not inside.any():
@@ -192,51 +183,46 @@ class EditSession:
     def write(
         self,
         command: str,
-        about: dict[str, Any],
-        before: Mapping[str, Tensor],
+        arguments: Mapping[str, Any],
+        scans: Mapping[str, ScanView],
         run: Callable[[], EditResult],
         parts: Parts | None = None,
+        guided: bool = False,
         measure: Callable[[Tensor], dict[str, Any]] | None = None,
     ) -> str:
         """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
         Args:
             command: Name of the edit.
-            about: Its own options, for the metadata.
-            before: Range images ``(H, W)`` of the scans by name.
+            arguments: Its own options, for the metadata.
+            scans: The scans by name.
             run: The edit.
             parts: Parts of the range image.
-            measure: More figures of the results ``(B, H, W)``.
+            guided: Whether features guide it.
+            measure: Errors of results ``(B, H, W)`` by method, where the scan was held out.
 
         Raises:
             ValueError: If the edit is refused, or ``out`` holds other scenes.
             OSError: If a file cannot be written.
         """
         job, settings = self.job, asdict(self.settings)
-        if not about["guided"]:
+        if not guided:
             del settings["strength"], settings["window"]
-        paths = {key: str(value) for key, value in about.items() if isinstance(value, Path)}
-        request = about | paths
+        own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
+        request = provenance(self.checkpoint, job.ckpt, self.geometry) | own
         request |= {
             "command": command,
-            "checkpoint": str(job.ckpt),
-            "checkpoint_written": written(job.ckpt),
-            "stage": self.checkpoint.stage,
-            "step": self.checkpoint.step,
-            "feature_source": self.checkpoint.feature_source,
+            "scans": {name: scan.path for name, scan in scans.items()},
+            "guided": guided,
             "weights": job.weights,
             "num": self.num,
             "seed": job.seed,
             "settings": settings,
             "device": self.device,
             "batch_size": job.batch_size,
-            "interpolant": self.checkpoint.interpolant,
-            "formats": list(job.formats),
-            "geometry": self.geometry.to_dict(),
-            "r3dpa": r3dpa.__version__,
-            "commit": source_commit(),
-            "torch": torch.__version__,
+            "formats": job.formats,
         }
+        request = json.loads(json.dumps(request, default=str))  # paths as text
         with SceneWriter(
             job.out, self.num, self.projection, job.formats, request, job.overwrite
         ) as writer:
@@ -246,7 +232,7 @@ class EditSession:
             seconds += time.perf_counter()
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
-            self._show(command, before, result.range_m, parts)
+            self._show(command, scans, result.range_m, parts)
             figures = {
                 "nfe": result.nfe,
                 "seconds": seconds,
@@ -254,9 +240,9 @@ class EditSession:
                 "vae_error_m": result.vae_error_m,
                 "round_trip_m": result.round_trip_m,
             }
-            figures |= measure(result.range_m) if measure else {}
-            writer.finish(request | figures)
-        return _summary(command, job.out, self.num, figures)
+            held_out = measure(result.range_m) if measure else {}
+            writer.finish(request | figures | ({"held_out": held_out} if held_out else {}))
+        return _summary(command, job.out, result, seconds, held_out)
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
@@ -270,31 +256,29 @@ class EditSession:
             def count(*_: Any) -> None:
                 bar.update()
 
-            hook = first.register_forward_hook(count)
-            try:
+            with first.register_forward_hook(count):
                 yield
-            finally:
-                hook.remove()
 
     def _show(
-        self, command: str, before: Mapping[str, Tensor], made: Tensor, parts: Parts | None
+        self, command: str, scans: Mapping[str, ScanView], made: Tensor, parts: Parts | None
     ) -> None:
         """Pictures of each scene, the sheet, the page, the mask and the scans before the edit."""
         out = self.job.out
-        scans = torch.stack(list(before.values()))
+        before = {name: scan.range_m for name, scan in scans.items()}
+        images = torch.stack(list(before.values()))
         with atomic_path(out / "before.npy") as temporary, temporary.open("wb") as file:
-            np.save(file, scans.numpy())
+            np.save(file, images.numpy())
         for index, range_m in enumerate(made[: self.job.pictures]):
-            draw_scene(out, f"{index:06d}", range_m, self.geometry)
+            draw_scene(out, index, range_m, self.geometry)
         after = {f"{command} {index}": image for index, image in enumerate(made[:_SHOWN])}
         rows = [viz.EditRow(name, image) for name, image in before.items()]
-        numbers, names = parts or (None, ())
+        numbers, names = None, parts.names if parts else ()
         if parts is not None:
-            shown = scans[0]
+            numbers, shown = parts.numbers.numpy().astype(np.uint8), images[0]
             if command == "mix":  # each part as in the scan that it follows
-                shown = scans.gather(0, torch.from_numpy(parts.numbers).long()[None])[0]
-            rows.append(viz.EditRow("mask", shown, parts.numbers))
-            viz.save(parts.numbers * np.uint8(255 // (len(names) - 1)), out / "mask.png")
+                shown = images.gather(0, parts.numbers.long()[None])[0]
+            rows.append(viz.EditRow("mask", shown, numbers))
+            viz.save(numbers * np.uint8(255 // (len(names) - 1)), out / "mask.png")
         rows += [viz.EditRow(name, image, outline=numbers) for name, image in after.items()]
         viz.save(viz.edit_sheet(rows, names, self.projection), out / "edit.png")
         page = viz.edit_page(before, after, numbers, names, self.projection, f"r3dpa {command}")
@@ -302,47 +286,21 @@ class EditSession:
             temporary.write_text(page, "utf-8")
 
 
-def _points(path: Path, sensor: LidarSensor) -> NDArray[np.float32]:
-    """Points ``(P, 4)`` of a file; the intensity is 0 if it has none."""
-    if path.suffix == ".bin":
-        return read_scan(path, sensor)
-    if path.suffix == ".ply":
-        points = read_ply(path)
-    elif path.suffix == ".npz":
-        members = read_npz(path)
-        if len(members) != 1:
-            raise ScanError(
-                f"{path}: holds {len(members)} scans ({', '.join(list(members)[:3])}); give a file "
-                "of one"
-            )
-        (points,) = members.values()
-    else:
-        raise ScanError(f"{path}: is no scan; give a .bin, .ply or .npz file")
-    if points.ndim != 2 or points.shape[1] not in (3, 4) or not np.isfinite(points).all():
-        raise ScanError(f"{path}: must hold finite points (P, 3) or (P, 4), got {points.shape}")
-    padded = np.zeros((len(points), 4), np.float32)
-    padded[:, : points.shape[1]] = points
-    if not in_range(torch.from_numpy(padded[:, :3]), sensor).any():
-        limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
-        raise ScanError(f"{path}: has no point within the sensor's range {limits}")
-    return padded
-
-
-def _summary(command: str, out: Path, num: int, figures: Mapping[str, Any]) -> str:
+def _summary(
+    command: str, out: Path, result: EditResult, seconds: float, held_out: Mapping[str, Any]
+) -> str:
     lines = [
-        f"{command}: {num} scenes in {out}, {figures['nfe']} network evaluations each, "
-        f"{figures['seconds']:.3g} s"
+        f"{command}: {len(result)} scenes in {out}, {result.nfe} network evaluations each, "
+        f"{seconds:.3g} s"
     ]
-    if figures["vae_error_m"] is not None:
-        lines.append(f"range error of encoder and decoder alone: {figures['vae_error_m']:.3f} m")
-    if figures["round_trip_m"] is not None:
-        lines.append(
-            f"inversion and back, without an edit: {figures['round_trip_m']:.4f} m more at most"
-        )
-    if figures["cosine"] is not None:
-        cosines = figures["cosine"]
-        lines.append(f"cosine with the guiding features: {sum(cosines) / len(cosines):.3f}")
-    for name, errors in figures.get("held_out", {}).items():
+    if result.vae_error_m is not None:
+        lines.append(f"range error of encoder and decoder alone: {result.vae_error_m:.3f} m")
+    if result.round_trip_m is not None:
+        round_trip = f"{result.round_trip_m:.4f} m more at most"
+        lines.append(f"inversion and back, without an edit: {round_trip}")
+    if result.cosine is not None:
+        lines.append(f"cosine with the guiding features: {float(result.cosine.mean()):.3f}")
+    for name, errors in held_out.items():
         lines.append(
             f"held out, {name}: {errors['mae_m']:.3f} m, returns as in the scan in "
             f"{errors['same_returns']:.1%} of the pixels"
@@ -350,12 +308,14 @@ def _summary(command: str, out: Path, num: int, figures: Mapping[str, Any]) -> s
     return "\n".join([*lines, f"open {out / 'edit.png'} and {out / 'edit.html'}"])
 
 
-def without_features(ckpt: Path) -> str:
-    """Error message for a checkpoint that features cannot guide."""
-    return (
-        f"{ckpt} was trained without 3D features, so that none can guide it; give a checkpoint of "
-        "a run with an extractor"
-    )
+def source_of(checkpoint: Checkpoint) -> str:
+    """Feature source of a checkpoint; ``ValueError`` if it was trained without."""
+    if checkpoint.feature_source is None:
+        raise ValueError(
+            f"{checkpoint.path} was trained without 3D features, so that none can guide it; give a "
+            "checkpoint of a run with an extractor"
+        )
+    return checkpoint.feature_source
 
 
 def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
@@ -373,11 +333,11 @@ def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str,
     common = missing
     for images in methods.values():
         common = common & (images > 0).all(dim=0)
-    held_out = {}
+    errors = {}
     for name, images in methods.items():
         same = ((images > 0) == (range_m > 0))[:, missing]
-        held_out[name] = {
+        errors[name] = {
             "mae_m": range_error_m(images, range_m.expand_as(images), common),
             "same_returns": float(same.double().mean()),
         }
-    return {"held_out": held_out}
+    return errors

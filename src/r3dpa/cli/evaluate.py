@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.cli.parser import check_file, check_folder, check_least
 
 MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
 if MYPY:
@@ -62,8 +63,7 @@ def reference(
     check_file(out)
     if out.exists():
         raise ValueError(f"{out} exists: delete it, or give another --out")
-    if limit is not None and limit < 2:
-        raise ValueError(f"limit must be at least 2, got {limit}")
+    check_least(2, limit=limit)
     module = read_data(data)
     train, val = module.limited_split()
     scans = {"train": train, "val": val, "all": sorted(train + val)}[split]
@@ -117,8 +117,6 @@ def evaluate(
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
         split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
     """
-    from dataclasses import replace
-
     from tqdm import tqdm
 
     from r3dpa.data.samples import read_samples
@@ -128,7 +126,7 @@ def evaluate(
     from r3dpa.viz.evaluation import save_figures
 
     check_folder(out)
-    made_with = _made_with(samples)
+    made_with = _made_with(samples)  # refuses damaged metadata before the work starts
     statistics = metrics.load_reference(reference, split)
     found = metrics.reference_spaces(statistics, spaces, ckpt, protocol, device)
     setting = statistics.protocol
@@ -149,9 +147,7 @@ def evaluate(
     )
     evaluation = comparison.evaluation
     if files.bad:  # the reader refused these, so that they never became scenes
-        bad = {"bad_samples": [*files.bad, *evaluation.bad_samples]}
-        about: Any = {**evaluation.about, "extra": {**evaluation.about["extra"], **bad}}
-        evaluation = replace(evaluation, about=about)
+        evaluation.about["extra"]["bad_samples"] = [*files.bad, *evaluation.bad_samples]
     if out is not None:
         save_reports(evaluation, statistics.about.get("split"), out)
         if figures := comparison.figure_data():
@@ -188,7 +184,7 @@ def _made_with(samples: Path) -> dict[str, Any]:
     sampler = found.get("sampler") or {}
     kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
     made_with = {key: found.get(key) for key in kept}
-    made_with |= {"solver": sampler.get("solver"), "steps": sampler.get("steps")}
+    made_with |= {key: sampler.get(key) for key in ("solver", "steps")}
     return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
 
 
@@ -203,8 +199,6 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
         reference: Folder of real scans (B), of two or more drives; a single one is halved.
         out: JSON file for the table and the curves behind it.
     """
-    from itertools import groupby
-
     from tqdm import tqdm
 
     from r3dpa.data.scans import find_scans
@@ -212,55 +206,41 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from r3dpa.metrics import realism_table
 
     check_file(out)
-    drives = []
-    for folder in (scans, reference):
-        groups = groupby(find_scans(folder), lambda scan: scan.drive)
-        drives.append({drive: list(group) for drive, group in groups})
+    ours, real = (
+        [(scan.drive, scan) for scan in find_scans(folder)] for folder in (scans, reference)
+    )
     notes = [f"A: {scans}", f"B: {reference}"]
-    if len(drives[1]) == 1:
-        drives[1], note = _halves(drives[1])
-        notes.append(note)
-    total = sum(len(found) for folder in drives for found in folder.values())
-    with tqdm(total=total, unit="scan", desc="realism", disable=None) as bar:
-        ours, real = (
-            {drive: _pooled(_counted(found, bar)) for drive, found in folder.items()}
-            for folder in drives
+    if len(real) == 1:
+        notes.append("B is a single scan: there is no floor; give a reference of two drives")
+    elif len({drive for drive, _ in real}) == 1:
+        middle = len(real) // 2
+        halves = ["first half"] * middle + ["second half"] * (len(real) - middle)
+        real = [
+            (f"{drive}, {half}", scan) for (drive, scan), half in zip(real, halves, strict=True)
+        ]
+        notes.append(
+            "B is a single drive: the floor compares its first half with its second one, which are "
+            "more alike than two drives; all ratios come out too high"
         )
-        table = realism_table(ours, real, notes)
+    with tqdm(total=len(ours) + len(real), unit="scan", desc="realism", disable=None) as bar:
+        table = realism_table(_by_drive(ours, bar), _by_drive(real, bar), notes)
     if out is not None:
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table
 
 
-def _halves(drives: dict[str, list[Scan]]) -> tuple[dict[str, list[Scan]], str]:
-    ((drive, scans),) = drives.items()
-    if len(scans) == 1:
-        return drives, "B is a single scan: there is no floor; give a reference of two drives"
-    middle = len(scans) // 2
-    halves = {f"{drive}, first half": scans[:middle], f"{drive}, second half": scans[middle:]}
-    return halves, (
-        "B is a single drive: the floor compares its first half with its second one, which are "
-        "more alike than two drives; all ratios come out too high"
-    )
-
-
-def _counted(scans: Iterable[Scan], bar: Any) -> Iterator[Scan]:
-    for scan in scans:
-        yield scan
-        bar.update()
-
-
-def _pooled(scans: Iterable[Scan]) -> ScanStatistics:
-    """Statistics of all these scans together."""
+def _by_drive(scans: Iterable[tuple[str, Scan]], bar: Any) -> dict[str, ScanStatistics]:
+    """Statistics of all scans of each drive together."""
     from r3dpa.data.scans import ScanError, read_scan
     from r3dpa.metrics import ScanStatistics, scan_statistics
 
-    total = ScanStatistics()
-    for scan in scans:
+    totals: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
+    for drive, scan in scans:
         points = read_scan(scan.path)
         try:
-            total += scan_statistics(points)
+            totals[drive] += scan_statistics(points)
         except ValueError as error:
             raise ScanError(f"{scan.path}: {error}") from error
-    return total
+        bar.update()
+    return totals

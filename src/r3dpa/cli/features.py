@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from inspect import signature
@@ -14,9 +13,9 @@ from typing import Any, Literal, cast
 from jsonargparse import Namespace
 from lightning import Trainer
 
-from r3dpa.cli.stages import StageParser
+from r3dpa.cli.stages import StageParser, ignore_harmless_warnings
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.feature_grids import Extractor, GridPlan, features_lock, plan
+from r3dpa.data.feature_grids import Extractor, features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
 from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
@@ -28,28 +27,16 @@ _TRAINER_OPTIONS = {
     "enable_progress_bar",
 }
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # others would convert the prepared scans too
-# Said by Lightning, and meant that way here: grids go to disk, and a process may have no scan.
-_HARMLESS = (
-    "predict returned None",
-    "You have overridden `transfer_batch_to_device`",
-    "Total length of .* across ranks is zero",
-    "The '.*_dataloader' does not have many workers",
-    "`isinstance.treespec, LeafSpec.` is deprecated",
-)
 
 
 def features(words: Sequence[str]) -> None:
-    """Runs the command; see ``r3dpa features --help``.
-
-    Args:
-        words: Command line after ``r3dpa features``.
+    """Runs the command with the words after ``r3dpa data features``.
 
     Raises:
         ValueError: If an argument is missing or out of its range, or a scan or the store cannot be
             used; the message names it.
     """
-    for message in _HARMLESS:
-        warnings.filterwarnings("ignore", message=message)
+    ignore_harmless_warnings()
     parser = _parser()
     config = parser.parse_args(_with_data_class(words))
     if config.extractor or config.ckpt:
@@ -79,7 +66,7 @@ def features(words: Sequence[str]) -> None:
 def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None:
     # The data module finds its scans, or simulates them; it must not extract grids itself.
     module, data.extractor = data.extractor, None
-    extractor, features_dir = cast(Extractor, module), cast(Path, data.features_dir)
+    extractor, folder = cast(Extractor, module), cast(Path, data.features_dir)
     sizes = config.grid_sizes if config.grid_sizes is not None else [data.grid_size]
     projection: Projection | None = None
     scans: list[Scan] = []
@@ -90,21 +77,21 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
             data.setup("predict")
             assert data.all_set is not None
             projection = data.geometry.projection
-            arguments = extractor, projection, sizes, features_dir, config.dtype, trainer.precision
+            arguments = extractor, projection, sizes, folder, config.dtype, trainer.precision
             todo = plan(data.all_set.scans, *arguments)
             if todo.missing:  # complete grids may lie on a read-only disk
-                job.enter_context(features_lock(features_dir))
+                job.enter_context(features_lock(folder))
                 todo = plan(data.all_set.scans, *arguments)  # another job may have made some
             scans = list(todo.missing)
-            _say(_announcement(todo, extractor.name))
-        extraction = FeatureExtraction(extractor, projection, sizes, features_dir, config.dtype)
-        missing = MissingScans(
-            scans,
-            extractor,
-            data.sensor,
-            data.batch_size if config.batch_size is None else config.batch_size,
-            data.num_workers,
-        )
+            stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.settings)
+            _say(
+                f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
+                f"done; {todo.num_bytes / 1e9:.3g} GB needed, {todo.free_bytes / 1e9:.3g} GB "
+                f"free, in {stores}"
+            )
+        extraction = FeatureExtraction(extractor, projection, sizes, folder, config.dtype)
+        batch_size = data.batch_size if config.batch_size is None else config.batch_size
+        missing = MissingScans(scans, extractor, data.sensor, batch_size, data.num_workers)
         started = time.monotonic()
         try:
             trainer.predict(extraction, missing, return_predictions=False)
@@ -118,20 +105,8 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
         rate = len(scans) / (time.monotonic() - started)
         _say(
             f"feature grids: {len(scans)} made, {todo.num_kept} kept, {rate:.3g} scans per second, "
-            f"in {', '.join(_stores(todo))}"
+            f"in {stores}"
         )
-
-
-def _announcement(todo: GridPlan, name: str) -> str:
-    return (
-        f"feature grids of {name}: {len(todo.missing)} scans to do, {todo.num_kept} done; "
-        f"{todo.num_bytes / 1e9:.3g} GB needed, {todo.free_bytes / 1e9:.3g} GB free, "
-        f"in {', '.join(_stores(todo))}"
-    )
-
-
-def _stores(todo: GridPlan) -> list[str]:
-    return [str(todo.features_dir / f"{h}x{w}") for h, w in todo.settings]
 
 
 def _say(line: str) -> None:
@@ -145,9 +120,7 @@ def read_data(source: Path) -> LidarDataModule:
     Raises:
         ValueError: If the path is neither.
     """
-    parser = StageParser()
-    parser.add_argument("--config", action="config")
-    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
+    parser = _data_parser()
     config = parser.parse_args(_with_data_class(["--data", str(source)]))
     settings = config.data.init_args
     settings.extractor = settings.features_dir = None
@@ -158,11 +131,7 @@ def read_data(source: Path) -> LidarDataModule:
 
 
 def _with_data_class(words: Sequence[str]) -> list[str]:
-    """The words with a folder or YAML file after ``--data`` as class path or ``--config``.
-
-    Raises:
-        ValueError: If a path after ``--data`` is neither.
-    """
+    """The words with a folder or YAML file after ``--data`` as class path or ``--config``."""
     found: list[str] = []
     rest = iter(words)
     for word in rest:
@@ -170,56 +139,47 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
         if name != "--data":
             found.append(word)
             continue
-        source = value if equals else next(rest, "")
-        if Path(source).is_dir():
-            in_layout = (Path(source) / "data_3d_raw").is_dir()
-            data, key = (
-                ("KITTI360DataModule", "root") if in_layout else ("LidarDataModule", "scans")
-            )
-            found += ["--data", f"r3dpa.data.{data}", f"--data.init_args.{key}", source]
-        elif Path(source).suffix in (".yaml", ".yml"):
-            found += ["--config", source]
-        elif "/" in source:
+        source = Path(value if equals else next(rest, ""))
+        if (source / "data_3d_raw").is_dir():
+            found += ["--data=r3dpa.data.KITTI360DataModule", f"--data.init_args.root={source}"]
+        elif source.is_dir():
+            found += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={source}"]
+        elif source.suffix in (".yaml", ".yml"):
+            found += ["--config", str(source)]
+        elif len(source.parts) > 1:
             raise ValueError(f"--data {source}: is no folder of scans and no data YAML")
         else:
-            found += ["--data", source]
+            found += ["--data", str(source)]
     return found
 
 
+def _data_parser(**about: Any) -> StageParser:
+    parser = StageParser(**about)
+    parser.add_argument("--config", action="config", help="YAML, the same as after --data")
+    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
+    return parser
+
+
 def _parser() -> StageParser:
-    parser = StageParser(
+    parser = _data_parser(
         prog="r3dpa data features",
         description="Write the feature grids of all scans of --data: a folder of scans, in the "
         "KITTI-360 layout or any other, or a data YAML. The same command completes an interrupted "
         "run. Several devices and nodes share the work.",
     )
-    parser.add_argument("--config", action="config", help="YAML, the same as after --data")
-    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-    parser.add_argument(
-        "--extractor",
-        type=str | None,
-        help=f"one of {', '.join(SOURCES)}; default: that of the data configuration, "
-        "or scalr if --ckpt is given",
-    )
-    parser.add_argument("--ckpt", type=Path | None, help="weights of the extractor")
-    parser.add_argument(
-        "--grid_sizes",
-        type=list[tuple[int, int]] | None,
-        help="rows and columns of each grid, such as '[[8, 64], [16, 128]]', all from one pass; "
-        "default: grid_size of the data",
-    )
-    parser.add_argument(
-        "--dtype",
-        type=Literal["float16", "int8"],
-        default="float16",
-        help="int8 takes half the space: 127 steps on either side of zero in each cell",
-    )
-    parser.add_argument(
-        "--batch_size", type=int | None, help="scans per pass; default: that of the data"
-    )
-    parser.add_argument(
-        "--out", type=Path | None, help="folder of the grids, in place of features_dir of the data"
-    )
+    sources = f"one of {', '.join(SOURCES)}; default: that of the data, or scalr if --ckpt is given"
+    sizes = "such as '[[8, 64], [16, 128]]', all from one pass; default: grid_size of the data"
+    steps = "int8 takes half the space: 127 steps on either side of zero in each cell"
+    options: dict[str, tuple[Any, str]] = {
+        "extractor": (str | None, sources),
+        "ckpt": (Path | None, "weights of the extractor"),
+        "grid_sizes": (list[tuple[int, int]] | None, f"rows and columns of each grid, {sizes}"),
+        "batch_size": (int | None, "scans per pass; default: that of the data"),
+        "out": (Path | None, "folder of the grids, in place of features_dir of the data"),
+    }
+    for name, (kind, text) in options.items():
+        parser.add_argument(f"--{name}", type=kind, help=text)
+    parser.add_argument("--dtype", type=Literal["float16", "int8"], default="float16", help=steps)
     skipped: Any = set(signature(Trainer).parameters) - _TRAINER_OPTIONS
     parser.add_class_arguments(
         Trainer, "trainer", fail_untyped=False, instantiate=False, sub_configs=True, skip=skipped

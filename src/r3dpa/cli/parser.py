@@ -9,11 +9,20 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
+from types import UnionType
 from typing import Any, NoReturn, Union, get_args, get_origin
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
-__all__ = ["OneLineErrors", "Parser", "check_file", "check_folder", "load", "run_function"]
+__all__ = [
+    "OneLineErrors",
+    "Parser",
+    "check_file",
+    "check_folder",
+    "check_least",
+    "load",
+    "run_function",
+]
 
 # jsonargparse denies os.system and its like already when a YAML file names them.
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
@@ -65,49 +74,36 @@ class Parser(OneLineErrors):
         return super().parse_args(self._with_lists(words), *more, **options)
 
     def _with_lists(self, words: Sequence[str]) -> list[str]:
-        kinds = {
-            name: kind
+        types = {
+            name: item_types
             for action in self._actions
             for name in action.option_strings
-            if _is_list(kind := getattr(action, "_typehint", None))
+            if (item_types := _item_types(getattr(action, "_typehint", None)))
         }
-        found: list[str] = []
+        joined: list[str] = []
         rest = list(words)
         while rest:
             name, equals, value = rest[0].partition("=")
-            found.append(rest.pop(0))
-            if name not in kinds:
+            joined.append(rest.pop(0))
+            if name not in types:
                 continue
             items = [value] if equals else []
-            while rest and not equals and (not rest[0].startswith("-") or _is_number(rest[0])):
+            while rest and not equals and re.match(r"[^-]|-\.?\d|$", rest[0]):  # no option
                 items.append(rest.pop(0))
             if items and not items[0].lstrip().startswith("["):
                 parts = [part.strip() for item in items for part in item.split(",")]
-                quoted = parts if _of_numbers(kinds[name]) else map(json.dumps, parts)
+                quoted = parts if types[name] <= {int, float} else map(json.dumps, parts)
                 items = [f"[{', '.join(quoted)}]"]
-            found = [*found[:-1], name, *items]
-        return found
+            joined = [*joined[:-1], name, *items]
+        return joined
 
 
-def _is_list(kind: Any) -> bool:
+def _item_types(kind: Any) -> set[Any]:
+    """Types of the items of a list or tuple, also of an optional one; empty for other types."""
     if get_origin(kind) in (list, tuple):
-        return True
-    union = get_origin(kind) is Union or type(kind).__name__ == "UnionType"
-    return union and any(_is_list(part) for part in get_args(kind))
-
-
-def _of_numbers(kind: Any) -> bool:
-    if get_origin(kind) in (list, tuple):
-        return set(get_args(kind)) <= {int, float}
-    return any(_of_numbers(part) for part in get_args(kind))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+        return set(get_args(kind))
+    union = get_origin(kind) in (Union, UnionType)
+    return set().union(*map(_item_types, get_args(kind))) if union else set()
 
 
 def load(target: str) -> Callable[..., Any]:
@@ -138,6 +134,13 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
         raise
     arguments.pop("config", None)
     return function(**arguments)
+
+
+def check_least(least: int, **values: int | None) -> None:
+    """Refuses a number below ``least``; None is none."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
 
 
 def check_folder(out: Path | None) -> None:

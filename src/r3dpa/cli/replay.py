@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import torch
-from torch import Tensor, nn
+MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
+if MYPY:
+    from torch import nn
 
-from r3dpa.callbacks.bad_batches import BadBatch
-from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.checkpoints.networks import format_table
-from r3dpa.modules import FlowMatching, GenerativeModule, JointAlignment, VAEAlignment
-from r3dpa.modules.steps import PathDraws
+    from r3dpa.callbacks.bad_batches import BadBatch
+    from r3dpa.checkpoints import Checkpoint
+    from r3dpa.modules import GenerativeModule
 
-_STAGES = {stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMatching)}
-_AUTOCAST = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
+__all__ = ["replay"]
+
+_AUTOCAST = {"bf16-mixed": "bfloat16", "16-mixed": "float16"}
 
 
 class _Observer:
@@ -33,7 +32,7 @@ class _Observer:
         self.called.add(name)
         if not _finite(output):
             self.outputs.setdefault(name, all(map(_finite, inputs)))
-        if isinstance(output, Tensor) and output.requires_grad:
+        if getattr(output, "requires_grad", False):
             note = self.gradients.setdefault
             output.register_hook(lambda grad: None if _finite(grad) else note(name, None))
 
@@ -58,6 +57,10 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         ckpt: Weights, best those of the last step before it.
         device: ``cpu``, ``cuda`` or ``cuda:1``.
     """
+    from r3dpa.callbacks.bad_batches import BadBatch
+    from r3dpa.checkpoints import read_checkpoint
+    from r3dpa.io import text_table
+
     saved, weights = BadBatch.read(file), read_checkpoint(ckpt)
     about, module = saved.about, _module(saved, weights).to(device)
     state = {name: value.clone() for name, value in module.state_dict().items()}
@@ -95,14 +98,19 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         for name, found in rows.items()
     ]
     head = ["network", "layers", "outputs not finite", "first", "gradients not finite", "first"]
-    lines.append(format_table(["", *columns], cells))
-    lines.append(format_table(head, [observer.row(name) for name, observer in seen.items()]))
-    return "\n".join([*lines, _conclusion(seen, about["world_size"])])
+    lines.append(text_table(cells, ["", *columns], "l" * (1 + len(columns))))
+    lines.append(
+        text_table([observer.row(name) for name, observer in seen.items()], head, "llllll")
+    )
+    return "\n".join([*lines, _conclusion(list(seen.values()), about["world_size"])])
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:
     """The stage with the networks of the checkpoint and the settings of the batch."""
-    stage = _STAGES[saved.about["stage"]]
+    from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
+
+    stages = {stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMatching)}
+    stage = stages[saved.about["stage"]]
     names = ["vae", "sit", "latent_norm", *(["discriminator"] if stage is not FlowMatching else [])]
     networks: dict[str, Any] = {name: weights.network(name).build() for name in names}
     settings = saved.weights
@@ -115,31 +123,36 @@ def _losses(
     module: GenerativeModule, saved: BadBatch, scans: slice, grad: bool
 ) -> dict[str, float]:
     """Losses of some scans without weights, and ``loss``, their weighted sum."""
+    import torch
+
+    from r3dpa.modules.steps import PathDraws
+
     draws = PathDraws(*(values[scans].to(module.device) for values in saved.draws))
     batch: Any = {name: value[scans].to(module.device) for name, value in saved.tensors.items()}
     # There is no trainer: no number of the batch, and nothing to log to.
     module.draw_path = lambda *_: draws  # type: ignore[method-assign]
     module.log_dict = lambda *_: None  # type: ignore[method-assign]
-    dtype = _AUTOCAST.get(saved.about["precision"])
+    name = _AUTOCAST.get(saved.about["precision"])
+    dtype = getattr(torch, name or "bfloat16")
     with torch.set_grad_enabled(grad):
-        with torch.autocast(module.device.type, dtype or torch.bfloat16, enabled=dtype is not None):
-            total = cast(Tensor, module.training_step(batch, 0))
+        with torch.autocast(module.device.type, dtype, enabled=name is not None):
+            total = cast(torch.Tensor, module.training_step(batch, 0))
         if grad:
             total.backward()
     return {name: float(value) for name, value in module.logged_losses.items()}
 
 
 def _finite(value: Any) -> bool:
-    return not isinstance(value, Tensor) or bool(value.isfinite().all())
+    return not hasattr(value, "isfinite") or bool(value.isfinite().all())
 
 
-def _conclusion(seen: Mapping[str, _Observer], world_size: int) -> str:
-    found = [item for observer in seen.values() for item in observer.outputs.items()]
-    if starts := [name for name, sound in found if sound]:
+def _conclusion(seen: list[_Observer], world_size: int) -> str:
+    outputs = [item for observer in seen for item in observer.outputs.items()]
+    if starts := [name for name, inputs_finite in outputs if inputs_finite]:
         return f"layers that turned finite inputs into others: {', '.join(starts)}"
-    if found:
+    if outputs:
         return "no layer turned finite inputs into others: it came with inputs or latents"
-    if any(observer.gradients for observer in seen.values()):
+    if any(observer.gradients for observer in seen):
         return "all outputs are finite: it starts in a loss or in a gradient"
     others = "; it may lie in the batch of another process" if world_size > 1 else ""
     return f"everything is finite with these weights: give an earlier or later checkpoint{others}"

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.parser import check_folder
+from r3dpa.cli.parser import check_folder, check_least
 
-MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
-if MYPY:
-    import torch
-    from torch import Tensor
-
-    from r3dpa.data.scene_writer import SceneWriter
-    from r3dpa.generation import SamplerConfig, SceneGenerator
-    from r3dpa.geometry import ScanGeometry
-
-__all__ = ["convert", "draw_scene", "report", "sample", "written"]
-
-_ON_SHEET = 16
-_ON_PAGE = 8
+__all__ = ["convert", "report", "sample"]
 
 
 def sample(
@@ -87,36 +73,28 @@ def sample(
         pictures: Number of scenes to draw.
         overwrite: Write into a folder that holds scenes already, and start anew.
     """
+    arguments = dict(locals())
     from dataclasses import asdict
 
-    import r3dpa
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.checkpoints.snapshots import read_snapshot
+    from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
-    from r3dpa.generation import Autoguidance, SceneGenerator
-    from r3dpa.io import source_commit, usable_device
+    from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
+    from r3dpa.io import usable_device
 
-    given = {
-        "solver": solver,
-        "steps": steps,
-        "shift": shift,
-        "eta": eta,
-        "sde_last": sde_last,
-        "sde_last_time": sde_last_time,
-    }
-    sampler, note = _sampler(quality, {k: v for k, v in given.items() if v is not None})
+    of_solver = ("solver", "steps", "shift", "eta", "sde_last", "sde_last_time")
+    given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
+    if quality is not None and given:
+        raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
+    chosen = quality or "good"
+    sampler = SamplerConfig(**given) if given else SamplerConfig.of_quality(chosen)
     if autoguidance is None and (guidance_scale or guidance_interval or allow_other_latents):
         raise ValueError(
             "--guidance_scale, --guidance_interval and --allow_other_latents need --autoguidance"
         )
-    for name, value, least in (
-        ("num", num, 1),
-        ("batch_size", batch_size, 1),
-        ("seed", seed, 0),
-        ("pictures", pictures, 0),
-    ):
-        if value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}")
+    check_least(1, num=num, batch_size=batch_size)
+    check_least(0, seed=seed, pictures=pictures)
     check_folder(out)
     device = usable_device(device)
     checkpoint = read_checkpoint(ckpt)
@@ -147,162 +125,28 @@ def sample(
         compile=compile,
     )
     generator.prepare()
-    request = {
-        "checkpoint": str(ckpt),
-        "checkpoint_written": written(ckpt),
-        "stage": checkpoint.stage,
-        "step": checkpoint.step,
-        "feature_source": checkpoint.feature_source,
-        "weights": weights,
-        "num": num,
-        "seed": seed,
+    request = provenance(checkpoint, ckpt, generator.geometry)
+    names = ("weights", "num", "seed", "precision", "compile", "batch_size", "decode_batch_size")
+    request |= {name: arguments[name] for name in names}
+    request |= {
+        "device": device,
+        "formats": list(formats),
         "sampler": asdict(sampler),
         "autoguidance": about_guide,
-        "interpolant": checkpoint.interpolant,
-        "precision": precision,
-        "device": device,
-        "compile": compile,
-        "batch_size": batch_size,
-        "decode_batch_size": decode_batch_size,
-        "formats": list(formats),
-        "geometry": generator.geometry.to_dict(),
-        "r3dpa": r3dpa.__version__,
-        "commit": source_commit(),
-        "torch": _torch_version(),
     }
-    with SceneWriter(
-        out, num, generator.geometry.projection, formats, request, overwrite
-    ) as writer:
-        measured = _generate(generator, writer, batch_size, seed)
-        drawn = _draw(out, writer.range_path, pictures, generator.geometry)
+    projection = generator.geometry.projection
+    with SceneWriter(out, num, projection, formats, request, overwrite) as writer:
+        measured = generate_all(generator, writer, batch_size, seed)
+        opened = draw_all(out, writer.range_path, pictures, generator.geometry)
         writer.finish(request | measured)
-    lines = [note, f"{num} scenes in {out}: {measured['nfe']:.5g} network evaluations each"]
+    line = f"{num} scenes in {out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
-        lines[-1] += (
+        line += (
             f", {measured['device_seconds_per_scene']:.3g} s a scene on the device, "
             f"{measured['seconds_per_scene']:.3g} s end to end"
         )
-    return "\n".join(line for line in [*lines, *drawn] if line)
-
-
-def _sampler(quality: Any, given: dict[str, Any]) -> tuple[SamplerConfig, str]:
-    """Sampler of the options, and a line that describes a chosen quality."""
-    from r3dpa.generation import SamplerConfig
-
-    if quality is not None and given:
-        raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
-    if given:
-        return SamplerConfig(**given), ""
-    quality = quality or "good"
-    return SamplerConfig.of_quality(quality), SamplerConfig.quality_line(quality)
-
-
-def _torch_version() -> str:
-    import torch
-
-    return torch.__version__
-
-
-def _generate(
-    generator: SceneGenerator, writer: SceneWriter, batch_size: int, seed: int
-) -> dict[str, Any]:
-    """Generates and writes the missing scenes; returns evaluations and times."""
-    import torch
-    from tqdm import tqdm
-
-    first_index, device_seconds = writer.num_done, _DeviceClock(generator.device)
-    start = time.perf_counter()
-    with tqdm(
-        total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
-    ) as progress:
-        for first in range(first_index, writer.num, batch_size):
-            indices = range(first, min(first + batch_size, writer.num))
-            device_seconds.mark()
-            batch = generator.generate(indices, seed)
-            device_seconds.mark()
-            writer.put(batch.range_m, batch.nfe)
-            progress.update(len(indices))
-    writer.close()
-    elapsed, drawn = time.perf_counter() - start, writer.num - first_index
-    nfe = writer.evaluations / writer.num  # a fraction only if a solver chooses its steps
-    return {
-        "nfe": int(nfe) if nfe.is_integer() else nfe,
-        "drawn_by_last_run": drawn,
-        "device_seconds_per_scene": device_seconds.total() / drawn if drawn else None,
-        "seconds_per_scene": elapsed / drawn if drawn else None,
-        "threads": torch.get_num_threads(),
-    }
-
-
-class _DeviceClock:
-    """Seconds between pairs of marks; on a GPU by its own events, without a synchronisation."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._on_gpu = device.type == "cuda"
-        self._marks: list[Any] = []
-
-    def mark(self) -> None:
-        import torch
-
-        if self._on_gpu:
-            self._marks.append(torch.cuda.Event(enable_timing=True))
-            self._marks[-1].record()
-        else:
-            self._marks.append(time.perf_counter())
-
-    def total(self) -> float:
-        import torch
-
-        pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
-        if not self._on_gpu:
-            return sum(stop - start for start, stop in pairs)
-        torch.cuda.synchronize()
-        return sum(start.elapsed_time(stop) / 1000 for start, stop in pairs)
-
-
-def _draw(out: Path, range_path: Path, pictures: int, geometry: ScanGeometry) -> list[str]:
-    """Draws the first scenes, a sheet of them and a page; returns what to open."""
-    import numpy as np
-    import torch
-
-    from r3dpa import viz
-    from r3dpa.cli.view import write_page
-    from r3dpa.geometry import points_of
-
-    ranges = np.load(range_path, mmap_mode="r")
-    drawn = [torch.from_numpy(np.array(range_m)) for range_m in ranges[:pictures]]
-    if not drawn:
-        return []
-    for index, range_m in enumerate(drawn):
-        draw_scene(out, f"{index:06d}", range_m, geometry)
-    viz.save(viz.scenes_sheet(drawn[:_ON_SHEET], geometry.projection), out / "scenes.png")
-    opened = [str(out / "scenes.png")]
-    scans = [
-        viz.PageScan(f"scene {index:06d}", points_of(image, geometry.projection).numpy())
-        for index, image in enumerate(drawn[:_ON_PAGE])
-        if (image > 0).any()  # neither empty nor NaN
-    ]
-    if scans:
-        title = f"{out.resolve().name} - r3dpa sample"
-        opened.append(str(write_page(out / "scenes.html", scans, title)))
-    return [f"open {' and '.join(opened)}"]
-
-
-def draw_scene(out: Path, name: str, range_m: Tensor, geometry: ScanGeometry) -> None:
-    """Pictures of a scene ``(H, W)``: range image, from above and from behind."""
-    from r3dpa import viz
-    from r3dpa.geometry import points_of
-
-    sensor, points = geometry.projection.sensor, points_of(range_m, geometry.projection)
-    picture = viz.range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
-    viz.save(picture, out / "range" / f"{name}.png")
-    viz.save(viz.birds_eye_view(points), out / "birds_eye" / f"{name}.png")
-    viz.save(viz.scene_3d(points), out / "scene_3d" / f"{name}.png")
-
-
-def written(path: Path) -> str:
-    """Time of the last change of a file: the same name may hold other weights later."""
-    return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
+    note = "" if given else SamplerConfig.quality_line(chosen)
+    return "\n".join(filter(None, (note, line, opened)))
 
 
 def convert(
@@ -346,9 +190,8 @@ def report(run: Path) -> str:
     """
     from statistics import fmean
 
-    from tabulate import tabulate
-
     from r3dpa import viz
+    from r3dpa.io import text_table
 
     paths = sorted(run.glob("version_*/metrics.csv"), key=lambda path: path.stat().st_mtime)
     if not paths:
@@ -369,11 +212,5 @@ def report(run: Path) -> str:
         change = [f"{last:.5g}", f"{last - first:+.5g}", ratio] if name in drawn else []
         rows.append([name, f"{first:.5g}", *change])
     head = ["quantity", "first tenth", "last tenth", "change", "ratio"]
-    table = tabulate(
-        rows,
-        head,
-        tablefmt="plain",
-        disable_numparse=True,
-        colalign=("left", "right", "right", "right", "right"),
-    )
+    table = text_table(rows, head, "lrrrr", "plain")
     return f"{table}\ncurves: {run / 'loss_curves.png'}" if drawn else table

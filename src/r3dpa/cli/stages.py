@@ -22,20 +22,29 @@ from r3dpa.cli.parser import OneLineErrors
 from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
 from r3dpa.modules import GenerativeModule
 
-__all__ = ["StageCLI", "StageParser", "conf_folder", "run"]
+__all__ = ["StageCLI", "StageParser", "conf_folder", "ignore_harmless_warnings", "run"]
 
-# Warnings of Lightning at every start that are intended here: averages and frozen networks stay in
-# evaluation mode; the rest is Lightning's own use of torch.
+# Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, and
+# a process may have no scan.
 _HARMLESS = (
     r"Found \d+ module\(s\) in eval mode",
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
     r"The number of training batches .* is smaller than the logging interval",
     r"The '.*_dataloader' does not have many workers",
+    r"predict returned None",
+    r"You have overridden `transfer_batch_to_device`",
+    r"Total length of .* across ranks is zero",
 )
 
 
 class StageParser(OneLineErrors, LightningArgumentParser):
     """Parser of stages and data modules."""
+
+
+def ignore_harmless_warnings() -> None:
+    """Hides warnings of Lightning about what is intended here."""
+    for message in _HARMLESS:
+        warnings.filterwarnings("ignore", message=message)
 
 
 def conf_folder() -> Path:
@@ -44,7 +53,7 @@ def conf_folder() -> Path:
 
 
 class _RecordConfig(SaveConfigCallback):
-    """Writes the configuration of a training to ``run_dir`` and to wandb; knows when it started."""
+    """Writes the configuration of a training to ``run_dir`` and to wandb."""
 
     started = False
 
@@ -69,11 +78,9 @@ class _RecordConfig(SaveConfigCallback):
 class StageCLI(LightningCLI):
     """Wires a stage, a data module and a trainer from YAML files.
 
-    ``run_dir`` is the one place a run writes to: checkpoints, loggers and pictures go below it. One
-    process at a time trains there, and one tests. ``--ckpt_path last`` means its newest checkpoint,
-    or none where there is none yet, so that one command starts a job and goes on with it.
-    A stage is a LightningModule; one whose batches only some data modules make names their class as
-    ``data_class``.
+    A run writes checkpoints, logs and pictures below ``run_dir``, where one process at a time
+    trains. ``--ckpt_path last`` is its newest checkpoint, or none, so that one command starts and
+    resumes a job. A stage that needs a kind of data module names its class as ``data_class``.
     """
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -90,11 +97,7 @@ class StageCLI(LightningCLI):
         )
 
     def _parse_ckpt_path(self) -> None:
-        """Checks that the file can be read; the model stays the one of the configuration.
-
-        Lightning would replace class and settings of the model by those of the checkpoint without
-        a word. Here the stages are compared in ``GenerativeModule.on_load_checkpoint``.
-        """
+        """Checks that the file can be read; the model stays the one of the configuration."""
         config = self.config[self.config.subcommand]
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
@@ -105,11 +108,9 @@ class StageCLI(LightningCLI):
     def _run_subcommand(self, subcommand: str) -> None:
         """Runs the command, unless another process does the same in ``run_dir``."""
         run_dir = Path(self.config[subcommand].run_dir)
-        alone = only_writer(
-            run_dir / f".{subcommand}.lock", f"runs r3dpa {subcommand} in {run_dir}"
-        )
+        what = f"runs r3dpa {subcommand} in {run_dir}"
         first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
-        with alone if first else nullcontext():
+        with only_writer(run_dir / f".{subcommand}.lock", what) if first else nullcontext():
             if subcommand == "fit" and first:
                 self._refuse_earlier_run()
                 delete_unfinished(run_dir / "checkpoints")
@@ -122,11 +123,7 @@ class StageCLI(LightningCLI):
                 raise
 
     def instantiate_classes(self) -> None:
-        """Builds stage, data module and trainer; checks that the first two belong together.
-
-        Raises:
-            ValueError: If the stage cannot use batches of the data module; both are named.
-        """
+        """Builds stage, data module and trainer; checks that the first two belong together."""
         super().instantiate_classes()
         expected = getattr(self.model, "data_class", LightningDataModule)
         if not isinstance(self.datamodule, expected):
@@ -158,7 +155,7 @@ class StageCLI(LightningCLI):
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
         if self.subcommand == "fit":
-            self._refuse_earlier_run()
+            self._refuse_earlier_run()  # before data are prepared
         Path(config.run_dir).mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
@@ -200,11 +197,7 @@ def _newest(run_dir: Path) -> str | None:
 
 
 def _with_preset(words: list[str]) -> list[str]:
-    """``STAGE [--preset NAME]`` after the command as the shipped configurations.
-
-    Raises:
-        ValueError: If there is no such stage or preset.
-    """
+    """``STAGE [--preset NAME]`` after the command as the shipped configurations."""
     if not words or words[0].startswith("-"):
         return words
     stage, preset, rest = words[0], "kitti360", words[1:]
@@ -230,16 +223,15 @@ def run(args: list[str]) -> None:
     """Runs a stage command.
 
     Args:
-        args: Command line after ``r3dpa``, such as ``["fit", "--config", "x.yaml"]``, or with
-            shipped configurations ``["fit", "joint", "--preset", "demo"]``.
+        args: Words after ``r3dpa``, such as ``["fit", "--config", "x.yaml"]``, or with shipped
+            configurations ``["fit", "joint", "--preset", "demo"]``.
 
     Raises:
-        ValueError: If the configuration cannot be used; its attribute ``during_training`` tells
-            errors of a running training apart.
+        ValueError: If the configuration cannot be used; errors of a running training have the
+            attribute ``during_training``.
     """
     words = [args[0], *_with_preset(args[1:])]
-    for message in _HARMLESS:
-        warnings.filterwarnings("ignore", message=message)
+    ignore_harmless_warnings()
     StageCLI(
         LightningModule,
         LightningDataModule,

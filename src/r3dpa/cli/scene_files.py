@@ -1,0 +1,180 @@
+"""Files that several commands read or write: clouds, pictures of scenes, pages, provenance."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+import r3dpa
+from r3dpa import viz
+from r3dpa.checkpoints import Checkpoint
+from r3dpa.data.scans import ScanError, read_npz, read_ply, read_scan
+from r3dpa.data.scene_writer import SceneWriter
+from r3dpa.generation import SceneGenerator
+from r3dpa.geometry import ScanGeometry, points_of
+from r3dpa.io import atomic_path, source_commit
+from r3dpa.simulation import Origin, Semantic
+
+__all__ = [
+    *("draw_all", "draw_scene", "generate_all", "provenance", "read_clouds", "write_page"),
+    "written",
+]
+
+# Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
+# that is not named here takes one of the palette.
+_COLOURS = dict(
+    re.findall(
+        r"(\w+) (#\w+)",
+        "UNLABELED #8a8f98 ROAD #75688f SIDEWALK #c77dba TERRAIN #a7c957 BUILDING #c9b48c "
+        "WALL #a08c80 FENCE #c08552 POLE #f2f2f2 SIGN #ffd84d VEGETATION #46b36b PERSON #ff5c5c "
+        "RIDER #ff9f1c CAR #4e9bff TRUCK #2459c4 BUS #00b8a9 BICYCLE #e056fd SURFACE #56606e "
+        "MIXED #ffb000 FOLIAGE #46b36b GLASS #5ce1e6 MIRROR #c792ea FOG #aab4c8 RAIN #4e9bff "
+        "SNOW #ffffff SPRAY #7fd1ff BLOOMING #ff6b6b SUN #ffe14d SECOND_RETURN #f78fb3",
+    )
+)
+_ON_SHEET, _ON_PAGE = 16, 8
+
+
+def read_clouds(path: Path) -> dict[str, NDArray]:
+    """Points ``(P, 3)`` or ``(P, 4)`` of each scan of a ``.bin``, ``.ply`` or ``.npz`` file.
+
+    Raises:
+        ScanError: If the file cannot be used; names it.
+    """
+    if path.suffix == ".npz":
+        clouds = read_npz(path)
+    elif path.suffix in (".bin", ".ply"):
+        clouds = {path.stem: read_scan(path) if path.suffix == ".bin" else read_ply(path)}
+    else:
+        raise ScanError(f"{path}: is no scan; give a .bin, .ply or .npz file")
+    for name, points in clouds.items():
+        if points.ndim != 2 or points.shape[1] not in (3, 4):
+            raise ScanError(
+                f"{path}: {name} must be points (P, 3) or (P, 4), got shape {points.shape}"
+            )
+    if not clouds:
+        raise ScanError(f"{path}: holds no scan")
+    return clouds
+
+
+def written(path: Path) -> str:
+    """Time of the last change of a file: the same name may hold other weights later."""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
+
+
+def provenance(checkpoint: Checkpoint, path: Path, geometry: ScanGeometry) -> dict[str, Any]:
+    """Checkpoint, geometry and versions, as the metadata of scenes holds them."""
+    return {
+        "checkpoint": str(path),
+        "checkpoint_written": written(path),
+        "stage": checkpoint.stage,
+        "step": checkpoint.step,
+        "feature_source": checkpoint.feature_source,
+        "interpolant": checkpoint.interpolant,
+        "geometry": geometry.to_dict(),
+        "r3dpa": r3dpa.__version__,
+        "commit": source_commit(),
+        "torch": torch.__version__,
+    }
+
+
+def generate_all(
+    generator: SceneGenerator, writer: SceneWriter, batch_size: int, seed: int
+) -> dict[str, Any]:
+    """Generates and writes the missing scenes; returns evaluations and times."""
+    first_index, times = writer.num_done, []
+    start = time.perf_counter()
+    with tqdm(
+        total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
+    ) as progress:
+        for first in range(first_index, writer.num, batch_size):
+            indices = range(first, min(first + batch_size, writer.num))
+            before = _mark(generator.device)
+            batch = generator.generate(indices, seed)
+            times.append((before, _mark(generator.device)))
+            writer.put(batch.range_m, batch.nfe)
+            progress.update(len(indices))
+    writer.close()
+    elapsed, drawn = time.perf_counter() - start, writer.num - first_index
+    nfe = writer.evaluations / writer.num  # a fraction only if a solver chooses its steps
+    return {
+        "nfe": int(nfe) if nfe.is_integer() else nfe,
+        "drawn_by_last_run": drawn,
+        "device_seconds_per_scene": sum(map(_seconds, times)) / drawn if drawn else None,
+        "seconds_per_scene": elapsed / drawn if drawn else None,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _mark(device: torch.device) -> float | torch.cuda.Event:
+    """Now; on a GPU as an event of its stream, without a synchronisation."""
+    if device.type != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def _seconds(marks: tuple[Any, Any]) -> float:
+    before, after = marks
+    if isinstance(before, float):
+        return after - before
+    after.synchronize()
+    return before.elapsed_time(after) / 1000
+
+
+def draw_scene(out: Path, index: int, range_m: Tensor, geometry: ScanGeometry) -> None:
+    """Pictures of a scene ``(H, W)``: range image, from above and from behind."""
+    sensor, points = geometry.projection.sensor, points_of(range_m, geometry.projection)
+    picture = viz.range_image_picture(range_m, sensor, scale=max(1, 1024 // sensor.columns))
+    viz.save(picture, out / "range" / f"{index:06d}.png")
+    viz.save(viz.birds_eye_view(points), out / "birds_eye" / f"{index:06d}.png")
+    viz.save(viz.scene_3d(points), out / "scene_3d" / f"{index:06d}.png")
+
+
+def draw_all(out: Path, range_path: Path, pictures: int, geometry: ScanGeometry) -> str:
+    """Draws the first scenes, a sheet of them and a page; returns what to open."""
+    ranges = np.load(range_path, mmap_mode="r")
+    drawn = [torch.from_numpy(np.array(range_m)) for range_m in ranges[:pictures]]
+    if not drawn:
+        return ""
+    for index, range_m in enumerate(drawn):
+        draw_scene(out, index, range_m, geometry)
+    viz.save(viz.scenes_sheet(drawn[:_ON_SHEET], geometry.projection), out / "scenes.png")
+    scans = [
+        viz.PageScan(f"scene {index:06d}", points_of(image, geometry.projection).numpy())
+        for index, image in enumerate(drawn[:_ON_PAGE])
+        if (image > 0).any()  # neither empty nor NaN
+    ]
+    if not scans:
+        return f"open {out / 'scenes.png'}"
+    page = write_page(out / "scenes.html", scans, f"{out.resolve().name} - r3dpa sample")
+    return f"open {out / 'scenes.png'} and {page}"
+
+
+def write_page(
+    path: Path, scans: Sequence[viz.PageScan], title: str, beside: viz.PageScan | None = None
+) -> Path:
+    """Writes a page of point clouds, coloured by the classes and origins of the simulator too."""
+    page = viz.scan_page(scans, title, _categories(Semantic), _categories(Origin), beside)
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, "utf-8")
+    return path
+
+
+def _categories(names: type[IntEnum]) -> dict[int, viz.Category]:
+    return {
+        int(member): viz.Category(member.name.lower().replace("_", " "), _COLOURS.get(member.name))
+        for member in names
+    }
