@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from r3dpa.cli.view import view
+from r3dpa.cli.data import view
 from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.simulation import Origin, Semantic
 

@@ -15,35 +15,32 @@ __all__ = ["COMMANDS", "main"]
 
 
 class Command(NamedTuple):
-    """Function ``file:name`` below ``r3dpa.cli``, summary for the help, and kind of command.
+    """Function ``file:name`` below ``r3dpa.cli``, and summary for the help.
 
-    ``own_parser`` is for functions that take the words of the command line; a ``resumable`` command
-    continues its work when it is repeated after an interrupt.
+    A ``resumable`` command continues its work when it is repeated after an interrupt.
     """
 
     target: str
     summary: str
-    own_parser: bool = False
     resumable: bool = False
+
+    @property
+    def own_parser(self) -> bool:
+        """Whether the function takes the words of the command line."""
+        return self.target in ("stages:run", "features:features")
 
 
 COMMANDS = {
-    "fit": Command("stages:run", "train a stage: r3dpa fit joint --preset demo", own_parser=True),
-    "validate": Command("stages:run", "evaluate on the validation split", own_parser=True),
-    "test": Command(
-        "stages:run", "sample scenes and compare them with real scans", own_parser=True
-    ),
-    "predict": Command("stages:run", "reconstruct scans with a checkpoint", own_parser=True),
+    "fit": Command("stages:run", "train a stage: r3dpa fit joint --preset demo"),
+    "validate": Command("stages:run", "evaluate on the validation split"),
+    "test": Command("stages:run", "sample scenes and compare them with real scans"),
+    "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
     "data simulate": Command("simulate:simulate", "write simulated scans", resumable=True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
-    "data view": Command("view:view", "draw scans: pictures and a page with point clouds"),
-    "data features": Command(
-        "features:features", "write the feature grids of a data set", True, resumable=True
-    ),
+    "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
+    "data features": Command("features:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
-    "data reference": Command(
-        "evaluate:reference", "write the statistics of real scans for evaluate", resumable=True
-    ),
+    "data reference": Command("evaluate:reference", "write statistics of real scans", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),
@@ -56,9 +53,7 @@ COMMANDS = {
     "report": Command("sample:report", "draw the loss curves of a run and list the losses"),
     "replay": Command("replay:replay", "repeat a skipped step to find the layer that failed"),
     "ablate": Command("ablate:ablate", "train and compare the paper's ablations", resumable=True),
-    "bench sampling": Command(
-        "bench:sampling", "measure accuracy against sampling time", resumable=True
-    ),
+    "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
 }
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
@@ -70,15 +65,11 @@ def _help(group: str = "") -> str:
     """Usage and summaries of all commands, or of those of a group."""
     shown = {name: command for name, command in COMMANDS.items() if name.startswith(group)}
     lines = [f"  {name:<17}{command.summary}" for name, command in shown.items()]
-    return "\n".join(
-        [
-            f"usage: r3dpa {f'{group} ' if group else ''}COMMAND [options]",
-            "",
-            *([] if group else ["Generate LiDAR scenes (R3DPA).", ""]),
-            *lines,
-            "",
-            "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out.",
-        ]
+    title = "" if group else "\nGenerate LiDAR scenes (R3DPA).\n"
+    return (
+        f"usage: r3dpa {group} COMMAND [options]\n{title}\n".replace("  ", " ")
+        + "\n".join(lines)
+        + "\n\nr3dpa COMMAND --help lists the options. `data` and `edit` may be left out."
     )
 
 

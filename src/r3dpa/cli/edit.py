@@ -73,7 +73,7 @@ def inpaint(
         scan: Scan to edit: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
         box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees).
-        mask: Picture with one pixel for each of the range image, bright where it is to change.
+        mask: Picture of H x W pixels as the range image, bright where it is to change.
         objects: File of ``r3dpa objects``, made with the feature source of the checkpoint.
         object: Class of that file.
         features_from: Scan that shows the object.
@@ -150,10 +150,8 @@ def mix(
         right: Scan of the right half.
         split: Azimuth in degrees where the left half starts; it ends half a turn further.
         blend: Width of the seams in degrees.
-        layout: In place of left and right: azimuth at which each sector starts, and its scan, such
-            as ``0 a.bin 120 b.bin 240 c.bin``.
-        mask: In place of split and blend: picture with one pixel for each of the range image,
-            bright where the right scan is to be followed.
+        layout: Start of each sector and its scan, not two scans: ``0 a.bin 120 b.bin 240 c.bin``.
+        mask: Instead of split and blend: picture of H x W pixels, bright where right is followed.
         features_ckpt: Weights of the feature source, if it has none of its own.
         strength: Guidance in velocities, 0 to 1.
         window: First and last guided time; 0 data, 1 noise.
@@ -230,9 +228,8 @@ def complete(
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
         beams: Rows of the range image to keep, such as ``0 4 8``.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
-        other_sensor: Keep what another sensor would see: beams, lowest and highest inclination in
-            degrees, such as ``32 -25 3``.
-        mask: Picture with one pixel for each of the range image, bright where it is missing.
+        other_sensor: Keep what so many beams between two inclinations see, such as ``32 -25 3``.
+        mask: Picture of H x W pixels as the range image, bright where it is missing.
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
         **options: See :class:`EditJob`.
@@ -324,7 +321,7 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
     session = EditSession(EditJob(**options), frames)
-    scans = {f"{n}: {p.stem}": session.read(p) for n, p in (("left", left), ("right", right))}
-    first, last = (scan.range_m for scan in scans.values())
-    run = partial(session.editor.interpolate, first, last, frames)
+    first, last = session.read(left), session.read(right)
+    run = partial(session.editor.interpolate, first.range_m, last.range_m, frames)
+    scans = {f"left: {left.stem}": first, f"right: {right.stem}": last}
     return session.write("interpolate", arguments, scans, run)

@@ -60,18 +60,7 @@ class Parts(NamedTuple):
 
 
 class EditSession:
-    """A checkpoint opened for one edit.
-
-    Args:
-        job: Options of all edits.
-        num: Number of results.
-        strength: Guidance strength; None for the default.
-        window: Guided times; None for the default.
-
-    Raises:
-        ValueError: If a number is out of its range or the checkpoint cannot be sampled from.
-        OSError: If the checkpoint cannot be read.
-    """
+    """A checkpoint opened for one edit with ``num`` results; None is the default guidance."""
 
     def __init__(
         self,
@@ -83,10 +72,9 @@ class EditSession:
         check_least(1, num=num)
         check_least(0, seed=job.seed, pictures=job.pictures)
         check_folder(job.out)
-        given: dict[str, Any] = {"strength": strength, "window": window}
-        given = {name: value for name, value in given.items() if value is not None}
         self.job, self.num = job, num
-        self.settings = EditSettings(job.solver, job.steps, job.shift, **given)
+        strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
+        self.settings = EditSettings(job.solver, job.steps, job.shift, strength, window)
         self.device = usable_device(job.device)
         self.checkpoint = read_checkpoint(job.ckpt)
         self.editor = SceneEditor.from_checkpoint(
@@ -107,11 +95,7 @@ class EditSession:
         return source_of(self.checkpoint)
 
     def read(self, path: Path, check: bool = True) -> ScanView:
-        """A scan; it must fill the field of view if ``check`` is set.
-
-        Raises:
-            ScanError: If the file cannot be used; names it.
-        """
+        """A scan; with ``check``, one that fills the field of view."""
         clouds = read_clouds(path)
         if len(clouds) > 1:
             raise ScanError(
@@ -200,10 +184,6 @@ class EditSession:
             parts: Parts of the range image.
             guided: Whether features guide it.
             measure: Errors of results ``(B, H, W)`` by method, where the scan was held out.
-
-        Raises:
-            ValueError: If the edit is refused, or ``out`` holds other scenes.
-            OSError: If a file cannot be written.
         """
         job, settings = self.job, asdict(self.settings)
         if not guided:

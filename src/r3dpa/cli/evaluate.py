@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +18,6 @@ if MYPY:
     from r3dpa.metrics.scene import EvaluationScene
 
 __all__ = ["evaluate", "realism", "reference"]
-
-_OPTION = "--{}"  # how the metrics name an option of these commands
 
 
 def reference(
@@ -143,7 +141,7 @@ def evaluate(
         commit=source_commit(),
         allow_few=allow_few,
         skip_bad=skip_bad,
-        option=_OPTION,
+        option="--{}",
     )
     evaluation = comparison.evaluation
     if files.bad:  # the reader refused these, so that they never became scenes
@@ -165,7 +163,7 @@ def _scenes(samples: Samples) -> Iterator[EvaluationScene]:
     except SampleError as error:
         if samples.skip_bad or error.__cause__ is None:  # that of one sample has a cause
             raise
-        advice = f"{_OPTION.format('skip_bad')} leaves such samples out, and lists them"
+        advice = "--skip_bad leaves such samples out, and lists them"
         raise SampleError(f"{error}. {advice}") from error
 
 
@@ -199,8 +197,6 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
         reference: Folder of real scans (B), of two or more drives; a single one is halved.
         out: JSON file for the table and the curves behind it.
     """
-    from tqdm import tqdm
-
     from r3dpa.data.scans import find_scans
     from r3dpa.io import atomic_path
     from r3dpa.metrics import realism_table
@@ -222,25 +218,25 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
             "B is a single drive: the floor compares its first half with its second one, which are "
             "more alike than two drives; all ratios come out too high"
         )
-    with tqdm(total=len(ours) + len(real), unit="scan", desc="realism", disable=None) as bar:
-        table = realism_table(_by_drive(ours, bar), _by_drive(real, bar), notes)
+    table = realism_table(_by_drive(ours, "scans"), _by_drive(real, "reference"), notes)
     if out is not None:
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table
 
 
-def _by_drive(scans: Iterable[tuple[str, Scan]], bar: Any) -> dict[str, ScanStatistics]:
+def _by_drive(scans: list[tuple[str, Scan]], name: str) -> dict[str, ScanStatistics]:
     """Statistics of all scans of each drive together."""
+    from tqdm import tqdm
+
     from r3dpa.data.scans import ScanError, read_scan
     from r3dpa.metrics import ScanStatistics, scan_statistics
 
     totals: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-    for drive, scan in scans:
+    for drive, scan in tqdm(scans, unit="scan", desc=name, disable=None):
         points = read_scan(scan.path)
         try:
             totals[drive] += scan_statistics(points)
         except ValueError as error:
             raise ScanError(f"{scan.path}: {error}") from error
-        bar.update()
     return totals

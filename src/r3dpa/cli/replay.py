@@ -97,12 +97,14 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         [name, *(f"{found[c]:.4g}" if c in found else "-" for c in columns)]
         for name, found in rows.items()
     ]
+    layers = [observer.row(name) for name, observer in seen.items()]
     head = ["network", "layers", "outputs not finite", "first", "gradients not finite", "first"]
-    lines.append(text_table(cells, ["", *columns], "l" * (1 + len(columns))))
-    lines.append(
-        text_table([observer.row(name) for name, observer in seen.items()], head, "llllll")
+    tables = (
+        text_table(cells, ["", *columns], "l" + "r" * len(columns)),
+        text_table(layers, head, "llllll"),
     )
-    return "\n".join([*lines, _conclusion(list(seen.values()), about["world_size"])])
+    conclusion = _conclusion(list(seen.values()), about["world_size"])
+    return "\n".join([*lines, *tables, conclusion])
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:

@@ -50,8 +50,7 @@ def sample(
         out: Folder for scenes, pictures and metadata; must not hold other scenes.
         num: Number of scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
-        quality: Measured choice of solver, steps and shift: ``draft``, ``good`` or ``best``;
-            default: ``good``, unless an option of the solver is given.
+        quality: Measured solver, steps and shift; default: good, unless one of these is given.
         solver: ODE solver, or ``euler_maruyama`` for the SDE; default: the latter.
         steps: Solver steps; default: 256.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
@@ -68,8 +67,7 @@ def sample(
         compile: Compile the networks: a minute or more at first, then faster.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         weights: Averaged (``ema``) or last weights of the SiT.
-        formats: Files of points: ``bin``, ``ply``, ``npz``; the range images are always in
-            ``range_m.npy``.
+        formats: Files of points: ``bin``, ``ply``, ``npz``; ``range_m.npy`` is always written.
         pictures: Number of scenes to draw.
         overwrite: Write into a folder that holds scenes already, and start anew.
     """

@@ -97,7 +97,7 @@ class StageCLI(LightningCLI):
         )
 
     def _parse_ckpt_path(self) -> None:
-        """Checks that the file can be read; the model stays the one of the configuration."""
+        """Checks the file; Lightning would take class and settings of the model from it."""
         config = self.config[self.config.subcommand]
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
