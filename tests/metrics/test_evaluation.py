@@ -8,7 +8,7 @@ import torch
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.bootstrap import Resampling
-from r3dpa.metrics.evaluation import TooFewScenesError, evaluate
+from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
 from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, precision_recall
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -383,3 +383,15 @@ def test_every_distance_worsens_with_each_corruption(reference, ladder, amounts,
         values = [rows[name].value for rows in steps]
         assert values == sorted(values), (name, values)
         assert values[0] < values[-1], name
+
+
+def test_one_metric_of_two_sets_is_that_of_an_evaluation(reference):
+    rows = rows_of(scenes(1), reference)
+    for name in ("JSD", "W1 range", "MMD"):
+        assert scene_distance(name, scenes(0), scenes(1), PROTOCOL) == rows[name].value
+    made = [through_sensor(scene, PROTOCOL)[:2] for scene in scenes(1, 8)]  # names and points
+    assert scene_distance("FGEO coverage", made, made, PROTOCOL) == 1
+    with pytest.raises(ValueError, match="no metric 'FGEO best'; of FGEO there are FGEO precision"):
+        scene_distance("FGEO best", made, made, PROTOCOL)
+    with pytest.raises(ValueError, match="FGEO KID: needs 4 scenes"):
+        scene_distance("FGEO KID", made[:2], made, PROTOCOL)

@@ -1,4 +1,4 @@
-"""How sure a number is: bootstrap intervals."""
+"""Bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Ends = tuple[float, float]
 
 @dataclass(frozen=True)
 class Interval:
-    """A value from all samples with the ends of its confidence interval."""
+    """A value with the ends of its confidence interval."""
 
     value: float
     low: float
@@ -36,10 +36,9 @@ def bootstrap_interval(
 
         bootstrap_interval(lambda a, b: frechet_distance_of(x[a], y[b]), (len(x), len(y)), gen)
 
-    The ends are the value minus the quantiles of (resampled - mean of all resampled). Distances of
-    distributions grow when samples repeat; the mean removes that growth, so that the interval
-    surrounds the value and shows how far it scatters at this number of samples, but not the bias
-    of few samples. An end may lie below zero for a distance near zero.
+    The ends are the value minus the quantiles of (resampled - mean of all resampled). The mean
+    removes the growth of distances when samples repeat: the interval shows the spread at this
+    number of samples, not the bias of few samples. An end may lie below zero.
 
     Source: basic bootstrap (Davison and Hinkley 1997, eq. 5.6) about the mean of the resamples.
 
@@ -47,8 +46,8 @@ def bootstrap_interval(
         statistic: Of index vectors ``(n_i,)`` int64, one for each set.
         sizes: Samples n_i of each set.
         generator: Source of the indices, on the CPU.
-        paired: Draw the same indices for all sets, which then have one size: for the difference
-            of two generators that were given the same references or seeds.
+        paired: Draw the same indices for all sets, for the difference of two generators with the
+            same references or seeds.
         num_resamples: Evaluations of the statistic.
         level: Share of intervals that hold the true value.
 
@@ -86,7 +85,7 @@ class Resampling:
     """Seed and cost of the intervals of an evaluation.
 
     Args:
-        seed: Of every metric alone, so that one more metric changes no other.
+        seed: Of each metric on its own.
         num_resamples: Of each 95 % bootstrap interval, at least 40; 0 for none.
     """
 
@@ -94,11 +93,11 @@ class Resampling:
     num_resamples: int = 100
 
     def generator(self) -> torch.Generator:
-        """Fresh source of randomness."""
+        """A new generator with the seed."""
         return torch.Generator().manual_seed(self.seed)
 
     def interval(self, statistic: Callable[[Tensor], float], size: int) -> Ends | None:
-        """Bootstrap interval over one set of samples; None where it has fewer than two."""
+        """Bootstrap interval over one set of samples; None if it has fewer than two."""
         if size < 2 or not self.num_resamples:
             return None
         result = bootstrap_interval(

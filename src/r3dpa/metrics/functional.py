@@ -22,11 +22,7 @@ _BLOCK = 1024  # rows of a distance matrix held at once
 
 
 def checked_features(features: Tensor, name: str = "features", at_least: int = 1) -> Tensor:
-    """Features ``(N, F)`` as float64, after a check that there are ``at_least`` finite rows.
-
-    Raises:
-        ValueError: If the shape is another one, a value is NaN or infinite, or N is too small.
-    """
+    """Features ``(N, F)`` as float64; a ``ValueError`` if one is not finite or N is too small."""
     if features.ndim != 2:
         raise ValueError(f"{name}: expected (N, F), got {tuple(features.shape)}; one row a sample")
     if len(features) < at_least:
@@ -42,11 +38,7 @@ def checked_features(features: Tensor, name: str = "features", at_least: int = 1
 
 
 def checked_pair(real: Tensor, generated: Tensor, at_least: int = 1) -> tuple[Tensor, Tensor]:
-    """Both sets of features as float64, after a check that they can be compared.
-
-    Raises:
-        ValueError: As :func:`checked_features`, or if their widths differ.
-    """
+    """Both sets as :func:`checked_features`; a ``ValueError`` if their widths differ, too."""
     real = checked_features(real, "real features", at_least)
     generated = checked_features(generated, "generated features", at_least)
     if real.shape[1] != generated.shape[1]:
@@ -61,14 +53,12 @@ def checked_pair(real: Tensor, generated: Tensor, at_least: int = 1) -> tuple[Te
 class Moments:
     """Count, mean and scatter of feature vectors; two of them merge without loss of digits.
 
-    The scatter is the sum of the outer products of the deviations from the mean, never a
-    difference of two large sums::
+    The scatter is the sum of the outer products of the deviations from the mean::
 
         mean    = mean_a + (mean_b - mean_a) * n_b / n
         scatter = scatter_a + scatter_b + outer(mean_b - mean_a) * n_a * n_b / n
 
-    Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing
-    sample variances", 1979.
+    Source: Chan, Golub, LeVeque, 1979.
 
     Args:
         count: ``()`` float64, number of samples N.
@@ -89,7 +79,7 @@ class Moments:
         return cls(features.new_full((), len(features)), mean, centred.T @ centred)
 
     def merge(self, other: Self) -> Self:
-        """Moments of both sets together; either may hold no sample."""
+        """Moments of both sets together; either may be empty."""
         if self.mean.shape != other.mean.shape:
             raise ValueError(
                 f"moments of {len(self.mean)} and of {len(other.mean)} features do not merge"
@@ -125,14 +115,12 @@ def merge_packed(packed: Tensor) -> Tensor:
 def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
     """Squared Fréchet (2-Wasserstein) distance ``()`` float64 of two normal distributions.
 
-    Means are ``(F,)``, covariances ``(F, F)`` symmetric and positive semi-definite.
-    The trace of the root of a product is a sum of singular values, so nothing becomes complex and
-    singular covariances are exact::
+    Means are ``(F,)``, covariances ``(F, F)`` symmetric and positive semi-definite::
 
         |mean_a - mean_b|^2 + tr(cov_a) + tr(cov_b) - 2 * sum(svdvals(cov_a^1/2 cov_b^1/2))
 
-    The eigenvalues of ``cov_a^1/2 cov_b cov_a^1/2`` are the squares of these singular values:
-    their roots would turn a rounding error of 1e-16 into one of 1e-8 in each empty direction.
+    Singular values keep singular covariances exact: roots of the eigenvalues of
+    ``cov_a^1/2 cov_b cov_a^1/2`` would turn a rounding error of 1e-16 into one of 1e-8.
 
     Source: Dowson and Landau, 1982; as FID of Heusel et al., 2017.
 
@@ -175,8 +163,8 @@ class FDInfinity:
 
     Args:
         value: Intercept of the line through the distances over 1/N; may be slightly negative.
-        standard_error: Of the intercept, from the scatter around the line. The subsets overlap,
-            so this is a lower limit of the true error.
+        standard_error: Of the intercept, from the scatter around the line; too low, since the
+            subsets overlap.
         sizes: Samples N of each set behind each distance.
         distances: Fréchet distances.
     """
@@ -192,9 +180,8 @@ def fd_infinity(
 ) -> FDInfinity:
     """Fréchet distance of ``(N, F)`` and ``(M, F)`` features, extrapolated to infinitely many.
 
-    The distance of N samples is too large by about c / N. Both sets are subsampled without
-    replacement at equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all
-    of it, and a line over 1/N gives the intercept.
+    The distance of N samples is too large by about c / N. A line is fitted over 1/N to subsets of
+    equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all of it.
 
     Source: Chong and Forsyth, "Effectively unbiased FID and Inception score", CVPR 2020.
 
@@ -231,9 +218,8 @@ def fd_infinity(
 def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
     """Unbiased squared maximum mean discrepancy under ``(x . y / F + 1) ** degree``.
 
-    Takes ``(N, F)`` and ``(M, F)`` with at least 2 rows each, returns ``()`` float64.
-    Pairs of a sample with itself are left out, so the mean over samples of one distribution is
-    zero and single values may be negative.
+    Takes ``(N, F)`` and ``(M, F)`` with at least 2 rows each, returns ``()`` float64, which may be
+    negative: pairs of a sample with itself are left out.
 
     Source: Gretton et al., JMLR 2012, eq. 3; kernel of Binkowski et al. (KID), ICLR 2018.
     """
@@ -258,9 +244,8 @@ def polynomial_mmd(
 ) -> tuple[float, float]:
     """Kernel distance (KID): mean and deviation of :func:`squared_mmd` over random subsets.
 
-    Subsets of ``subset_size`` rows are drawn without replacement from ``(N, F)`` and ``(M, F)``.
-    The standard error of the mean is below the deviation, but not ``std / sqrt(num_subsets)``,
-    since subsets overlap.
+    Subsets of ``subset_size`` rows are drawn without replacement from ``(N, F)`` and ``(M, F)``;
+    as they overlap, the standard error of the mean is above ``std / sqrt(num_subsets)``.
 
     Raises:
         ValueError: If a set is smaller than a subset.
@@ -282,14 +267,9 @@ def polynomial_mmd(
 
 
 def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
-    """Earth mover's distance of ``(N,)`` and ``(M,)`` numbers, in their unit.
+    """Earth mover's distance of ``(N,)`` and ``(M,)`` numbers, in their unit; exact.
 
-    Exact for sets of unequal size: the area between the two quantile functions, which are steps,
-    is summed between all places where one of them steps. For counts in bins there is
-    :func:`wasserstein_1`.
-
-    Raises:
-        ValueError: If a set is empty or holds NaN or infinity.
+    It is the area between the two quantile functions. NaN or an empty set is a ``ValueError``.
     """
     a = checked_features(values_a.reshape(-1, 1), "values_a")[:, 0].sort().values
     b = checked_features(values_b.reshape(-1, 1), "values_b")[:, 0].sort().values
@@ -317,12 +297,10 @@ def wasserstein_1(
 
 
 def jensen_shannon(counts_a: NDArray[np.float64], counts_b: NDArray[np.float64]) -> float:
-    """Jensen-Shannon divergence of two normalised histograms, in nats.
+    """Jensen-Shannon divergence of two normalised histograms of any shape, in nats.
 
-    ``(KL(a | m) + KL(b | m)) / 2`` with ``m = (a + b) / 2`` and natural logarithms: 0 for equal
-    histograms, ln 2 = 0.693 for disjoint ones. Not its square root.
-
-    The counts may have any shape; NaN where a histogram is empty.
+    ``(KL(a | m) + KL(b | m)) / 2`` with ``m = (a + b) / 2``: 0 for equal histograms, ln 2 = 0.693
+    for disjoint ones, NaN if one is empty.
     """
     if counts_a.sum() == 0 or counts_b.sum() == 0:
         return float("nan")
@@ -332,22 +310,19 @@ def jensen_shannon(counts_a: NDArray[np.float64], counts_b: NDArray[np.float64])
 
 
 def curve_rmse(curve_a: NDArray[np.float64], curve_b: NDArray[np.float64]) -> float:
-    """Root mean square difference of two curves over the bins that both know.
-
-    Unknown values are NaN, and so is the result where no bin is known in both.
-    """
+    """Root mean square difference of two curves over the bins that are not NaN in either."""
     both = np.isfinite(curve_a) & np.isfinite(curve_b)
     return float(np.sqrt(np.mean((curve_a[both] - curve_b[both]) ** 2))) if both.any() else np.nan
 
 
 @dataclass(frozen=True)
 class PRDC:
-    """How much of each set the other one covers.
+    """Overlap of two sets of samples.
 
-    ``precision`` is the share of generated samples inside the ball of some real sample, ``recall``
-    that of real samples inside the ball of some generated sample, ``density`` the real balls
-    around a generated sample, on average, divided by k (may exceed 1), and ``coverage`` the share
-    of real samples whose ball holds a generated sample.
+    ``precision`` is the share of generated samples inside the ball of a real one, ``recall`` that
+    of real samples inside the ball of a generated one, ``density`` the mean number of real balls
+    around a generated sample divided by k (may exceed 1), and ``coverage`` the share of real
+    samples whose ball holds a generated sample.
     """
 
     precision: float
@@ -358,7 +333,7 @@ class PRDC:
 
 @dataclass(frozen=True)
 class SharedBalls:
-    """Sample by sample, whether the balls of the other set hold it; means of this are PRDC.
+    """Membership of each sample in the balls of the other set; PRDC are its means.
 
     ``in_real`` ``(M,)`` int64 counts the real balls that a generated sample is in, ``recalled``
     ``(N,)`` bool says whether a real sample is in a generated ball, and ``covered`` ``(N,)`` bool
@@ -402,9 +377,9 @@ def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) ->
 
 
 def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> SharedBalls:
-    """Which samples lie in the balls of the other set, each up to the k-th neighbour in its own.
+    """Samples in the balls of the other set; a ball reaches to the k-th neighbour in its own set.
 
-    A sample on the edge of a ball is outside. Distances are held 1024 rows at a time.
+    A sample on the edge of a ball is outside.
 
     Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
     Arguments and errors are those of :func:`precision_recall`.

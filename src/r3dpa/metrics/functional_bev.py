@@ -1,6 +1,5 @@
-"""Distances between sets of point clouds seen from above: histograms and matching of cells.
+"""Distances between sets of point clouds as occupied cells of a bird's-eye view.
 
-A cloud is the set of cells of a bird's-eye view that hold a point; nothing else of it counts.
 Letters: P points, R references, S samples.
 """
 
@@ -69,11 +68,8 @@ class BEVGrid:
     def cells(self, points: Tensor, name: str = "cloud") -> Tensor:
         """Cells ``(n,)`` int64 that hold a point, ``x index * columns + y index``, ascending.
 
-        Index 0 is that of the lower limit. The division is done in the precision of the points,
-        as in the official code: another one moves points on the border of two cells.
-
-        Raises:
-            ValueError: As :meth:`kept`.
+        Index 0 is at the lower limit. The division has the precision of the points, as in the
+        official code, which decides on points between two cells. Errors are those of :meth:`kept`.
         """
         inside = self.kept(points, name)[:, :2]
         # A tensor, not a number: division by a number may become a product with its inverse.
@@ -85,7 +81,7 @@ class BEVGrid:
         return (row * columns + column).unique()
 
     def histogram(self, clouds: Iterable[Tensor]) -> Tensor:
-        """How many clouds occupy each cell: ``shape`` int64."""
+        """Number of clouds that occupy each cell: ``shape`` int64."""
         counts = torch.zeros(math.prod(self.shape), dtype=torch.int64)
         for index, points in enumerate(clouds):
             counts[self.cells(points, f"cloud {index}").cpu()] += 1
@@ -145,16 +141,10 @@ def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
 
 
 def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
-    """Chamfer distance of two clouds, square metres: the published "CD".
+    """Chamfer distance of two clouds ``(P, 3 or more)``, square metres: the published "CD".
 
     Mean squared distance to the nearest point of the other cloud, averaged over both directions.
-
-    Args:
-        points_a: ``(P, 3 or more)`` x, y, z in metres; further columns do not count.
-        points_b: ``(Q, 3 or more)``.
-
-    Raises:
-        ValueError: If a cloud is empty or holds NaN.
+    An empty cloud or NaN is a ``ValueError``.
     """
     a, b = (
         _checked_points(points, name)[:, :3].double().cpu().numpy()
@@ -169,8 +159,8 @@ class Matching:
     """The nearest sample of each reference.
 
     ``squared_normalised`` ``(R,)`` float64 is the squared Chamfer distance in units of the squared
-    width of the grid, ``nearest`` ``(R,)`` int64 the index of the sample, and ``num_compared``
-    counts the pairs of the R * S whose second direction had to be computed.
+    width of the grid, ``nearest`` ``(R,)`` int64 the index of the sample, and ``num_compared`` the
+    number of pairs whose second direction was computed.
     """
 
     squared_normalised: Tensor
@@ -188,16 +178,13 @@ def minimum_matching(
 ) -> Matching:
     """Smallest Chamfer distance from each reference to any sample, on occupied cells.
 
-    Clouds are vectors of :meth:`BEVGrid.cells` on one square grid; as many threads as PyTorch uses
-    share the work.
+    Clouds are vectors of :meth:`BEVGrid.cells` on one square grid. The distance of two is
+    ``(mean_x min_y |x - y|^2 + mean_y min_x |x - y|^2) / 2`` over the indices of their cells
+    divided by the cells along a side: squared, without a unit.
 
-    The distance of two clouds is ``(mean_x min_y |x - y|^2 + mean_y min_x |x - y|^2) / 2`` over
-    the indices of their cells divided by the cells along a side. It is squared and has no unit.
-
-    Exact, and equal to comparing all cells with all: squared distances between cells are integers,
-    and a distance transform tells that of *every* cell of the grid to a cloud, so that a cloud is
-    transformed once and then only looked up. The second direction is looked up in order of the
-    first, until the first alone exceeds the best sum.
+    Exact: a distance transform of a cloud has the squared distance, an integer, of every cell of
+    the grid to it. The second direction is looked up in order of the first, until the first alone
+    exceeds the best sum. The work is shared by as many threads as PyTorch uses.
 
     Source: Achlioptas et al., ICML 2018; in this form LiDM, CVPR 2024.
 

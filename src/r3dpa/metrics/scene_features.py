@@ -11,7 +11,7 @@ name      features                                        width     weights
 ``fgeo``  ``geometric``, mean over points                 64        needs none
 ========  ==============================================  ========  ==========================
 
-Distances in the last two have no published numbers; they need no download.
+Distances in the last two have no published numbers.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ class SceneFeatures:
         name: One of :data:`SPACES`.
         label: Head of the column in tables.
         dim: Width F of the features.
-        card: What they are made with: ``backbone``, ``layer``, ``weights`` (SHA-256, or None
-            without weights) and ``preprocessing``.
+        card: ``backbone``, ``layer``, ``weights`` (SHA-256 or None) and ``preprocessing``.
         extract: Features ``(B, F)`` of scenes that :func:`through_sensor` made.
     """
 
@@ -65,13 +64,10 @@ class SceneFeatures:
 
     @torch.inference_mode()
     def __call__(self, scenes: Sequence[EvaluationScene]) -> Tensor:
-        """Features ``(B, F)`` float32 on the CPU.
-
-        Args:
-            scenes: As :func:`through_sensor` makes them, at least one.
+        """Features ``(B, F)`` float32 on the CPU of one or more scenes of :func:`through_sensor`.
 
         Raises:
-            ValueError: If a feature is NaN or infinite; the message names the scene.
+            ValueError: If a feature is NaN or infinite; names the scene.
         """
         # GPUs round the factors of a convolution to 10 bits (TF32) unless told not to.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
