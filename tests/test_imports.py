@@ -1,8 +1,9 @@
-"""The import rule: an area imports only the areas listed for it."""
+"""The import rule: an area imports only the areas listed for it, and no import closes a circle."""
 
 from __future__ import annotations
 
 import ast
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -66,10 +67,32 @@ def modules() -> dict[str, Path]:
     return {name.removesuffix(".__init__"): path for name, path in paths.items()}
 
 
+def graph() -> dict[str, set[str]]:
+    """Modules that each module imports; a name of a module is an import of that module."""
+    known = modules()
+    edges = {}
+    for name, path in known.items():
+        targets = {
+            target if target in known else target.rpartition(".")[0]
+            for target in imported(path.read_text())
+        }
+        edges[name] = targets & set(known) - {name}
+    return edges
+
+
 @pytest.mark.parametrize("name", sorted(modules()))
 def test_area_imports_only_what_it_may(name):
     if name != "r3dpa":
         assert not violations(modules()[name].read_text(), name.split(".")[1])
+
+
+def test_no_import_closes_a_circle():
+    edges = graph()
+    edges["r3dpa"] = set()  # its names are loaded on first use
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
 @pytest.mark.parametrize(
