@@ -9,7 +9,9 @@ import json
 
 import numpy as np
 import pytest
+from tiny_networks import SIT_ARGS, VAE_ARGS, tiny_networks
 
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
@@ -65,16 +67,6 @@ def refused(smoke_args, tmp_path):
         return str(caught.value)
 
     return run
-
-
-@pytest.fixture(scope="module")
-def flow_checkpoint(smoke_args, vae_checkpoint, tmp_path_factory):
-    """Checkpoint of the flow-matching stage, which has no discriminator."""
-    run_dir = tmp_path_factory.mktemp("flow_matching")
-    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
-    more += ["--model.init_args.init_from", str(vae_checkpoint)]
-    main(smoke_args("flow_matching", run_dir, *more))
-    return run_dir / "checkpoints" / "last.ckpt"
 
 
 BROKEN = {
@@ -142,70 +134,51 @@ class TestFeatureGrids:
         assert "grid_size [4, 16]" in message
         assert str(tmp_path / "grids") in message
 
-    def test_alignment_without_a_feature_source(self, folder, refused):
-        message = refused("joint", *data_args(folder), "--data.init_args.extractor=null")
-        assert "joint aligns with 3D features, but the data module has none" in message
+
+@pytest.mark.parametrize(
+    ("option", "named"),
+    [
+        ("--model.init_args.sit.init_args.dpeth=3", "dpeth"),
+        ("--trainer.max_stepz=3", "max_stepz"),
+        ("data: {init_args: {bacth_size: 3}}", "bacth_size"),
+        ("optimiser: {lr: 3}", "optimiser"),
+        ("--data.init_args.batch_size=many", "batch_size"),
+        ("--config=conf/nothing.yaml", "conf/nothing.yaml"),
+    ],
+)
+def test_an_option_or_key_that_cannot_be_is_named(option, named, tmp_path, refused, capsys):
+    if not option.startswith("--"):
+        (tmp_path / "extra.yaml").write_text(option)
+        option = f"--config={tmp_path / 'extra.yaml'}"
+    assert refused("joint", option, error=SystemExit) == "2"
+    assert named in capsys.readouterr().err.split("error:")[-1]
 
 
-class TestConfig:
-    @pytest.mark.parametrize(
-        ("option", "unknown"),
-        [
-            ("--model.init_args.sit.init_args.dpeth=3", "dpeth"),
-            ("--model.init_args.wieghts.kl=0", "wieghts"),
-            ("--data.init_args.bacth_size=3", "bacth_size"),
-            ("--trainer.max_stepz=3", "max_stepz"),
-        ],
-    )
-    def test_unknown_option_is_named(self, option, unknown, refused, capsys):
-        assert refused("joint", option, error=SystemExit) == "2"
-        assert unknown in capsys.readouterr().err.split("error:")[-1]
-
-    @pytest.mark.parametrize(
-        ("text", "unknown"),
-        [
-            ("trainer: {max_stepz: 3}", "max_stepz"),
-            ("data: {init_args: {bacth_size: 3}}", "bacth_size"),
-            ("model: {init_args: {wieghts: {kl: 0}}}", "wieghts"),
-            ("optimiser: {lr: 3}", "optimiser"),
-        ],
-    )
-    def test_unknown_key_of_a_file_is_named(self, text, unknown, tmp_path, refused, capsys):
-        (tmp_path / "extra.yaml").write_text(text)
-        assert refused("joint", "--config", tmp_path / "extra.yaml", error=SystemExit) == "2"
-        assert unknown in capsys.readouterr().err.split("error:")[-1]
-
-    def test_value_of_another_type(self, refused, capsys):
-        assert refused("joint", "--data.init_args.batch_size=many", error=SystemExit) == "2"
-        message = capsys.readouterr().err.split("error:")[-1]
-        assert "batch_size" in message
-        assert "many" in message
-
-    def test_missing_config_file_is_named(self, refused, capsys):
-        assert refused("joint", "--config", "conf/nothing.yaml", error=SystemExit) == "2"
-        assert "conf/nothing.yaml" in capsys.readouterr().err.split("error:")[-1]
-
-
-class TestSizes:
-    def test_latent_size_that_does_not_fit_the_sensor(self, folder, refused):
-        size = "--model.init_args.sit.init_args.input_size=[4, 8]"
-        message = refused("joint", *data_args(folder), size)
-        assert "(16, 64) range image gives (4, 16) latents" in message
-        assert "sit.input_size is (4, 8); set sit.input_size to (4, 16)" in message
-
-    def test_grid_size_that_does_not_fit_the_tokens(self, folder, refused):
-        message = refused("joint", *data_args(folder), "--data.init_args.grid_size=[4, 16]")
-        assert "feature grids are (4, 16), but the SiT has (2, 8) tokens" in message
-
-    def test_feature_width_that_does_not_fit_the_projector(self, folder, refused):
-        width = "--model.init_args.sit.init_args.feature_dim=20"
-        message = refused("joint", *data_args(folder), width)
-        assert "features have width 16, but sit.feature_dim is 20" in message
-
-    def test_latent_channels_that_differ(self, folder, refused):
-        channels = "--model.init_args.sit.init_args.in_channels=8"
-        message = refused("joint", *data_args(folder), channels)
-        assert "sit.in_channels is 8, but the VAE has 4 latent channels" in message
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("data.init_args.extractor=null", "joint aligns with 3D features, but the data module has"),
+        (
+            "model.init_args.sit.init_args.input_size=[4, 8]",
+            "(16, 64) range image gives (4, 16) latents, but sit.input_size is (4, 8); "
+            "set sit.input_size to (4, 16)",
+        ),
+        (
+            "data.init_args.grid_size=[4, 16]",
+            "feature grids are (4, 16), but the SiT has (2, 8) tokens",
+        ),
+        (
+            "model.init_args.sit.init_args.feature_dim=20",
+            "features have width 16, but sit.feature_dim is 20",
+        ),
+        (
+            "model.init_args.sit.init_args.in_channels=8",
+            "sit.in_channels is 8, but the VAE has 4 latent channels",
+        ),
+    ],
+)
+def test_networks_and_data_that_do_not_fit(option, message, folder, refused):
+    assert message in refused("joint", *data_args(folder), f"--{option}")
 
 
 class TestCheckpoints:
@@ -241,9 +214,17 @@ class TestCheckpoints:
         assert str(path) in message
         assert "damaged" in message
 
-    def test_joint_stage_from_a_checkpoint_without_discriminator(self, flow_checkpoint, refused):
-        message = refused("joint", "--model.init_args.init_from", flow_checkpoint)
-        assert str(flow_checkpoint) in message
+    def test_joint_stage_from_a_checkpoint_without_discriminator(self, refused, tmp_path):
+        networks = zip(
+            ("vae", "sit", "latent_norm"),
+            tiny_networks(),
+            (VAE_ARGS, SIT_ARGS, {"channels": 4}),
+            strict=True,
+        )
+        states = {name: NetworkState.of(network, args) for name, network, args in networks}
+        flow = save_checkpoint(Checkpoint(tmp_path, "flow_matching", states), tmp_path / "flow")
+        message = refused("joint", "--model.init_args.init_from", flow)
+        assert str(flow) in message
         assert "stage 'flow_matching' and has no discriminator" in message
         assert "joint needs: vae, discriminator, sit, latent_norm" in message
 
@@ -266,18 +247,14 @@ class TestCheckpoints:
         assert "give model.init_from a checkpoint of stage vae_alignment or joint" in message
 
 
-class TestGeometry:
+@pytest.mark.parametrize(
+    ("stage", "option"),
+    [("vae_alignment", "--ckpt_path"), ("joint", "--model.init_args.init_from")],
+)
+def test_range_images_of_another_encoding(stage, option, vae_checkpoint, refused):
     """A checkpoint knows the range images it was trained on."""
-
-    OTHER = "--data.init_args.codec={encoding: log2}"
-
-    def test_resume_with_another_encoding(self, vae_checkpoint, refused):
-        message = refused("vae_alignment", self.OTHER, "--ckpt_path", vae_checkpoint)
-        assert "encoding='linear'" in message
-        assert "encoding='log2'" in message
-
-    def test_next_stage_with_another_encoding(self, vae_checkpoint, refused):
-        message = refused("joint", self.OTHER, "--model.init_args.init_from", vae_checkpoint)
-        assert str(vae_checkpoint) in message
-        assert "encoding='linear'" in message
-        assert "encoding='log2'" in message
+    other = "--data.init_args.codec={encoding: log2}"
+    message = refused(stage, other, option, vae_checkpoint)
+    assert "encoding='linear'" in message
+    assert "encoding='log2'" in message
+    assert stage == "vae_alignment" or str(vae_checkpoint) in message

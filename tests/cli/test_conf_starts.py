@@ -1,6 +1,6 @@
-"""``r3dpa fit --trainer.fast_dev_run`` starts with every YAML under ``conf``.
+"""Every YAML under ``conf`` is used: a stage starts with it, or its network is built.
 
-Networks and images have their own sizes in the slow tests, but for the depth of the largest SiTs.
+Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
 from __future__ import annotations
@@ -18,34 +18,39 @@ from safetensors.torch import save_file
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.nn import VAE, ImageVAE, LatentNorm, SiT
+from r3dpa.nn import VAE, ImageVAE, LatentNorm, SiT, UNet
 from r3dpa.nn.backbones import DINOv2
+from r3dpa.simulation import simulate
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 ELSEWHERE = {  # and the test that starts them
     "data/dead_leaves": "test_rgb_stages",
+    "data/images": "test_rgb_stages",
+    "data/points": "test_stage_cli",
     "experiment/image_vae": "test_rgb_stages",
+    "experiment/rgb_pretraining": "test_rgb_stages",
     "experiment/rgb_pretraining_demo": "test_rgb_stages",
+    "experiment/waffleiron_s": "test_stage_cli",
+    "launch/nodes": "test_documented_commands, and test_nodes",
+    "net/discriminator": "vae_alignment and joint",
+    "net/discriminator_demo": "vae_alignment_demo and joint_demo",
     "net/image_vae_demo": "test_rgb_stages",
-    "net/sit_rgb_demo": "test_rgb_stages",
     **{
         path.relative_to(CONF).with_suffix("").as_posix(): "test_ablate"
         for path in CONF.glob("ablation/*/*.yaml")
     },
 }
 EXPERIMENTS = ("vae_alignment", "joint", "flow_matching")
-SCANS = ("demo", "demo_folder", "folder", "kitti360", "simulated")
-VAES = sorted(path.stem for path in CONF.glob("net/vae_h*.yaml"))
-SITS = ("sit_b2",)
-UNETS = ("unet_lidm", "unet_small")
-STARTED = {
-    *("smoke", "trainer", "trainer_demo", "launch/nodes", "data/images", "data/points"),
-    *("experiment/waffleiron_s", "experiment/rgb_pretraining", "net/sd_vae", "net/sit_rgb_b2"),
-    *("net/discriminator", "net/discriminator_demo", "net/vae_demo", "net/sit_demo"),
-    *("net/unet_demo", *(f"net/{name}" for name in (*VAES, *SITS, *UNETS))),
-    *(f"data/{name}" for name in SCANS),
-    *(f"experiment/{name}{size}" for name in EXPERIMENTS for size in ("", "_demo")),
+STARTS = {
+    "vae_alignment": "kitti360",
+    "joint": "folder",
+    "flow_matching": "simulated",
+    "vae_alignment_demo": "demo",
+    "joint_demo": "demo_folder",
+    "flow_matching_demo": "demo",
 }
+VAES = sorted(path.stem for path in CONF.glob("net/vae_*.yaml"))
+VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {
     "trainer.accelerator": "cpu",
     "trainer.devices": 1,
@@ -64,8 +69,12 @@ pytestmark = pytest.mark.filterwarnings(*WARNINGS)
 
 def test_no_file_is_left_out():
     files = {path.relative_to(CONF).with_suffix("").as_posix() for path in CONF.rglob("*.yaml")}
-    assert files == STARTED | set(ELSEWHERE)
-    assert not STARTED & set(ELSEWHERE)
+    started = {"smoke", "trainer", "trainer_demo", "net/sd_vae"}
+    started |= {f"experiment/{name}" for name in STARTS}
+    started |= {f"data/{name}" for name in STARTS.values()}
+    started |= {f"net/{name}" for name in (*VAES, *VELOCITIES)}
+    assert files == started | set(ELSEWHERE)
+    assert not started & set(ELSEWHERE)
 
 
 def words_of(configs, settings, run_dir):
@@ -114,13 +123,68 @@ def start_flow(folder, vae, size):
     return {"model.init_args.init_from": vae_file(folder, vae, size)}
 
 
-@pytest.mark.parametrize("stage", EXPERIMENTS)
-def test_experiments_with_tiny_networks(stage, start, smoke_root, tmp_path):
-    settings = SIMULATED | {"data.init_args.root": smoke_root}
+@pytest.mark.parametrize(("experiment", "data"), STARTS.items())
+def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp_path):
+    """Each with other data, all of which are the scans of the smoke size here."""
+    simulate(smoke_root, 12)  # unless they are there
+    stage = experiment.removesuffix("_demo")
+    configs = ["trainer", f"experiment/{stage}", "smoke", f"data/{data}"]
+    if stage != experiment:
+        configs[1:2] = ["trainer_demo", f"experiment/{stage}", f"experiment/{experiment}"]
+    settings = {
+        f"data.init_args.{'scans' if 'folder' in data else 'root'}": smoke_root,
+        "data.init_args.sensor": "{beams: 16, columns: 64}",
+        "data.init_args.grid_size": "[2, 8]",
+        "data.init_args.extractor": f"{{class_path: {GEOMETRIC}, init_args: {{dim: 16}}}}",
+    }
+    if data in ("demo", "simulated"):
+        settings |= SIMULATED
     if stage == "flow_matching":
         vae = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["vae"]
         settings |= start_flow(tmp_path, vae["init_args"], (16, 64))
-    start(("trainer", f"experiment/{stage}", "smoke"), settings)
+    start(configs, settings)
+
+
+def test_demo_grids_are_the_tokens_and_features_come_from_shipped_weights():
+    for data in set(STARTS.values()):
+        settings = yaml.safe_load((CONF / f"data/{data}.yaml").read_text())["data"]["init_args"]
+        assert settings["extractor"]["class_path"].endswith("WaffleIronS")
+        sit = net("sit_demo" if "demo" in data else "sit_b2")
+        assert settings["grid_size"] == [size // sit["patch_size"] for size in sit["input_size"]]
+
+
+def test_cells_of_the_point_teacher_fill_its_grid():
+    data, stage = (
+        yaml.safe_load((CONF / name).read_text())
+        for name in ("data/points.yaml", "experiment/waffleiron_s.yaml")
+    )
+    network = stage["model"]["init_args"]["network"]["init_args"]
+    grid = data["data"]["init_args"]["prepare"]["init_args"]["grid"]
+    extent = [hi - lo for lo, hi in zip(grid["minimum_m"], grid["maximum_m"], strict=True)]
+    assert network["cells"] == [round(length / grid["cell_m"]) for length in extent]
+
+
+@pytest.mark.parametrize("name", [*VAES, "sd_vae"])
+def test_autoencoders_are_built_at_their_own_size(name):
+    """On the meta device, which has shapes and no memory."""
+    image = torch.empty(1, 3, 256, 256) if name == "sd_vae" else torch.empty(1, 1, 64, 1024)
+    with torch.device("meta"):
+        network = (ImageVAE if name == "sd_vae" else VAE)(**net(name))
+        latents = network.encode(image.to("meta")).mean
+        assert network.decode(latents).shape == image.shape
+    stride = (8, 8) if name == "sd_vae" else network.stride
+    sides = [side // s for side, s in zip(image.shape[2:], stride, strict=True)]
+    assert list(latents.shape[1:]) == [net(name)["latent_channels"], *sides]
+
+
+@pytest.mark.parametrize("name", VELOCITIES)
+def test_velocity_networks_are_built_at_their_own_size(name):
+    with torch.device("meta"):
+        network = (SiT if name.startswith("sit") else UNet)(**net(name))
+        latents = torch.empty(2, net(name)["in_channels"], *net(name)["input_size"])
+        output = network(latents, torch.empty(2))
+    assert output.velocity.shape == latents.shape
+    assert output.features.shape[2] == net(name)["feature_dim"]
 
 
 @pytest.mark.slow
@@ -129,24 +193,9 @@ def test_nodes(smoke_root, tmp_path):
     settings = SIMULATED | {"data.init_args.root": smoke_root, "trainer.num_nodes": 1}
     configs = ("trainer", "launch/nodes", "experiment/vae_alignment", "smoke")
     words = [sys.executable, "-m", "r3dpa", *words_of(configs, settings, tmp_path)]
-    told = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
-    assert "distributed_backend=gloo" in told.stderr
-
-
-@pytest.mark.parametrize("data", SCANS)
-def test_scans(data, start, smoke_root, vae_checkpoint):
-    """With the VAE alignment at smoke size, whose checkpoint comes with simulated scans."""
-    key = "scans" if "folder" in data else "root"
-    settings = {
-        f"data.init_args.{key}": smoke_root,
-        "data.init_args.sensor": "{beams: 16, columns: 64}",
-        "data.init_args.grid_size": "[2, 8]",
-        "data.init_args.extractor": f"{{class_path: {GEOMETRIC}, init_args: {{dim: 16}}}}",
-    }
-    if data in ("demo", "simulated"):
-        settings |= SIMULATED
-    start(("trainer", "experiment/vae_alignment", "smoke", f"data/{data}"), settings)
+    result = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "distributed_backend=gloo" in result.stderr
 
 
 @pytest.mark.slow
@@ -165,49 +214,30 @@ def test_demo_sizes(stage, start, smoke_root, tmp_path):
     start(("trainer", "trainer_demo", *configs), settings)
 
 
+@pytest.mark.slow
 def test_the_point_teacher(start, smoke_root):
-    source = {f"data.init_args.source.init_args.{k}": v for k, v in (("root", smoke_root),)}
-    source |= {
+    source = {
+        "data.init_args.source.init_args.root": smoke_root,
         "data.init_args.source.init_args.num_scans": 12,
         "data.init_args.source.init_args.simulation_seed": 0,
     }
     start(("trainer", "data/points", "experiment/waffleiron_s"), source)
 
 
-def full_size(smoke_root, grid_size):
-    """Settings for 64 x 1024 range images of the scans there are."""
-    return SIMULATED | {
-        "data.init_args.root": smoke_root,
-        "data.init_args.extractor": WIDE,
-        "data.init_args.features_dir": smoke_root / "wide_grids",
-        "data.init_args.grid_size": list(grid_size),
-        "trainer.callbacks": [],
-        "trainer.limit_val_batches": 0,
-    }
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", EXPERIMENTS)
 def test_experiments_at_their_own_size(stage, start, smoke_root, tmp_path):
-    settings = full_size(smoke_root, (8, 64))
+    """With 64 x 1024 range images of the scans there are."""
+    settings = SIMULATED | {
+        "data.init_args.root": smoke_root,
+        "data.init_args.extractor": WIDE,
+        "data.init_args.features_dir": smoke_root / "wide_grids",
+        "trainer.callbacks": [],
+        "trainer.limit_val_batches": 0,
+    }
     if stage == "flow_matching":
         settings |= start_flow(tmp_path, net("vae_h2p4d8"), (64, 1024))
     start(("trainer", "data/simulated", f"experiment/{stage}"), settings)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", VAES)
-def test_vaes_at_their_own_size(name, start, smoke_root):
-    stride = VAE(**net(name)).stride
-    size = [side // s for side, s in zip((64, 1024), stride, strict=True)]
-    settings = full_size(smoke_root, [side // 2 for side in size]) | {
-        "model.init_args.vae": CONF / f"net/{name}.yaml",
-        "model.init_args.sit.init_args.input_size": size,
-        "model.init_args.sit.init_args.in_channels": net(name)["latent_channels"],
-        "model.init_args.sit.init_args.hidden_size": 64,
-        "model.init_args.sit.init_args.num_heads": 2,
-    }
-    start(("trainer", "data/simulated", "experiment/vae_alignment"), settings)
 
 
 # Widths, depths and heads of DiT and SiT; millions of parameters as those papers print them, which
@@ -216,32 +246,13 @@ def test_vaes_at_their_own_size(name, start, smoke_root):
     ("width", "depth", "heads", "millions"),
     [(384, 12, 6, 33), (768, 12, 12, 130), (1024, 24, 16, 458), (1152, 28, 16, 675)],
 )
-@pytest.mark.parametrize("patch", [2, 4, 8])
-def test_a_size_is_two_overrides(width, depth, heads, millions, patch):
-    sizes = {"hidden_size": width, "depth": depth, "num_heads": heads, "patch_size": patch}
+def test_a_size_is_three_overrides(width, depth, heads, millions):
+    sizes = {"hidden_size": width, "depth": depth, "num_heads": heads}
     with torch.device("meta"):
         sit = SiT(**{**net("sit_b2"), **sizes})
     head = sum(p.numel() for p in sit.projector.parameters())
     count = sum(p.numel() for p in sit.parameters()) - head
     assert count / 1e6 == pytest.approx(millions, rel=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*SITS, *UNETS])
-def test_velocity_networks_at_their_own_size(name, start, smoke_root, tmp_path):
-    """On the latents of a narrow VAE; SiTs have one block more than they are aligned at."""
-    thin = net("vae_h2p4d8") | {"channels": 32, "num_res_blocks": 1}
-    settings = full_size(smoke_root, (8, 64)) | start_flow(tmp_path, thin, (64, 1024))
-    settings |= {f"model.init_args.vae.init_args.{key}": thin[key] for key in thin}
-    settings |= {f"data.init_args.{key}": "null" for key in ("extractor", "features_dir")}
-    settings["model.init_args.sit"] = CONF / f"net/{name}.yaml"
-    if name in SITS:
-        given = net(name)
-        settings["model.init_args.sit.init_args.depth"] = given["alignment_depth"] + 1
-        settings["data.init_args.grid_size"] = [s // given["patch_size"] for s in (16, 128)]
-    else:
-        settings["data.init_args.grid_size"] = [4, 32]
-    start(("trainer", "data/simulated", "experiment/flow_matching"), settings)
 
 
 @pytest.mark.slow

@@ -13,7 +13,14 @@ from tiny_networks import tiny_checkpoint
 from r3dpa.cli import main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
 from r3dpa.editing import SceneEditor
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, range_image
+from r3dpa.geometry import (
+    LidarSensor,
+    RangeCodec,
+    ScanGeometry,
+    SphericalProjection,
+    points_of,
+    range_image,
+)
 from r3dpa.simulation import simulate
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -31,9 +38,9 @@ def checkpoint(folder, feature_source="geometric"):
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory):
+def files(tmp_path_factory):
     """Folder with checkpoints, two simulated scans and a library of their objects."""
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("edit")
     simulate(folder / "data", 2, drives=["0000"])
     for number, path in enumerate(sorted((folder / "data").rglob("data/*.bin"))):
         (folder / f"{'ab'[number]}.bin").symlink_to(path)
@@ -46,24 +53,24 @@ def desk(tmp_path_factory):
     return folder
 
 
-def edit(desk, command, out, *more, num=2, ckpt="geometric"):
-    words = ["--ckpt", desk / f"{ckpt}.safetensors", "--out", out, "--steps", 2, "--device", "cpu"]
+def edit(files, command, out, *more, num=2, ckpt="geometric", pictures=0):
+    words = ["--ckpt", files / f"{ckpt}.safetensors", "--out", out, "--steps", 2, "--device", "cpu"]
     if command != "interpolate":
         words += ["--num", num]
-    main([command, *map(str, [*words, "--pictures", 1, *more])])
+    main([command, *map(str, [*words, "--pictures", pictures, *more])])
     return json.loads((out / "metadata.json").read_text())
 
 
-def images(desk, name="a"):
-    points = torch.from_numpy(read_scan(desk / f"{name}.bin"))
+def images(files, name="a"):
+    points = torch.from_numpy(read_scan(files / f"{name}.bin"))
     return range_image(points[:, :3], PROJECTION)[0]
 
 
 class TestFiles:
-    def test_inpaint_writes_everything_and_leaves_the_rest_of_the_scan(self, desk, tmp_path):
-        scan = ["--scan", desk / "a.bin", "--box", "-40", "40", "-20", "0"]
-        library = ["--objects", desk / "lib.safetensors", "--object", "car"]
-        about = edit(desk, "inpaint", tmp_path / "o", *scan, *library)
+    def test_inpaint_writes_everything_and_leaves_the_rest_of_the_scan(self, files, tmp_path):
+        scan = ["--scan", files / "a.bin", "--box", "-40", "40", "-20", "0"]
+        library = ["--objects", files / "lib.safetensors", "--object", "car"]
+        about = edit(files, "inpaint", tmp_path / "o", *scan, *library, pictures=1)
         names = {path.name for path in (tmp_path / "o").iterdir()}
         assert names == {
             *("range_m.npy", "bin", "range", "birds_eye", "scene_3d", "metadata.json"),
@@ -73,7 +80,7 @@ class TestFiles:
         mask = torch.from_numpy(np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0)
         assert mask.shape == (16, 64)
         assert made.shape == (2, 16, 64)
-        assert all(one[~mask].equal(images(desk)[~mask]) for one in made)
+        assert all(one[~mask].equal(images(files)[~mask]) for one in made)
         assert about["command"] == "inpaint"
         assert about["box"] == [-40, 40, -20, 0]
         assert about["object"] == "car"
@@ -85,86 +92,78 @@ class TestFiles:
         assert "inpaint 1" in page
 
         # The mask that was written is one that can be read.
-        again = ["--scan", desk / "a.bin", "--mask", tmp_path / "o" / "mask.png"]
-        edit(desk, "inpaint", tmp_path / "again", *again, *library)
+        again = ["--scan", files / "a.bin", "--mask", tmp_path / "o" / "mask.png"]
+        edit(files, "inpaint", tmp_path / "again", *again, *library)
         assert np.array_equal(np.load(tmp_path / "again" / "range_m.npy"), made.numpy())
 
     @pytest.mark.parametrize("source", [["--label", "car"], ["--features_box3d"]])
-    def test_an_object_of_another_scan_guides(self, desk, tmp_path, source):
+    def test_an_object_of_another_scan_guides(self, files, tmp_path, source):
         if source[0] == "--features_box3d":
-            points = read_scan(desk / "b.bin", SENSOR)
+            points = read_scan(files / "b.bin", SENSOR)
             near = points[np.linalg.norm(points[:, :3], axis=1) > 5][0]
             source = [*source, *map(float, near[:3]), 2, 2, 2, 30]
-        box = ["--scan", desk / "a.bin", "--box3d", 10, 0, -0.5, 4, 3, 2, 0]
-        other = next((desk / "data").rglob("data/*.bin"))
-        about = edit(
-            desk, "inpaint", tmp_path, *box, "--features_from", other.parent / "0000000001.bin"
-            if source[0] == "--label" else desk / "b.bin", *source, num=1,
-        )  # fmt: skip
+        box = ["--scan", files / "a.bin", "--box3d", 10, 0, -0.5, 4, 3, 2, 0]
+        other = max((files / "data").rglob("data/*.bin"))  # with its labels beside it
+        about = edit(files, "inpaint", tmp_path, *box, "--features_from", other, *source, num=1)
         assert about["guided"]
         assert about["cosine"]
 
-    def test_mix_of_two_halves_is_that_of_a_layout(self, desk, tmp_path):
-        sides = ["--left", desk / "a.bin", "--right", desk / "b.bin", "--split", "30"]
-        edit(desk, "mix", tmp_path / "sides", *sides)
-        layout = [30, desk / "a.bin", 210, desk / "b.bin"]
-        about = edit(desk, "mix", tmp_path / "layout", "--layout", *layout)
+    def test_mix_of_two_halves_is_that_of_a_layout(self, files, tmp_path):
+        sides = ["--left", files / "a.bin", "--right", files / "b.bin", "--split", "30"]
+        edit(files, "mix", tmp_path / "sides", *sides)
+        layout = [30, files / "a.bin", 210, files / "b.bin"]
+        about = edit(files, "mix", tmp_path / "layout", "--layout", *layout)
         made = [np.load(tmp_path / name / "range_m.npy") for name in ("sides", "layout")]
         assert np.array_equal(*made)
         assert list(about["scans"]) == ["0: a", "1: b"]
         mask = np.asarray(Image.open(tmp_path / "sides" / "mask.png"))
         assert set(np.unique(mask)) == {0, 255}
 
-    @pytest.mark.parametrize("suffix", ["bin", "ply", "npz"])
-    def test_complete_takes_any_file_and_measures_what_was_left_out(self, desk, tmp_path, suffix):
-        points = read_scan(desk / "a.bin")
+    @pytest.mark.parametrize("suffix", ["ply", "npz"])
+    def test_complete_takes_any_file_and_measures_what_was_left_out(self, files, tmp_path, suffix):
+        points = read_scan(files / "a.bin")
         path = tmp_path / f"scan.{suffix}"
-        if suffix == "npz":
-            write_npz(path, {"scan": points})
-        else:
-            {"bin": write_bin, "ply": write_ply}[suffix](path, points)
+        write_ply(path, points) if suffix == "ply" else write_npz(path, {"scan": points})
         more = ["--scan", path, "--keep_every", 2, "--sector", 170, -170]
-        about = edit(desk, "complete", tmp_path / "out", *more, num=1)
+        about = edit(files, "complete", tmp_path / "out", *more, num=1)
         made = torch.from_numpy(np.load(tmp_path / "out" / "range_m.npy"))[0]
         missing = torch.from_numpy(np.asarray(Image.open(tmp_path / "out" / "mask.png")) > 0)
         assert missing[1::2].all()
         assert missing[:, [0, 63]].all()
-        assert made[~missing].equal(images(desk)[~missing])
+        assert made[~missing].equal(images(files)[~missing])
         assert set(about["held_out"]) == {"completed", "nearest", "linear"}
         assert about["held_out"]["linear"]["mae_m"] < about["held_out"]["nearest"]["mae_m"]
 
-    def test_beams_that_are_empty_are_missing(self, desk, tmp_path):
-        range_m = images(desk)
+    def test_beams_that_are_empty_are_missing(self, files, tmp_path):
+        range_m = images(files)
         range_m[1::2] = -1
-        from r3dpa.geometry import points_of
-
         write_bin(tmp_path / "sparse.bin", points_of(range_m, PROJECTION))
-        edit(desk, "complete", tmp_path / "o", "--scan", tmp_path / "sparse.bin", "--empty_beams")
+        edit(files, "complete", tmp_path / "o", "--scan", tmp_path / "sparse.bin", "--empty_beams")
         assert (np.asarray(Image.open(tmp_path / "o" / "mask.png"))[1::2] == 255).all()
 
-    def test_another_sensor_sees_fewer_beams(self, desk, tmp_path):
-        more = ["--scan", desk / "a.bin", "--other_sensor", "[8, -25, 3]"]
-        about = edit(desk, "complete", tmp_path / "o", *more, num=1)
+    def test_another_sensor_sees_fewer_beams(self, files, tmp_path):
+        more = ["--scan", files / "a.bin", "--other_sensor", "[8, -25, 3]"]
+        about = edit(files, "complete", tmp_path / "o", *more, num=1)
         missing = np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0
         assert missing.all(axis=1).sum() == 8  # of 16 rows; its columns are ours
         assert missing.any(axis=1).sum() == 8
         assert about["other_sensor"] == [8, -25.0, 3.0]
 
-    def test_vary_and_interpolate(self, desk, tmp_path):
-        about = edit(desk, "vary", tmp_path / "v", "--scan", desk / "a.bin", "--start", 0.3)
+    def test_vary_and_interpolate(self, files, tmp_path):
+        about = edit(files, "vary", tmp_path / "v", "--scan", files / "a.bin", "--start", 0.3)
         assert about["nfe"] == 4
         assert "strength" not in about["settings"]
-        ends = ["--left", desk / "a.bin", "--right", desk / "b.bin", "--frames", 3]
-        about = edit(desk, "interpolate", tmp_path / "i", *ends)
+        ends = ["--left", files / "a.bin", "--right", files / "b.bin", "--frames", 3]
+        about = edit(files, "interpolate", tmp_path / "i", *ends)
         assert np.load(tmp_path / "i" / "range_m.npy").shape == (3, 16, 64)
         assert not (tmp_path / "i" / "mask.png").exists()
 
-    def test_a_second_edit_needs_overwrite_and_leaves_nothing_of_the_first(self, desk, tmp_path):
-        scan = ["--scan", desk / "a.bin"]
-        edit(desk, "inpaint", tmp_path, *scan, "--box", -40, 40, -20, 0)
+    def test_a_second_edit_needs_overwrite_and_leaves_nothing_of_the_first(self, files, tmp_path):
+        scan = ["--scan", files / "a.bin"]
+        edit(files, "inpaint", tmp_path, *scan, "--box", -40, 40, -20, 0)
         with pytest.raises(ValueError, match="holds scenes already"):
-            edit(desk, "vary", tmp_path, *scan)
-        edit(desk, "vary", tmp_path, *scan, "--overwrite")
+            edit(files, "vary", tmp_path, *scan)
+        edit(files, "vary", tmp_path, *scan, "--overwrite")
         assert not (tmp_path / "mask.png").exists()
 
 
@@ -179,8 +178,7 @@ REFUSED = {
     "no part": ("inpaint", [], "one of --box, --box3d and --mask"),
     "two parts": ("inpaint", ["--box", 0, 9, -9, 0, "--mask", "m.png"], "one of --box, --box3d"),
     "outside the view": (
-        "inpaint",
-        ["--box", 0, 20, 10, 20],
+        *("inpaint", ["--box", 0, 20, 10, 20]),
         "no ray meets it.*-24.1 to 2.1 degrees",
     ),
     "beyond range": (
@@ -217,18 +215,23 @@ REFUSED = {
     "device": ("vary", ["--device", "tpu"], "device 'tpu' cannot be used here"),
     "one scan": ("mix", ["--left", "a.bin", "--right", "a.bin"], "nothing to mix: .*a.bin"),
     "box of no size": (
-        "inpaint",
-        [
-            *("--mask", "m.png", "--features_from", "a.bin"),
-            "--features_box3d",
-            9,
-            0,
-            0,
-            2,
-            2,
-            -1,
-            0,
-        ],
+        *(
+            "inpaint",
+            [
+                "--mask",
+                "m.png",
+                "--features_from",
+                "a.bin",
+                "--features_box3d",
+                "9",
+                "0",
+                "0",
+                "2",
+                "2",
+                "-1",
+                "0",
+            ],
+        ),
         "a size above 0 on every axis, got .*-1",
     ),
     "start": ("vary", ["--start", 0], "start must be a time above 0"),
@@ -239,67 +242,67 @@ REFUSED = {
 
 @pytest.mark.parametrize(("command", "more", "message"), REFUSED.values(), ids=list(REFUSED))
 def test_bad_input_is_refused_before_networks_run(
-    desk, tmp_path, monkeypatch, command, more, message
+    files, tmp_path, monkeypatch, command, more, message
 ):
     picture(tmp_path / "m.png")
     picture(tmp_path / "other.png", (128, 32))
     picture(tmp_path / "empty.png", value=0)
-    files = {"lib": desk / "lib.safetensors", "a.bin": desk / "a.bin"}
-    words = [files.get(word, tmp_path / word if str(word).endswith(".png") else word)
-             for word in more]  # fmt: skip
+    places = {"lib": files / "lib.safetensors", "a.bin": files / "a.bin"}
+    places |= {name: tmp_path / name for name in ("m.png", "other.png", "empty.png")}
+    words = [places.get(word, word) for word in more]
     if command == "interpolate":
-        words += ["--left", desk / "a.bin", "--right", desk / "b.bin"]
+        words += ["--left", files / "a.bin", "--right", files / "b.bin"]
     elif command != "mix":
-        words += ["--scan", desk / "a.bin"]
+        words += ["--scan", files / "a.bin"]
     monkeypatch.setattr(SceneEditor, "encode", lambda *_: pytest.fail("a network ran"))
     with pytest.raises(ValueError, match=message):
-        edit(desk, command, tmp_path / "out", *words)
+        edit(files, command, tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
 
 
-def test_an_interrupt_ends_in_one_line_and_leaves_nothing(desk, tmp_path, monkeypatch, capsys):
+def test_an_interrupt_ends_in_one_line_and_leaves_nothing(files, tmp_path, monkeypatch, capsys):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(SceneEditor, "vary", interrupted)
     with pytest.raises(SystemExit, match="130"):
-        edit(desk, "vary", tmp_path / "out", "--scan", desk / "a.bin")
+        edit(files, "vary", tmp_path / "out", "--scan", files / "a.bin")
     error = capsys.readouterr().err
     assert error.endswith("r3dpa vary: stopped\n")
     assert not list((tmp_path / "out").rglob("*"))
     # Nothing is in the way of another edit.
-    edit(desk, "complete", tmp_path / "out", "--scan", desk / "a.bin", "--keep_every", 2)
+    edit(files, "complete", tmp_path / "out", "--scan", files / "a.bin", "--keep_every", 2)
 
 
 class TestScansAndCheckpoints:
-    def refused(self, desk, tmp_path, scan, message, ckpt="geometric", more=()):
+    def refused(self, files, tmp_path, scan, message, ckpt="geometric", more=()):
         box = ["--scan", scan, "--box", -40, 40, -20, 0, *more]
         with pytest.raises(ValueError, match=message):
-            edit(desk, "inpaint", tmp_path / "out", *box, ckpt=ckpt)
+            edit(files, "inpaint", tmp_path / "out", *box, ckpt=ckpt)
 
-    def test_a_scan_of_another_sensor(self, desk, tmp_path):
-        points = read_scan(desk / "a.bin", SENSOR)
+    def test_a_scan_of_another_sensor(self, files, tmp_path):
+        points = read_scan(files / "a.bin", SENSOR)
         level = points[points[:, 2] > -0.03 * np.linalg.norm(points[:, :3], axis=1)]
         write_bin(tmp_path / "level.bin", level)
-        self.refused(desk, tmp_path, tmp_path / "level.bin", r"level.bin: .*of the 16 beams")
+        self.refused(files, tmp_path, tmp_path / "level.bin", r"level.bin: .*of the 16 beams")
         ahead = points[points[:, 0] > np.abs(points[:, 1])]
         write_bin(tmp_path / "ahead.bin", ahead)
-        self.refused(desk, tmp_path, tmp_path / "ahead.bin", r"ahead.bin: .*of the 64 columns")
+        self.refused(files, tmp_path, tmp_path / "ahead.bin", r"ahead.bin: .*of the 64 columns")
         tilted = points[:, [2, 1, 0, 3]]
         write_bin(tmp_path / "tilted.bin", tilted)
-        self.refused(desk, tmp_path, tmp_path / "tilted.bin", r"tilted.bin: .*outside the field")
+        self.refused(files, tmp_path, tmp_path / "tilted.bin", r"tilted.bin: .*outside the field")
 
-    def test_files_that_are_no_single_scan(self, desk, tmp_path):
-        points = read_scan(desk / "a.bin")
+    def test_files_that_are_no_single_scan(self, files, tmp_path):
+        points = read_scan(files / "a.bin")
         write_npz(tmp_path / "two.npz", {"x": points, "y": points})
-        self.refused(desk, tmp_path, tmp_path / "two.npz", r"holds 2 scans \(x, y\)")
+        self.refused(files, tmp_path, tmp_path / "two.npz", r"holds 2 scans \(x, y\)")
         (tmp_path / "scan.pcd").write_bytes(b"VERSION")
-        self.refused(desk, tmp_path, tmp_path / "scan.pcd", "scan.pcd: is no scan")
-        self.refused(desk, tmp_path, tmp_path / "gone.bin", "gone.bin")
+        self.refused(files, tmp_path, tmp_path / "scan.pcd", "scan.pcd: is no scan")
+        self.refused(files, tmp_path, tmp_path / "gone.bin", "gone.bin")
 
-    def test_features_that_the_checkpoint_was_not_aligned_with(self, desk, tmp_path):
-        library = ["--objects", desk / "lib.safetensors", "--object", "car"]
+    def test_features_that_the_checkpoint_was_not_aligned_with(self, files, tmp_path):
+        library = ["--objects", files / "lib.safetensors", "--object", "car"]
         self.refused(
-            desk, tmp_path, desk / "a.bin", "'geometric'.*'waffleiron-s'", "waffleiron-s", library
+            files, tmp_path, files / "a.bin", "'geometric'.*'waffleiron-s'", "waffleiron-s", library
         )
-        self.refused(desk, tmp_path, desk / "a.bin", "without 3D features", "None", library)
+        self.refused(files, tmp_path, files / "a.bin", "without 3D features", "None", library)

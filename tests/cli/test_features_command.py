@@ -1,4 +1,7 @@
-"""``r3dpa features`` from the outside: forms of the command, interrupts, kills, many processes."""
+"""``r3dpa features`` from the outside: forms of the command, refusals, several processes.
+
+Interrupts and kills are in tests/faults.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,7 @@ import json
 import logging
 import multiprocessing
 import os
-import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ NUM = 30
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 GEOMETRIC = {"class_path": "r3dpa.nn.backbones.GeometricFeatures", "init_args": {"dim": 16}}
 QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
+OWN_DISKS = ("--trainer.num_nodes=2", "--data.init_args.prepare_data_per_node=true")
 ROW = 2 * 8 * 16 * 2  # bytes of a 2 x 8 grid, 16 float16 a cell
 
 
@@ -166,15 +168,6 @@ class TestForms:
         settings = json.loads((out / "4x16" / "settings.json").read_text())
         assert (settings["dtype"], settings["grid_size"]) == ("int8", [4, 16])
 
-    def test_scans_are_simulated_first(self, tmp_path):
-        (tmp_path / "lasers.yaml").write_text("lasers: [{vert_correction: -0.1}]")
-        arguments = {"root": str(tmp_path / "data"), "num_scans": 2, "extractor": GEOMETRIC}
-        arguments["simulation_sensor"] = str(tmp_path / "lasers.yaml")
-        block = {"class_path": "r3dpa.data.SimulatedDataModule", "init_args": arguments}
-        (tmp_path / "data.yaml").write_text(yaml.safe_dump({"data": block}))
-        features("--data", tmp_path / "data.yaml")
-        assert num_written(tmp_path / "data" / "feature_grids" / "geometric") == 2
-
     def test_scalr_by_its_checkpoint_in_the_configuration(self, data, tmp_path):
         network = WaffleIron(width=4, depth=1, head_dim=5)
         weights = {f"module.{official_name(k)}": v for k, v in network.state_dict().items()}
@@ -199,19 +192,8 @@ class TestForms:
         (["--data", "{yaml}", "--grid_sizes", "[[3, 8]]"], "grid.*3"),
         (["--data", "{yaml}", "--batch_size", "0"], "batch_size must be at least 1, got 0"),
         (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
-        (
-            [
-                "--data",
-                "{yaml}",
-                "--trainer.num_nodes=2",
-                "--data.init_args.prepare_data_per_node=true",
-            ],
-            "data.init_args.prepare_data_per_node is for disks of the nodes' own",
-        ),
-        (
-            ["--data", "{yaml}", "--out", "{yaml}/below"],
-            "cannot be written to .*give a folder",
-        ),
+        (["--data", "{yaml}", *OWN_DISKS], "prepare_data_per_node is for disks of the nodes' own"),
+        (["--data", "{yaml}", "--out", "{yaml}/below"], "cannot be written to .*give a folder"),
     ],
 )
 def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):
@@ -221,49 +203,6 @@ def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=message):
         features(*words, *out)
     assert not (tmp_path / "grids" / "2x8").exists()
-
-
-@pytest.mark.parametrize("words", [["--dtype", "int4"], ["--grid_sizes", "[[8]]"], ["--dat", "x"]])
-def test_usage_errors_name_the_option(words, data, capsys):
-    with pytest.raises(SystemExit) as stop:
-        features("--data", data, *words)
-    assert stop.value.code == 2
-    assert words[0].lstrip("-") in capsys.readouterr().err
-
-
-def test_killed_three_times_and_resumed_equals_undisturbed(data, expected, tmp_path):
-    """At random moments, after one more scan at least; no grid may be lost or damaged."""
-    draw, out = random.Random(0), data.parent / "killed"
-    words = ["--data", data, "--out", out, "--batch_size", 1]
-    counts = [0]
-    for _ in range(3):
-        process = start(tmp_path / "log", *words)
-        wait_for(lambda: num_written(out) > counts[-1], process)
-        time.sleep(draw.uniform(0, 0.02))
-        os.kill(process.pid, signal.SIGKILL)
-        process.join()
-        counts.append(num_written(out))
-    assert 0 < counts[1] < counts[2] < counts[3] < NUM
-    features(*words)
-    assert num_written(out) == NUM
-    assert rows(out) == expected
-
-
-def test_ctrl_c_keeps_what_was_made(data, expected, tmp_path):
-    out = data.parent / "interrupted"
-    words = ["--data", data, "--out", out, "--batch_size", 1]
-    process = start(tmp_path / "log", *words)
-    wait_for(lambda: num_written(out) >= 2, process)
-    os.kill(process.pid, signal.SIGINT)
-    process.join()
-    assert process.exitcode == 130
-    line = "r3dpa features: stopped; the same command continues\n"
-    log = (tmp_path / "log").read_text()
-    assert log.endswith(line)
-    assert "Traceback" not in log
-    assert 2 <= num_written(out) < NUM
-    features(*words)
-    assert rows(out) == expected
 
 
 def test_a_second_job_waits_and_then_makes_what_is_missing(data, expected, tmp_path):

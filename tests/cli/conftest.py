@@ -1,0 +1,40 @@
+"""A short training and a checkpoint of random weights, shared by the tests of all commands."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from tiny_networks import tiny_checkpoint
+
+from r3dpa.cli import main
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+
+CSV_LOGGER = {
+    "class_path": "lightning.pytorch.loggers.CSVLogger",
+    "init_args": {"save_dir": "", "name": ""},
+}
+
+
+@pytest.fixture(scope="session")
+def joint_run(smoke_args, vae_checkpoint, tmp_path_factory):
+    """Run of the joint stage whose last and averaged weights have moved apart."""
+    run_dir = tmp_path_factory.mktemp("joint")
+    more = [f"--trainer.logger={json.dumps([CSV_LOGGER])}", "--trainer.limit_val_batches=0"]
+    more += ["--model.init_args.optimizer.lr=1e-2", "--model.init_args.ema_decay=0.5"]
+    more += ["--model.init_args.init_from", str(vae_checkpoint), "--trainer.callbacks=[]"]
+    main(smoke_args("joint", run_dir, *more))
+    return run_dir
+
+
+@pytest.fixture(scope="session")
+def joint_checkpoint(joint_run):
+    return joint_run / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="session")
+def tiny_file(tmp_path_factory):
+    """Checkpoint of random weights for images of 16 x 64, without a training."""
+    projection = SphericalProjection(LidarSensor(beams=16, columns=64))
+    geometry = ScanGeometry(projection, RangeCodec(), (2, 8))
+    return tiny_checkpoint(tmp_path_factory.mktemp("tiny") / "tiny.safetensors", geometry, step=3)

@@ -1,0 +1,332 @@
+"""``r3dpa simulate``, ``check``, ``view``, ``objects`` and ``realism``."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from r3dpa.cli import main
+from r3dpa.cli.data import objects
+from r3dpa.cli.evaluate import realism
+from r3dpa.cli.view import view
+from r3dpa.data.objects import ObjectLibrary
+from r3dpa.data.scans import ScanError, read_scan, write_bin, write_npz, write_ply
+from r3dpa.nn.backbones import GeometricFeatures
+from r3dpa.simulation import Origin, Semantic, simulate
+
+CALIBRATION = "lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Four scans of two drives."""
+    root = tmp_path_factory.mktemp("simulated")
+    simulate(root, 4, drives=["0003", "0004"])
+    return root
+
+
+class TestSimulate:
+    """One small scan each; what is asked for is recorded in the manifest."""
+
+    @pytest.fixture
+    def simulate(self, tmp_path):
+        """``simulate(*words)``: manifest of a data set of one scan."""
+        calibration = tmp_path / "lasers.yaml"
+        calibration.write_text(CALIBRATION)
+        out = tmp_path / "out"
+
+        def run(*words):
+            fixed = ["--out", out, "--scans", 1, "--sensor", calibration]
+            main(["simulate", *map(str, [*fixed, *words])])
+            return json.loads((out / "simulation.json").read_text())
+
+        return run
+
+    def test_options_reach_the_manifest_and_costs_are_printed(self, simulate, capsys):
+        words = ["--return_mode", "dual", "--weather.visibility_m", 50]
+        words += ["--weather.clear_sky", "false", "--effects.range_noise", "off"]
+        manifest = simulate(*words, "--effects.soft_raydrop=on")
+        assert manifest["effects"] == {"range_noise": "off", "soft_raydrop": "on"}
+        assert manifest["sensor"]["return_mode"] == "dual"
+        assert manifest["sensor"]["lasers"]["inclination_rad"] == [0.02, -0.1]
+        weather = manifest["weather"]
+        assert (weather["visibility_m"], weather["clear_sky"]) == (50, False)
+        assert weather["rain_mm_h"] == 0
+        lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+        assert lines["range_noise"].split()[1:4] == ["0", "0", "1"]
+        assert lines["range_noise"].endswith("switched off")
+        assert lines["detection_limit"].split()[1:4] == ["1", "0", "0"]
+        assert lines["total"].endswith("100.0%")
+
+    @pytest.mark.parametrize("words", [[], ["--effects", "{range_noise: off, soft_raydrop: on}"]])
+    def test_switches_in_yaml_and_on_the_command_line(self, simulate, tmp_path, words):
+        config = tmp_path / "request.yaml"
+        config.write_text(
+            "seed: 3\ndrives: ['0003']\nweather: {rain_mm_h: 2}\n"
+            "effects: {range_noise: off, soft_raydrop: on, rolling_shutter: auto}\n"
+        )
+        manifest = simulate("--config", config, *words, "--effects.ego_occlusion", "off")
+        expected = {"ego_occlusion": "off", "range_noise": "off", "soft_raydrop": "on"}
+        assert manifest["effects"] == expected
+        assert (manifest["seed"], manifest["drives"]) == (3, ["0003"])
+        assert manifest["weather"]["rain_mm_h"] == 2
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--effects.fogg", "off"], "there is no effect 'fogg'; there are dual_return, "),
+            (["--sensor", "hdl65e"], "there is no sensor 'hdl65e': give hdl64e, "),
+            (["--weather.rain_mm_h", "-1"], "^rain_mm_h must be 0 or greater, got -1"),
+        ],
+    )
+    def test_wrong_words_are_named(self, simulate, words, message, tmp_path):
+        with pytest.raises(ValueError, match=message):
+            simulate(*words)
+        assert not (tmp_path / "out").exists()
+
+    def test_a_data_module_asks_for_the_same_before_features_are_made(self, simulate, tmp_path):
+        config = tmp_path / "data.yaml"
+        config.write_text(
+            "data: {class_path: r3dpa.data.SimulatedDataModule, init_args: {"
+            f"root: {tmp_path / 'data'}, num_scans: 2, simulation_sensor: "
+            f"{tmp_path / 'lasers.yaml'}, effects: {{range_noise: off}}, "
+            "weather: {rain_mm_h: 2}, extractor: r3dpa.nn.backbones.GeometricFeatures}}\n"
+        )
+        words = ["--scans", 2, "--effects.range_noise", "off", "--weather.rain_mm_h", 2]
+        manifest = simulate(*words)
+        main(["features", "--config", str(config)])
+        assert json.loads((tmp_path / "data" / "simulation.json").read_text()) == manifest
+        (rows,) = (tmp_path / "data" / "feature_grids" / "geometric").rglob("*.jsonl")
+        assert len(rows.read_text().splitlines()) == 2
+
+
+def check(root, capsys):
+    """Exit status, and lines, of ``r3dpa check``."""
+    capsys.readouterr()
+    status = 0
+    try:
+        main(["check", str(root)])
+    except SystemExit as stop:
+        status = stop.code
+    return status, capsys.readouterr().out.splitlines()
+
+
+def test_check_names_every_bad_scan(tmp_path, capsys):
+    (tmp_path / "lasers.yaml").write_text(CALIBRATION)
+    words = ["--scans", "3", "--drives", "0000", "0003", "--sensor", tmp_path / "lasers.yaml"]
+    main(["simulate", "--out", str(tmp_path), *map(str, words)])
+    truncated, *_, infinite = sorted(tmp_path.rglob("data/*.bin"))
+    assert "drive_0000" in str(truncated)
+    assert "drive_0003" in str(infinite)
+    status, lines = check(tmp_path, capsys)
+    assert status == 0
+    assert "3 scans in 2 drives, all usable" in lines[-1]
+    truncated.write_bytes(truncated.read_bytes()[:-3])
+    points = read_scan(infinite)
+    points[1, 2] = np.inf
+    infinite.write_bytes(points.tobytes())
+    status, lines = check(tmp_path, capsys)
+    assert status == 1
+    first, second = (line for line in lines if line.startswith("bad: "))
+    assert f"{truncated}: " in first
+    assert "not a multiple of 16" in first
+    assert f"{infinite}: " in second
+    assert "NaN or infinite" in second
+
+
+def test_check_names_missing_folders(tmp_path, capsys):
+    (tmp_path / "data_3d_raw" / "2013_05_28_drive_0000_sync").mkdir(parents=True)
+    status, lines = check(tmp_path, capsys)
+    assert status == 1
+    missing = [line for line in lines if line.startswith("missing: ")]
+    assert len(missing) == 9
+    assert missing[0].endswith("drive_0000_sync/velodyne_points/data")
+    assert missing[1].endswith("drive_0002_sync")
+    status, lines = check(tmp_path / "nowhere", capsys)
+    assert status == 1
+    assert f"missing: {tmp_path / 'nowhere'}" in lines
+
+
+class TestObjects:
+    def test_writes_a_library_and_says_what_it_holds(self, simulated, tmp_path):
+        out = tmp_path / "objects.safetensors"
+        text = objects(data=str(simulated), out=out, dim=32, device="cpu")
+        library = ObjectLibrary.load(out)
+        assert {"road", "car"} <= set(library.names)
+        assert library.source == GeometricFeatures.name
+        library.check_source("geometric", 32)
+        for name in library.names:
+            assert name in text
+        assert "4 scans" in text
+        # What is found does not depend on what else is looked for.
+        objects(data=str(simulated), out=out, classes=["car"], dim=32, device="cpu")
+        assert ObjectLibrary.load(out).feature("car").equal(library.feature("car"))
+
+    def test_what_cannot_be_made_leaves_no_file(self, simulated, tmp_path):
+        for arguments, message in (
+            ({"out": tmp_path / "objects.npz"}, r"\.safetensors file, got .*objects\.npz"),
+            ({"source": "none"}, "no feature source 'none'"),
+            ({"classes": ["tram"]}, "no class tram"),
+            ({"limit": 0}, "limit must be at least 1, got 0"),
+            ({"grid_size": (7, 64)}, "does not divide"),
+        ):
+            given = {"out": tmp_path / "a.safetensors", "dim": 32, "device": "cpu"} | arguments
+            with pytest.raises(ValueError, match=message):
+                objects(data=str(simulated), **given)
+        assert not list(tmp_path.iterdir())
+
+
+class TestRealism:
+    def test_folders_are_compared_drive_by_drive(self, simulated, tmp_path, capsys):
+        out = tmp_path / "realism.json"
+        words = ["--scans", simulated, "--reference", simulated, "--out", out]
+        main(["realism", *map(str, words)])
+        rows = json.loads(out.read_text())["rows"]
+        assert "A: 4 scans of 2 drives, 2 to 2 each" in capsys.readouterr().out
+        assert all(row["pooled"] == 0 for row in rows)
+        # Two drives: pairs (0, 0), (0, 1), (1, 0), (1, 1), so the median is half the floor.
+        assert all(row["ratio"] == pytest.approx(0.5) for row in rows if row["floor"])
+        assert rows[0]["name"] == "returns per scan"
+        assert list(tmp_path.iterdir()) == [out]
+
+    def test_a_single_drive_is_halved_and_a_single_scan_has_no_floor(self, simulated):
+        drive = next(simulated.glob("data_3d_raw/*0003*"))
+        table = realism(scans=drive, reference=drive)
+        assert "B: 2 scans of 2 drives, 1 to 1 each" in table.notes
+        assert "first half" in table.notes[-1]
+        assert any(row.within is not None for row in table.rows)
+        scan = min(drive.rglob("*.bin"))
+        table = realism(scans=scan, reference=scan)
+        assert all(math.isnan(row.floor) for row in table.rows)
+        assert "there is no floor" in str(table)
+
+    def test_a_scan_of_the_wrong_intensity_is_named(self, simulated, tmp_path):
+        write_bin(tmp_path / "raw.bin", np.float32([[10, 0, 0, 255]]))
+        with pytest.raises(ScanError, match=r"raw\.bin: intensity must lie in \[0, 1\]"):
+            realism(scans=tmp_path, reference=simulated)
+
+
+def points(num_points=200, seed=0):
+    generator = np.random.default_rng(seed)
+    scale = np.array([20, 20, 1, 0])
+    return (generator.uniform(-1, 1, (num_points, 4)) * scale).astype(np.float32)
+
+
+class TestView:
+    NAME = "2013_05_28_drive_0003_sync/0000000004"
+
+    @pytest.fixture
+    def drive(self, tmp_path) -> Path:
+        """A drive in the KITTI-360 layout with one scan, its labels and its origins."""
+        folder = tmp_path / "root/data_3d_raw/2013_05_28_drive_0003_sync/velodyne_points"
+        write_bin(folder / "data" / "0000000004.bin", points())
+        for name in ("labels", "origins"):
+            (folder / name).mkdir()
+        labels = np.full(200, int(Semantic.CAR) | 3 << 16, "<u4")
+        (folder / "labels" / "0000000004.label").write_bytes(labels.tobytes())
+        origins = np.full(200, int(Origin.RAIN), np.uint8)
+        (folder / "origins" / "0000000004.origin").write_bytes(origins.tobytes())
+        return folder
+
+    def show(self, source, out, num=8, reference=None):
+        """Printed text, and the data of the written page."""
+        text = view(source, out=out, num=num, reference=reference)
+        page = (out / "view.html").read_text("utf-8")
+        found = json.loads(re.search(r'id="page">(.*?)</script>', page, re.DOTALL)[1])
+        return text, found, [header["name"] for header in found["scans"]]
+
+    def test_writes_two_pictures_and_a_page_and_prints_their_paths(self, drive, tmp_path):
+        out = tmp_path / "new" / "out"
+        scan = drive / "data" / "0000000004.bin"
+        text, page, names = self.show(scan, out, reference=scan)
+        written = ["birds_eye.png", "range_images.png", "view.html"]
+        assert sorted(path.name for path in out.iterdir()) == written
+        for name in written:
+            assert str(out / name) in text.splitlines()
+        for name in written[:2]:
+            assert np.asarray(Image.open(out / name)).std() > 10
+        assert names == [self.NAME, f"reference: {self.NAME}"]
+        assert page["reference"] == 1
+
+    def test_labels_and_origins_beside_the_scan_are_read_and_named(self, drive, tmp_path):
+        _, page, _ = self.show(tmp_path / "root", tmp_path / "out")
+        assert {"semantic", "instance", "origin"} < set(page["scans"][0]["columns"])
+        assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]
+        assert [row[:2] for row in page["categories"]["origin"]] == [[int(Origin.RAIN), "rain"]]
+        (drive / "labels" / "0000000004.label").unlink()
+        (drive / "origins" / "0000000004.origin").unlink()
+        _, page, _ = self.show(drive, tmp_path / "without")
+        assert page["scans"][0]["columns"] == ["x", "y", "z", "intensity"]
+
+    @pytest.mark.parametrize(
+        ("path", "num_bytes", "count"),
+        [
+            ("labels/0000000004.label", 796, "199"),
+            ("labels/0000000004.label", 798, "199.5"),
+            ("origins/0000000004.origin", 0, "0"),
+        ],
+    )
+    def test_another_length_than_the_scan_names_both_files_and_counts(
+        self, drive, tmp_path, path, num_bytes, count
+    ):
+        (drive / path).write_bytes(bytes(num_bytes))
+        scan = drive / "data" / "0000000004.bin"
+        message = f"{drive / path} holds {count} numbers but {scan} 200 points"
+        with pytest.raises(ValueError, match=re.escape(message)):
+            self.show(drive, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+    def test_of_a_folder_scans_are_spread_evenly(self, tmp_path):
+        for number in range(10):
+            write_bin(tmp_path / "scans" / f"{number:03d}.bin", points(seed=number))
+        text, _, names = self.show(tmp_path / "scans", tmp_path / "out", num=4)
+        assert names == [f"scans/{number:03d}" for number in (0, 2, 5, 7)]
+        assert text.startswith("4 of 10 scans")
+
+    def test_the_default_folder_is_named_after_the_source(self, drive, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        main(["view", "root", "--num", "1"])
+        main(["data", "view", str(drive / "data" / "0000000004.bin")])
+        assert sorted(path.name for path in (tmp_path / "view").iterdir()) == ["0000000004", "root"]
+
+    def test_ply_and_npz_files_are_scans_too(self, tmp_path):
+        write_ply(tmp_path / "one.ply", points()[:, :3])
+        write_npz(tmp_path / "many.npz", {"a": points(), "b": points()[:, :3]})
+        assert self.show(tmp_path / "one.ply", tmp_path / "ply")[2] == [f"{tmp_path.name}/one"]
+        assert self.show(tmp_path / "many.npz", tmp_path / "npz")[2] == ["many/a", "many/b"]
+
+    def test_a_file_with_an_evil_name_is_harmless(self, tmp_path):
+        write_bin(tmp_path / "<script>alert(1)<&$x$.bin", points())
+        names = self.show(tmp_path, tmp_path / "out")[2]
+        assert names == [f"{tmp_path.name}/<script>alert(1)<&$x$"]
+        assert "<script>alert" not in (tmp_path / "out" / "view.html").read_text("utf-8")
+
+    def test_refuses_what_it_cannot_show(self, tmp_path):
+        (tmp_path / "notes.txt").write_text("no scan")
+        (tmp_path / "damaged.npz").write_bytes(b"")
+        np.savez(tmp_path / "counts.npz", counts=np.zeros(3))
+        np.savez(tmp_path / "empty.npz")
+        for name, num, message in (
+            ("notes.txt", 8, r"notes.txt: is no scan; give a .bin, .ply or .npz"),
+            ("absent", 8, "No scan found"),
+            ("", 0, "num must be 1 or greater, got 0"),
+            ("damaged.npz", 8, r"damaged\.npz: is no \.npz file of scans"),
+            ("counts.npz", 8, r"counts must be points .*, got shape \(3,\)"),
+            ("empty.npz", 8, r"empty\.npz: holds no scan"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                view(tmp_path / name, out=tmp_path / "out", num=num, reference=None)
+
+    @pytest.mark.data
+    def test_real_scans(self, real_scans_dir, tmp_path):
+        _, page, _ = self.show(real_scans_dir, tmp_path / "out", num=3)
+        assert len(page["scans"]) == 3
+        assert all(header["step_m"] == 0.005 for header in page["scans"])
+        size = (tmp_path / "out" / "view.html").stat().st_size
+        assert size < 0.6e6 * 3  # half a megabyte a scan, as documented

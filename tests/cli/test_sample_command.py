@@ -1,0 +1,261 @@
+"""``r3dpa sample``, ``convert`` and ``report``: what they print, write, and refuse."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from r3dpa.cli import main
+from r3dpa.cli.parser import function_parser
+from r3dpa.cli.sample import sample as sample_command
+from r3dpa.data.scans import read_npz, read_ply, read_scan
+from r3dpa.flow.solvers import ODE_SOLVERS
+from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
+from r3dpa.io import source_commit
+
+SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
+
+
+def sample(checkpoint, out, *more, pictures=0, steps=("--steps", 3)):
+    words = ["--ckpt", checkpoint, "--out", out, "--num", 3, *steps, "--pictures", pictures, *more]
+    main(["sample", *map(str, words)])
+    return json.loads((out / "metadata.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def scenes(tiny_file, tmp_path_factory):
+    out = tmp_path_factory.mktemp("scenes") / "new" / "folder"
+    sample(tiny_file, out, pictures=2)
+    return out
+
+
+def values(folder):
+    return {p.stem: read_scan(p)[:, :3] for p in sorted((folder / "bin").iterdir())}
+
+
+def assert_same_scenes(actual, expected, num=3):
+    """Up to the rounding of another batch size: 1e-5 in the latents, 1e-3 m in the points."""
+    actual, expected = values(actual), values(expected)
+    assert len(actual) == num
+    for name, points in actual.items():
+        np.testing.assert_allclose(points, expected[name], atol=1e-3, rtol=0)
+
+
+class TestSample:
+    def test_writes_every_scene(self, scenes):
+        clouds = values(scenes)
+        assert list(clouds) == ["000000", "000001", "000002"]
+        projection = SphericalProjection(SENSOR)
+        for points, range_m in zip(clouds.values(), np.load(scenes / "range_m.npy"), strict=True):
+            assert 0 < len(points) <= SENSOR.beams * SENSOR.columns
+            assert in_range(torch.from_numpy(points), SENSOR).all()
+            np.testing.assert_array_equal(points, points_of(torch.from_numpy(range_m), projection))
+        assert not np.array_equal(clouds["000000"], clouds["000001"])
+        assert {p.name for p in scenes.iterdir()} == {
+            *("bin", "range_m.npy", "range", "birds_eye", "scene_3d", "scenes.png"),
+            *("scenes.html", "metadata.json"),
+        }
+
+    def test_draws_as_many_scenes_as_asked_for(self, scenes):
+        pictures = [scenes / "scenes.png"]
+        for folder in ("range", "birds_eye", "scene_3d"):
+            pictures += sorted((scenes / folder).iterdir())
+        assert len(pictures) == 1 + 3 * 2
+        for path in pictures:
+            with Image.open(path) as picture:
+                assert min(picture.size) >= 100
+                assert len(picture.convert("RGB").getcolors(1 << 20)) > 10
+
+    def test_other_forms_on_demand_and_scenes_are_kept(self, tiny_file, scenes, tmp_path):
+        sample(tiny_file, tmp_path, "--formats", "ply,npz")
+        names = {"ply", "scenes.npz", "range_m.npy", "metadata.json"}
+        assert {p.name for p in tmp_path.iterdir()} == names
+        clouds = read_npz(tmp_path / "scenes.npz")
+        for name, points in values(scenes).items():
+            np.testing.assert_array_equal(clouds[name], points)
+            np.testing.assert_array_equal(read_ply(tmp_path / "ply" / f"{name}.ply"), points)
+        before = (tmp_path / "range_m.npy").read_bytes()
+        with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
+            sample(tiny_file, tmp_path, "--seed", 1)
+        assert (tmp_path / "range_m.npy").read_bytes() == before
+        assert sample(tiny_file, tmp_path, "--seed", 1, "--overwrite")["seed"] == 1
+        assert (tmp_path / "range_m.npy").read_bytes() != before
+
+    def test_metadata_is_enough_to_repeat_the_run(self, scenes, tiny_file):
+        metadata = json.loads((scenes / "metadata.json").read_text())
+        expected = {
+            "checkpoint": str(tiny_file),
+            "stage": "joint",
+            "step": 3,
+            "weights": "ema",
+            "num": 3,
+            "seed": 0,
+            "interpolant": "linear",
+            "nfe": 3,
+            "precision": "fp32",
+            "batch_size": 8,
+            "compile": False,
+            "formats": ["bin"],
+            "autoguidance": None,
+            "drawn_by_last_run": 3,
+            "r3dpa": "0.1.0",
+            "commit": source_commit(),
+            "torch": torch.__version__,
+        }
+        assert {key: metadata[key] for key in expected} == expected
+        assert metadata["sampler"] == {
+            "solver": "euler_maruyama",
+            "steps": 3,
+            "sde_last_time": 0.04,
+            "sde_last": "denoise",
+            "shift": 1.0,
+            "eta": 1.0,
+        }
+        assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
+        assert metadata["seconds_per_scene"] > metadata["device_seconds_per_scene"] > 0
+        assert metadata["threads"] == torch.get_num_threads()
+
+    def test_options_reach_the_sampler(self, tiny_file, tmp_path, capsys):
+        words = ["--solver", "heun", "--seed", 5, "--num", 1, "--shift", 2]
+        words += ["--precision", "bf16", "--decode_batch_size", 2]
+        metadata = sample(tiny_file, tmp_path, *words)
+        assert (metadata["sampler"]["solver"], metadata["sampler"]["shift"]) == ("heun", 2)
+        assert [metadata[key] for key in ("nfe", "seed", "num")] == [5, 5, 1]
+        assert (metadata["precision"], metadata["decode_batch_size"]) == ("bf16", 2)
+        assert ": 5 network evaluations each, " in capsys.readouterr().out
+
+    def test_every_solver_can_be_chosen(self):
+        parser = function_parser(sample_command, "sample")
+        for solver in (*ODE_SOLVERS, "euler_maruyama"):
+            parser.parse_args(["--ckpt", "a", "--out", "b", "--solver", solver])
+
+    def test_a_quality_chooses_the_sampler_and_says_so(self, tiny_file, tmp_path, capsys):
+        words = ["--num", 1, "--quality", "draft"]
+        chosen = sample(tiny_file, tmp_path / "out", *words, steps=())["sampler"]
+        assert chosen == asdict(SamplerConfig.of_quality("draft"))
+        line = f"quality draft: {chosen['solver']}, {chosen['steps']} steps, shift"
+        assert line in capsys.readouterr().out
+        with pytest.raises(ValueError, match=r"--quality draft chooses what --steps gives"):
+            sample(tiny_file, tmp_path / "out", *words)
+
+    def test_guidance_by_the_model_itself_changes_nothing(
+        self, tiny_file, scenes, tmp_path, monkeypatch
+    ):
+        """v + s (v - v) = v, for twice the evaluations; paths are kept as they are given."""
+        monkeypatch.chdir(tiny_file.parent)
+        words = ("--autoguidance", tiny_file.name, "--guidance_scale", 3)
+        metadata = sample(tiny_file.name, tmp_path, *words)
+        assert_same_scenes(tmp_path, scenes)
+        assert metadata["nfe"] == 6
+        assert metadata["autoguidance"]["scale"] == 3
+        assert metadata["autoguidance"]["interval"] == [0, 1]
+        assert metadata["checkpoint"] == metadata["autoguidance"]["checkpoint"] == tiny_file.name
+        for folder in (tiny_file.parent, tmp_path, Path.home()):
+            assert str(folder) not in (tmp_path / "metadata.json").read_text()
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--solver", "heun", "--eta", 0.5], "solver heun does not read eta"),
+            (["--shift", 2], "solver euler_maruyama does not read shift"),
+            (["--solver", "ab2", "--sde_last", "mean"], "solver ab2 does not read sde_last"),
+            (["--guidance_scale", 2], "--guidance_scale, .* need --autoguidance"),
+            (["--guidance_interval", "[0, 1]"], "--guidance_interval .* need --autoguidance"),
+            (["--allow_other_latents", "true"], "--allow_other_latents .* --autoguidance"),
+            (["--sde_last_time", 2], r"must lie in \(0, 1\), got 2"),
+            (["--num", 0], "num must be at least 1, got 0"),
+            (["--seed", -1], "seed must be at least 0, got -1"),
+            (["--pictures", -1], "pictures must be at least 0, got -1"),
+            (["--batch_size", 0], "batch_size must be at least 1, got 0"),
+        ],
+    )
+    def test_options_that_say_nothing_are_refused_and_nothing_is_touched(
+        self, words, message, tiny_file, tmp_path
+    ):
+        """Not even with --overwrite in a folder that holds scenes."""
+        (tmp_path / "metadata.json").write_text("{}")
+        (tmp_path / "range_m.npy").write_bytes(b"scenes")
+        with pytest.raises(ValueError, match=message):
+            sample(tiny_file, tmp_path, *words, "--overwrite", "true")
+        assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
+        assert len(list(tmp_path.iterdir())) == 2
+
+    def test_an_interrupted_run_goes_on(self, tiny_file, scenes, tmp_path, monkeypatch):
+        def stop(*_):
+            raise KeyboardInterrupt
+
+        words = ("--batch_size", 1)
+        with monkeypatch.context() as patch:
+            generate, calls = SceneGenerator.generate, []
+            patch.setattr(
+                SceneGenerator,
+                "generate",
+                lambda *args: stop() if len(calls) == 2 else calls.append(1) or generate(*args),
+            )
+            with pytest.raises(SystemExit) as stopped:
+                sample(tiny_file, tmp_path, *words)
+        assert stopped.value.code == 130
+        assert not (tmp_path / "metadata.json").exists()
+        with pytest.raises(ValueError, match=r"unfinished run with seed 0, not 1"):
+            sample(tiny_file, tmp_path, *words, "--seed", 1)
+        metadata = sample(tiny_file, tmp_path, *words)
+        assert_same_scenes(tmp_path, scenes)
+        assert (metadata["drawn_by_last_run"], metadata["nfe"]) == (1, 3)
+
+    def test_a_checkpoint_without_velocity_is_refused(self, vae_checkpoint, tmp_path):
+        message = r"last\.ckpt.*stage vae_alignment.*joint or flow_matching"
+        with pytest.raises(ValueError, match=message):
+            sample(vae_checkpoint, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
+def test_an_exported_training_gives_the_same_scenes(joint_checkpoint, tmp_path, capsys):
+    exported = tmp_path / "joint.safetensors"
+    exported.write_bytes(b"precious")
+    with pytest.raises(ValueError, match=r"joint\.safetensors exists already"):
+        main(["convert", str(joint_checkpoint), str(exported)])
+    assert exported.read_bytes() == b"precious"
+    main(["convert", str(joint_checkpoint), str(exported), "--overwrite"])
+    out = capsys.readouterr().out
+    for name in ("vae", "discriminator", "sit", "latent_norm", "ema", "ema_latent_norm"):
+        assert f"\n{name} " in out
+    sample(joint_checkpoint, tmp_path / "trained", "--num", 1)
+    metadata = sample(exported, tmp_path / "exported", "--num", 1)
+    assert (metadata["stage"], metadata["step"]) == ("joint", 3)
+    assert_same_scenes(tmp_path / "exported", tmp_path / "trained", num=1)
+    sample(exported, tmp_path / "last", "--num", 1, "--weights", "last")
+    average, last = (np.load(tmp_path / n / "range_m.npy") for n in ("exported", "last"))
+    assert not np.allclose(average, last, atol=1e-2)
+
+
+class TestReport:
+    def test_draws_curves_and_prints_a_table(self, joint_run, capsys):
+        main(["report", str(joint_run)])
+        out = capsys.readouterr().out
+        with Image.open(joint_run / "loss_curves.png") as picture:
+            assert min(picture.size) >= 100
+        (metrics,) = joint_run.glob("version_*/metrics.csv")
+        columns = metrics.read_text().splitlines()[0].split(",")
+        for name in (name for name in columns if name.startswith("train/")):
+            (row,) = [line for line in out.splitlines() if line.startswith(f"{name} ")]
+            first, last, change = map(float, row.split()[1:4])
+            assert last - first == pytest.approx(change, abs=1e-3 * max(1, abs(first)))
+        assert str(joint_run / "loss_curves.png") in out
+
+    def test_values_are_means_of_the_ends(self, tmp_path, capsys):
+        """20 values 20, 19, ..., 1 over two runs: first tenth 19.5, last tenth 1.5."""
+        for version, start in ((0, 20), (1, 10)):
+            rows = [f"{20 - value},{value}" for value in range(start, start - 10, -1)]
+            (tmp_path / f"version_{version}").mkdir()
+            text = "\n".join(["step,train/loss", *rows, ""])
+            (tmp_path / f"version_{version}" / "metrics.csv").write_text(text)
+        main(["report", str(tmp_path)])
+        (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("train/loss")]
+        assert row.split()[1:] == ["19.5", "1.5", "-18", "0.077"]
