@@ -8,9 +8,8 @@ import sys
 import pytest
 import torch
 import yaml
-from torch import nn
 
-from r3dpa.checkpoints import NetworkState, read_checkpoint
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
@@ -69,13 +68,7 @@ class TestCheckpoints:
             read_checkpoint(path)
         assert not (tmp_path / "imported").exists()
 
-    @pytest.mark.parametrize(
-        "name",
-        [
-            *("r3dpa.nn.os", "", 3, None, "r3dpa.nn..vae.VAE", "r3dpa.nn.vae."),
-            "r3dpa.nn.backbones.ScaLR.from_checkpoint",
-        ],
-    )
+    @pytest.mark.parametrize("name", ["", 3, None, "r3dpa.nn..vae.VAE", "r3dpa.nn.vae."])
     def test_other_names(self, name, tmp_path):
         with pytest.raises(ValueError, match=r"a\.ckpt: vae: class"):
             read_checkpoint(self.lightning(tmp_path / "a.ckpt", name))
@@ -94,11 +87,8 @@ class TestCheckpoints:
         ("class_path", "init_args"),
         [
             ("r3dpa.nn.SiT", {"depth": 10**9}),
-            ("r3dpa.nn.SiT", {"hidden_size": 2**62}),
             ("r3dpa.nn.VAE", {"num_res_blocks": 10**8}),
-            ("r3dpa.nn.VAE", {"channels": 0}),
             ("r3dpa.nn.VAE", {"channels": "many"}),
-            ("r3dpa.nn.PatchDiscriminator", {"num_layers": 10**8}),
             ("r3dpa.nn.VAE", ["no", "mapping"]),
         ],
     )
@@ -106,10 +96,3 @@ class TestCheckpoints:
         path = self.lightning(tmp_path / "a.ckpt", class_path, init_args)
         with pytest.raises(ValueError, match=r"cannot read .*a\.ckpt: vae: "):
             read_checkpoint(path)
-
-    def test_networks_still_check_after_a_refusal(self, tmp_path):
-        with pytest.raises(ValueError, match="more than 8 parameters"):
-            NetworkState("r3dpa.nn.SiT", {}, {"weight": torch.zeros(1)}).check()
-        network = nn.Sequential(*(nn.BatchNorm1d(1) for _ in range(9)))  # counted in files alone
-        with pytest.raises(ValueError, match="not allowed"):
-            NetworkState.of(network, {})

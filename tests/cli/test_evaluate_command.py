@@ -9,15 +9,12 @@ import yaml
 
 import r3dpa.cli.evaluate as command
 from r3dpa.cli import main
-from r3dpa.data.scans import write_bin, write_npz
+from r3dpa.data.scans import write_bin
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.metrics import scene as protocol
-from r3dpa.metrics.bootstrap import Resampling
-from r3dpa.metrics.evaluation import evaluate as evaluate_scenes
-from r3dpa.metrics.evaluation import reference_spaces
+from r3dpa.metrics import protocol
+from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -155,19 +152,9 @@ def test_bad_samples_stop_or_are_listed(reference_file, samples, tmp_path, capsy
         evaluate(*words)
 
 
-def images(height=16, width=64):
-    return np.full((3, 1, height, width), 10.0, np.float32)
-
-
-def one_empty():
-    values = images()
-    values[1] = -1
-    return values
-
-
-def one_nan():
-    values = images()
-    values[1, 0, 3, 5] = np.nan
+def images(height=16, width=64, second=10.0):
+    values = np.full((3, 1, height, width), 10.0, np.float32)
+    values[1] = second
     return values
 
 
@@ -175,10 +162,10 @@ def one_nan():
     ("content", "message"),
     [
         (
-            one_empty(),
+            images(second=-1),
             r"img\.npz, sample .*1.*: has no pixel within the sensor's range.*--skip_bad",
         ),
-        (one_nan(), r"img\.npz, sample .*1.*: has NaN or infinite ranges in 1 pixels.*--skip_bad"),
+        (images(second=np.nan), r"img\.npz, sample .*1.*: has NaN or infinite ranges.*--skip_bad"),
         (images(8, 8), r"img\.npz, .*: has an image of 8 x 8 pixels, but the sensor has 16 x 64"),
         (images()[:1], r"1 generated scenes; a comparison needs at least 2"),
         (images(), r"3 generated scenes for the 64 features of FGEO.*--allow_few"),
@@ -222,24 +209,6 @@ def test_official_weights_are_given_by_space(data, samples, tmp_path):
     torch.save({official_name(k): v for k, v in network.state_dict().items()}, weights)
     with pytest.raises(ValueError, match="fsvd is not that of the reference: weights"):
         evaluate(*words, "--ckpt.fsvd", weights)
-
-
-def test_generated_scenes_need_no_files(reference_file, tmp_path):
-    """The same numbers from images in memory and from a file of their points."""
-    made = [EvaluationScene(f"{i}", None, m) for i, m in enumerate(range_images(1, 10))]
-    statistics = ReferenceStatistics.load(reference_file)
-    options = {"allow_few": True, "resampling": Resampling(0, 40)}
-    spaces = reference_spaces(statistics, None, None, None, "cpu")
-    found = evaluate_scenes(made, statistics, spaces, label="memory", **options)
-    rows = {row.name: row.value for row in found.evaluation.rows}
-    write_npz(tmp_path / "made.npz", {str(i): p for i, p in enumerate(clouds(1, 10))})
-    path = tmp_path / "made.npz"
-    evaluate("--samples", path, "--reference", reference_file, "--allow_few", "--out", tmp_path)
-    stored = Evaluation.load(tmp_path / "evaluation.json")
-    assert {row.name for row in stored.rows} == set(rows)
-    for row in stored.rows:
-        if row.value is not None and not row.name.startswith("FGEO"):
-            assert row.value == pytest.approx(rows[row.name], rel=0.01), row.name
 
 
 @pytest.mark.parametrize(

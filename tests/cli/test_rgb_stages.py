@@ -169,7 +169,6 @@ def test_broken_steps_of_images_are_skipped_too(tmp_path, monkeypatch):
         ({}, "give model.init_from a checkpoint of stage image_vae"),
         ({"model.init_args.weights.sit_alignment": 0.5}, "go together"),
         ({"data.init_args.image_size": 32}, r"give \(16, 16\) latents"),
-        ({"model.init_args.sit.init_args.in_channels": 8}, "sit.in_channels is 8, but the VAE"),
     ],
 )
 def test_what_does_not_fit_is_said(settings, message, tmp_path, capsys):

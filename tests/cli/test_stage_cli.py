@@ -109,8 +109,6 @@ def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):
     assert config["model"]["init_args"]["sit"]["init_args"]["hidden_size"] == 192
     assert config["data"]["init_args"]["root"] == "runs/demo/data"
     assert (config["run_dir"], config["trainer"]["max_steps"]) == ("runs/demo/joint", 7)
-    with pytest.raises(ValueError, match=r"there is no experiment 'jointly'; give one of .*joint"):
-        main(["fit", "jointly"])
     with pytest.raises(ValueError, match=r"there is no data 'kitti'; give one of .*kitti360"):
         main(["fit", "joint", "--preset", "kitti"])
 
