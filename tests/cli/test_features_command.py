@@ -168,6 +168,7 @@ def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):
 
 
 @pytest.mark.ddp
+@pytest.mark.slow  # two more starts of the command
 def test_two_processes_write_what_one_does(data, expected):
     """Also what a process finds that begins late: the list of the first one counts."""
     out = data.parent / "two"

@@ -247,6 +247,7 @@ def flat(rows):
 
 
 @pytest.mark.ddp
+@pytest.mark.slow  # two more starts of the command
 def test_two_processes_give_the_numbers_of_one(reference, words, tmp_path):
     """Batches are the same, whoever samples them; threads, of which two processes have fewer each,
     may round sums otherwise."""
