@@ -39,10 +39,10 @@ class TestHelp:
             "print('loaded', [name for name in ('torch', 'lightning') if name in sys.modules])",
         )
         assert out.splitlines()[-1] == "loaded []"
-        names = [name for name in COMMANDS if not COMMANDS[name].own_parser and name != "replay"]
+        names = [name for name in COMMANDS if not COMMANDS[name].own_parser]
         assert all(f"{name} [" in out for name in names)
 
-    @pytest.mark.parametrize("command", ["fit", "test", "data features", "replay"])
+    @pytest.mark.parametrize("command", ["fit", "data features"])
     def test_of_stages_and_extraction(self, command, capsys):
         with pytest.raises(SystemExit) as stop:
             main([*command.split(), "--help"])

@@ -12,9 +12,8 @@ import pytest
 from PIL import Image
 
 from r3dpa.cli import main
-from r3dpa.cli.data import objects
+from r3dpa.cli.data import objects, view
 from r3dpa.cli.evaluate import realism
-from r3dpa.cli.view import view
 from r3dpa.data.objects import ObjectLibrary
 from r3dpa.data.scans import ScanError, read_scan, write_bin, write_npz, write_ply
 from r3dpa.nn.backbones import GeometricFeatures
@@ -302,8 +301,8 @@ class TestView:
         for name, num, message in (
             ("notes.txt", 8, r"notes.txt: is no scan; give a .bin, .ply or .npz"),
             ("absent", 8, "No scan found"),
-            ("", 0, "num must be 1 or greater, got 0"),
-            ("damaged.npz", 8, r"damaged\.npz: is no \.npz file of scans"),
+            ("", 0, "num must be at least 1, got 0"),
+            ("damaged.npz", 8, r"damaged\.npz: is damaged or no \.npz file of scans"),
             ("counts.npz", 8, r"counts must be points .*, got shape \(3,\)"),
             ("empty.npz", 8, r"empty\.npz: holds no scan"),
         ):

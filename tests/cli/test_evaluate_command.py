@@ -11,10 +11,10 @@ import r3dpa.cli.evaluate as command
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.metrics import protocol
-from r3dpa.metrics.protocol import DEFAULT, PUBLISHED
+from r3dpa.metrics import scene as protocol
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 
 SENSOR = LidarSensor(beams=16, columns=64)
