@@ -228,7 +228,7 @@ def complete(
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
         beams: Rows of the range image to keep, such as ``0 4 8``.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
-        other_sensor: Keep what so many beams between two inclinations see, such as ``32 -25 3``.
+        other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
