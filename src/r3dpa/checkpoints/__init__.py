@@ -1,19 +1,17 @@
 """Checkpoints: our files, Lightning's and the official ones, with strict loading."""
 
-from r3dpa.checkpoints.convert import ConversionReport, convert
-from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint
-from r3dpa.checkpoints.networks import (
-    NETWORK_NAMES,
-    Checkpoint,
-    NetworkState,
-    load_into,
-    weights_sha256,
+from r3dpa.checkpoints.convert import (
+    ConversionReport,
+    TransferReport,
+    TransferRow,
+    convert,
+    transfer_rgb,
 )
+from r3dpa.checkpoints.files import read_checkpoint, save_checkpoint
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, load_into, weights_sha256
 from r3dpa.checkpoints.official import from_official, to_official
-from r3dpa.checkpoints.transfer import TransferReport, TransferRow, transfer_rgb
 
 __all__ = [
-    "NETWORK_NAMES",
     "Checkpoint",
     "ConversionReport",
     "NetworkState",

@@ -1,4 +1,4 @@
-"""Checkpoint files: read every layout, write ours and the official one, convert between them."""
+"""Checkpoint files: reads every layout, writes ours."""
 
 from __future__ import annotations
 
@@ -9,51 +9,32 @@ import pickle
 import re
 import reprlib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import safetensors
 import torch
 import yaml
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.diffusers import from_diffusers, is_diffusers
-from r3dpa.checkpoints.networks import NETWORK_NAMES, Checkpoint, NetworkState
+from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, checked, path_of
 from r3dpa.checkpoints.official import from_official, is_official
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit
+from r3dpa.nn.image_vae import ImageVAE
 
-__all__ = [
-    "official_neighbour",
-    "read_checkpoint",
-    "refuse_existing",
-    "save_checkpoint",
-]
+__all__ = ["official_neighbour", "read_checkpoint", "refuse_existing", "save_checkpoint"]
 
 _FORMAT = "r3dpa-checkpoint-1"
-_ABOUT = (
-    "stage",
-    "step",
-    "geometry",
-    "augmentation",
-    "feature_source",
-    "interpolant",
-    "version",
-    "commit",
-    "official_args",
-    "left_out",
-)
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
-_LIGHTNING = {
-    "vae": ("vae.", "vae"),
-    "discriminator": ("discriminator.", "discriminator"),
-    "sit": ("sit.", "sit"),
-    "latent_norm": ("latent_norm.", "latent_norm"),
-    "ema": ("ema.sit.", "sit"),
-    "ema_latent_norm": ("ema.latent_norm.", "latent_norm"),
-}
+_LIGHTNING = {name: (f"{name}.", name) for name in ("vae", "discriminator", "sit", "latent_norm")}
+_LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
+_DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
+# Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
+_OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 
 
 def read_checkpoint(
@@ -83,24 +64,22 @@ def read_checkpoint(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint file {path}; give an existing file")
-    try:
-        if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
+        with _naming(path):
             described = path.with_suffix(".yaml").is_file()
-            foreign = not described and is_diffusers(path)
-            return from_diffusers(path) if foreign else _read_ours(path)
-        content = _load_pickle(path)
+            return _from_ours(path) if described else _from_diffusers(path)
+    content = _load_pickle(path)
+    with _naming(path):
         if isinstance(content, dict) and "pytorch-lightning_version" in content:
             return _from_lightning(content, path)
         if is_official(content):
-            content, args = _official_neighbours(path, content)
+            content, args = _with_neighbours(content, path)
             return from_official(content, path, args=args, sit_args=sit_args, encoding=encoding)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
-    found = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
-    raise ValueError(
-        f"cannot read {path}: it holds {found}; expected a Lightning checkpoint of r3dpa, an "
-        "official R3DPA checkpoint, or a .safetensors file with its .yaml"
-    )
+        found = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
+        raise ValueError(
+            f"it holds {found}; expected a Lightning checkpoint of r3dpa, an official R3DPA "
+            "checkpoint, or a .safetensors file with its .yaml"
+        )
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -128,10 +107,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
         "step": checkpoint.step,
         "version": __version__,
         "commit": source_commit(),
-        "networks": {
-            name: {"class_path": state.class_path, "init_args": dict(state.init_args)}
-            for name, state in checkpoint.networks.items()
-        },
+        "networks": {name: state.config for name, state in checkpoint.networks.items()},
         "geometry": checkpoint.geometry,
         "augmentation": checkpoint.augmentation,
         "feature_source": checkpoint.feature_source,
@@ -149,12 +125,49 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
     return path
 
 
+def refuse_existing(paths: list[Path], overwrite: bool) -> None:
+    """Raises a ``ValueError`` that names the files that exist, unless they may be replaced."""
+    existing = [str(path) for path in paths if path.exists()]
+    if existing and not overwrite:
+        raise ValueError(f"{', '.join(existing)} exists already; choose another name or overwrite")
+
+
 def official_neighbour(vae: Path, kind: str) -> Path:
     """Name of the file that belongs to an official VAE file."""
     return vae.with_name(f"{vae.stem}-{kind}.pt")
 
 
-def _official_neighbours(path: Path, content: Any) -> tuple[Any, dict[str, Any]]:
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turns what a damaged file raises into a ``ValueError`` that names the file."""
+    try:
+        yield
+    except (yaml.YAMLError, SafetensorError, *UNPICKLING_ERRORS) as error:
+        reason = str(error)
+        if not isinstance(error, ValueError) or isinstance(error, UnicodeError):
+            reason = f"the file is damaged ({type(error).__name__}: {first_line(error)})"
+            reason += "; copy or download it again"
+        raise ValueError(f"cannot read {path}: {reason}") from error
+
+
+def _load_pickle(path: Path) -> Any:
+    """Content of a file of ``torch.save``: tensors, plain values and ``argparse.Namespace``."""
+    mmap = zipfile.is_zipfile(path)
+    with _naming(path), torch.serialization.safe_globals([argparse.Namespace]):
+        try:
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        except (pickle.UnpicklingError, ValueError) as error:
+            forbidden = re.search(r"GLOBAL (\S+)", str(error))
+            if forbidden is None:
+                raise ValueError("the file is damaged, or was not written by torch.save") from error
+            raise ValueError(
+                f"the file would run {forbidden[1]} when loaded; only tensors, plain values and "
+                "argparse.Namespace are read. Save networks with `r3dpa fit`, or with "
+                "r3dpa.checkpoints.save_checkpoint"
+            ) from error
+
+
+def _with_neighbours(content: Any, path: Path) -> tuple[Any, dict[str, Any]]:
     """Content with the files that belong to an official VAE, and the options of ``args.json``."""
     if "encoder.conv_in.weight" in content:
         content = {"vae": content}
@@ -163,51 +176,40 @@ def _official_neighbours(path: Path, content: Any) -> tuple[Any, dict[str, Any]]
             content["discriminator"] = _load_pickle(discriminator)
         statistics = official_neighbour(path, "latents-stats")
         if statistics.is_file():
-            found = _load_pickle(statistics)
-            if not is_official(found):
-                raise ValueError(f"{statistics} holds no latent statistics")
-            content |= found
-    folders = [path.parent, *([path.parent.parent] if path.parent.name == "checkpoints" else [])]
-    for options in (folder / "args.json" for folder in folders):
-        if options.is_file():
-            try:
+            content |= _load_pickle(statistics)
+    folder = path.parent
+    for options in (folder / "args.json", folder.parent / "args.json"):
+        if options.is_file() and (options.parent == folder or folder.name == "checkpoints"):
+            with _naming(options):
                 return content, dict(json.loads(options.read_text()))
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"{options} holds no training options: {error}") from error
     return content, {}
 
 
-def _load_pickle(path: Path) -> Any:
-    """Content of a file of ``torch.save``: tensors, plain values and ``argparse.Namespace``."""
-    try:
-        with torch.serialization.safe_globals([argparse.Namespace]):
-            return torch.load(
-                path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-            )
-    except pickle.UnpicklingError as error:
-        forbidden = re.search(r"GLOBAL (\S+)", str(error))
-        if forbidden is None:
-            raise ValueError("the file is damaged, or was not written by torch.save") from error
-        if forbidden[1].startswith(("r3dpa.", "torch.nn.")):
-            raise ValueError(
-                f"the file holds a pickled {forbidden[1]}, as a module built by hand saves it; "
-                "train with `r3dpa fit`, or write networks with r3dpa.checkpoints.save_checkpoint"
-            ) from error
+def _from_ours(path: Path) -> Checkpoint:
+    description = path.with_suffix(".yaml")
+    with _naming(description):
+        about = yaml.safe_load(description.read_text())
+        if not isinstance(about, dict) or about.get("format") != _FORMAT:
+            raise ValueError(f"it does not describe a {_FORMAT}")
+        kept = {key: about[key] for key in ("step", "official_args", "left_out")}
+        facts = {key: about[key] for key in FACTS if key in about}  # older files have fewer
+        configs, sha256 = dict(about["networks"]), about["sha256"]
+    if sha256 != _sha256(path):
         raise ValueError(
-            f"the file would run {forbidden[1]} when loaded; only tensors, plain values and "
-            "argparse.Namespace are read"
-        ) from error
-    except UNPICKLING_ERRORS as error:
-        raise ValueError(f"the file is damaged or incomplete ({first_line(error)})") from error
+            f"the file is not the one that {description.name} was written for (SHA-256 differs): "
+            "it is incomplete, was changed, or belongs to another checkpoint"
+        )
+    weights: dict[str, dict[str, Tensor]] = {name: {} for name in configs}
+    for full_name, value in load_file(path).items():
+        name, _, key = full_name.partition(".")
+        weights.setdefault(name, {})[key] = value
+    networks = {name: _network(name, configs.get(name), own) for name, own in weights.items()}
+    return Checkpoint(path=path, networks=networks, **kept, **facts)
 
 
 def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
-    weights = content.get("state_dict")
-    if not isinstance(weights, Mapping) or not all(isinstance(key, str) for key in weights):
-        raise ValueError("the Lightning checkpoint holds no state_dict")
+    weights = content["state_dict"]
     arguments, about = content.get("hyper_parameters", {}), content.get("r3dpa", {})
-    if not isinstance(arguments, Mapping) or not isinstance(about, Mapping):
-        raise ValueError("its hyper_parameters or entry r3dpa are no tables")
     networks: dict[str, NetworkState] = {}
     for name, (prefix, argument) in _LIGHTNING.items():
         own = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
@@ -219,78 +221,66 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
                 "class_path": "r3dpa.nn.latent_norm.LatentNorm",
                 "init_args": {"channels": len(own["running_mean"])},
             }
-        networks[name] = _network_state(name, config, own)
+        networks[name] = _network(name, config, own)
     prefixes = tuple(prefix for prefix, _ in _LIGHTNING.values())
     others = {key.split(".")[0] for key in weights if not key.startswith(prefixes)}
+    facts = {"stage": arguments.get("_class_path", "unknown")}
+    facts |= {key: about[key] for key in FACTS if key in about}
     return Checkpoint(
         path=path,
-        stage=about.get("stage", arguments.get("_class_path", "unknown")),
         networks=networks,
         step=content.get("global_step"),
-        geometry=about.get("geometry"),
-        augmentation=about.get("augmentation"),
-        feature_source=about.get("feature_source"),
-        interpolant=about.get("interpolant", "linear"),
-        version=about.get("version"),
-        commit=about.get("commit"),
         left_out=dict.fromkeys(sorted(others), "no network that checkpoints exchange"),
+        **facts,
     )
 
 
-def _read_ours(path: Path) -> Checkpoint:
-    description = path.with_suffix(".yaml")
-    if not description.is_file():
-        raise ValueError(f"its description {description.name} is not beside it; copy both files")
-    try:
-        about = yaml.safe_load(description.read_text())
-    except (yaml.YAMLError, *UNPICKLING_ERRORS) as error:
-        raise ValueError(f"{description.name} is damaged: {error}") from error
-    if not isinstance(about, dict) or about.get("format") != _FORMAT:
-        raise ValueError(f"{description.name} does not describe a {_FORMAT}")
-    for key in ("augmentation", "feature_source"):
-        about.setdefault(key, None)  # as files written before there was any
-    missing = {*_ABOUT, "networks", "sha256"} - set(about)
-    if missing:
-        raise ValueError(f"{description.name} lacks {', '.join(sorted(missing))}")
-    if about["sha256"] != _sha256(path):
-        raise ValueError(
-            f"the file is not the one that {description.name} was written for (SHA-256 differs): "
-            "it is incomplete, was changed, or belongs to another checkpoint"
-        )
-    try:
-        weights = load_file(path)
-    except (safetensors.SafetensorError, *UNPICKLING_ERRORS) as error:
-        raise ValueError(f"the file is damaged: {error}") from error
-    if not isinstance(about["networks"], dict):
-        raise ValueError(f"{description.name}: networks must be a table of networks by name")
-    networks: dict[str, NetworkState] = {}
-    for name, config in about["networks"].items():
-        own = {
-            key.removeprefix(f"{name}."): value
-            for key, value in weights.items()
-            if key.startswith(f"{name}.")
-        }
-        networks[name] = _network_state(name, config, own)
-    orphans = [key for key in weights if key.split(".")[0] not in networks]
-    if orphans:
-        raise ValueError(f"{description.name} names no network for the weights {orphans[:10]}")
-    return Checkpoint(path=path, networks=networks, **{key: about[key] for key in _ABOUT})
-
-
-def _network_state(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkState:
-    if name not in NETWORK_NAMES:
-        raise ValueError(f"unknown network {name!r}; known are {', '.join(NETWORK_NAMES)}")
+def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkState:
     if not isinstance(config, Mapping) or "class_path" not in config:
         raise ValueError(
             f"it does not say which class and arguments its {name} has (found "
             f"{reprlib.repr(config)}); train with `r3dpa fit`, which records them"
         )
-    state = NetworkState(config["class_path"], config.get("init_args") or {}, weights)
-    try:
-        state.check()
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    return state
+    return checked(name, NetworkState(config["class_path"], config.get("init_args") or {}, weights))
+
+
+def _from_diffusers(path: Path) -> Checkpoint:
+    """Image VAE in the layout of diffusers; every tensor is used.
+
+    Widths and depths are read from the weights, ``norm_num_groups`` from ``config.json`` beside the
+    file, if there is one.
+    """
+    weights = {_renamed(key): value for key, value in load_file(path).items()}
+    if _DIFFUSERS_KEY not in weights:
+        raise ValueError(
+            f"its description {path.with_suffix('.yaml').name} is not beside it; copy both files"
+        )
+    config = path.with_name("config.json")
+    with _naming(config):
+        about = json.loads(config.read_text()) if config.is_file() else {}
+        num_groups = int(about.get("norm_num_groups", 32))
+    levels = range(_count(weights, r"encoder\.down_blocks\.(\d+)\."))
+    init_args = {
+        "latent_channels": weights["post_quant_conv.weight"].shape[0],
+        "channels": [
+            len(weights[f"encoder.down_blocks.{level}.resnets.0.conv1.weight"]) for level in levels
+        ],
+        "num_res_blocks": _count(weights, r"encoder\.down_blocks\.0\.resnets\.(\d+)\."),
+        "norm_groups": num_groups,
+    }
+    vae = checked("vae", NetworkState(path_of(ImageVAE), init_args, weights))
+    return Checkpoint(path=path, stage="diffusers", networks={"vae": vae})
+
+
+def _renamed(key: str) -> str:
+    for old, new in _OLD_ATTENTION.items():
+        key = re.sub(rf"(\.attentions\.\d+\.){old}\.", rf"\g<1>{new}.", key)
+    return key
+
+
+def _count(keys: Iterable[str], pattern: str) -> int:
+    """Number of different indices that a pattern finds."""
+    return len({found[1] for key in keys if (found := re.match(pattern, key))})
 
 
 def _unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -304,13 +294,6 @@ def _unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         seen.add(own.untyped_storage().data_ptr())
         result[key] = own
     return result
-
-
-def refuse_existing(paths: list[Path], overwrite: bool) -> None:
-    """Raises a ``ValueError`` that names the files that exist, unless they may be replaced."""
-    existing = [str(path) for path in paths if path.exists()]
-    if existing and not overwrite:
-        raise ValueError(f"{', '.join(existing)} exists already; choose another name or overwrite")
 
 
 def _sha256(path: Path) -> str:

@@ -1,69 +1,62 @@
-"""Networks apart from the code that trains them: class, arguments, weights; strict loading."""
+"""Networks as data: class, arguments and weights; strict loading into networks."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
 import inspect
-import itertools
 import reprlib
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
+
+from r3dpa.io import UNPICKLING_ERRORS
 
 __all__ = [
-    "NETWORK_NAMES",
+    "FACTS",
     "Checkpoint",
     "NetworkState",
-    "format_table",
+    "checked",
     "load_into",
+    "path_of",
     "weights_sha256",
 ]
 
-NETWORK_NAMES = ("vae", "discriminator", "sit", "latent_norm", "ema", "ema_latent_norm")
-"""Names a network may have in a checkpoint; ``ema`` is the averaged copy of ``sit``."""
+#: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
+FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
 
-_ALLOWED_PACKAGE = "r3dpa.nn"
+_ALLOWED_PACKAGE = "r3dpa.nn."
 _NUM_LISTED = 10
-# Of constructors that are given numbers or types that make no sense.
-_BUILD_ERRORS = (
-    *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError),
-    *(NotImplementedError, RuntimeError, TypeError, ValueError),
-)
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
-_SHAPELESS_ARGS = {
-    "input_size": "input_size",
-    "num_heads": "num_heads",
-    "alignment_depth": "alignment_depth",
-    "legacy_upsample": "legacy",
-    "eps": "eps",
-    "norm_groups": "num_groups",
-}
+_SHAPELESS_ARGS = {key: key for key in ("input_size", "num_heads", "alignment_depth", "eps")}
+_SHAPELESS_ARGS |= {"legacy_upsample": "legacy", "norm_groups": "num_groups"}
+
+
+def path_of(kind: type) -> str:
+    """Import path of a class."""
+    return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _network_class(class_path: str) -> type[nn.Module]:
     """The class of a network, looked up inside ``r3dpa.nn`` only."""
     refusal = (
         f"class {class_path!r} is not allowed: a checkpoint may only name networks defined in "
-        f"{_ALLOWED_PACKAGE}. Edit the class_path if the class was moved; otherwise do not trust "
-        f"the file"
+        "r3dpa.nn. Edit the class_path if the class was moved; otherwise do not trust the file"
     )
     module_path, _, name = str(class_path).rpartition(".")
-    if module_path != _ALLOWED_PACKAGE and not module_path.startswith(f"{_ALLOWED_PACKAGE}."):
+    if not f"{module_path}.".startswith(_ALLOWED_PACKAGE):
         raise ValueError(refusal)
     try:
         found = getattr(importlib.import_module(module_path), name)
     except (ImportError, AttributeError, TypeError) as error:
         raise ValueError(f"class {class_path!r} does not exist in this version ({error})") from None
     is_network = isinstance(found, type) and issubclass(found, nn.Module)
-    if not is_network or not found.__module__.startswith(f"{_ALLOWED_PACKAGE}."):
+    if not is_network or not found.__module__.startswith(_ALLOWED_PACKAGE):
         raise ValueError(refusal)
     return found
 
@@ -88,10 +81,14 @@ class NetworkState:
         Raises:
             ValueError: If the class is not allowed, or the arguments do not rebuild this network.
         """
-        kind = type(network)
-        state = cls(f"{kind.__module__}.{kind.__qualname__}", init_args, network.state_dict())
+        state = cls(path_of(type(network)), init_args, network.state_dict())
         state.check()
         return state
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Class and arguments in the form that YAML files have."""
+        return {"class_path": self.class_path, "init_args": dict(self.init_args)}
 
     @property
     def kind(self) -> type[nn.Module]:
@@ -112,15 +109,12 @@ class NetworkState:
             ValueError: If the class is not allowed or does not accept the arguments.
         """
         kind = self.kind
-        if not isinstance(self.init_args, Mapping):
-            given = type(self.init_args).__name__
-            raise ValueError(f"{self.class_path} needs arguments by name, got a {given}")
         try:
-            return kind(**{str(key): _tuples(value) for key, value in self.init_args.items()})
-        except _BUILD_ERRORS as error:
+            return kind(**{key: _tuples(value) for key, value in self.init_args.items()})
+        except UNPICKLING_ERRORS as error:
             raise ValueError(
                 f"{self.class_path} does not accept the arguments "
-                f"{reprlib.repr(dict(self.init_args))}: {error}"
+                f"{reprlib.repr(self.init_args)}: {error}"
             ) from error
 
     def build(self) -> nn.Module:
@@ -130,7 +124,7 @@ class NetworkState:
             ValueError: As :meth:`new`, or if any key or shape does not fit, listing all of them.
         """
         network = self.new()
-        _raise_if_any(self.problems(network), f"the weights do not fit {self.class_path}")
+        self._refuse_problems(network)
         network.load_state_dict(self.state_dict, strict=True)
         return network
 
@@ -140,60 +134,56 @@ class NetworkState:
         Raises:
             ValueError: As :meth:`build`.
         """
-        with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
+        with torch.device("meta"):
             network = self.new()
-        _raise_if_any(self.problems(network), f"the weights do not fit {self.class_path}")
+        self._refuse_problems(network)
 
     def problems(self, network: nn.Module) -> list[str]:
         """All keys and shapes that differ between ``network`` and these weights."""
-        own = network.state_dict()
-        missing = [f"missing in the checkpoint: {key}" for key in own if key not in self.state_dict]
-        unexpected = [
-            f"unknown to the network: {key} {tuple(value.shape)}"
-            for key, value in self.state_dict.items()
-            if key not in own
+        own = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+        here = {key: tuple(value.shape) for key, value in self.state_dict.items()}
+        differ = [key for key in own if key in here and own[key] != here[key]]
+        return [
+            *(f"shape of {key}: checkpoint {here[key]}, network {own[key]}" for key in differ),
+            *(f"missing in the checkpoint: {key}" for key in own if key not in here),
+            *(f"unknown to the network: {key} {here[key]}" for key in here if key not in own),
         ]
-        shapes = [
-            f"shape of {key}: checkpoint {tuple(self.state_dict[key].shape)}, "
-            f"network {tuple(value.shape)}"
-            for key, value in own.items()
-            if key in self.state_dict and self.state_dict[key].shape != value.shape
-        ]
-        return shapes + missing + unexpected
+
+    def _refuse_problems(self, network: nn.Module) -> None:
+        problems = _shortened(self.problems(network))
+        if problems:
+            raise ValueError("\n  ".join([f"the weights do not fit {self.class_path}:", *problems]))
+
+
+def checked(name: str, state: NetworkState) -> NetworkState:
+    """The state after :meth:`NetworkState.check`, whose errors start with ``name``."""
+    try:
+        state.check()
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    return state
 
 
 @dataclass(frozen=True)
 class Checkpoint:
     """Everything a checkpoint file says about its networks, whatever its format.
 
-    Args:
-        path: File it was read from.
-        stage: Training stage that wrote it (``vae_alignment``, ``joint``, ``official``, ...).
-        networks: Networks by name, see :data:`NETWORK_NAMES`.
-        step: Optimiser steps taken, None if the file does not tell.
-        geometry: Plain values of the ``ScanGeometry`` it was trained for, None if unknown.
-        augmentation: Plain values of the ``Augmentation`` of its training, None if unknown.
-        feature_source: Name of the feature source of its last training stage; None if unknown or
-            none.
-        interpolant: Path between latents and noise that its SiT was trained on.
-        version: Version of r3dpa that wrote it, None for official files.
-        commit: Commit of r3dpa that wrote it, if known.
-        official_args: Options of the official training script, kept for the way back.
-        left_out: Entries of the file that are not read, with the reason.
+    Networks are called ``vae``, ``discriminator``, ``sit``, ``latent_norm``, and the averaged
+    copies ``ema`` and ``ema_latent_norm``. A field is None if the file does not state it.
     """
 
-    path: Path
-    stage: str
+    path: Path  #: file it was read from
+    stage: str  #: training stage that wrote it: ``vae_alignment``, ``joint``, ``official``, ...
     networks: Mapping[str, NetworkState]
-    step: int | None = None
-    geometry: Mapping[str, Any] | None = None
-    augmentation: Mapping[str, Any] | None = None
-    feature_source: str | None = None
-    interpolant: Literal["linear", "cosine"] = "linear"
-    version: str | None = None
-    commit: str | None = None
-    official_args: Mapping[str, Any] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    step: int | None = None  #: optimiser steps taken
+    geometry: Mapping[str, Any] | None = None  #: plain values of its ``ScanGeometry``
+    augmentation: Mapping[str, Any] | None = None  #: plain values of its ``Augmentation``
+    feature_source: str | None = None  #: feature source of its last training stage
+    interpolant: Literal["linear", "cosine"] = "linear"  #: path from latents to noise of its SiT
+    version: str | None = None  #: version of r3dpa that wrote it
+    commit: str | None = None  #: commit of r3dpa that wrote it
+    official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options
+    left_out: Mapping[str, str] = field(default_factory=dict)  #: unread entries, and the reason
 
     def network(self, name: str) -> NetworkState:
         """The network called ``name``; raises a ``ValueError`` if the checkpoint has none."""
@@ -246,17 +236,6 @@ def weights_sha256(state: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Plain-text table with aligned columns."""
-    lines = [tuple(header), *(tuple(row) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    lines.insert(1, tuple("-" * width for width in widths))
-    return "\n".join(
-        "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
-
-
 def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
     """Arguments that differ although all weights fit."""
     differences = []
@@ -269,30 +248,7 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
     return differences
 
 
-@contextmanager
-def _at_most(count: int) -> Iterator[None]:
-    """Limits the number of parameters: a damaged file may ask for a billion layers."""
-    left = itertools.count(count, -1)
-
-    def counted(*_: Any) -> None:
-        if next(left) <= 0:
-            raise ValueError(
-                f"it asks for more than {count} parameters, far more than its weights are"
-            )
-
-    handle = register_module_parameter_registration_hook(counted)
-    try:
-        yield
-    finally:
-        handle.remove()
-
-
 def _shortened(lines: list[str]) -> list[str]:
     """The first lines and a count of the others."""
     rest = len(lines) - _NUM_LISTED
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]
-
-
-def _raise_if_any(problems: list[str], what: str) -> None:
-    if problems:
-        raise ValueError(f"{what}:\n  " + "\n  ".join(_shortened(problems)))

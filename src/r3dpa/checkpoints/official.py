@@ -1,34 +1,25 @@
 """Official R3DPA checkpoints: keys and options of valeoai/R3DPA, translated in both directions.
 
 An official SiT or UNet holds the latent batch norm as ``bn.*`` and its projector as
-``projectors.0.*``; everything else has the same name here. Training checkpoints written by
-:func:`r3dpa.checkpoints.convert` also hold an entry ``r3dpa``, which the official code ignores:
-arguments of the networks, sensor, encoding and other facts without a place in the official layout.
+``projectors.0.*``; everything else has the same name here. Arguments are inferred from the weights
+and the training options. Training checkpoints that we write also hold an entry ``r3dpa``, which the
+official code ignores: all facts without a place in the official layout.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from r3dpa.checkpoints.networks import Checkpoint, NetworkState
-from r3dpa.checkpoints.official_arguments import (
-    OFFICIAL_PROJECTION,
-    UNET_NAMES,
-    discriminator_state,
-    is_vae,
-    path_of,
-    sit_arguments,
-    unet_arguments,
-    vae_state,
-    vae_strides,
-)
+from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, checked, path_of
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -38,24 +29,39 @@ from r3dpa.nn.vae import VAE
 __all__ = ["facts_of", "from_official", "is_official", "statistics_of", "to_official"]
 
 StateDict = Mapping[str, Tensor]
+Options = Mapping[str, Any]
 Encoding = Literal["linear", "log2"]
+Strides = tuple[int, int] | None
 
-_OFFICIAL_PREFIX, _OUR_PREFIX, _NORM_PREFIX = "projectors.0.", "projector.", "bn."
-_SIZE_NAMES = {(384, 12): "S", (768, 12): "B", (1024, 24): "L", (1152, 28): "XL"}
 _SIT_NETWORKS = {"model": ("sit", "latent_norm"), "ema": ("ema", "ema_latent_norm")}
 _OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
 _STATISTICS = {"latents_scale", "latents_bias"}
 _OURS = "r3dpa"
-_FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
 _DATASET_CONFIGS: dict[Encoding, str] = {"linear": "kitti.yaml", "log2": "kitti_logscale.yaml"}
+_SIT_SIZES = {(384, 12): "S", (768, 12): "B", (1024, 24): "L", (1152, 28): "XL"}
+_SIT_HEADS = {384: 6, 768: 12, 1024: 16, 1152: 16}  # by token width
+_UNET_NAMES = {256: "UNet_lidm", 160: "UNet_small"}  # by channels
+_UNET_HEAD_CHANNELS = 32  # of both
+_UPSAMPLING = {(1, 5): [1, 2], (3, 3): [2, 2]}  # stride of the VAE by kernel of its decoder
+_PROJECTION: dict[str, Any] = {
+    "kind": "spherical",
+    "sensor": {
+        "beams": 64,
+        "columns": 1024,
+        "inclination_max_deg": 3.0,
+        "inclination_min_deg": -25.0,
+        "range_min_m": 1.0,
+        "range_max_m": 56.0,
+    },
+}
 
 
 def is_official(content: Any) -> bool:
-    """Whether what a ``.pt`` file holds is one of the four official layouts."""
+    """Whether the content of a ``.pt`` file is one of the four official layouts."""
     return isinstance(content, Mapping) and (
         any(isinstance(content.get(key), Mapping) for key in _SIT_NETWORKS)
         or set(content) == _STATISTICS
-        or is_vae(content)
+        or _is_vae(content)
         or _is_discriminator(content)
     )
 
@@ -64,23 +70,20 @@ def from_official(
     content: Mapping[str, Any],
     path: Path,
     *,
-    args: Mapping[str, Any] | None = None,
-    sit_args: Mapping[str, Any] | None = None,
+    args: Options | None = None,
+    sit_args: Options | None = None,
     encoding: Encoding | None = None,
 ) -> Checkpoint:
     """Checkpoint from the content of an official file; every key is translated or left out by name.
 
-    The geometry is known if the file holds :func:`facts_of`, or if the options or
-    ``encoding`` give the encoding of a SiT for range images.
-
     Args:
-        content: A training checkpoint (``model``, ``ema``, ``vae``, ``discriminator``, ``steps``,
-            ``args``, optimisers), or the weights of a VAE, of a discriminator, or latent
-            statistics (``latents_scale``, ``latents_bias``) alone.
+        content: A training checkpoint, or the weights of a VAE, of a discriminator, or latent
+            statistics alone.
         path: File that held it.
         args: Options of the official training script, where ``content`` has no ``args``.
         sit_args: Arguments of SiT or UNet that override those of the file.
-        encoding: Encoding of the range image. Default: that of the options.
+        encoding: Encoding of the range image. Default: that of the options. Without it the
+            geometry is unknown, unless the file holds :func:`facts_of`.
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
@@ -90,7 +93,7 @@ def from_official(
         return _from_ours(content, path, sit_args or {})
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
-    if is_vae(content):
+    if _is_vae(content):
         content = {"vae": content}
     elif _is_discriminator(content):
         content = {"discriminator": content}
@@ -98,31 +101,25 @@ def from_official(
     left_out: dict[str, str] = {}
     if set(content) >= _STATISTICS:
         networks["latent_norm"] = _norm_from_statistics(content)
-        content = {key: value for key, value in content.items() if key not in _STATISTICS}
-    strides = vae_strides(content.get("vae", {}), options)
+    strides = _vae_strides(content.get("vae", {}), options)
     for key, value in content.items():
         if key in _SIT_NETWORKS:
             parts = _sit(_weights(key, value), options, sit_args or {}, strides)
             networks |= dict(zip(_SIT_NETWORKS[key], parts, strict=True))
-        elif key == "vae" and not is_vae(value):
-            left_out[key] = "that of the file is not for range images"
+        elif key == "vae" and _is_vae(value):
+            networks[key] = _vae(_weights(key, value))
         elif key == "vae":
-            networks[key] = vae_state(_weights(key, value))
+            left_out[key] = "that of the file is not for range images"
         elif key == "discriminator":
-            networks[key] = discriminator_state(_weights(key, value))
+            networks[key] = _discriminator(_weights(key, value))
         elif key in _OPTIMISERS:
             left_out[key] = f"optimiser of the {_OPTIMISERS[key]}: training starts with a new one"
-        elif key not in ("args", "steps"):
+        elif key not in {"args", "steps"} | _STATISTICS:
             left_out[key] = "no part of an official checkpoint"
-    for name, state in networks.items():
-        try:
-            state.check()
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
     return Checkpoint(
         path=path,
         stage="official",
-        networks=networks,
+        networks={name: checked(name, state) for name, state in networks.items()},
         step=content.get("steps"),
         geometry=_geometry(networks, options, encoding) if strides is not None else None,
         official_args=options,
@@ -130,23 +127,23 @@ def from_official(
     )
 
 
-def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Mapping[str, Any]) -> Checkpoint:
+def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Checkpoint:
     """Checkpoint from an official file with :func:`facts_of`."""
     about = content[_OURS]
     networks: dict[str, NetworkState] = {}
-    for name, config in about.get("networks", {}).items():
+    for name, config in about["networks"].items():
         key = next((key for key, names in _SIT_NETWORKS.items() if name in names), name)
         sit, norm = _split(_weights(key, content.get(key)))
         weights = norm if name.endswith("latent_norm") else sit
         changes = sit_args if name in ("sit", "ema") else {}
-        networks[name] = NetworkState(
-            config["class_path"], {**config["init_args"], **changes}, weights
-        )
-        networks[name].check()
-    facts = {key: about[key] for key in _FACTS if key in about}
-    options = about.get("official_args", {})
+        state = NetworkState(config["class_path"], {**config["init_args"], **changes}, weights)
+        networks[name] = checked(name, state)
     return Checkpoint(
-        path=path, networks=networks, step=content.get("steps"), official_args=options, **facts
+        path=path,
+        networks=networks,
+        step=content.get("steps"),
+        official_args=about["official_args"],
+        **{key: about[key] for key in FACTS if key in about},
     )
 
 
@@ -168,21 +165,19 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
         if sit_name in checkpoint.networks:
             sit = _official_part(checkpoint, sit_name, SiT, UNet)
             norm = checkpoint.networks.get(norm_name) or checkpoint.network("latent_norm")
-            content[key] = {
-                _renamed(k, _OUR_PREFIX, _OFFICIAL_PREFIX): v for k, v in sit.state_dict.items()
-            } | {f"{_NORM_PREFIX}{k}": v for k, v in norm.state_dict.items()}
-    if "vae" in checkpoint.networks:
-        vae = _official_part(checkpoint, "vae", VAE)
-        if not vae.arguments["legacy_upsample"]:
-            raise ValueError(
-                f"the VAE of {checkpoint.path} wraps columns when it upsamples, the official one "
-                "does not, so its weights would decode to other images there: only a VAE built "
-                "with legacy_upsample=True has an official counterpart"
-            )
-        content["vae"] = dict(vae.state_dict)
-    if "discriminator" in checkpoint.networks:
-        state = _official_part(checkpoint, "discriminator", PatchDiscriminator)
-        content["discriminator"] = dict(state.state_dict)
+            weights = {
+                re.sub(r"^projector\.", "projectors.0.", k): v for k, v in sit.state_dict.items()
+            }
+            content[key] = weights | {f"bn.{k}": v for k, v in norm.state_dict.items()}
+    for key, kind in (("vae", VAE), ("discriminator", PatchDiscriminator)):
+        if key in checkpoint.networks:
+            content[key] = dict(_official_part(checkpoint, key, kind).state_dict)
+    if "vae" in content and not checkpoint.network("vae").arguments["legacy_upsample"]:
+        raise ValueError(
+            f"the VAE of {checkpoint.path} wraps columns when it upsamples, the official one "
+            "does not, so its weights would decode to other images there: only a VAE built "
+            "with legacy_upsample=True has an official counterpart"
+        )
     if checkpoint.step is not None:
         content["steps"] = checkpoint.step
     args = dict(checkpoint.official_args) or _args_of(checkpoint)
@@ -191,12 +186,9 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
 
 def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
     """Entry for an official training checkpoint: the facts that its layout has no place for."""
-    about: dict[str, Any] = {key: getattr(checkpoint, key) for key in _FACTS}
+    about: dict[str, Any] = {key: getattr(checkpoint, key) for key in FACTS}
     about["official_args"] = dict(checkpoint.official_args)
-    about["networks"] = {
-        name: {"class_path": state.class_path, "init_args": dict(state.init_args)}
-        for name, state in checkpoint.networks.items()
-    }
+    about["networks"] = {name: state.config for name, state in checkpoint.networks.items()}
     return {_OURS: about}
 
 
@@ -216,57 +208,180 @@ def _official_part(checkpoint: Checkpoint, name: str, *kinds: type[nn.Module]) -
     return state
 
 
-def _weights(key: str, value: Any) -> StateDict:
-    if not isinstance(value, Mapping) or not all(isinstance(v, Tensor) for v in value.values()):
-        raise ValueError(f"entry {key!r} holds no weights but {type(value).__name__}")
-    return value
+def _is_vae(content: Any) -> bool:
+    """Whether these are weights of a VAE for one-channel range images."""
+    conv_in = content.get("encoder.conv_in.weight") if isinstance(content, Mapping) else None
+    return isinstance(conv_in, Tensor) and conv_in.dim() == 4 and conv_in.shape[1] == 1
 
 
 def _is_discriminator(content: Mapping[str, Any]) -> bool:
     return len(content) > 0 and all(str(key).startswith("main.") for key in content)
 
 
-def _renamed(key: str, old: str, new: str) -> str:
-    return new + key.removeprefix(old) if key.startswith(old) else key
+def _weights(key: str, value: Any) -> StateDict:
+    if not isinstance(value, Mapping) or not all(isinstance(v, Tensor) for v in value.values()):
+        raise ValueError(f"entry {key!r} holds no weights but {type(value).__name__}")
+    return value
 
 
 def _split(weights: StateDict) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Weights of an official network by our names, and its latent statistics."""
-    norm = {
-        key.removeprefix(_NORM_PREFIX): value
-        for key, value in weights.items()
-        if key.startswith(_NORM_PREFIX)
-    }
+    norm = {k.removeprefix("bn."): v for k, v in weights.items() if k.startswith("bn.")}
     sit = {
-        _renamed(key, _OFFICIAL_PREFIX, _OUR_PREFIX): value
-        for key, value in weights.items()
-        if not key.startswith(_NORM_PREFIX)
+        re.sub(r"^projectors\.0\.", "projector.", k): v
+        for k, v in weights.items()
+        if not k.startswith("bn.")
     }
     return sit, norm
 
 
 def _sit(
-    weights: StateDict,
-    args: Mapping[str, Any],
-    sit_args: Mapping[str, Any],
-    strides: tuple[int, int] | None,
+    weights: StateDict, args: Options, given: Options, strides: Strides
 ) -> tuple[NetworkState, NetworkState]:
     """SiT or UNet and its latent statistics from an official one."""
     sit, norm = _split(weights)
-    kind: type[nn.Module] = UNet if any(key.startswith("input_blocks.") for key in sit) else SiT
-    if kind is UNet:
-        init_args = unet_arguments(sit, sit_args)
+    if any(key.startswith("input_blocks.") for key in sit):
+        network = NetworkState(path_of(UNet), _unet_arguments(sit, given), sit)
     else:
-        init_args = sit_arguments(sit, args, sit_args, strides)
+        network = NetworkState(path_of(SiT), _sit_arguments(sit, args, given, strides), sit)
     norm_args = {
-        "channels": init_args["in_channels"],
+        "channels": network.init_args["in_channels"],
         "momentum": args.get("bn_momentum", 0.1),
         "legacy_inverse": True,
     }
-    return (
-        NetworkState(path_of(kind), init_args, sit),
-        NetworkState(path_of(LatentNorm), norm_args, norm),
-    )
+    return network, NetworkState(path_of(LatentNorm), norm_args, norm)
+
+
+@contextmanager
+def _inferring(what: str) -> Iterator[None]:
+    """Turns a missing key or an unexpected shape into a ``ValueError``."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"the weights are not those of an official {what} ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _sit_arguments(
+    sit: StateDict, args: Options, given: Options, strides: Strides
+) -> dict[str, Any]:
+    with _inferring("SiT or UNet"):
+        hidden_size, in_channels, patch_size, _ = sit["x_embedder.proj.weight"].shape
+        num_rows = len(sit["y_embedder.embedding_table.weight"])
+        inferred: dict[str, Any] = {
+            "in_channels": in_channels,
+            "patch_size": patch_size,
+            "hidden_size": hidden_size,
+            "depth": len({key.split(".")[1] for key in sit if key.startswith("blocks.")}),
+            "mlp_ratio": len(sit["blocks.0.mlp.fc1.weight"]) / hidden_size,
+            "feature_dim": len(sit["projector.4.weight"]),
+            "projector_dim": len(sit["projector.0.weight"]),
+            "qk_norm": "blocks.0.attn.q_norm.weight" in sit,
+        }
+        num_tokens = sit["pos_embed"].shape[1]
+    num_classes = {**args, **given}.get("num_classes", max(1, num_rows - 1))
+    if num_rows not in (num_classes, num_classes + 1):
+        raise ValueError(
+            f"the label table has {num_rows} rows, which fits no model of {num_classes} classes"
+        )
+    inferred |= {"num_classes": num_classes, "class_dropout": num_rows > num_classes}
+    if "encoder_depth" in args:
+        inferred["alignment_depth"] = args["encoder_depth"]
+    if hidden_size in _SIT_HEADS:
+        inferred["num_heads"] = _SIT_HEADS[hidden_size]
+    if strides is None:
+        rows = columns = patch_size * round(num_tokens**0.5)  # a square image
+    else:
+        rows = _PROJECTION["sensor"]["beams"] // strides[0]
+        columns = _PROJECTION["sensor"]["columns"] // strides[1]
+    if rows * columns == num_tokens * patch_size**2:
+        inferred["input_size"] = [rows, columns]
+    init_args = inferred | dict(given)
+    unknown = {"alignment_depth", "num_heads", "input_size"} - set(init_args)
+    if unknown:
+        raise ValueError(
+            f"neither weights nor training options (args, args.json) hold {sorted(unknown)} of "
+            f"this SiT with {num_tokens} tokens of width {hidden_size}; give them as sit_args"
+        )
+    return init_args
+
+
+def _unet_arguments(unet: StateDict, given: Options) -> dict[str, Any]:
+    with _inferring("UNet"):
+        _, channels, *input_size = unet["ape.bias"].shape
+        num_levels = 1 + sum(key.endswith(".op.weight") for key in unet)
+        num_up = len({key.split(".")[1] for key in unet if key.startswith("output_blocks.")})
+        num_res_blocks = num_up // num_levels - 1
+        # A level is its residual blocks and, but for the last, a step down; first comes the input.
+        last_blocks = [(level + 1) * (num_res_blocks + 1) - 1 for level in range(num_levels)]
+        widths = [len(unet[f"input_blocks.{i}.0.out_layers.3.weight"]) for i in last_blocks]
+        inferred: dict[str, Any] = {
+            "input_size": list(input_size),
+            "in_channels": unet["input_blocks.0.0.weight"].shape[1],
+            "channels": channels,
+            "channel_multipliers": [width // channels for width in widths],
+            "num_res_blocks": num_res_blocks,
+            "feature_dim": len(unet["projector.4.weight"]),
+            "projector_dim": len(unet["projector.0.weight"]),
+            "num_classes": len(unet["label_emb.weight"]),
+        }
+    attends = [f"input_blocks.{i}.1.qkv.weight" in unet for i in last_blocks]
+    if not all(attends):
+        inferred["attention_resolutions"] = [2**i for i in range(num_levels) if attends[i]]
+    if channels in _UNET_NAMES:
+        inferred["head_channels"] = _UNET_HEAD_CHANNELS
+    init_args = inferred | dict(given)
+    if "head_channels" not in init_args:
+        raise ValueError(
+            f"unknown head_channels of a UNet with {channels} channels; give them as sit_args"
+        )
+    return init_args
+
+
+def _vae_strides(vae: StateDict, args: Options) -> Strides:
+    """Rows and columns of the image per latent, of a range-image VAE or of its official name.
+
+    ``h2p4d8``: patches of 4 x 4 pixels, twice as long horizontally, 8 channels.
+    """
+    if _is_vae(vae):
+        strides = _vae(vae).init_args["strides"]
+        return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
+    name = re.fullmatch(r"h(\d+)(?:p(\d+))?d\d+", str(args.get("vae", "")))
+    if name is None:
+        return None
+    patch = int(name[2] or 1)
+    return patch, patch * int(name[1])
+
+
+def _vae(weights: StateDict) -> NetworkState:
+    with _inferring("VAE"):
+        levels = range(len({k.split(".")[2] for k in weights if k.startswith("encoder.down.")}))
+        channels = len(weights["encoder.conv_in.weight"])
+        widths = [len(weights[f"encoder.down.{i}.block.0.conv1.weight"]) for i in levels]
+        ups = [weights[f"decoder.up.{i}.upsample.conv.weight"] for i in levels[1:]]
+        blocks = {key.split(".")[4] for key in weights if key.startswith("encoder.down.0.block.")}
+        attends = [i for i in levels if f"encoder.down.{i}.attn.0.q.weight" in weights]
+        init_args = {
+            "in_channels": weights["encoder.conv_in.weight"].shape[1],
+            "latent_channels": len(weights["post_quant_conv.weight"]),
+            "channels": channels,
+            "channel_multipliers": [width // channels for width in widths],
+            "strides": [_UPSAMPLING[(int(up.shape[2]), int(up.shape[3]))] for up in ups],
+            "num_res_blocks": len(blocks),
+            "attention_levels": attends,
+            "legacy_upsample": True,
+        }
+    return NetworkState(path_of(VAE), init_args, dict(weights))
+
+
+def _discriminator(weights: StateDict) -> NetworkState:
+    with _inferring("discriminator"):
+        channels, in_channels, _, _ = weights["main.0.weight"].shape
+    num_convolutions = sum(value.dim() == 4 for value in weights.values())
+    num_layers = num_convolutions - 2
+    init_args = {"in_channels": in_channels, "channels": channels, "num_layers": num_layers}
+    return NetworkState(path_of(PatchDiscriminator), init_args, dict(weights))
 
 
 def _norm_from_statistics(content: StateDict) -> NetworkState:
@@ -282,15 +397,13 @@ def _norm_from_statistics(content: StateDict) -> NetworkState:
 
 
 def _geometry(
-    networks: Mapping[str, NetworkState],
-    args: Mapping[str, Any],
-    encoding: Encoding | None,
+    networks: Mapping[str, NetworkState], args: Options, encoding: Encoding | None
 ) -> dict[str, Any] | None:
     """Plain values of the official ``ScanGeometry``; None without a network or encoding."""
     if encoding is None and "dataset_config" in args:
         by_config = {config: key for key, config in _DATASET_CONFIGS.items()}
         encoding = by_config.get(Path(str(args["dataset_config"])).name)
-    sit = next((networks[name] for name in ("sit", "ema") if name in networks), None)
+    sit = networks.get("sit") or networks.get("ema")
     if encoding is None or sit is None:
         return None
     if sit.kind is UNet:
@@ -298,41 +411,37 @@ def _geometry(
     else:
         patch_size = sit.init_args["patch_size"]
     return {
-        "projection": OFFICIAL_PROJECTION,
+        "projection": _PROJECTION,
         "codec": {"encoding": encoding, "scale": None, "legacy_inverse": False},
         "grid_size": [side // patch_size for side in sit.init_args["input_size"]],
     }
 
 
 def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The options that the official scripts read, as far as the checkpoint tells them."""
+    """The options that the official scripts read, as far as the checkpoint determines them."""
     args: dict[str, Any] = {}
     if "vae" in checkpoint.networks:
         vae = checkpoint.network("vae").arguments
         rows, columns = (math.prod(stride[axis] for stride in vae["strides"]) for axis in (0, 1))
         patch = f"p{rows}" if rows > 1 else ""
         args["vae"] = f"h{columns // rows}{patch}d{vae['latent_channels']}"
-    sit_name = next((name for name in ("sit", "ema") if name in checkpoint.networks), None)
-    if sit_name is not None:
-        sit = checkpoint.network(sit_name).arguments
-        args |= {
-            "num_classes": sit["num_classes"],
-            "bn_momentum": checkpoint.network("latent_norm").arguments["momentum"],
-        }
-        if checkpoint.network(sit_name).kind is UNet:
-            model = UNET_NAMES.get(sit["channels"])
+    state = checkpoint.networks.get("sit") or checkpoint.networks.get("ema")
+    if state is not None:
+        sit = state.arguments
+        args["num_classes"] = sit["num_classes"]
+        args["bn_momentum"] = checkpoint.network("latent_norm").arguments["momentum"]
+        if state.kind is UNet:
+            model = _UNET_NAMES.get(sit["channels"])
         else:
-            args |= {
-                "cfg_prob": 0.1 if sit["class_dropout"] else 0.0,
-                "encoder_depth": sit["alignment_depth"],
-                "qk_norm": sit["qk_norm"],
-            }
-            size = _SIZE_NAMES.get((sit["hidden_size"], sit["depth"]))
+            args["cfg_prob"] = 0.1 if sit["class_dropout"] else 0.0
+            args["encoder_depth"] = sit["alignment_depth"]
+            args["qk_norm"] = sit["qk_norm"]
+            size = _SIT_SIZES.get((sit["hidden_size"], sit["depth"]))
             model = None if size is None else f"SiT-{size}/{sit['patch_size']}"
         if model is not None:
             args["model"] = model
     if checkpoint.geometry is not None:
         projection, codec = checkpoint.geometry["projection"], checkpoint.geometry["codec"]
-        if all(projection[key] == value for key, value in OFFICIAL_PROJECTION.items()):
+        if all(projection[key] == value for key, value in _PROJECTION.items()):
             args["dataset_config"] = f"configs/{_DATASET_CONFIGS[codec['encoding']]}"
     return args

@@ -50,12 +50,10 @@ def read_snapshot(
 ) -> WeakModel:
     """Reads a weak model that may guide a given one; any checkpoint with an average will do.
 
-    Latents mean the same to both only if one VAE made them: then normalisations that drifted apart
-    are converted exactly but for differences between channels, see :data:`NORM_TOLERANCE`. Stage
-    ``flow_matching`` freezes the VAE. In stage ``joint`` the VAE moves between a snapshot and the
-    end, and no conversion exists: guidance is an approximation there, and refused unless allowed.
-    It then equates the normalised latents of both models, since the normalisation removes at least
-    the drift of mean and scale.
+    If both models have one VAE, which stage ``flow_matching`` freezes, normalisations that drifted
+    apart are converted, up to :data:`NORM_TOLERANCE`. With another VAE, as after a snapshot of
+    stage ``joint``, no conversion exists: the normalised latents of both are equated, which removes
+    the drift of mean and scale only, and is refused unless allowed.
 
     Args:
         path: File of :class:`r3dpa.callbacks.EMASnapshots`, or another checkpoint.
@@ -65,8 +63,8 @@ def read_snapshot(
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no weak model of this one: no average or no fitted statistics, other
-            latent size or path, other VAE, or statistics further apart than the tolerance.
+        ValueError: If the file has no average or no fitted statistics, or another latent size, path
+            or VAE, or statistics further apart than the tolerance.
     """
     checkpoint = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(checkpoint.networks):
@@ -75,11 +73,11 @@ def read_snapshot(
             f"only {', '.join(checkpoint.networks)}; give a file of a run's snapshots, or a "
             "checkpoint of stage joint or flow_matching"
         )
-    names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
-    sizes = [_latent_size(c, name) for c, name in ((checkpoint, "ema"), (strong, names[0]))]
-    if sizes[0] != sizes[1]:
+    sit_name, norm_name = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
+    size, own_size = _latent_size(checkpoint, "ema"), _latent_size(strong, sit_name)
+    if size != own_size:
         raise ValueError(
-            f"{path} is a model of latents {sizes[0]}, {strong.path} one of {sizes[1]}; give a "
+            f"{path} is a model of latents {size}, {strong.path} one of {own_size}; give a "
             "snapshot of a run with the same VAE and range images"
         )
     if checkpoint.interpolant != strong.interpolant:
@@ -87,8 +85,8 @@ def read_snapshot(
             f"{path} was trained on the {checkpoint.interpolant} path, {strong.path} on the "
             f"{strong.interpolant} one; give a snapshot of the same path"
         )
-    norm = _norm(checkpoint, "ema_latent_norm")
-    scale, shift, spread = _conversion(norm, _norm(strong, names[1]))
+    norms = _norm(checkpoint, "ema_latent_norm"), _norm(strong, norm_name)
+    scale, shift, spread = _conversion(*norms)
     problem = None
     vae = _vae_note(checkpoint)
     if vae is None or vae != _vae_note(strong):
