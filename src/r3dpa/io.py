@@ -188,13 +188,18 @@ def one_line(values: str | dict[str, Any]) -> str:
 
 
 def text_table(
-    rows: Iterable[Sequence[str]], heads: Sequence[str], align: str, style: str = "simple"
+    rows: Iterable[Sequence[str]], heads: Sequence[str], align: str = "", style: str = "simple"
 ) -> str:
-    """A table of texts; ``align`` holds ``l`` or ``r`` per column, ``style`` is of ``tabulate``."""
+    """A table of texts; ``align`` is ``l`` (default) or ``r`` per column, ``style`` of tabulate."""
     from tabulate import tabulate
 
     sides = ["left" if side == "l" else "right" for side in align]
     text = tabulate(
-        list(rows), heads, style, disable_numparse=True, colalign=sides, preserve_whitespace=True
+        list(rows),
+        heads,
+        style,
+        disable_numparse=True,
+        colalign=sides or None,
+        preserve_whitespace=True,
     )
     return "\n".join(line.rstrip() for line in text.splitlines())

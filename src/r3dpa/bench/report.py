@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from r3dpa import viz
 from r3dpa.bench.measure import Comparison
 from r3dpa.bench.rows import Row, duration, front_of, quality_levels, sentences
-from r3dpa.checkpoints.networks import format_table
-from r3dpa.io import atomic_path, one_line
+from r3dpa.io import atomic_path, one_line, text_table
 
 #: NFE of the rows where there is time for all; the picture shows the least time of each.
 EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
@@ -158,7 +157,7 @@ def _table(found: Finding) -> str:
             ]
         )
     header = ["row", "NFE", "error", "precision", "range m", "IoU", "device s", "end to end"]
-    return format_table([*header, "GFLOP", "TFLOP/s", "of peak", "GPU GiB"], lines)
+    return text_table(lines, [*header, "GFLOP", "TFLOP/s", "of peak", "GPU GiB"])
 
 
 def _notes(found: Finding) -> list[str]:

@@ -27,10 +27,9 @@ from tqdm import tqdm
 
 from r3dpa.bench.measure import peak_bytes, synchronise
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
-from r3dpa.checkpoints.networks import format_table
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import atomic_path, command, machine, one_line, usable_device, versions
+from r3dpa.io import atomic_path, command, machine, one_line, text_table, usable_device, versions
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
 from r3dpa.nn.backbones import GeometricFeatures
@@ -140,7 +139,7 @@ def training(
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
     rows = [cost.row() for cost in costs]
-    table = format_table(list(rows[0]), ([*row.values()] for row in rows))
+    table = text_table(([*row.values()] for row in rows), list(rows[0]))
     return "\n".join([table, *(f"{name}: {one_line(values)}" for name, values in about.items())])
 
 

@@ -61,7 +61,7 @@ class TransferReport:
         """The report as text, one line per group."""
         heads = ("weights", "tensors", "fate", "largest tensor, RGB", "here", "reason")
         rows = [tuple(map(str, astuple(row))) for row in self.rows]
-        return f"RGB weights from {self.path}\n{text_table(rows, heads, 'llllll')}"
+        return f"RGB weights from {self.path}\n{text_table(rows, heads)}"
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ConversionReport:
             kind = state.class_path.rpartition(".")[2]
             rows.append((name, kind, str(len(state.state_dict)), f"{size:,}"))
         lines = [f"{self.source} -> {', '.join(str(path) for path in self.outputs)}"]
-        lines.append(text_table(rows, ("network", "class", "tensors", "elements"), "llll"))
+        lines.append(text_table(rows, ("network", "class", "tensors", "elements")))
         lines += [f"not converted: {k} ({why})" for k, why in self.checkpoint.left_out.items()]
         if self.transfer is not None:
             lines += ["", self.transfer.table()]
