@@ -5,14 +5,17 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import itertools
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from r3dpa.io import UNPICKLING_ERRORS
 
@@ -134,7 +137,7 @@ class NetworkState:
         Raises:
             ValueError: As :meth:`build`.
         """
-        with torch.device("meta"):
+        with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
             network = self.new()
         self._refuse_problems(network)
 
@@ -246,6 +249,22 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
             if own != wanted:
                 differences.append(f"{key}: checkpoint {wanted}, network {own}")
     return differences
+
+
+@contextmanager
+def _at_most(count: int) -> Iterator[None]:
+    """Limits the number of parameters: a damaged file may ask for a billion layers."""
+    left = itertools.count(count, -1)
+
+    def counted(*_: Any) -> None:
+        if next(left) <= 0:
+            raise ValueError(f"more than {count} parameters, far more than its weights are")
+
+    handle = register_module_parameter_registration_hook(counted)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def _shortened(lines: list[str]) -> list[str]:
