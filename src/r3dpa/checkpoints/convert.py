@@ -231,8 +231,8 @@ def transfer_rgb(
             merged |= {key: _label_rows(rgb_part[key], value) for key, value in own_part.items()}
         else:
             merged |= rgb_part
-        shapes = (str(_largest(part) or "-") for part in (rgb_part, own_part))
-        rows.append(TransferRow(group, len(own_part), fate, *shapes, reason))
+        source, target = (str(_largest(part) or "-") for part in (rgb_part, own_part))
+        rows.append(TransferRow(group, len(own_part), fate, source, target, reason))
     init_args = rgb.arguments | {"input_size": sit.input_size}
     if any(row.group == "projector" and row.fate == "fresh" for row in rows):
         init_args["alignment_depth"] = sit.alignment_depth  # a new head may look at another block
