@@ -222,7 +222,9 @@ class TestCheckpoints:
             strict=True,
         )
         states = {name: NetworkState.of(network, args) for name, network, args in networks}
-        flow = save_checkpoint(Checkpoint(tmp_path, "flow_matching", states), tmp_path / "flow")
+        flow = save_checkpoint(
+            Checkpoint(tmp_path, "flow_matching", states), tmp_path / "flow.safetensors"
+        )
         message = refused("joint", "--model.init_args.init_from", flow)
         assert str(flow) in message
         assert "stage 'flow_matching' and has no discriminator" in message
