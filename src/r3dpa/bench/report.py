@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from r3dpa import viz
 from r3dpa.bench.measure import Comparison
-from r3dpa.bench.rows import Row, duration, front_of, quality_levels, sentences
+from r3dpa.bench.rows import Row, front_of, quality_levels, sentences
 from r3dpa.io import atomic_path, one_line, text_table
 
 #: NFE of the rows where there is time for all; the picture shows the least time of each.
@@ -135,36 +135,40 @@ def _points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
     ]
 
 
+#: Column of the table, key of the row, factor and format.
+_COLUMNS = (
+    ("NFE", "nfe", 1, "d"),
+    ("error", "error", 1, ".3g"),
+    ("precision", "precision_error", 1, ".3g"),
+    ("range m", "range_rmse_m", 1, ".3g"),
+    ("IoU", "mask_iou", 1, ".3g"),
+    ("device ms", "seconds", 1e3, ".4g"),
+    ("end to end ms", "end_to_end", 1e3, ".4g"),
+    ("GFLOP", "flop", 1e-9, ".3g"),
+    ("TFLOP/s", "flop_s", 1e-12, ".3g"),
+    ("of peak", "peak_share", 1, ".1%"),
+    ("GPU GiB", "memory_bytes", 2**-30, ".2f"),
+)
+
+
 def _table(found: Finding) -> str:
     """All rows."""
     lines = []
-    for record in (row.record() for row in found.rows):
-        values = (record[key] for key in ("error", "precision_error", "range_rmse_m", "mask_iou"))
-        error, *others = ("-" if value is None else f"{value:.3g}" for value in values)
-        memory = record["memory_bytes"]
-        lines.append(
-            [
-                record["label"],
-                str(record["nfe"]),
-                error + ("" if record["converged"] else " ?"),
-                *others,
-                duration(record["seconds"]),
-                duration(record["end_to_end"]),
-                f"{record['flop'] / 1e9:.3g}",
-                f"{record['flop_s'] / 1e12:.3g}",
-                f"{record['peak_share']:.1%}",
-                "-" if memory is None else f"{memory / 2**30:.2f}",
-            ]
-        )
-    header = ["row", "NFE", "error", "precision", "range m", "IoU", "device s", "end to end"]
-    return text_table(lines, [*header, "GFLOP", "TFLOP/s", "of peak", "GPU GiB"])
+    for row in found.rows:
+        values = row.record()
+        cells = [
+            "-" if values[key] is None else format(values[key] * factor, style)
+            for _, key, factor, style in _COLUMNS
+        ]
+        lines.append([row.label + ("" if row.converged else " ?"), *cells])
+    return text_table(lines, ["row", *(column[0] for column in _COLUMNS)])
 
 
 def _notes(found: Finding) -> list[str]:
     """Conditions of the measurement that a reader of the table needs."""
     return [
         f"error: RMSE from Heun-{found.steps} of {found.samples} samples, itself "
-        f"{found.self_error:.3g} from half its steps; ?: too small for that reference",
+        f"{found.self_error:.3g} from half its steps; ?: error too small for that reference",
         f"timing: first row over itself {found.timing.repeat}"
         + ("" if found.timing.sound else ": the machine was too busy, claim nothing"),
         f"peak {found.peak_flop_s / 1e12:.3g} TFLOP/s; "
