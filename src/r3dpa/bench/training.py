@@ -159,7 +159,7 @@ def _in_new_process(
     stage: str, files: list[Path], folder: Path, settings: StepSettings
 ) -> StageCost:
     # spawn: a forked process would share memory with this one.
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), _silence_lightning) as pool:
         try:
             return pool.submit(_measure, stage, files, folder, settings).result()
         except BrokenProcessPool as error:
@@ -170,11 +170,14 @@ def _in_new_process(
             ) from error
 
 
-def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
-    """Trains one stage in this process."""
-    # Hints about loaders and loggers do not apply to a benchmark.
+def _silence_lightning() -> None:
+    """Hides hints about loaders and loggers, which do not apply to a benchmark."""
     warnings.filterwarnings("ignore", module="lightning")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+
+
+def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
+    """Trains one stage in this process."""
     L.seed_everything(0, verbose=False)
     module = _build(files, folder / f"{stage}.safetensors")
     meter = _StepMeter(settings.steps)
