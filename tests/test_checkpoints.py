@@ -506,7 +506,7 @@ class TestConvert:
         assert made.network("sit").arguments["input_size"] == (4, 8)
         sit, norm = SiT(**SIT_ARGS | {"input_size": (4, 8)}), LatentNorm(4)
         again = transfer_rgb(made, sit, norm, keep_projector=True)
-        assert {row.fate for row in again.rows} == {"kept"}
+        assert {row.result for row in again.rows} == {"kept"}
         rng = torch.get_rng_state()
         twin = convert(source, tmp_path / "twin.safetensors", into=into).checkpoint
         assert torch.equal(torch.get_rng_state(), rng)
@@ -547,7 +547,7 @@ class TestTransfer:
         return Checkpoint(Path("rgb.pt"), "rgb", networks)
 
     def fates(self, report):
-        return {row.group: row.fate for row in report.rows}
+        return {row.group: row.result for row in report.rows}
 
     def test_a_twin_keeps_everything(self):
         source, sit, norm = self.source(), SiT(**SIT_ARGS), LatentNorm(4)
@@ -585,7 +585,7 @@ class TestTransfer:
             self.source(feature_dim=5), SiT(**SIT_ARGS), LatentNorm(4), keep_projector=True
         )
         row = next(row for row in report.rows if row.group == "projector")
-        assert (row.fate, row.reason) == ("fresh", "asked for, but its shapes differ")
+        assert (row.result, row.reason) == ("fresh", "requested, but its shapes differ")
 
     def test_positions_of_another_grid_with_as_many_tokens_are_fresh(self):
         source = self.source(input_size=(8, 4))

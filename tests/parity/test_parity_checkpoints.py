@@ -222,7 +222,7 @@ def test_rgb_transfer_of_the_imagenet_variants(official_listing):
                     assert not value.any(), (name, key)
             assert torch.equal(norm.running_var, torch.ones(config["in_channels"]))
 
-            fates = {row.group: row.fate for row in report.rows}
+            fates = {row.group: row.result for row in report.rows}
             assert fates["projector"] == ("kept" if keep_projector else "fresh")
             assert fates["x_embedder"] == fates["final_layer.linear"] == "fresh"
             assert fates["latent_norm"] == "fresh"

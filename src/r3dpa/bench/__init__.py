@@ -1,1 +1,1 @@
-"""What training steps, simulated scans and feature grids cost, measured on the machine at hand."""
+"""Accuracy against sampling time, and the cost of training steps, measured on this machine."""

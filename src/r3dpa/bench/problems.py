@@ -1,4 +1,4 @@
-"""What samplers are judged on: a mixture with an exact velocity, and the networks of a checkpoint.
+"""Problems for samplers: a mixture with an exact velocity, and the networks of a checkpoint.
 
 Letters: N scenes or samples, D dimensions.
 """

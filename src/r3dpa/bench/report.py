@@ -64,9 +64,9 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
     tail += [f"{key}: {one_line(values)}" for key, values in facts.items()]
     lines = ["# What accuracy costs in time", "", "![Pareto front](pareto.png)", ""]
     for key, part in found.items():
-        told = sentences(front_of(part.rows, part.timing.tolerance))
+        steps = sentences(front_of(part.rows, part.timing.tolerance))
         lines += [f"## {_TITLES[key]}", "", "What each further second buys:", ""]
-        lines += [*(f"- {sentence}" for sentence in told), "", "```", _table(part), *_notes(part)]
+        lines += [*(f"- {sentence}" for sentence in steps), "", "```", _table(part), *_notes(part)]
         lines += ["```", ""]
     _write(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
     files = sorted(path.name for path in out.iterdir() if path.is_file())

@@ -158,7 +158,7 @@ def _smaller(values: Floats, tolerance: float = 0.0) -> NDArray[np.bool_]:
 
 
 def sentences(front: Sequence[Row]) -> list[str]:
-    """What each further second buys: one sentence for each step along the front."""
+    """One sentence for each step along the Pareto front: its cost and its gain."""
     return [
         f"From {duration(cheap.seconds)} ({cheap.label}) to {duration(dear.seconds)} "
         f"({dear.label}): the error of the latents falls from {cheap.error:.3g} to "

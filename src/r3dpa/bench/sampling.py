@@ -77,7 +77,7 @@ class Work:
             )
 
     def piece(self, name: str, make: Callable[[], Any]) -> Any:
-        """What ``make`` returns: tensors, numbers, strings, tuples, lists, dictionaries."""
+        """Cached result of ``make``: tensors, numbers, strings, tuples, lists, dictionaries."""
         if self.folder is None:
             return make()
         path = self.folder / f"{name}.pt"
@@ -114,7 +114,7 @@ def sampling(
         device: Where the model is computed.
 
     Returns:
-        Tables, what each further second buys, and where the files are.
+        Tables, error per second along the front, and where the files are.
 
     Raises:
         ValueError: If a number is out of its range, the checkpoint cannot be sampled from, or the
@@ -126,7 +126,7 @@ def sampling(
     if quick:
         usual = Effort(8, 200, EVALUATIONS[1:-3], 3, _BATCH[kind])
     toy = _TOY_QUICK if quick else _TOY
-    asked = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
+    chosen = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
     about, work = {}, Work()
     problems: dict[str, Callable[[], Finding]] = {
         # Without a network neither precision nor compilation applies.
@@ -137,11 +137,11 @@ def sampling(
     if ckpt is not None:
         checkpoint = read_checkpoint(ckpt)
         about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
-        model = ModelProblem(checkpoint, device, asked.batch)
+        model = ModelProblem(checkpoint, device, chosen.batch)
         written = ckpt.stat().st_mtime_ns
-        work = Work(out / "work", [about, written, str(asked), device, quick])
-        ways = settings_of(asked, kind, (False,) if quick else (False, True))
-        problems["model"] = lambda: run_problem(model, ways, asked, work)
+        work = Work(out / "work", [about, written, str(chosen), device, quick])
+        ways = settings_of(chosen, kind, (False,) if quick else (False, True))
+        problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     facts = {

@@ -54,7 +54,7 @@ class RunCheckpoint(ModelCheckpoint):
     epoch starts the next one.
     """
 
-    _signal = 0  # that asked to stop
+    _signal = 0  # received by this process, 0 for none
     _step = 0  # optimiser steps when a batch ended last
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
@@ -79,10 +79,10 @@ class RunCheckpoint(ModelCheckpoint):
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGINT):  # Lightning restores those before
 
-                def stop(asked: int, _: object) -> None:
-                    if self._signal == asked == signal.SIGINT and trainer.world_size == 1:
+                def stop(received: int, _: object) -> None:
+                    if self._signal == received == signal.SIGINT and trainer.world_size == 1:
                         raise KeyboardInterrupt  # of several, torchrun sends each another one
-                    self._signal = asked
+                    self._signal = received
 
                 signal.signal(number, stop)
 
@@ -112,14 +112,14 @@ class RunCheckpoint(ModelCheckpoint):
             self._stop_if_asked(trainer)
 
     def _asked(self, trainer: L.Trainer) -> int:
-        """Signal that asked any process to stop, 0 for none; the same answer in all of them."""
+        """Stop signal received by any process, 0 for none; the same answer in all of them."""
         guard = _guard(trainer)
         if trainer.world_size == 1:
             return self._signal
         if guard is not None:
             return guard.stop
-        asked = torch.tensor(self._signal, device=trainer.strategy.root_device)
-        return int(trainer.strategy.reduce(asked, reduce_op="max"))
+        received = torch.tensor(self._signal, device=trainer.strategy.root_device)
+        return int(trainer.strategy.reduce(received, reduce_op="max"))
 
     def _stop_if_asked(self, trainer: L.Trainer) -> None:
         number = self._asked(trainer)

@@ -43,7 +43,7 @@ from r3dpa.viz.evaluation import save_figures
 __all__ = ["SceneScorer"]
 
 _SAMPLER = SamplerConfig()
-_OPTION = "--scorer.{} true"  # how the SceneScorer of `r3dpa test` is told to allow something
+_OPTION = "--scorer.{} true"  # command-line option that makes SceneScorer allow something
 
 
 class SceneScorer(L.Callback):
@@ -169,7 +169,7 @@ class SceneScorer(L.Callback):
                 source=str(trainer.ckpt_path),
                 made_with=made_with,
                 commit=source_commit(),
-                allow_few=True,  # checked before; what falls out later is told
+                allow_few=True,  # checked before; scenes left out later are listed
                 skip_bad=self.skip_bad,
                 option=_OPTION,
             )
@@ -209,7 +209,7 @@ class SceneScorer(L.Callback):
     def _made_with(
         self, trainer: L.Trainer, module: GenerativeModule, folder: Path
     ) -> dict[str, Any]:
-        """What made the scenes; ``nfe`` is the mean over all of them, whoever drew them."""
+        """Sampler, checkpoint and seed of the scenes; ``nfe`` is the mean over all of them."""
         total = 0
         for first in range(0, self.num_scenes, self.batch_size):
             with safe_open(_part(folder, first), framework="pt") as file:
@@ -249,8 +249,8 @@ class SceneScorer(L.Callback):
 def _stamp(scans: Sequence[Scan]) -> str:
     """Hash of names, sizes and times of change: scans replaced by others of their names differ."""
     stats = [(scan.name, scan.path.stat()) for scan in scans]
-    told = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
-    return hashlib.sha256(repr(told).encode()).hexdigest()
+    keys = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    return hashlib.sha256(repr(keys).encode()).hexdigest()
 
 
 def _parts(folder: Path) -> Path:

@@ -26,7 +26,7 @@ from r3dpa.nn.sit import SiT
 
 __all__ = ["ConversionReport", "TransferReport", "TransferRow", "convert", "transfer_rgb"]
 
-Fate = Literal["kept", "fresh", "resized", "truncated", "extended"]
+Result = Literal["kept", "fresh", "resized", "truncated", "extended"]
 Groups = Mapping[str, Mapping[str, Tensor]]
 
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
@@ -37,14 +37,14 @@ _NORM = "latent_norm."
 class TransferRow:
     """One group of weights, whose keys start alike.
 
-    ``fate`` is ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
+    ``result`` is ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
     ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
     ``extended`` (label table).
     """
 
     group: str
     num_tensors: int  #: in the receiving network
-    fate: Fate
+    result: Result
     source: str  #: shape of the largest tensor in the RGB checkpoint, ``-`` if absent
     target: str  #: the same in the receiving network
     reason: str
@@ -59,7 +59,7 @@ class TransferReport:
 
     def table(self) -> str:
         """The report as text, one line per group."""
-        heads = ("weights", "tensors", "fate", "largest tensor, RGB", "here", "reason")
+        heads = ("weights", "tensors", "result", "largest tensor, RGB", "here", "reason")
         rows = [tuple(map(str, astuple(row))) for row in self.rows]
         return f"RGB weights from {self.path}\n{text_table(rows, heads)}"
 
@@ -224,17 +224,17 @@ def transfer_rgb(
     merged: dict[str, Tensor] = {}
     for group in dict.fromkeys((*ours, *theirs)):
         rgb_part, own_part = theirs.get(group, {}), ours.get(group, {})
-        fate, reason = _fate(group, theirs, ours, keep_projector, same_grid)
-        if fate in ("fresh", "resized"):
+        result, reason = _result(group, theirs, ours, keep_projector, same_grid)
+        if result in ("fresh", "resized"):
             merged |= own_part
-        elif fate in ("truncated", "extended"):
+        elif result in ("truncated", "extended"):
             merged |= {key: _label_rows(rgb_part[key], value) for key, value in own_part.items()}
         else:
             merged |= rgb_part
         source, target = (str(_largest(part) or "-") for part in (rgb_part, own_part))
-        rows.append(TransferRow(group, len(own_part), fate, source, target, reason))
+        rows.append(TransferRow(group, len(own_part), result, source, target, reason))
     init_args = rgb.arguments | {"input_size": sit.input_size}
-    if any(row.group == "projector" and row.fate == "fresh" for row in rows):
+    if any(row.group == "projector" and row.result == "fresh" for row in rows):
         init_args["alignment_depth"] = sit.alignment_depth  # a new head may look at another block
     norm = {k.removeprefix(_NORM): v for k, v in merged.items() if k.startswith(_NORM)}
     weights = {k: v for k, v in merged.items() if not k.startswith(_NORM)}
@@ -250,10 +250,10 @@ def transfer_rgb(
     return TransferReport(checkpoint.path, tuple(rows))
 
 
-def _fate(
+def _result(
     group: str, theirs: Groups, ours: Groups, keep_projector: bool, same_grid: bool
-) -> tuple[Fate, str]:
-    """Fate of a group of weights and its reason, by the rules of the official tuning stages."""
+) -> tuple[Result, str]:
+    """Result of a group of weights and its reason, by the rules of the official tuning stages."""
     rgb, own = (_largest(groups.get(group, {})) for groups in (theirs, ours))
     embeddings = [_largest(groups["x_embedder"]) for groups in (theirs, ours)]
     channels, patches = ([shape[axis] for shape in embeddings] for axis in (1, 2))
@@ -265,9 +265,9 @@ def _fate(
     if group == "pos_embed" and not same_grid:
         return "resized", "other token grid: computed for that of this run"
     if group == "projector" and not keep_projector:
-        return "fresh", "not asked for"
+        return "fresh", "not requested"
     if group == "projector" and _shapes(theirs.get(group, {})) != _shapes(ours[group]):
-        return "fresh", "asked for, but its shapes differ"
+        return "fresh", "requested, but its shapes differ"
     if group != "y_embedder" or rgb[0] == own[0]:
         return "kept", "fits"
     if rgb[0] < own[0]:
@@ -285,7 +285,7 @@ def _label_rows(theirs: Tensor, ours: Tensor) -> Tensor:
 
 
 def _grouped(sit: Mapping[str, Tensor], norm: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Weights of both networks by the part of their key that decides their fate."""
+    """Weights of both networks by the part of their key that decides what happens to them."""
     groups: dict[str, dict[str, Tensor]] = {}
     for key, value in {**sit, **{_NORM + k: v for k, v in norm.items()}}.items():
         parts = key.split(".")

@@ -59,14 +59,14 @@ def check_view(
         )
     returns = (range_m > 0) & expected
     for name, axis, least in (("beams", 1, _LEAST_ROWS), ("columns", 0, _LEAST_COLUMNS)):
-        asked = expected.any(dim=axis)
-        share = returns.any(dim=axis)[asked].double().mean().item()
+        required = expected.any(dim=axis)
+        share = returns.any(dim=axis)[required].double().mean().item()
         if share < least:
             raise ValueError(
-                f"the scan fills {share:.0%} of the {int(asked.sum())} {name} that the checkpoint "
-                f"was trained on ({sensor.beams} x {sensor.columns} pixels, {lowest:.1f} to "
-                f"{highest:.1f} degrees above the horizon): it is of another sensor, a part of a "
-                "scan, which `r3dpa complete` fills, or not in the frame of the sensor"
+                f"the scan fills {share:.0%} of the {int(required.sum())} {name} that the "
+                f"checkpoint was trained on ({sensor.beams} x {sensor.columns} pixels, "
+                f"{lowest:.1f} to {highest:.1f} degrees above the horizon): it is of another "
+                "sensor, a part of a scan, which `r3dpa complete` fills, or not in the frame of the sensor"
             )
     above = returns[:-1] & expected[1:]
     dense = returns[1:][above].double().mean().item()

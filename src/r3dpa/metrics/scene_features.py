@@ -69,7 +69,7 @@ class SceneFeatures:
         Raises:
             ValueError: If a feature is NaN or infinite; names the scene.
         """
-        # GPUs round the factors of a convolution to 10 bits (TF32) unless told not to.
+        # GPUs round the factors of a convolution to 10 bits (TF32) unless disabled.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             features = self.extract(scenes).float().cpu()
         broken = (~features.isfinite().all(dim=1)).nonzero().flatten().tolist()

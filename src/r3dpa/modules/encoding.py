@@ -1,4 +1,4 @@
-"""What a frozen VAE makes of training data, once for all epochs."""
+"""Cache of VAE posteriors of the training set."""
 
 from __future__ import annotations
 

@@ -126,9 +126,9 @@ class FlowMatching(GenerativeModule):
         if not num_batches or self.trainer.ckpt_path:  # a resumed run starts anywhere
             return dataset.scans
         loader = self._datamodule.train_dataloader()
-        asked = list(loader.sampler)[: num_batches * self._datamodule.batch_size]
+        indices = list(loader.sampler)[: num_batches * self._datamodule.batch_size]
         # With augmentation the epoch comes with the index.
-        return [dataset.scans[one[-1] if isinstance(one, tuple) else one] for one in asked]
+        return [dataset.scans[one[-1] if isinstance(one, tuple) else one] for one in indices]
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""

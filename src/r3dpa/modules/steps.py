@@ -227,7 +227,7 @@ def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:
 def predict(
     sit: VelocityNetwork, noisy: Tensor, time: Tensor, velocity: bool, features: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Velocity and projected features; what is not asked for is None and not computed."""
+    """Velocity and projected features; an output that is not requested is None and not computed."""
     if velocity and features:
         return sit(noisy, time)
     if velocity:

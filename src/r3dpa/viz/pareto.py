@@ -56,7 +56,7 @@ def pareto_figure(
         front: Points of the Pareto front, from the fastest on.
         levels: Horizontal lines by name, such as the error of bf16; at most three.
         limits: Seconds that NFE evaluations take at the peak of the device, by NFE.
-        sentences: Under the picture: what each further second buys.
+        sentences: Under the picture: one for each step along the front.
 
     Raises:
         ValueError: If there is no point, or a time or value is not above 0.
@@ -119,8 +119,8 @@ def pareto_figure(
     axes.set_ylim(min(values) / (max(values) / min(values)) ** 0.13 / 1.1, None)
     axes.grid(alpha=0.25, which="major")
     upper.suptitle(title, fontsize=12, x=0.02, ha="left")
-    told = "\n".join(["What each further second buys", *lines])
-    lower.text(0.02, 0.98, told, ha="left", va="top", fontsize=8.5, parse_math=False)
+    text = "\n".join(["Error and time along the front", *lines])
+    lower.text(0.02, 0.98, text, ha="left", va="top", fontsize=8.5, parse_math=False)
     return figure
 
 
