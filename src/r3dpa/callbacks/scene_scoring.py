@@ -209,7 +209,7 @@ class SceneScorer(L.Callback):
     def _made_with(
         self, trainer: L.Trainer, module: GenerativeModule, folder: Path
     ) -> dict[str, Any]:
-        """Sampler, checkpoint and seed of the scenes; ``nfe`` is the mean over all of them."""
+        """Sampler, checkpoint and seed of the scenes, and their mean NFE."""
         total = 0
         for first in range(0, self.num_scenes, self.batch_size):
             with safe_open(_part(folder, first), framework="pt") as file:
