@@ -19,11 +19,9 @@ from r3dpa.metrics.functional_bev import (
 from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import lip_loc_space, range_vit_space, voxel_space
 from r3dpa.nn.backbones.liploc import LIPLoc
-from r3dpa.nn.backbones.minkowski import MinkowskiNet
+from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
 from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.sparse import SparseConv, Voxels
-from r3dpa.nn.backbones.sparse_features import voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN
+from r3dpa.nn.backbones.sparse import SparseConv, Voxels, voxelize
 
 pytestmark = pytest.mark.bench
 

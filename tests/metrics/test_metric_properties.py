@@ -33,7 +33,7 @@ from r3dpa.metrics.functional_bev import (
 )
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, usable_scenes
 from r3dpa.metrics.scene_features import scene_features
-from r3dpa.nn.backbones.sparse_features import pool_voxels
+from r3dpa.nn.backbones.sparse import pool_voxels
 
 SEEDS = range(4)
 GRID = BEVGrid((-10.0, 10.0), (-10.0, 10.0), 0.5)

@@ -15,10 +15,9 @@ from r3dpa.metrics.scene_features import (
 )
 from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
 from r3dpa.nn.backbones.liploc import LIPLoc
-from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
+from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet, official_name
 from r3dpa.nn.backbones.rangevit import _NAMES, RangeViT
-from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN
+from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
 
 SENSOR = LidarSensor(beams=16, columns=64)
 CENTRE, CORNER = DEFAULT.with_sensor(SENSOR), PUBLISHED.with_sensor(SENSOR)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import Masking, ScanGrid, prepare_scan
-from r3dpa.nn.backbones.masking import NUM_TARGETS
+from r3dpa.nn.backbones.voxels import NUM_TARGETS
 
 GRID = ScanGrid((-8.0, -8.0, -2.0), (8.0, 8.0, 4.0), cell_m=0.5, voxel_m=0.1, num_neighbors=4)
 LOCAL = 8  # descriptors of the point itself; then 8 of each window, of which:

@@ -7,10 +7,16 @@ import math
 import pytest
 import torch
 
-from r3dpa.nn.backbones.minkowski import MinkowskiNet, scaled_widths
-from r3dpa.nn.backbones.sparse import Voxels
-from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN, Points, corners, to_points, to_voxels
+from r3dpa.nn.backbones.minkowski import (
+    SPVCNN,
+    MinkowskiNet,
+    Points,
+    corners,
+    scaled_widths,
+    to_points,
+    to_voxels,
+)
+from r3dpa.nn.backbones.sparse import Voxels, pool_voxels, voxelize
 
 WIDTHS = scaled_widths(0.125)
 

@@ -7,10 +7,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from r3dpa.nn.backbones.minkowski import MinkowskiNet, scaled_widths
-from r3dpa.nn.backbones.sparse import SparseConv, Voxels, kernel_offsets
-from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN, Points, corners, to_points, to_voxels
+from r3dpa.nn.backbones.minkowski import (
+    SPVCNN,
+    MinkowskiNet,
+    Points,
+    corners,
+    scaled_widths,
+    to_points,
+    to_voxels,
+)
+from r3dpa.nn.backbones.sparse import SparseConv, Voxels, kernel_offsets, pool_voxels, voxelize
 
 NETWORKS = {"minkowskinet": MinkowskiNet, "spvcnn": SPVCNN}
 STAGES = [f"stage{i}" for i in range(1, 5)] + [f"up{i}" for i in range(1, 5)]

@@ -1,7 +1,6 @@
 """Sensor, projections and range images: the one place that maps points to pixels."""
 
 from r3dpa.geometry.projection import (
-    EMPTY_RANGE_M,
     Projection,
     RingProjection,
     SphericalProjection,
@@ -11,9 +10,8 @@ from r3dpa.geometry.projection import (
     range_image,
     unproject,
 )
-from r3dpa.geometry.range_codec import RangeCodec
-from r3dpa.geometry.scan_geometry import ScanGeometry, projection_to_dict
-from r3dpa.geometry.sensor import LidarSensor
+from r3dpa.geometry.scan_geometry import RangeCodec, ScanGeometry, projection_to_dict
+from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 __all__ = [
     "EMPTY_RANGE_M",

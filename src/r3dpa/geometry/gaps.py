@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.geometry.projection import Projection, in_range
-from r3dpa.geometry.range_codec import EMPTY_RANGE_M
-from r3dpa.geometry.rays import angles_of
+from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of
 
 __all__ = ["Gaps", "check_view", "filled", "range_error_m", "refined"]
 

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from r3dpa.geometry.range_codec import EMPTY_RANGE_M
-from r3dpa.geometry.rays import (
+from r3dpa.geometry.rings import RingProjection
+from r3dpa.geometry.sensor import (
+    EMPTY_RANGE_M,
+    LidarSensor,
     PixelRays,
     angles_of,
     check_points,
@@ -26,8 +28,6 @@ from r3dpa.geometry.rays import (
     pixel_offset,
     range_of,
 )
-from r3dpa.geometry.rings import RingProjection
-from r3dpa.geometry.sensor import LidarSensor
 
 _BAG = 32  # points of a cell that are added in float32; more are no faster
 

@@ -18,7 +18,7 @@ from einops import rearrange, repeat
 from torch import Tensor
 
 from r3dpa.geometry.projection import Projection
-from r3dpa.geometry.rays import column_azimuths
+from r3dpa.geometry.sensor import column_azimuths
 
 __all__ = [
     "angle_box",

@@ -13,7 +13,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from r3dpa.geometry.rays import (
+from r3dpa.geometry.sensor import (
+    LidarSensor,
     PixelRays,
     angles_of,
     check_points,
@@ -21,7 +22,6 @@ from r3dpa.geometry.rays import (
     column_of,
     range_of,
 )
-from r3dpa.geometry.sensor import LidarSensor
 
 _BACKWARD_RAD = 1.0  # a smaller step back is jitter, a larger one starts the next ring
 _OUT_OF_PLACE_SHARE = 1 / 8  # of the field of view; 1/2 where the lowest ring comes first

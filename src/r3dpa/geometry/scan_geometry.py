@@ -1,18 +1,107 @@
-"""Projection, range encoding and grid size as one value that checkpoints store."""
+"""Metres to the [-1, 1] of the networks and back; projection, codec and grid size as one value."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self, cast
 
 import torch
+from torch import Tensor
 
 from r3dpa.geometry.projection import Projection, RingProjection, SphericalProjection
-from r3dpa.geometry.range_codec import RangeCodec
-from r3dpa.geometry.sensor import LidarSensor
+from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
 _ROUNDING_M = 1e-3
+_DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84}
+_LOG_OFFSET_M = 1e-4
+_LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
+_THRESHOLD_MARGIN = 1e-6
+
+
+@dataclass(frozen=True)
+class RangeCodec:
+    """Range in metres to an image in [-1, 1] and back.
+
+    Formulas, with range d in metres::
+
+        linear  image = 2 * d / scale - 1
+        log2    image = 2 * log2(d + 1 + 1e-4) / scale - 1
+
+    both clipped to [-1, 1]; a pixel without a return counts as d = 0.
+
+    Source: the two data configurations of valeoai/R3DPA. Its inverse of the logarithm leaves
+    the 1e-4 m out; ``legacy_inverse`` does so too, for published numbers.
+
+    Args:
+        encoding: ``linear`` or ``log2``.
+        scale: Divisor of the formula; 56 for ``linear`` and 5.84 for ``log2`` where None.
+        legacy_inverse: Return ranges that are 1e-4 m too long from a ``log2`` image.
+
+    Raises:
+        ValueError: If the encoding is unknown or the scale is not positive and finite.
+    """
+
+    encoding: Literal["linear", "log2"] = "linear"
+    scale: float | None = None
+    legacy_inverse: bool = False
+
+    def __post_init__(self) -> None:
+        if self.encoding not in _DEFAULT_SCALES:
+            raise ValueError(f"range encoding must be 'linear' or 'log2', got {self.encoding!r}")
+        if self.scale is None:  # so that a codec equals the same one written out
+            object.__setattr__(self, "scale", _DEFAULT_SCALES[self.encoding])
+        if not 0.0 < self._divisor < math.inf:
+            raise ValueError(f"range scale must be positive and finite, got {self.scale}")
+
+    @property
+    def _divisor(self) -> float:
+        return cast(float, self.scale)
+
+    @property
+    def threshold(self) -> float:
+        """Image value in [-1, 1] above which a pixel holds a return: about 4 mm of range."""
+        if self.encoding == "linear":
+            fraction = _LEAST_VALID_M / self._divisor
+        else:
+            fraction = math.log2(1 + _LEAST_VALID_M) / self._divisor
+        return 2 * fraction - 1 + _THRESHOLD_MARGIN
+
+    def encode(self, range_m: Tensor) -> Tensor:
+        """Image in [-1, 1], float32, of ranges in metres; any negative range means no return."""
+        # Clamped first: log2 of a range below -1 m is NaN, which would survive the last clamp.
+        # float64: float32 logarithms alone would move a range of 50 m by 2e-5 m.
+        metres = range_m.double().clamp(min=0)
+        if self.encoding == "log2":
+            metres = torch.log1p(metres + _LOG_OFFSET_M) / math.log(2)
+        return (2 * metres / self._divisor - 1).clamp(-1, 1).float()
+
+    def valid_mask(self, image: Tensor) -> Tensor:
+        """Pixels of an encoded image that hold a return, bool."""
+        return image > self.threshold
+
+    def to_range(self, image: Tensor) -> Tensor:
+        """Inverse of the formula for every pixel, float32 metres; negative below an image of -1."""
+        metres = (image.double() + 1) / 2 * self._divisor
+        if self.encoding == "log2":
+            offset = 0.0 if self.legacy_inverse else _LOG_OFFSET_M
+            metres = torch.expm1(metres * math.log(2)) - offset
+        return metres.float()
+
+    def decode(self, image: Tensor, sensor: LidarSensor) -> Tensor:
+        """Ranges of an encoded image, float32 metres.
+
+        Args:
+            image: Any shape, encoded range; decoder outputs outside [-1, 1] are allowed.
+            sensor: Gives the range limits, which are exclusive.
+
+        Returns:
+            ``EMPTY_RANGE_M`` where the pixel is empty, outside the range limits, or NaN.
+        """
+        range_m = self.to_range(image)
+        inside = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+        return torch.where(inside & self.valid_mask(image), range_m, EMPTY_RANGE_M)
 
 
 @dataclass(frozen=True)

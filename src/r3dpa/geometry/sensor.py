@@ -1,9 +1,19 @@
-"""The LiDAR sensor as the rest of the package sees it."""
+"""The LiDAR sensor, range and angles of points, and the rays of pixels.
+
+Axes are x forward, y left, z up, in metres, with the sensor at the origin.
+"""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+EMPTY_RANGE_M = -1.0  # a pixel without a return
 
 
 @dataclass(frozen=True)
@@ -72,3 +82,76 @@ class LidarSensor:
     def inclination_min_rad(self) -> float:
         """Lower border of the last row, radians."""
         return math.radians(self.inclination_min_deg)
+
+
+class PixelRays(ABC):
+    """Rays of the pixels of a projection; its settings are hashable, so that rays are kept."""
+
+    @abstractmethod
+    def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
+        """Inclination of each row and azimuth of each column, ``(H,)`` and ``(W,)`` radians."""
+
+    def ray_directions(
+        self,
+        corner: bool = False,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:
+        """Unit vectors ``(H, W, 3)`` along the rays of the pixels.
+
+        With ``corner`` they pass the upper left corner of the pixel, not its centre, as in the
+        official code: half a pixel (0.22 degrees up, 0.18 sideways).
+        """
+        return kept_directions(self, corner, dtype, torch.device(device)).clone()
+
+
+@lru_cache(maxsize=16)
+def kept_directions(
+    rays: PixelRays, corner: bool, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Directions ``(H, W, 3)`` that are shared by all callers and must not be written to."""
+    # A tensor made in inference mode could never take part in a backward pass again.
+    with torch.inference_mode(False):
+        inclination, azimuth = rays.ray_angles(corner)
+        inclination, azimuth = torch.meshgrid(inclination, azimuth, indexing="ij")
+        horizontal = inclination.cos()
+        directions = torch.stack(
+            [horizontal * azimuth.cos(), horizontal * azimuth.sin(), inclination.sin()], dim=-1
+        )
+        return directions.to(device=device, dtype=dtype)
+
+
+def check_points(points: Tensor) -> None:
+    """Refuse points whose last axis is not x, y, z with a ValueError."""
+    if points.ndim < 1 or points.shape[-1] != 3:
+        raise ValueError(f"points must be (..., 3) x, y, z, got shape {tuple(points.shape)}")
+
+
+def range_of(points: Tensor) -> Tensor:
+    """Distance from the sensor, correctly rounded float32; not finite for such points."""
+    return torch.linalg.vector_norm(points.double(), dim=-1).float()
+
+
+def angles_of(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Inclination and azimuth of points, float64 radians; 0, 0 where not finite."""
+    check_points(points)
+    finite = points.isfinite().all(dim=-1, keepdim=True)
+    x, y, z = torch.where(finite, points.double(), 0.0).unbind(-1)
+    return torch.atan2(z, torch.hypot(x, y)), torch.atan2(y, x)
+
+
+def column_of(azimuth: Tensor, columns: int, legacy_seam: bool = False) -> Tensor:
+    """Column of an azimuth in radians, int64; column 0 looks backwards."""
+    column = ((math.pi - azimuth) / (2 * math.pi) * columns).floor().long()
+    return column.clamp(max=columns - 1) if legacy_seam else column % columns
+
+
+def pixel_offset(corner: bool) -> float:
+    """Where in the pixel its ray passes, as a share of the pixel from its upper left corner."""
+    return 0.0 if corner else 0.5
+
+
+def column_azimuths(columns: int, corner: bool) -> Tensor:
+    """Azimuth ``(W,)`` of the centres or left borders of the columns, float64 radians."""
+    index = torch.arange(columns, dtype=torch.float64) + pixel_offset(corner)
+    return math.pi - index * (2 * math.pi / columns)

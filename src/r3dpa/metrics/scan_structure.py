@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.geometry.rays import angles_of
 from r3dpa.geometry.rings import rings_in_order
+from r3dpa.geometry.sensor import angles_of
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

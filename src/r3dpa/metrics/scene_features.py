@@ -30,11 +30,10 @@ from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
 from r3dpa.nn.backbones.geometric import CENTRES
 from r3dpa.nn.backbones.liploc import GREY_LEVELS_PER_M, LIPLoc
-from r3dpa.nn.backbones.minkowski import MinkowskiNet
+from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
 from r3dpa.nn.backbones.point_features import sha256
 from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.sparse_features import NUM_BINS, pool_voxels, voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN
+from r3dpa.nn.backbones.sparse import NUM_BINS, pool_voxels, voxelize
 
 #: Names that :func:`scene_features` knows.
 SPACES = ("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo")

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from r3dpa.data.point_datamodule import PointDataModule
 from r3dpa.data.scans import evenly
 from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
-from r3dpa.nn.backbones.masking import NUM_TARGETS, MaskedScan, Masking
 from r3dpa.nn.backbones.point_features import save_weights
+from r3dpa.nn.backbones.voxels import NUM_TARGETS, MaskedScan, Masking
 
 _SCANS_TO_QUANTISE = 16
 

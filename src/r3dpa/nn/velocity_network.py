@@ -1,4 +1,4 @@
-"""Interface of the networks that predict velocities and projected features.
+"""Interface of the networks that predict velocities and features, and the average of one.
 
 Letters: B batch, C latent channels, h x w latent size, N tokens, F feature width, T times,
 M width of a modulation row.
@@ -6,19 +6,22 @@ M width of a modulation row.
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.layers import at_least_float32, no_autocast
 
 __all__ = [
+    "EMA",
     "TIME_WIDTH",
     "AlignedPass",
     "VelocityNetwork",
@@ -235,6 +238,67 @@ class VelocityNetwork(nn.Module, ABC):
                 f"{type(self).__name__} was built for latents of shape "
                 f"(B, {', '.join(map(str, expected))}), got {tuple(latents.shape)}"
             )
+
+
+class EMA(nn.Module):
+    """Averaged float32 copies of a velocity network and of its latent statistics.
+
+    Parameters follow ``average = decay * average + (1 - decay) * weight`` after every optimiser
+    step. Buffers (the latent statistics, which are an average already) are copied by default: at
+    decay 0.9999 an averaged statistic lags about 1e4 steps behind the VAE. The official code
+    averages floating-point buffers too, as does ``buffers="decay"``.
+
+    Args:
+        sit: Network to average; copied, never changed.
+        latent_norm: Its statistics.
+        decay: Weight of the old average, in [0, 1).
+        buffers: ``copy`` or ``decay``.
+    """
+
+    def __init__(
+        self,
+        sit: VelocityNetwork,
+        latent_norm: LatentNorm,
+        decay: float = 0.9999,
+        buffers: Literal["copy", "decay"] = "copy",
+    ) -> None:
+        super().__init__()
+        if not 0.0 <= decay < 1.0:
+            raise ValueError(f"EMA decay must be in [0, 1), got {decay}")
+        if buffers not in ("copy", "decay"):
+            raise ValueError(f"EMA buffers must be 'copy' or 'decay', got {buffers!r}")
+        self.decay = decay
+        self.decays_buffers = buffers == "decay"
+        self.sit = copy.deepcopy(sit).float().eval().requires_grad_(False)
+        self.latent_norm = copy.deepcopy(latent_norm).float().eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
+        """Moves the averages one step towards the current weights."""
+        for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
+            pairs: list[tuple[Tensor, Tensor]] = list(
+                zip(average.parameters(), network.parameters(), strict=True)
+            )
+            for target, source in zip(average.buffers(), network.buffers(), strict=True):
+                if self.decays_buffers and source.is_floating_point():
+                    pairs.append((target, source))
+                else:
+                    target.copy_(source)
+            if pairs:
+                targets, sources = zip(*pairs, strict=True)
+                torch._foreach_lerp_(
+                    targets, [source.float() for source in sources], 1.0 - self.decay
+                )
+
+    @torch.no_grad()
+    def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
+        """Sets the averages to the current weights, as at the start of a training stage."""
+        self.sit.load_state_dict(sit.state_dict())
+        self.latent_norm.load_state_dict(latent_norm.state_dict())
+
+    def train(self, mode: bool = True) -> EMA:
+        """Stays in evaluation mode."""
+        return super().train(False)
 
 
 def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:

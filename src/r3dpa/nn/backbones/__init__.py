@@ -1,15 +1,15 @@
 """Frozen extractors: point features to align with, and the networks of the published metrics."""
 
-from r3dpa.nn.backbones.dinov2 import DINOv2
 from r3dpa.nn.backbones.geometric import GeometricFeatures
 from r3dpa.nn.backbones.liploc import LIPLoc
-from r3dpa.nn.backbones.masking import MaskedScan, Masking
-from r3dpa.nn.backbones.minkowski import MinkowskiNet
+from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
 from r3dpa.nn.backbones.point_features import SOURCES, ScaLR, WaffleIronS, feature_source
 from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.sparse_features import pool_voxels, voxelize
-from r3dpa.nn.backbones.spvcnn import SPVCNN
+from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
+from r3dpa.nn.backbones.vit import DINOv2
 from r3dpa.nn.backbones.voxels import (
+    MaskedScan,
+    Masking,
     PointCloudBatch,
     PreparedScan,
     ScanGrid,

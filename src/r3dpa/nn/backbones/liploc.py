@@ -15,13 +15,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r3dpa.nn.backbones.official import load_strictly, read_state_dict, renamed
-from r3dpa.nn.backbones.vit import TransformerTrunk, trunk_depth, usual_heads
+from r3dpa.nn.backbones.vit import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    TransformerTrunk,
+    trunk_depth,
+    usual_heads,
+)
 
 _NORM_EPS = 1e-6
 GREY_LEVELS_PER_M = 5.1
-# Mean and deviation of red, green and blue on ImageNet.
-_MEAN = (0.485, 0.456, 0.406)
-_DEVIATION = (0.229, 0.224, 0.225)
 _ENCODER = "encoder_lidar.model."
 # Beginning of our names -> of the official ones.
 _NAMES = {"embedding.": "patch_embed.proj.", "encoder.": "", "norm.": "fc_norm."}
@@ -126,8 +129,8 @@ def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tens
         raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
     grey = wrapped_grey_levels(range_m).float()[:, None] / 255
     grey = F.interpolate(grey, size, mode="bilinear", align_corners=False, antialias=True)
-    mean, deviation = (grey.new_tensor(values).view(3, 1, 1) for values in (_MEAN, _DEVIATION))
-    return (grey - mean) / deviation
+    mean, std = (grey.new_tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    return (grey - mean) / std
 
 
 def wrapped_grey_levels(range_m: Tensor) -> Tensor:
