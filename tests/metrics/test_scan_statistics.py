@@ -11,7 +11,7 @@ import torch
 
 from r3dpa.data.scans import find_scans, read_scan
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of, range_image
-from r3dpa.metrics import MEASURES, ScanStatistics, scan_statistics
+from r3dpa.metrics import ScanStatistics, measures, scan_statistics
 
 SHOTS = 2000
 HEIGHT_M = 1.73
@@ -42,24 +42,28 @@ def statistics_of(range_m: np.ndarray, intensity: float = 0.5) -> ScanStatistics
 
 
 def feature(name: str, statistics: ScanStatistics) -> np.ndarray:
-    return next(m for m in MEASURES if m.name == name).feature(statistics)
+    return measures(statistics)[name].values
 
 
 def value(name: str, statistics: ScanStatistics) -> float:
-    return next(m for m in MEASURES if m.name == name).value(statistics)
+    return measures(statistics)[name].summary
 
 
 def same(a: ScanStatistics, b: ScanStatistics) -> bool:
     return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
 
 
-def test_a_whole_scan_has_no_dropout():
-    statistics = statistics_of(road_and_wall())
-    assert statistics.num_beam_scans == statistics.num_ground_scans == 1
-    assert statistics.shots == pytest.approx(SHOTS)
-    assert feature("dropout by beam", statistics) == pytest.approx(0, abs=1e-4)
-    assert statistics.drop_runs.sum() == 0
-    assert statistics.num_returns == 64 * SHOTS
+@pytest.fixture(scope="module")
+def whole() -> ScanStatistics:
+    return statistics_of(road_and_wall())
+
+
+def test_a_whole_scan_has_no_dropout(whole):
+    assert whole.num_beam_scans == whole.num_ground_scans == 1
+    assert whole.shots == pytest.approx(SHOTS)
+    assert feature("dropout by beam", whole) == pytest.approx(0, abs=1e-4)
+    assert whole.drop_runs.sum() == 0
+    assert whole.num_returns == 64 * SHOTS
 
 
 def test_a_tenth_dropped_at_random_keeps_nine_tenths():
@@ -67,13 +71,12 @@ def test_a_tenth_dropped_at_random_keeps_nine_tenths():
     range_m = road_and_wall()
     range_m[generator.random(range_m.shape) < 0.1] = 0
     statistics = statistics_of(range_m)
-    assert feature("dropout by beam", statistics) == pytest.approx(
-        0.1, abs=0.03
-    )  # 4 sd of 2000 shots
-    keep_rates = [m for m in MEASURES if m.name.startswith("keep rate")]
+    dropout = feature("dropout by beam", statistics)
+    assert dropout == pytest.approx(0.1, abs=0.03)  # 4 sd of 2000 shots
+    keep_rates = [m for m in measures(statistics).values() if m.name.startswith("keep rate")]
     assert len(keep_rates) == 5
     for measure in keep_rates:
-        assert measure.value(statistics) == pytest.approx(0.9, abs=0.006)
+        assert measure.summary == pytest.approx(0.9, abs=0.006)
     # Runs of independent losses are geometric: 0.9 of them are of a single shot.
     assert statistics.drop_runs[1] / statistics.drop_runs.sum() == pytest.approx(0.9, abs=0.01)
 
@@ -126,14 +129,13 @@ def test_ground_plane_residual_is_the_roughness_of_the_road():
     assert value("ground plane residual", statistics) == pytest.approx(30, rel=0.03)
 
 
-def test_ground_rings_lie_where_the_beams_meet_the_road():
-    statistics = statistics_of(road_and_wall())
+def test_ground_rings_lie_where_the_beams_meet_the_road(whole):
     distance = HEIGHT_M / np.tan(-INCLINATION[~ON_WALL])
-    measured = statistics.ground_distance_m / statistics.ground_returns.clip(1)
+    measured = whole.ground_distance_m / whole.ground_returns.clip(1)
     on_road = np.flatnonzero(~ON_WALL)
     assert measured[on_road] == pytest.approx(distance, abs=1e-3)
-    assert value("last ground ring", statistics) == pytest.approx(distance[0], abs=0.5)
-    spacing = feature("ground ring spacing", statistics)
+    assert value("last ground ring", whole) == pytest.approx(distance[0], abs=0.5)
+    spacing = feature("ground ring spacing", whole)
     near = distance[:-1] < 25
     assert spacing[on_road[:-1][near]] == pytest.approx(-np.diff(distance)[near], abs=1e-3)
 
@@ -147,9 +149,8 @@ def test_last_ring_needs_a_tenth_of_the_azimuth():
         assert value("last ground ring", statistics_of(range_m)) == pytest.approx(expected, abs=0.5)
 
 
-def test_incidence_on_a_wall_is_the_inclination_and_on_the_road_its_complement():
-    statistics = statistics_of(road_and_wall())
-    ground, upright = statistics.keep_by_incidence[..., 1]
+def test_incidence_on_a_wall_is_the_inclination_and_on_the_road_its_complement(whole):
+    ground, upright = whole.keep_by_incidence[..., 1]
     assert upright[0] > 0
     assert upright[1:].sum() == 0  # all wall beams are within 4 degrees of the horizon
     angles = 90 - np.degrees(-INCLINATION[~ON_WALL])
@@ -174,14 +175,14 @@ def test_intensity_by_range_and_incidence():
     assert value("saturated share", statistics_of(road_and_wall(), intensity=0.99)) == 1
 
 
-def test_dummies_and_far_points_are_no_returns():
-    points = scan_of(road_and_wall())
+def test_dummies_and_far_points_are_no_returns(whole):
     more = np.array([[100, 0, 0, 0.5], [0, 0, 0, 0]], dtype=np.float32)
-    assert same(scan_statistics(points), scan_statistics(np.concatenate([points, more])))
+    points = np.concatenate([scan_of(road_and_wall()), more])
+    assert same(scan_statistics(points), whole)
 
 
-def test_pooling_adds_what_scans_contribute():
-    near, far = statistics_of(road_and_wall()), statistics_of(2 * road_and_wall())
+def test_pooling_adds_what_scans_contribute(whole):
+    near, far = whole, statistics_of(2 * road_and_wall())
     assert same(near + ScanStatistics(), near)
     both = near + far
     assert both.num_scans == 2
@@ -189,15 +190,14 @@ def test_pooling_adds_what_scans_contribute():
     assert means[2] == pytest.approx((means[0] + means[1]) / 2)
 
 
-def test_counts_by_cell_and_sector():
-    statistics = statistics_of(road_and_wall())
+def test_counts_by_cell_and_sector(whole):
     cells = np.unique(np.floor(scan_of(road_and_wall())[:, :2]), axis=0)
-    shares = feature("occupied cells by sector", statistics)
+    shares = feature("occupied cells by sector", whole)
     assert shares.mean() == pytest.approx(len(cells) / (math.pi * 50**2))
     assert shares.reshape(4, 4) == pytest.approx(np.tile(shares[:4], (4, 1)))  # quarter turns
-    assert statistics.bev_counts.sum() == statistics.num_returns
+    assert whole.bev_counts.sum() == whole.num_returns
     # The wall is hit up to 2 degrees above the sensor.
-    top = statistics.height_counts.nonzero()[0][-1] * 0.05 - 3
+    top = whole.height_counts.nonzero()[0][-1] * 0.05 - 3
     assert top == pytest.approx(WALL_M * math.tan(math.radians(2)), abs=0.05)
 
 

@@ -34,10 +34,10 @@ from r3dpa.metrics.functional_bev import (
     minimum_matching,
 )
 from r3dpa.metrics.realism import (
-    MEASURES,
     Measure,
     RealismRow,
     RealismTable,
+    measures,
     realism_table,
 )
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -49,7 +49,6 @@ from r3dpa.metrics.scene_features import SceneFeatures, scene_features
 
 __all__ = [
     "DEFAULT",
-    "MEASURES",
     "PUBLISHED",
     "BEVGrid",
     "BEVHistogramDistance",
@@ -84,6 +83,7 @@ __all__ = [
     "frechet_distance_of",
     "histogram_distance",
     "jensen_shannon",
+    "measures",
     "minimum_matching",
     "polynomial_mmd",
     "precision_recall",

@@ -14,37 +14,25 @@ itself in nats, not its root.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, product
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from r3dpa.io import text_table
 from r3dpa.metrics.functional import curve_rmse, jensen_shannon, wasserstein_1
 from r3dpa.metrics.scan_statistics import (
     BEAMS,
     BEV_EXTENT_M,
-    GROUND_REACH,
-    GROUND_RESIDUAL,
-    HEIGHT,
+    BINS,
     INTENSITY_LEVELS,
-    RANGE,
-    RESIDUAL,
-    RETURNS,
-    RUN,
     SENSOR,
-    STEP,
-    VALID_SHARE,
-    Bins,
     ScanStatistics,
 )
-
-Floats = NDArray[np.float64]
-_Feature = Callable[[ScanStatistics], Any]
+from r3dpa.metrics.scan_structure import Floats
 
 _MAX_RATIO = 3.0
 _COLUMNS = ("measure", "unit", "A", "B", "distance", "floor", "(max)", "ratio", "<= 3", "pooled")
@@ -63,32 +51,154 @@ _NEEDS = {
 
 
 class Measure(NamedTuple):
-    """One row of the realism table.
+    """One quantity of a set of scans.
 
     Args:
         name: Printed name.
-        unit: Unit of the distance and of the value.
-        needs: What scans must have: names of ``_NEEDS``, separated by spaces.
-        feature: Number, curve or histogram that is compared.
-        distance: Of two features; NaN where they cannot be compared.
-        value: One number that summarises a data set; NaN where there is none.
+        unit: Unit of the distance and of the summary.
+        lacks: Why the set cannot give the measure; empty where it can.
+        distance: Of the values of two sets; NaN where they cannot be compared.
+        values: Number, curve or histogram that is compared.
+        summary: One number for the set; NaN where there is none.
     """
 
     name: str
     unit: str
-    needs: str
-    feature: _Feature
+    lacks: str
     distance: Callable[[Any, Any], float]
-    value: _Feature = lambda _: math.nan
+    values: Any
+    summary: float = math.nan
 
-    def between(self, a: ScanStatistics, b: ScanStatistics) -> float:
-        """Distance of two sets of scans; NaN where one of them cannot give it."""
-        return float(self.distance(self.feature(a), self.feature(b)))
 
-    def missing_in(self, statistics: ScanStatistics) -> str:
-        """Why a set of scans cannot give this measure; empty where it can."""
-        needs = [_NEEDS[need] for need in self.needs.split()]
-        return next((why for count, why in needs if not getattr(statistics, count)), "")
+def measures(s: ScanStatistics) -> dict[str, Measure]:
+    """The 36 measures of a set of scans by name."""
+    missing = {need: why for need, (count, why) in _NEEDS.items() if not getattr(s, count)}
+    found = {}
+    for measure in _measures(s):  # whose ``lacks`` are still names of ``_NEEDS``
+        lacks = next((missing[need] for need in measure.lacks.split() if need in missing), "")
+        found[measure.name] = measure._replace(lacks=lacks)
+    return found
+
+
+def _measures(s: ScanStatistics) -> Iterator[Measure]:
+    row_shares = _ratio(s.row_returns, s.num_scans * SENSOR.columns)
+    mean_returns = _ratio(s.num_returns, s.num_scans)
+    hit_rows = (row_shares > _HIT_ROW_SHARE).sum()
+    yield _w1("returns per scan", "points", "points", s, "points_per_scan", mean_returns)
+    yield _w1("valid share of the image", "1", "points", s, "valid_share", row_shares.mean())
+    yield Measure("valid share by image row", "1", "points", curve_rmse, row_shares)
+    yield _number("image rows > 2 % valid", "rows", "points", hit_rows)
+
+    upper, lower = s.range_counts
+    for block, ranges in (("", upper + lower), (", upper block", upper), (", lower block", lower)):
+        yield _w1(f"range W1{block}", "m", "points", s, "range_counts", histogram=ranges)
+        yield _jsd(f"range JSD{block}", "points", ranges)
+
+    dropout = (1 - _ratio(s.beam_returns, s.shots)).clip(0)  # no return between 1 and 80 m
+    yield Measure("dropout by beam", "1", "beams", curve_rmse, dropout, dropout.mean())
+    yield _w1("dropout run length", "shots", "rings", s, "drop_runs")
+    yield _keep_rate("range, any surface", "rings", s.keep_by_range)
+    yield _keep_rate("range, ground", "rings ground", s.surface_keep_by_range[0])
+    yield _keep_rate("range, upright", "rings", s.surface_keep_by_range[1])
+    yield _keep_rate("incidence, ground", "rings ground", s.keep_by_incidence[0])
+    yield _keep_rate("incidence, upright", "rings", s.keep_by_incidence[1])
+
+    # Around the neighbours in the ring. From the median of the absolute residuals, as for a normal
+    # variable, so that the few returns of grass and foliage that pass for smooth do not count more.
+    noise_mm = _quantile(s.residual_counts, 0.5) * BINS["residual_counts"].width * 1000
+    noise_mm /= _NORMAL_MEDIAN
+    median_mm = _known(np.median, noise_mm)
+    yield Measure("range residual sd by beam", "mm", "beams", curve_rmse, noise_mm, median_mm)
+    # Median range of a beam minus that of both neighbouring beams.
+    middle = BINS["step_counts"].number / 2
+    bias_mm = (_quantile(s.step_counts, 0.5) - middle) * BINS["step_counts"].width * 1000
+    yield Measure("range bias by beam", "mm", "beams", curve_rmse, bias_mm)
+    yield _number("spread of the beams' bias", "mm", "beams", _known(np.std, bias_mm))
+
+    intensities = s.intensity_by_range.sum(axis=0)
+    saturated = intensities[-2:].sum()  # 0.99 is the largest intensity in KITTI files
+    yield _jsd("intensity JSD", "intensity", intensities)
+    yield _intensity("range", "intensity", s.intensity_by_range)
+    yield _intensity("incidence, ground", "intensity ground", s.intensity_by_incidence[0])
+    yield _intensity("incidence, upright", "intensity rings", s.intensity_by_incidence[1])
+    yield _number("saturated share", "1", "intensity", _ratio(saturated, intensities.sum()))
+
+    low = _ratio(s.low_points, s.num_returns)
+    yield _number("share below z = -1.4 m", "1", "points", low)
+    heights = BINS["ground_residual_counts"]
+    shares = _ratio(s.ground_residual_counts, s.ground_residual_counts.sum())
+    centres_mm = (np.arange(heights.number) + 0.5) * heights.width * 1000
+    spread_mm = np.sqrt((shares * (centres_mm - (shares * centres_mm).sum()) ** 2).sum())
+    yield _w1(
+        "ground plane residual", "mm", "ground", s, "ground_residual_counts", spread_mm, scale=1000
+    )
+    # Horizontal distance at or beyond which 10 % of the azimuth still sees ground.
+    last = _quantile(s.ground_reach_counts, 1 - _LAST_RING_SHARE, 1)
+    yield _number("last ground ring", "m", "ground", last * BINS["ground_reach_counts"].width)
+    yield _w1("ground reach by sector", "m", "ground", s, "ground_reach_counts")
+    ring_m = _ratio(s.ground_distance_m, s.ground_returns, _MIN_COUNT)
+    spacing_m = np.where(ring_m[:-1] < _NEAR_RINGS_M, -np.diff(ring_m), np.nan)
+    median_m = _known(np.median, spacing_m)
+    yield Measure("ground ring spacing", "m", "beams ground", curve_rmse, spacing_m, median_m)
+
+    pairs, mixed, jumps = s.neighbours
+    cells = len(s.bev_counts) // 2
+    coarse = s.bev_counts.reshape(cells, 2, cells, 2).sum(axis=(1, 3))
+    # Of the 1-m cells within 50 m, those that hold a return.
+    in_sector = np.pi * BEV_EXTENT_M**2 / len(s.sector_cells)
+    occupied = _ratio(s.sector_cells, s.num_scans * in_sector)
+    yield _number("mixed pixels", "1", "rings", _ratio(mixed, pairs))
+    yield _number("jumps > 0.5 m to the next", "1", "rings", _ratio(jumps, pairs))
+    yield _jsd("BEV JSD, 0.5 m cells", "points", s.bev_counts)
+    yield _jsd("BEV JSD, 1 m cells", "points", coarse)
+    yield _w1("height map W1", "m", "points", s, "height_counts")
+    yield Measure("occupied cells by sector", "1", "points", curve_rmse, occupied, occupied.mean())
+
+
+def _number(name: str, unit: str, needs: str, value: float) -> Measure:
+    return Measure(name, unit, needs, lambda a, b: abs(a - b), value, value)
+
+
+def _jsd(name: str, needs: str, histogram: Floats) -> Measure:
+    return Measure(name, "nats", needs, jensen_shannon, histogram)
+
+
+def _w1(
+    name: str,
+    unit: str,
+    needs: str,
+    s: ScanStatistics,
+    table: str,
+    summary: float | None = None,
+    *,
+    histogram: Floats | None = None,
+    scale: float = 1.0,
+) -> Measure:
+    """Earth mover's distance of a histogram; its mean unless there is another summary."""
+    bins = BINS[table]
+    values = getattr(s, table) if histogram is None else histogram
+    if summary is None:
+        centres = bins.start + (np.arange(bins.number) + 0.5) * bins.width
+        summary = _ratio(values @ centres, values.sum())
+    distance = partial(wasserstein_1, bin_width=bins.width * scale)
+    return Measure(name, unit, needs, distance, values, summary)
+
+
+def _keep_rate(by: str, needs: str, outcomes: Floats) -> Measure:
+    """Share of the shots that came back, among those between two returns of one surface."""
+    curve = _ratio(outcomes[:, 1], outcomes.sum(axis=-1), _MIN_COUNT)
+    mean = _ratio(outcomes[:, 1].sum(), outcomes.sum())
+    return Measure(f"keep rate by {by}", "1", needs, curve_rmse, curve, mean)
+
+
+def _intensity(by: str, needs: str, histograms: Floats) -> Measure:
+    """Median intensity; each step of 0.01 is an interval."""
+
+    def median(levels: Floats) -> Any:
+        return (_quantile(levels, 0.5) - 0.5) / (INTENSITY_LEVELS - 1)
+
+    curve, summary = median(histograms), median(histograms.sum(axis=0))
+    return Measure(f"median intensity by {by}", "1", needs, curve_rmse, curve, summary)
 
 
 def _ratio(numerator: Any, denominator: Any, at_least: float = 0.0) -> Any:
@@ -97,13 +207,13 @@ def _ratio(numerator: Any, denominator: Any, at_least: float = 0.0) -> Any:
     return np.where(known, numerator / np.where(known, denominator, 1.0), np.nan)
 
 
-def _quantile(counts: Floats, quantile: float, at_least: float = _MIN_COUNT) -> Floats:
+def _quantile(histograms: Floats, quantile: float, at_least: float = _MIN_COUNT) -> Floats:
     """Quantile along the last axis in bins from 0, linear within a bin; NaN for too few counts."""
-    cdf = counts.cumsum(axis=-1)
+    cdf = histograms.cumsum(axis=-1)
     total = cdf[..., -1:]
     wanted = quantile * total
-    index = (cdf < wanted).sum(axis=-1, keepdims=True).clip(max=counts.shape[-1] - 1)
-    inside = np.take_along_axis(counts, index, axis=-1)
+    index = (cdf < wanted).sum(axis=-1, keepdims=True).clip(max=histograms.shape[-1] - 1)
+    inside = np.take_along_axis(histograms, index, axis=-1)
     below = np.take_along_axis(cdf, index, axis=-1) - inside
     return np.where(total >= at_least, index + _ratio(wanted - below, inside), np.nan)[..., 0]
 
@@ -112,167 +222,6 @@ def _known(statistic: Callable[[Floats], Any], curve: Floats) -> float:
     """Statistic of the finite values of a curve."""
     finite = curve[np.isfinite(curve)]
     return float(statistic(finite)) if len(finite) else math.nan
-
-
-def _row_shares(s: ScanStatistics) -> Floats:
-    return _ratio(s.row_returns, s.num_scans * SENSOR.columns)
-
-
-def _dropout(s: ScanStatistics) -> Floats:
-    """Probability by beam that a shot gives no return between 1 and 80 m."""
-    return (1 - _ratio(s.beam_returns, s.shots)).clip(0)
-
-
-def _residual_sd_mm(s: ScanStatistics) -> Floats:
-    """Standard deviation by beam of a range around its neighbours in the ring.
-
-    From the median of the absolute residuals, as for a normal variable, so that the few returns of
-    grass and foliage that pass for smooth do not count more than others.
-    """
-    return _quantile(s.residual_counts, 0.5) * RESIDUAL.width * 1000 / _NORMAL_MEDIAN
-
-
-def _bias_mm(s: ScanStatistics) -> Floats:
-    """Median range of a beam minus that of both neighbouring beams."""
-    return (_quantile(s.step_counts, 0.5) - STEP.number / 2) * STEP.width * 1000
-
-
-def _median_intensity(counts: Floats) -> Floats:
-    """Median along the last axis; each step of 0.01 is an interval."""
-    return (_quantile(counts, 0.5) - 0.5) / (INTENSITY_LEVELS - 1)
-
-
-def _intensities(s: ScanStatistics) -> Floats:
-    return s.intensity_by_range.sum(axis=0)
-
-
-def _ground_residual_sd_mm(s: ScanStatistics) -> float:
-    centres_mm = (np.arange(GROUND_RESIDUAL.number) + 0.5) * GROUND_RESIDUAL.width * 1000
-    shares = _ratio(s.ground_residual_counts, s.ground_residual_counts.sum())
-    return np.sqrt((shares * (centres_mm - (shares * centres_mm).sum()) ** 2).sum())
-
-
-def _last_ring_m(s: ScanStatistics) -> Floats:
-    """Horizontal distance at or beyond which 10 % of the azimuth still sees ground."""
-    return _quantile(s.ground_reach_counts, 1 - _LAST_RING_SHARE, 1) * GROUND_REACH.width
-
-
-def _ring_spacing_m(s: ScanStatistics) -> Floats:
-    """Distance ``(H - 1,)`` between the ground rings of neighbouring beams within 25 m."""
-    distance = _ratio(s.ground_distance_m, s.ground_returns, _MIN_COUNT)
-    return np.where(distance[:-1] < _NEAR_RINGS_M, -np.diff(distance), np.nan)
-
-
-def _coarse_bev(s: ScanStatistics) -> Floats:
-    cells = len(s.bev_counts) // 2
-    return s.bev_counts.reshape(cells, 2, cells, 2).sum(axis=(1, 3))
-
-
-def _sector_shares(s: ScanStatistics) -> Floats:
-    """Share of the 1-m cells within 50 m that hold a return, by azimuth sector."""
-    cells = np.pi * BEV_EXTENT_M**2 / len(s.sector_cells)
-    return _ratio(s.sector_cells, s.num_scans * cells)
-
-
-def _number(name: str, unit: str, needs: str, number: _Feature) -> Measure:
-    return Measure(name, unit, needs, number, lambda a, b: abs(a - b), number)
-
-
-def _share(name: str, needs: str, part: _Feature, whole: _Feature) -> Measure:
-    return _number(name, "1", needs, lambda s: _ratio(part(s), whole(s)))
-
-
-def _jsd(name: str, needs: str, counts: _Feature) -> Measure:
-    return Measure(name, "nats", needs, counts, jensen_shannon)
-
-
-def _w1(name: str, unit: str, needs: str, counts: _Feature, bins: Bins) -> Measure:
-    def mean(s: ScanStatistics) -> float:
-        centres = bins.start + (np.arange(bins.number) + 0.5) * bins.width
-        return _ratio(counts(s) @ centres, counts(s).sum())
-
-    return Measure(name, unit, needs, counts, lambda a, b: wasserstein_1(a, b, bins.width), mean)
-
-
-def _range(where: str, counts: _Feature) -> tuple[Measure, Measure]:
-    """W1 and JSD of the range histogram of some blocks of lasers."""
-    return (
-        _w1(f"range W1{where}", "m", "points", counts, RANGE),
-        _jsd(f"range JSD{where}", "points", counts),
-    )
-
-
-def _keep_rate(by: str, needs: str, counts: _Feature) -> Measure:
-    """Share of the shots that came back, among those between two returns of one surface."""
-    return Measure(
-        f"keep rate by {by}",
-        "1",
-        needs,
-        lambda s: _ratio(counts(s)[:, 1], counts(s).sum(axis=-1), _MIN_COUNT),
-        curve_rmse,
-        lambda s: _ratio(counts(s)[:, 1].sum(), counts(s).sum()),
-    )
-
-
-def _intensity(by: str, needs: str, counts: _Feature) -> Measure:
-    return Measure(
-        f"median intensity by {by}",
-        "1",
-        needs,
-        lambda s: _median_intensity(counts(s)),
-        curve_rmse,
-        lambda s: _median_intensity(counts(s).sum(axis=0)),
-    )
-
-
-# fmt: off
-MEASURES: tuple[Measure, ...] = (
-    _w1("returns per scan", "points", "points", attrgetter("points_per_scan"), RETURNS)
-        ._replace(value=lambda s: _ratio(s.num_returns, s.num_scans)),
-    _w1("valid share of the image", "1", "points", attrgetter("valid_share"), VALID_SHARE)
-        ._replace(value=lambda s: _row_shares(s).mean()),
-    Measure("valid share by image row", "1", "points", _row_shares, curve_rmse),
-    _number("image rows > 2 % valid", "rows", "points",
-        lambda s: (_row_shares(s) > _HIT_ROW_SHARE).sum()),
-    *_range("", lambda s: s.range_counts.sum(axis=0)),
-    *_range(", upper block", lambda s: s.range_counts[0]),
-    *_range(", lower block", lambda s: s.range_counts[1]),
-    Measure("dropout by beam", "1", "beams", _dropout, curve_rmse, lambda s: _dropout(s).mean()),
-    _w1("dropout run length", "shots", "rings", attrgetter("drop_runs"), RUN),
-    _keep_rate("range, any surface", "rings", lambda s: s.keep_by_range[0]),
-    _keep_rate("range, ground", "rings ground", lambda s: s.keep_by_range[1]),
-    _keep_rate("range, upright", "rings", lambda s: s.keep_by_range[2]),
-    _keep_rate("incidence, ground", "rings ground", lambda s: s.keep_by_incidence[0]),
-    _keep_rate("incidence, upright", "rings", lambda s: s.keep_by_incidence[1]),
-    Measure("range residual sd by beam", "mm", "beams", _residual_sd_mm, curve_rmse,
-        lambda s: _known(np.median, _residual_sd_mm(s))),
-    Measure("range bias by beam", "mm", "beams", _bias_mm, curve_rmse),
-    _number("spread of the beams' bias", "mm", "beams", lambda s: _known(np.std, _bias_mm(s))),
-    _jsd("intensity JSD", "intensity", _intensities),
-    _intensity("range", "intensity", lambda s: s.intensity_by_range),
-    _intensity("incidence, ground", "intensity ground", lambda s: s.intensity_by_incidence[0]),
-    _intensity("incidence, upright", "intensity rings", lambda s: s.intensity_by_incidence[1]),
-    # 0.99 is the largest intensity in KITTI files.
-    _share("saturated share", "intensity",
-        lambda s: _intensities(s)[-2:].sum(), lambda s: _intensities(s).sum()),
-    _share("share below z = -1.4 m", "points", attrgetter("low_points"), attrgetter("num_returns")),
-    _w1("ground plane residual", "mm", "ground", attrgetter("ground_residual_counts"),
-        Bins(GROUND_RESIDUAL.width * 1000, GROUND_RESIDUAL.number))
-        ._replace(value=_ground_residual_sd_mm),
-    _number("last ground ring", "m", "ground", _last_ring_m),
-    _w1("ground reach by sector", "m", "ground", attrgetter("ground_reach_counts"), GROUND_REACH),
-    Measure("ground ring spacing", "m", "beams ground", _ring_spacing_m, curve_rmse,
-        lambda s: _known(np.median, _ring_spacing_m(s))),
-    _share("mixed pixels", "rings", lambda s: s.neighbours[1], lambda s: s.neighbours[0]),
-    _share("jumps > 0.5 m to the next", "rings",
-        lambda s: s.neighbours[2], lambda s: s.neighbours[0]),
-    _jsd("BEV JSD, 0.5 m cells", "points", attrgetter("bev_counts")),
-    _jsd("BEV JSD, 1 m cells", "points", _coarse_bev),
-    _w1("height map W1", "m", "points", attrgetter("height_counts"), HEIGHT),
-    Measure("occupied cells by sector", "1", "points", _sector_shares, curve_rmse,
-        lambda s: _sector_shares(s).mean()),
-)
-# fmt: on
 
 
 class RealismRow(NamedTuple):
@@ -321,12 +270,9 @@ class RealismTable:
 
     def to_dict(self) -> dict[str, Any]:
         """Rows, notes and the curves and histograms behind them, for JSON (null where unknown)."""
+        rows = [row._asdict() | {"within_3x": row.within} for row in self.rows]
         return {
-            "rows": [
-                {key: _json(value) for key, value in row._asdict().items()}
-                | {"within_3x": row.within}
-                for row in self.rows
-            ],
+            "rows": [{key: _json(value) for key, value in row.items()} for row in rows],
             "notes": list(self.notes),
             "a": _described(self.statistics_a),
             "b": _described(self.statistics_b),
@@ -347,39 +293,37 @@ def realism_table(
         raise ValueError("realism needs at least one drive of scans and one of the reference")
     a = sum(scans.values(), ScanStatistics())
     b = sum(reference.values(), ScanStatistics())
-    pairs = list(product(scans.values(), reference.values()))
-    real_pairs = list(combinations(reference.values(), 2))
-    rows = tuple(_row(measure, a, b, pairs, real_pairs) for measure in MEASURES)
+    of_scans, of_reference = ([*map(measures, drives.values())] for drives in (scans, reference))
+    pairs, real_pairs = [*product(of_scans, of_reference)], [*combinations(of_reference, 2)]
+    whole_b = measures(b)
+    rows = []
+    for name, own in measures(a).items():
+        distances, floors = (
+            np.array([float(own.distance(x[name].values, y[name].values)) for x, y in both])
+            for both in (pairs, real_pairs)
+        )
+        distance, floor = _known(np.median, distances), _known(np.median, floors)
+        real, ratio = whole_b[name], math.nan
+        lacks = {"A": own.lacks, "B": real.lacks}
+        reason = "; ".join(f"{side}: {why}" for side, why in lacks.items() if why)
+        if reason:
+            pass
+        elif math.isnan(distance):
+            reason = "no bin holds enough returns in a drive of A and in one of B"
+        elif math.isnan(floor):
+            reason = "no two drives of B can be compared, so there is no floor"
+        elif floor == 0:
+            ratio = 0.0 if distance == 0 else math.inf
+        else:
+            ratio = distance / floor
+        values = float(own.summary), float(real.summary)
+        pooled = float(own.distance(own.values, real.values))
+        largest = _known(np.max, floors)
+        rows.append(
+            RealismRow(name, own.unit, *values, distance, floor, largest, pooled, ratio, reason)
+        )
     described = (_counted("A", scans, a), _counted("B", reference, b))
-    return RealismTable(rows, (*described, *notes), a, b)
-
-
-_Pairs = list[tuple[ScanStatistics, ScanStatistics]]
-
-
-def _row(
-    measure: Measure, a: ScanStatistics, b: ScanStatistics, pairs: _Pairs, real_pairs: _Pairs
-) -> RealismRow:
-    distances = np.array([measure.between(*pair) for pair in pairs])
-    floors = np.array([measure.between(*pair) for pair in real_pairs])
-    distance, floor = _known(np.median, distances), _known(np.median, floors)
-    absent = {"A": measure.missing_in(a), "B": measure.missing_in(b)}
-    ratio, reason = math.nan, ""
-    if any(absent.values()):
-        reason = "; ".join(f"{name}: {why}" for name, why in absent.items() if why)
-    elif math.isnan(distance):
-        reason = "no bin holds enough returns in a drive of A and in one of B"
-    elif math.isnan(floor):
-        reason = "no two drives of B can be compared, so there is no floor"
-    elif floor == 0:
-        ratio = 0.0 if distance == 0 else math.inf
-    else:
-        ratio = distance / floor
-    values = float(measure.value(a)), float(measure.value(b))
-    largest, pooled = _known(np.max, floors), measure.between(a, b)
-    return RealismRow(
-        measure.name, measure.unit, *values, distance, floor, largest, pooled, ratio, reason
-    )
+    return RealismTable(tuple(rows), (*described, *notes), a, b)
 
 
 def _cells(row: RealismRow) -> tuple[str, ...]:
@@ -398,9 +342,9 @@ def _text(value: float) -> str:
 
 
 def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics) -> str:
-    counts = [statistics.num_scans for statistics in drives.values()]
+    sizes = [statistics.num_scans for statistics in drives.values()]
     total = f"{name}: {pooled.num_scans} scans of {len(drives)} drive{'s' * (len(drives) > 1)}, "
-    total += f"{min(counts)} to {max(counts)} each"
+    total += f"{min(sizes)} to {max(sizes)} each"
     parts = {
         "not in ring order": pooled.num_scans - pooled.num_ring_scans,
         "with another number of rings": pooled.num_ring_scans - pooled.num_beam_scans,
@@ -412,18 +356,18 @@ def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatis
 
 
 def _described(statistics: ScanStatistics) -> dict[str, Any]:
-    features = {measure.name: np.asarray(measure.feature(statistics)) for measure in MEASURES}
+    values = {name: np.asarray(found.values) for name, found in measures(statistics).items()}
     return {
         "scans": statistics.num_scans,
         "scans_in_ring_order": statistics.num_ring_scans,
         "scans_with_all_rings": statistics.num_beam_scans,
         "shots_per_turn": _json(_ratio(statistics.shots, statistics.num_beam_scans)),
-        "curves": {name: _json(values) for name, values in features.items() if values.ndim == 1},
+        "curves": {name: _json(value) for name, value in values.items() if value.ndim == 1},
     }
 
 
 def _json(value: Any) -> Any:
     """Numbers and arrays for JSON, None for those that are not finite; texts as they are."""
-    if isinstance(value, str):
+    if value is None or isinstance(value, str):
         return value
     return np.asarray(np.where(np.isfinite(value), value, None)).tolist()

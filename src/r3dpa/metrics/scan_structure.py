@@ -1,12 +1,11 @@
 """Structure of one scan: neighbours along each ring, ground plane, and surface directions.
 
-Letters: P returns, R rings. All functions take float64 points in metres, sensor frame.
+Letters: P returns. All functions take float64 points in metres, sensor frame.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,41 +38,23 @@ _MAX_STEP_DEG = 60.0
 _MAX_UPRIGHT_NORMAL_Z = 0.5  # normals less than 30 degrees from the horizon
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """Returns of one scan in ring order, with their neighbours along azimuth.
+class Sweep(NamedTuple):
+    """Returns of one scan in ring order, with their neighbours along azimuth."""
 
-    Args:
-        order: ``(P,)`` index of each return in the scan.
-        ring: ``(P,)`` ring from 0 (highest), ascending.
-        num_rings: R.
-        azimuth: ``(P,)`` radians in [0, 2 pi).
-        shot_rad: Mean azimuth between two shots of a laser.
-        missing: ``(P,)`` shots without a return between each return and the following one of its
-            ring; the last one of a ring is followed by its first.
-    """
-
-    order: Indices
-    ring: Indices
-    num_rings: int
-    azimuth: Floats
-    shot_rad: float
-    missing: Indices
-
-    @property
-    def shots(self) -> float:
-        """Shots of each laser per turn."""
-        return 2 * math.pi / self.shot_rad
+    order: Indices  # (P,) index of each return in the scan
+    ring: Indices  # (P,) from 0 (highest), ascending
+    azimuth: Floats  # (P,) radians in [0, 2 pi)
+    shot_rad: float  # mean azimuth between two shots of a laser
+    missing: Indices  # (P,) shots without a return up to the next return; a ring is a circle
 
     def neighbour(self, offset: int) -> Indices:
         """Index ``(P,)`` of the return ``offset`` places further along its ring."""
         return _around(self.ring, offset)
 
     def other_ring(self, step: int) -> tuple[Indices, Mask]:
-        """Return of nearest azimuth in the ring ``step`` rings lower.
+        """Index ``(P,)`` of the return of nearest azimuth ``step`` rings lower.
 
-        Returns:
-            Index ``(P,)``, and whether it lies within 1.5 shots and in that ring.
+        The mask tells whether it lies within 1.5 shots and in that ring.
         """
         key = self.ring * 2 * math.pi + self.azimuth
         ascending = np.argsort(key, kind="stable")
@@ -92,16 +73,14 @@ class Sweep:
 def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
     """Ring structure of the returns of one scan; None if it is not stored ring after ring.
 
-    A scan does not store its number of shots per turn. It follows from the mean azimuth step over
-    unbroken neighbours; the median would be wrong, as the encoder of the real HDL-64E gives steps
-    of 0.09 and 0.18 degrees.
+    The shots per turn follow from the mean azimuth step over unbroken neighbours; the median would
+    be wrong, as the encoder of the real HDL-64E gives steps of 0.09 and 0.18 degrees.
     """
     inclination, azimuth = angles_of(torch.from_numpy(points))
     try:
-        in_order, num_rings = rings_in_order(inclination, azimuth, sensor)
+        ring = rings_in_order(inclination, azimuth, sensor)[0].numpy()
     except ValueError:
         return None
-    ring = in_order.numpy()
     order = np.argsort(ring, kind="stable")
     ring, turn = ring[order], azimuth.numpy()[order] % (2 * math.pi)
     step = _forward(turn[_around(ring, 1)] - turn)
@@ -110,18 +89,18 @@ def sweep_of(points: Floats, sensor: LidarSensor) -> Sweep | None:
         return None
     shot_rad = float(ahead[ahead < _UNBROKEN * np.median(ahead)].mean())
     missing = np.maximum(np.rint(step / shot_rad).astype(np.int64) - 1, 0)
-    return Sweep(order, ring, num_rings, turn, shot_rad, missing)
+    return Sweep(order, ring, turn, shot_rad, missing)
 
 
 class Ground(NamedTuple):
-    """Plane ``z = slope_x * x + slope_y * y + offset_m`` in the sensor frame."""
+    """Plane ``z = slope_x * x + slope_y * y + offset_m``."""
 
     slope_x: float
     slope_y: float
     offset_m: float
 
     def height_m(self, points: Floats) -> Floats:
-        """Vertical distance ``(P,)`` of points ``(P, 3)`` above the plane, metres."""
+        """Vertical distance ``(P,)`` of points ``(P, 3)`` above the plane."""
         return points[:, 2] - (
             self.slope_x * points[:, 0] + self.slope_y * points[:, 1] + self.offset_m
         )
@@ -152,18 +131,11 @@ def fit_ground(points: Floats) -> Ground | None:
 
 
 class Upright(NamedTuple):
-    """Smooth surfaces that stand up (facades, sides of cars), for returns in sweep order.
+    """Smooth surfaces that stand up (facades, sides of cars), for returns in sweep order."""
 
-    Args:
-        incidence_deg: ``(P,)`` angle between ray and surface normal; NaN off upright surfaces.
-        residual_m: ``(P,)`` :func:`_residual`; NaN off the ground and off upright surfaces.
-        step_m: ``(P,)`` range minus the line through the neighbouring rings; NaN off upright
-            surfaces and where one is met at 60 degrees or more.
-    """
-
-    incidence_deg: Floats
-    residual_m: Floats
-    step_m: Floats
+    incidence_deg: Floats  # (P,) between ray and surface normal; NaN off upright surfaces
+    residual_m: Floats  # (P,) of :func:`_residual`; NaN off the ground and off upright surfaces
+    step_m: Floats  # (P,) range minus the line through the neighbouring rings; NaN from 60 degrees
 
 
 def upright_surfaces(points: Floats, range_m: Floats, sweep: Sweep, ground: Mask) -> Upright:
@@ -184,12 +156,8 @@ def upright_surfaces(points: Floats, range_m: Floats, sweep: Sweep, ground: Mask
     half = np.full(len(points), 0.5)
     share = np.divide(inclination - inclination[down], span, out=half, where=span > 0)
     step_m = range_m - (range_m[down] + share * (range_m[up] - range_m[down]))
-    smooth = on_line & (ground | upright)
-    return Upright(
-        angle_deg,
-        np.where(smooth, _residual(range_m, sweep), np.nan),
-        np.where(angle_deg < _MAX_STEP_DEG, step_m, np.nan),
-    )
+    residual_m = np.where(on_line & (ground | upright), _residual(range_m, sweep), np.nan)
+    return Upright(angle_deg, residual_m, np.where(angle_deg < _MAX_STEP_DEG, step_m, np.nan))
 
 
 def level_enough(left_m: Floats, right_m: Floats, shots: Indices) -> Mask:
