@@ -155,7 +155,7 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield Measure("occupied cells by sector", "1", "points", curve_rmse, occupied, occupied.mean())
 
 
-def _number(name: str, unit: str, needs: str, value: float) -> Measure:
+def _number(name: str, unit: str, needs: str, value: Any) -> Measure:
     return Measure(name, unit, needs, lambda a, b: abs(a - b), value, value)
 
 

@@ -108,7 +108,7 @@ class ScanStatistics:
         names = [column.name for column in fields(self)]
         return type(self)(*(getattr(self, name) + getattr(other, name) for name in names))
 
-    def count(self, name: str, *columns: NDArray[Any], weight: Floats | None = None) -> None:
+    def count(self, name: str, *columns: NDArray[Any], weight: NDArray[Any] | None = None) -> None:
         """Adds rows of columns to a table; a column holds indices, or values of a binned axis."""
         table, index = getattr(self, name), []
         for axis, column in zip(_AXES[name], columns, strict=True):
@@ -232,7 +232,7 @@ def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg
     middle_m = (range_m[left] + range_m[right]) / 2
     angle_deg = (incidence_deg[:, left] + incidence_deg[:, right]) / 2
     surface, pair = np.isfinite(angle_deg).nonzero()
-    own = {"weight": weight[pair]}
+    own: dict[str, Any] = {"weight": weight[pair]}
     s.count("keep_by_range", middle_m, outcome, weight=weight)
     s.count("surface_keep_by_range", surface, middle_m[pair], outcome[pair], **own)
     s.count("keep_by_incidence", surface, angle_deg[surface, pair], outcome[pair], **own)
