@@ -12,8 +12,7 @@ from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
 from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, precision_recall
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.results import Evaluation, EvaluationTable
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 

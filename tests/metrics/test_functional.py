@@ -11,7 +11,6 @@ import torch
 from scipy.linalg import sqrtm
 from scipy.stats import wasserstein_distance
 
-from r3dpa.metrics.bootstrap import bootstrap_interval
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -401,54 +400,3 @@ def test_matching_refuses():
 
 
 # How sure a number is
-
-
-def test_interval_of_a_mean():
-    """The mean of 400 numbers of deviation s is known to 1.96 s / 20."""
-    x = draw(400) + 3
-    interval = bootstrap_interval(
-        lambda i: x[i].mean(), [400], torch.Generator().manual_seed(0), num_resamples=2000
-    )
-    half = 1.96 * x.std().item() / 20
-    assert interval.value == pytest.approx(x.mean().item())
-    assert interval.high - interval.value == pytest.approx(half, rel=0.1)
-    assert interval.value - interval.low == pytest.approx(half, rel=0.1)
-    again = bootstrap_interval(
-        lambda i: x[i].mean(), [400], torch.Generator().manual_seed(0), num_resamples=2000
-    )
-    assert again == interval
-
-
-def test_interval_surrounds_a_value_that_resampling_shifts():
-    """Of 100 indices a resample holds 63.4 on average, with a standard deviation of 3.1."""
-    found = bootstrap_interval(lambda i: len(i.unique()), [100], torch.Generator().manual_seed(0))
-    assert found.value == 100
-    assert 100 - found.low == pytest.approx(1.96 * 3.1, abs=1)
-    assert found.high - 100 == pytest.approx(1.96 * 3.1, abs=1)
-
-
-def test_paired_sets_are_resampled_alike():
-    x = draw(50)
-
-    def difference(i, j):
-        return (x[i] - (x[j] - 0.5)).mean()
-
-    generator = torch.Generator().manual_seed(0)
-    paired = bootstrap_interval(difference, [50, 50], generator, paired=True)
-    assert paired.low == pytest.approx(0.5)
-    assert paired.high == pytest.approx(0.5)
-    alone = bootstrap_interval(difference, [50, 50], generator)
-    assert alone.high - alone.low > 0.2
-
-
-@pytest.mark.parametrize(
-    ("sizes", "options", "message"),
-    [
-        ([1], {}, r"\[1\] samples; resampling"),
-        ([3, 4], {"paired": True}, "paired sets of"),
-        ([3], {"num_resamples": 10}, "10 resamples cannot tell"),
-    ],
-)
-def test_interval_refuses(sizes, options, message):
-    with pytest.raises(ValueError, match=message):
-        bootstrap_interval(lambda *i: 0.0, sizes, torch.Generator(), **options)

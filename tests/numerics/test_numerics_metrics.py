@@ -13,7 +13,7 @@ from scipy.spatial.distance import jensenshannon
 from tiny import drawn
 
 from r3dpa.metrics import BEVGrid, BEVHistogramDistance, FrechetDistance
-from r3dpa.metrics.bootstrap import bootstrap_interval
+from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -206,12 +206,15 @@ def test_a_difference_within_the_intervals_is_a_tie(naive):
     def distance(scenes):
         return histogram_distance(real.sum(0), scenes.sum(0)).jsd_distance
 
-    rows = []
-    for scenes in models:
-        found = bootstrap_interval(
-            lambda drawn, scenes=scenes: distance(scenes[drawn]), [60], generator()
+    resampling = Resampling(num_resamples=1000)
+    rows = [
+        MetricResult(
+            "JSD",
+            distance(scenes),
+            resampling.interval(lambda drawn, scenes=scenes: distance(scenes[drawn]), 60),
         )
-        rows.append(MetricResult("JSD", found.value, interval=(found.low, found.high)))
+        for scenes in models
+    ]
     assert rows[0].ties_with(rows[1])
     floor = distance(clouds(3))
     values = [row.value for row in rows]

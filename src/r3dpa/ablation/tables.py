@@ -20,8 +20,12 @@ from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.run import evaluation_of, settled, stage_folder, state_of
 from r3dpa.io import atomic_path, command, machine, versions
-from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import About, Evaluation, published_evaluation
+from r3dpa.metrics.results import (
+    Evaluation,
+    EvaluationTable,
+    published_evaluation,
+    save_csv,
+)
 from r3dpa.metrics.scene_features import SPACES
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
@@ -73,8 +77,7 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
         rows.append(replace(row, value=mean, interval=(mean - half, mean + half), note=notes))
     bad = [name for e in evaluations for name in e.bad_samples]
     extra = first.about["extra"] | {"bad_samples": bad, "seeds": len(evaluations)}
-    about: About = {**first.about, "seed": None, "extra": extra}
-    return Evaluation(label, tuple(rows), about)
+    return Evaluation(label, tuple(rows), first.about | {"seed": None, "extra": extra})
 
 
 def _students(values: Sequence[float]) -> float:
@@ -146,12 +149,10 @@ def write_table(
         for suffix in ("md", "tex", "csv", "json"):  # of another run, they would look like its own
             (out / f"{table.name}.{suffix}").unlink(missing_ok=True)
         return f"{table.name}: {table.caption}\n\nno row has a result", results
-    distances = [
-        replace(e, rows=tuple(row for row in e.rows if row.name in _DISTANCES)) for e in own
-    ]
+    distances = [evaluation.only(_DISTANCES) for evaluation in own]
     shown = EvaluationTable((*_published(table), *distances))
     orders = order_results(
-        table, results, [name for name in shown.metrics if any(e.row(name) for e in distances)]
+        table, results, [name for name in shown.columns if any(e.row(name) for e in distances)]
     )
     seeds = ", ".join(map(str, plan.seeds))
     intervals = "those of the scenes: another training differs by more."
@@ -173,9 +174,9 @@ def write_table(
     if len(commits) > 1:
         notes.append(f"trained or tested by different commits: {', '.join(commits)}")
     listed = "\n".join(f"- {line}" for line in notes)
-    _save(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown.markdown()}\n{listed}\n")
+    _save(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
     _save(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
-    EvaluationTable(tuple(own)).save(out / f"{table.name}.csv")
+    save_csv(own, out / f"{table.name}.csv")
     trained = [stage for row in table.rows for chain in row.stages.values() for stage in chain]
     stored = {
         "table": table.name,

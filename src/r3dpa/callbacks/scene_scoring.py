@@ -33,8 +33,7 @@ from r3dpa.metrics.evaluation import (
     reference_spaces,
 )
 from r3dpa.metrics.reference import ReferenceStatistics, cached_reference
-from r3dpa.metrics.result_table import report, save_reports
-from r3dpa.metrics.results import Evaluation
+from r3dpa.metrics.results import Evaluation, report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule

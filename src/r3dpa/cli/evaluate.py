@@ -120,7 +120,7 @@ def evaluate(
     from r3dpa.data.samples import read_samples
     from r3dpa.io import source_commit
     from r3dpa.metrics import evaluation as metrics
-    from r3dpa.metrics.result_table import report, save_reports
+    from r3dpa.metrics.results import report, save_reports
     from r3dpa.viz.evaluation import save_figures
 
     check_folder(out)

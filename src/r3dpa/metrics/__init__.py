@@ -1,6 +1,6 @@
 """How realistic scans are, and how near generated scenes are to real ones."""
 
-from r3dpa.metrics.bootstrap import Interval, Resampling, bootstrap_interval
+from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     BEVHistogramDistance,
     MinimumMatchingDistance,
@@ -41,8 +41,12 @@ from r3dpa.metrics.realism import (
     realism_table,
 )
 from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.result_table import EvaluationTable
-from r3dpa.metrics.results import Evaluation, MetricResult, published_evaluations
+from r3dpa.metrics.results import (
+    Evaluation,
+    EvaluationTable,
+    MetricResult,
+    published_evaluations,
+)
 from r3dpa.metrics.scan_statistics import ScanStatistics, scan_statistics
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol
 from r3dpa.metrics.scene_features import SceneFeatures, scene_features
@@ -58,7 +62,6 @@ __all__ = [
     "EvaluationTable",
     "FrechetDistance",
     "FrechetInfinity",
-    "Interval",
     "Measure",
     "MetricResult",
     "MinimumMatchingDistance",
@@ -73,7 +76,6 @@ __all__ = [
     "Resampling",
     "ScanStatistics",
     "SceneFeatures",
-    "bootstrap_interval",
     "chamfer_squared",
     "curve_rmse",
     "evaluate",

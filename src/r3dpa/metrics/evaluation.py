@@ -23,7 +23,7 @@ from r3dpa.metrics.feature_distances import (
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics, is_official
 from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.results import About, Evaluation, MetricResult
+from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import (
     FREE_SPACES,
@@ -339,7 +339,7 @@ def _about(
     made_with: Mapping[str, Any] | None,
     commit: str | None,
     source: str,
-) -> About:
+) -> dict[str, Any]:
     extra, protocol = dict(made_with or {}), reference.protocol
     known = ("solver", "steps", "seed", "precision", "feature_source")
     given = {key: extra.pop(key, None) for key in known}
@@ -347,7 +347,7 @@ def _about(
         extra["scenes"] = f"only the first {count} were used, as many as the protocol counts"
     elif count < protocol.num_samples:
         extra["scenes"] = f"{count}, where the protocol asks for {protocol.num_samples}"
-    about: Any = {
+    return {
         "backbones": {space.label: dict(space.card) for space in spaces},
         "protocol": protocol.to_dict(),
         "reference": reference.describe(),
@@ -357,7 +357,6 @@ def _about(
         "source": source,
         "extra": extra,
     }
-    return cast(About, about)
 
 
 def _floors(

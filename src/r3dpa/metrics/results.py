@@ -1,4 +1,4 @@
-"""Results of evaluations: numbers with intervals and floors, and their provenance.
+"""Results of evaluations: numbers with bootstrap intervals and floors, and their tables.
 
 Values are stored as computed; a power of ten applies to the printed column only: JSD = 0.0567 is
 stored, and 5.67 is printed below 10^-2.
@@ -6,21 +6,51 @@ stored, and 5.67 is printed below 10^-2.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
-from functools import cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache, cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self, TypedDict, get_args
+from typing import Any, Literal, Self
+
+from tabulate import LATEX_ESCAPE_RULES
 
 from r3dpa.io import atomic_path, text_table
+from r3dpa.metrics.bootstrap import Ends
 
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
+Mark = Literal["", "best", "second", "tie"]
 
 _SHOWN_BAD = 20  # samples left out that are printed
+_PAPER_ORDER = ("FRID", "FLD", "FSVD", "FPVD", "JSD", "MMD")
+_FLOOR = "real vs. real (floor)"
+_DISTANCES = (*_PAPER_ORDER, "FWID", "FGEO")
+#: Provenance of an evaluation, by default unknown.
+_ABOUT: dict[str, Any] = {
+    "backbones": {},  # card of each feature network
+    "protocol": {},
+    "reference": "",  # split, count and hash of the names of the real scans
+    "solver": None,
+    "steps": None,
+    "seed": None,
+    "precision": None,
+    "commit": None,
+    "feature_source": None,  # features that the generator was aligned to
+    "published": False,
+    "source": "",  # files of the samples, or line of the publication
+    "extra": {},  # anything else, such as "bad_samples": those left out, each with the reason
+}
+_MARKDOWN: dict[Mark, str] = {"": "{}", "best": "**{}**", "second": "_{}_", "tie": "= {}"}
+_LATEX: dict[Mark, str] = {
+    "": "{}",
+    "best": r"\textbf{{{}}}",
+    "second": r"\underline{{{}}}",
+    "tie": "{}$^{{=}}$",
+}
 
 
 @dataclass(frozen=True)
@@ -41,12 +71,12 @@ class MetricResult:
         note: Remark for the reader; may be empty.
 
     Raises:
-        ValueError: If a field is not as above; names metric and field.
+        ValueError: If a number is not finite, or the ends of the interval are out of order.
     """
 
     name: str
     value: float | None
-    interval: tuple[float, float] | None = None
+    interval: Ends | None = None
     floor: float | None = None
     direction: Direction = "lower"
     unit: str = ""
@@ -56,34 +86,26 @@ class MetricResult:
     note: str = ""
 
     def __post_init__(self) -> None:
-        ends = self.interval
-        pair = isinstance(ends, tuple | list) and len(ends) == 2 and all(map(_is_finite, ends))
-        checks = {
-            "name": (isinstance(self.name, str) and self.name, "a text"),
-            "value": (
-                _is_finite(self.value) or (self.value is None and self.note),
-                "a finite number, or None with the reason in the note",
-            ),
-            "interval": (
-                ends is None or (pair and ends[0] <= ends[1]),
-                "two finite numbers, the lower end first, or None",
-            ),
-            "floor": (
-                self.floor is None or (_is_finite(self.floor) and self.floor >= 0),
-                "0 or more",
-            ),
-            "direction": (self.direction in get_args(Direction), "lower or higher"),
-        }
-        for key, (valid, advice) in checks.items():
-            if not valid:
-                given = getattr(self, key)
-                raise ValueError(f"metric {self.name!r}: {key} is {given!r}; give {advice}")
-        object.__setattr__(self, "interval", None if ends is None else tuple(ends))
+        low, high = self.interval or (0.0, 0.0)
+        known = [number for number in (self.value, self.floor) if number is not None]
+        if not all(map(math.isfinite, (*known, low, high))) or low > high:
+            raise ValueError(f"{self}: give finite numbers, the lower end of the interval first")
+        if self.value is None and not self.note:
+            raise ValueError(f"{self.name}: value is None; give the reason in the note")
+        if self.interval is not None:
+            object.__setattr__(self, "interval", (low, high))
 
     @property
     def half_width(self) -> float:
         """Half the width of the interval; 0 without one."""
         return 0.0 if self.interval is None else (self.interval[1] - self.interval[0]) / 2
+
+    @property
+    def badness(self) -> float:
+        """The value with a sign that makes smaller ones better; infinite if it is None."""
+        if self.value is None:
+            return math.inf
+        return self.value if self.direction == "lower" else -self.value
 
     def ties_with(self, other: MetricResult) -> bool:
         """Whether two values differ by no more than their floors or their intervals.
@@ -92,34 +114,21 @@ class MetricResult:
 
             |a - b| <= max(floor_a, floor_b, sqrt(half_width_a^2 + half_width_b^2))
         """
-        if self.value is None or other.value is None:
-            raise ValueError(f"{self.name}: a value that is None ties with nothing; leave it out")
-        allowed = math.hypot(self.half_width, other.half_width)
-        return abs(self.value - other.value) <= max(allowed, self.floor or 0.0, other.floor or 0.0)
+        intervals = math.hypot(self.half_width, other.half_width)
+        allowed = max(intervals, self.floor or 0.0, other.floor or 0.0)
+        return abs(self.badness - other.badness) <= allowed
 
+    def printed(self, number: float | None) -> str:
+        """A number of this metric in its column: two decimals, more if it is small."""
+        if number is None:
+            return "-"
+        number /= 10.0**self.scale
+        return f"{number:.2g}" if 0 < abs(number) < 0.1 else f"{number:.2f}"
 
-class About(TypedDict):
-    """Provenance of the numbers of an evaluation; None for what is unknown or does not apply.
-
-    ``backbones`` has the card of each feature network, ``reference`` split, count and hash of the
-    names of the real scans, ``precision`` the number format of the samples, ``commit`` the version
-    of the code, ``feature_source`` the features the generator was aligned to, ``source`` the
-    files of the samples or the line of the publication, and ``extra`` anything else, such as
-    ``bad_samples``: those left out, each with the reason.
-    """
-
-    backbones: dict[str, dict[str, Any]]
-    protocol: dict[str, Any]
-    reference: str
-    solver: str | None
-    steps: int | None
-    seed: int | None
-    precision: str | None
-    commit: str | None
-    feature_source: str | None
-    published: bool
-    source: str
-    extra: dict[str, Any]
+    @property
+    def printed_interval(self) -> str:
+        """``[low, high]``; empty without an interval."""
+        return ", ".join(map(self.printed, self.interval)).join("[]") if self.interval else ""
 
 
 @dataclass(frozen=True)
@@ -129,26 +138,21 @@ class Evaluation:
     Args:
         label: Of the generator or the run.
         rows: One for each metric.
-        about: All keys of ``About``; kept as JSON holds it (tuples become lists).
+        about: Provenance, with the keys of ``_ABOUT``; those left out get its defaults.
 
     Raises:
-        ValueError: If a metric occurs twice, or ``about`` lacks a key, has an unknown one, or
-            holds what JSON cannot.
+        ValueError: If ``about`` has an unknown key, or holds what JSON cannot.
     """
 
     label: str
     rows: tuple[MetricResult, ...]
-    about: About
+    about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.label, str) or not self.label.strip():
-            raise ValueError(f"label of an evaluation is {self.label!r}; give a text")
-        names = [row.name for row in self.rows]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"{self.label}: more than one row for {twice}; give one per metric")
-        _check_keys(self.about, About.__annotations__, f"{self.label}: about")
+        if unknown := sorted(self.about.keys() - _ABOUT.keys()):
+            raise ValueError(f"about has the unknown keys {unknown}; put them in its extra")
         try:
-            about = json.loads(json.dumps(self.about, allow_nan=False))
+            about = json.loads(json.dumps(_ABOUT | self.about, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self.label}: about is not for JSON: {error}") from None
         object.__setattr__(self, "rows", tuple(self.rows))
@@ -173,6 +177,10 @@ class Evaluation:
         """Result of a metric; None without such a row or without a value."""
         return next((r for r in self.rows if r.name == name and r.value is not None), None)
 
+    def only(self, names: Sequence[str]) -> Self:
+        """The evaluation with the rows of these metrics alone."""
+        return replace(self, rows=tuple(row for row in self.rows if row.name in names))
+
     def __str__(self) -> str:
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
         table = text_table(map(_cells, self.rows), heads, align="lrrrlrrl")
@@ -187,10 +195,9 @@ class Evaluation:
         ]
         if bad:
             lines.append(f"samples that cannot be used and are left out: {len(bad)}")
-            lines += bad[:_SHOWN_BAD]
         if len(bad) > _SHOWN_BAD:
-            lines.append(f"and {len(bad) - _SHOWN_BAD} more")
-        return "\n".join([self.label, *head, "", table, "", *lines])
+            bad = [*bad[:_SHOWN_BAD], f"and {len(bad) - _SHOWN_BAD} more"]
+        return "\n".join([self.label, *head, "", table, "", *lines, *bad])
 
     def save(self, path: str | Path) -> None:
         """Writes the evaluation as JSON."""
@@ -203,13 +210,176 @@ class Evaluation:
         """Reads what ``save`` wrote; a ``ValueError`` names the file and the fault."""
         try:
             stored = json.loads(Path(path).read_text(encoding="utf-8"))
-            _check_keys(stored, [field.name for field in fields(cls)], "evaluation")
-            for number, row in enumerate(stored["rows"]):
-                _check_keys(row, [f.name for f in fields(MetricResult)], f"row {number}")
-            rows = tuple(MetricResult(**row) for row in stored["rows"])
-            return cls(stored["label"], rows, stored["about"])
-        except (TypeError, ValueError) as error:
+            stored["rows"] = tuple(MetricResult(**row) for row in stored["rows"])
+            return cls(**stored)
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no evaluation: {error}") from error
+
+
+@dataclass(frozen=True)
+class EvaluationTable:
+    """Evaluations as lines, metrics as columns; ``str`` gives the table for a terminal.
+
+    The best and the second best value are marked where intervals and floors separate them from all
+    that follow; tied values have an equals sign instead. A column with fewer than two values to
+    rank has no marks, and published numbers, which have no intervals, are not ranked.
+
+    Args:
+        evaluations: At least one; published ones are printed first.
+    """
+
+    evaluations: Sequence[Evaluation]
+
+    def __post_init__(self) -> None:
+        ordered = sorted(self.evaluations, key=lambda evaluation: not evaluation.published)
+        object.__setattr__(self, "evaluations", tuple(ordered))
+
+    @cached_property
+    def columns(self) -> dict[str, list[MetricResult | None]]:
+        """Results of each metric that has a value, one per evaluation; those of the paper first."""
+        given = [row.name for e in self.evaluations for row in e.rows]
+        names = dict.fromkeys((*_PAPER_ORDER, *given))
+        columns = {name: [e.row(name) for e in self.evaluations] for name in names}
+        return {name: column for name, column in columns.items() if any(column)}
+
+    def marks(self, metric: str) -> list[Mark]:
+        """Mark of each evaluation in a column."""
+        marks: list[Mark] = [""] * len(self.evaluations)
+        left = {
+            index: result
+            for index, result in enumerate(self.columns[metric])
+            if result is not None and not self.evaluations[index].published
+        }
+        places: tuple[Mark, ...] = ("best", "second") if len(left) > 1 else ()
+        for place in places:
+            best = min(left.values(), key=lambda result: result.badness)
+            tied = [index for index, result in left.items() if result.ties_with(best)]
+            if len(tied) > 1:
+                return ["tie" if index in tied else mark for index, mark in enumerate(marks)]
+            marks[tied[0]] = place
+            del left[tied[0]]
+        return marks
+
+    def __str__(self) -> str:
+        def cell(result: MetricResult, mark: Mark) -> str:
+            value = _MARKDOWN[mark].format(result.printed(result.value))
+            return f"{value} {result.printed_interval}".strip()
+
+        heads = []
+        for result in map(_first, self.columns.values()):
+            scale = f"1e{result.scale}" * bool(result.scale)
+            kind = ", ".join(filter(None, [scale, result.unit, result.direction]))
+            heads.append(f"{result.name} ({kind})")
+        lines = self._lines(cell)
+        table = text_table(lines, ["", *heads], "l" + "r" * len(heads), "pipe")
+        interval = "[low, high]: 95 % interval of the value at this number of scenes"
+        below = [*self._legend("**best**, _second_"), interval, *self.notes]
+        return "\n".join([table, "", *(f"- {text}" for text in below)]) + "\n"
+
+    def latex(self) -> str:
+        r"""The table as a ``tabular`` of the package booktabs: best bold, second underlined.
+
+        Intervals, which would make it too wide for a page, are left out; legend and notes are
+        comments.
+        """
+
+        def cell(result: MetricResult, mark: Mark) -> str:
+            return _LATEX[mark].format(result.printed(result.value))
+
+        arrows = {"lower": r"$\downarrow$", "higher": r"$\uparrow$"}
+        heads = []
+        for result in map(_first, self.columns.values()):
+            scale = rf"$\times 10^{{{result.scale}}}$" * bool(result.scale)
+            heads.append(f"{_latex(result.name)} {arrows[result.direction]} {scale}{result.unit}")
+        lines = [[_latex(first), *cells] for first, *cells in self._lines(cell)]
+        table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
+        for rule in ("toprule", "midrule", "bottomrule"):
+            table = table.replace(r"\hline", f"\\{rule}", 1)
+        comments = [*self._legend("bold best, underlined second"), *self.notes]
+        return "\n".join([*(f"% {' '.join(text.split())}" for text in comments), table]) + "\n"
+
+    @property
+    def notes(self) -> list[str]:
+        """Differences between the evaluations, samples left out, reasons of absent values."""
+        own = [e for e in self.evaluations if not e.published]
+        notes = [
+            f"not the same {key}: {', '.join(e.label for e in own)}"
+            for key in ("protocol", "reference", "backbones")
+            if any(e.about[key] != own[0].about[key] for e in own[1:])
+        ]
+        counts: dict[str, str] = {}
+        for e in self.evaluations:
+            numbers = sorted({row.num_samples for row in e.rows if row.num_samples})
+            counts[e.name] = " or ".join(f"{number:,}" for number in numbers) or "unknown"
+        if len(set(counts.values())) > 1:
+            listed = "; ".join(f"{name} {numbers}" for name, numbers in counts.items())
+            notes.append(f"not the same number of scenes: {listed}")
+        for e in own:
+            if e.bad_samples:
+                left_out = f"samples that cannot be used and are left out: {len(e.bad_samples)}"
+                notes.append(f"{e.name}: {left_out}")
+            notes += [f"{e.name}, {row.name}: {row.note}" for row in e.rows if row.value is None]
+        return notes
+
+    def _lines(self, cell: Callable[[MetricResult, Mark], str]) -> list[list[str]]:
+        """Lines of cells: the published evaluations, the others, the floors."""
+        cells = []
+        for metric, column in self.columns.items():
+            known = sorted(r.floor for r in column if r is not None and r.floor is not None)
+            floors = dict.fromkeys(map(_first(column).printed, known[:1] + known[-1:]))
+            marked = zip(column, self.marks(metric), strict=True)
+            texts = [cell(result, mark) if result else "-" for result, mark in marked]
+            cells.append([*texts, " to ".join(floors) or "-"])
+        names = [" ".join(e.name.split()).replace("|", "/") for e in self.evaluations]
+        lines = [list(line) for line in zip([*names, _FLOOR], *cells, strict=True)]
+        return lines if any(text != "-" for text in lines[-1][1:]) else lines[:-1]
+
+    def _legend(self, marks: str) -> list[str]:
+        """Meaning of the marks, and origin of the published numbers."""
+        marked = any(mark for metric in self.columns for mark in self.marks(metric))
+        tie = "= tie for the next place: no further apart than the floor or the intervals"
+        published = {e.about["reference"]: None for e in self.evaluations if e.published}
+        against = f"published: against {' and '.join(published)}, not ranked"
+        return [f"{marks}, {tie}"] * marked + [against] * bool(published)
+
+
+def report(evaluation: Evaluation, split: str | None) -> str:
+    """All numbers of an evaluation, and its distances beside the published ones."""
+    return f"{evaluation}\n\n{_beside_published(evaluation, split)}"
+
+
+def save_reports(evaluation: Evaluation, split: str | None, out: Path) -> None:
+    """Writes ``evaluation.json`` and ``metrics.csv`` (all rows), ``table.md`` and ``table.tex``.
+
+    The latter two have the distances beside the published ones.
+    """
+    evaluation.save(out / "evaluation.json")
+    save_csv((evaluation,), out / "metrics.csv")
+    table = _beside_published(evaluation, split)
+    for name, text in (("table.md", str(table)), ("table.tex", table.latex())):
+        with atomic_path(out / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
+    """Writes every row of every evaluation as a line, with values as they were computed."""
+    keys = [key.name for key in fields(MetricResult) if key.name not in ("name", "interval")]
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["label", "published", "metric", "low", "high", *keys])
+        for e in evaluations:
+            for row in e.rows:
+                low, high = row.interval or (None, None)
+                values = [getattr(row, key) for key in keys]
+                writer.writerow([e.label, e.published, row.name, low, high, *values])
+
+
+def _beside_published(evaluation: Evaluation, split: str | None) -> EvaluationTable:
+    own = evaluation.only(_DISTANCES)
+    names = [row.name for row in own.rows]
+    published = published_evaluations("val-only" if split == "val" else "train-val")
+    others = [other.only(names) for other in published]
+    return EvaluationTable((*(other for other in others if other.rows), own))
 
 
 @cache
@@ -220,25 +390,21 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
-    if split not in get_args(Split):
-        raise ValueError(f"split is {split!r}; the paper has {', '.join(get_args(Split))}")
     table = _published_table()
-    found = []
-    for method in table["methods"]:
-        counts = dict.fromkeys(method[split], (method["num_samples"], None))
-        counts["MMD"] = (table["num_mmd_samples"], table["num_mmd_references"])
-        evaluation = published_evaluation(
+    counts = {"MMD": (table["num_mmd_samples"], table["num_mmd_references"])}
+    return tuple(
+        published_evaluation(
             method["label"],
             method[split],
             f"KITTI-360, {split}",
             f"{table['source']}, line {method['line']}",
-            counts,
+            dict.fromkeys(method[split], (method["num_samples"], None)) | counts,
+            solver=method["solver"],
+            steps=method["steps"],
+            extra={"venue": method["venue"]},
         )
-        about = evaluation.about
-        about |= {"solver": method["solver"], "steps": method["steps"]}
-        about["extra"] = {"venue": method["venue"]}
-        found.append(evaluation)
-    return tuple(found)
+        for method in table["methods"]
+    )
 
 
 def published_evaluation(
@@ -247,37 +413,22 @@ def published_evaluation(
     reference: str,
     source: str,
     counts: Mapping[str, tuple[int | None, int | None]] | None = None,
+    **about: Any,
 ) -> Evaluation:
     """Evaluation of numbers as the paper printed them, with counts of scenes by metric."""
-    scales = published_scales()
-    rows = []
+    scales, rows = published_scales(), []
     for name, number in printed.items():
         num_samples, num_references = (counts or {}).get(name, (None, None))
-        value = float(f"{number}e{scales[name]}")  # decimal shift, free of rounding
-        rows.append(
-            MetricResult(
-                name,
-                value,
-                scale=scales[name],
-                num_samples=num_samples,
-                num_references=num_references,
-            )
+        row = MetricResult(
+            name,
+            float(f"{number}e{scales[name]}"),  # decimal shift, free of rounding
+            scale=scales[name],
+            num_samples=num_samples,
+            num_references=num_references,
         )
-    about: About = {
-        "backbones": {},
-        "protocol": {"name": "published"},
-        "reference": reference,
-        "solver": None,
-        "steps": None,
-        "seed": None,
-        "precision": None,
-        "commit": None,
-        "feature_source": None,
-        "published": True,
-        "source": source,
-        "extra": {},
-    }
-    return Evaluation(label, tuple(rows), about)
+        rows.append(row)
+    about |= {"protocol": {"name": "published"}, "reference": reference, "source": source}
+    return Evaluation(label, tuple(rows), about | {"published": True})
 
 
 def published_scales() -> dict[str, int]:
@@ -290,42 +441,25 @@ def _published_table() -> Any:
     return json.loads(files(__package__).joinpath("published.json").read_text(encoding="utf-8"))
 
 
-def printed(value: float | None, scale: int = 0) -> str:
-    """A number in a column of a power of ten: two decimals, more if it is small."""
-    if value is None:
-        return "-"
-    number = value / 10.0**scale
-    return f"{number:.2g}" if 0 < abs(number) < 0.1 else f"{number:.2f}"
-
-
 def _cells(row: MetricResult) -> tuple[str, ...]:
-    ends = [printed(end, row.scale) for end in row.interval or ()]
     counts = ["-" if n is None else f"{n:,}" for n in (row.num_samples, row.num_references)]
-    name = row.name + (f" x1e{row.scale}" if row.scale else "")
+    scale, unit = f" x1e{row.scale}" * bool(row.scale), f" ({row.unit})" * bool(row.unit)
     return (
-        f"{name} ({row.unit})" if row.unit else name,
-        printed(row.value, row.scale),
-        ", ".join(ends).join("[]") if ends else "-",
-        printed(row.floor, row.scale),
+        f"{row.name}{scale}{unit}",
+        row.printed(row.value),
+        row.printed_interval or "-",
+        row.printed(row.floor),
         row.direction,
         *counts,
         row.note,
     )
 
 
-def _is_finite(number: Any) -> bool:
-    is_number = isinstance(number, int | float) and not isinstance(number, bool)
-    return is_number and math.isfinite(number)
+def _first(column: Sequence[MetricResult | None]) -> MetricResult:
+    """A result of a column, for direction, unit and scale."""
+    return next(filter(None, column))
 
 
-def _check_keys(given: Any, expected: Iterable[str], what: str) -> None:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{what} is {given!r}; give keys with values")
-    wanted = list(expected)
-    missing = [key for key in wanted if key not in given]
-    unknown = [key for key in given if key not in wanted]
-    if missing or unknown:
-        raise ValueError(
-            f"{what} lacks the keys {missing} and has the unknown keys {unknown}; "
-            f"give {', '.join(wanted)}"
-        )
+def _latex(text: str) -> str:
+    """A text with commands escaped."""
+    return "".join(LATEX_ESCAPE_RULES.get(character, character) for character in text)
