@@ -14,8 +14,13 @@ import yaml
 from tiny_networks import VAE_ARGS
 
 from r3dpa.callbacks import EMASnapshots
-from r3dpa.checkpoints import NetworkState, read_checkpoint, save_checkpoint, weights_sha256
-from r3dpa.checkpoints.snapshots import read_snapshot
+from r3dpa.checkpoints import (
+    NetworkState,
+    read_checkpoint,
+    read_snapshot,
+    save_checkpoint,
+    weights_sha256,
+)
 from r3dpa.cli import main
 from r3dpa.flow.autoguidance import renormalised
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -305,7 +310,7 @@ def test_models_that_do_not_belong_together_are_refused(pair, tmp_path):
     wide = {**early.networks, "ema": NetworkState.of(SiT(**arguments), arguments)}
     fresh = {**early.networks, "ema_latent_norm": NetworkState.of(LatentNorm(4), {"channels": 4})}
     for other, message in (
-        (replace(early, interpolant="cosine"), "trained on the cosine path.* linear"),
+        (replace(early, interpolant="cosine"), "on the cosine path.* linear"),
         (replace(early, networks=wide), r"latents \(4, 4, 8\).*\(4, 4, 16\)"),
         (replace(early, networks=fresh), r"other\.safetensors: ema_latent_norm holds no fitted"),
     ):

@@ -9,8 +9,7 @@ from typing import Any, cast
 import lightning as L
 from lightning.pytorch.utilities import rank_zero_info
 
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
-from r3dpa.checkpoints.snapshots import vae_fingerprint
+from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, vae_fingerprint
 from r3dpa.modules import GenerativeModule
 
 __all__ = ["EMASnapshots"]

@@ -1,4 +1,4 @@
-"""Checkpoint files: reads every layout, writes ours."""
+"""Checkpoint files: reads every layout, writes ours and the official one."""
 
 from __future__ import annotations
 
@@ -21,20 +21,28 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
-from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, checked, path_of
-from r3dpa.checkpoints.official import from_official, is_official
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit
+from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
+from r3dpa.checkpoints.official import (
+    facts_of,
+    from_official,
+    is_official,
+    statistics_of,
+    to_official,
+)
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
 from r3dpa.nn.image_vae import ImageVAE
 
-__all__ = ["official_neighbour", "read_checkpoint", "refuse_existing", "save_checkpoint"]
+__all__ = ["convert", "read_checkpoint", "save_checkpoint"]
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
 _LIGHTNING = {name: (f"{name}.", name) for name in ("vae", "discriminator", "sit", "latent_norm")}
 _LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
+_LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
 # Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
 _OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
+_OLD_KEY = re.compile(rf"(\.attentions\.\d+\.)({'|'.join(_OLD_ATTENTION)})\.")
 
 
 def read_checkpoint(
@@ -95,9 +103,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
     if path.suffix != ".safetensors":
         raise ValueError(f"our checkpoints are called <name>.safetensors, got {path}")
     description = path.with_suffix(".yaml")
-    refuse_existing([path, description], overwrite)
-    weights = {
-        f"{name}.{key}": value
+    _refuse_existing([path, description], overwrite)
+    weights = {  # copies: safetensors wants contiguous tensors that share no memory
+        f"{name}.{key}": value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, state in checkpoint.networks.items()
         for key, value in state.state_dict.items()
     }
@@ -116,7 +124,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
         "left_out": dict(checkpoint.left_out),
     }
     with atomic_path(path) as weights_file, atomic_path(description) as description_file:
-        save_file(_unshared(weights), weights_file)
+        save_file(weights, weights_file)
         about["sha256"] = _sha256(weights_file)
         try:
             description_file.write_text(yaml.safe_dump(about, sort_keys=False))
@@ -125,14 +133,85 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
     return path
 
 
-def refuse_existing(paths: list[Path], overwrite: bool) -> None:
-    """Raises a ``ValueError`` that names the files that exist, unless they may be replaced."""
+def convert(
+    source: str | Path,
+    out: str | Path,
+    to: Literal["r3dpa", "official"] = "r3dpa",
+    *,
+    overwrite: bool = False,
+    sit_args: Mapping[str, Any] | None = None,
+    encoding: Literal["linear", "log2"] | None = None,
+) -> str:
+    """Rewrites a checkpoint of any layout in ours, or in the official one.
+
+    Weights stay equal bit for bit; optimisers are left out. Official training checkpoints keep all
+    facts for the way back. A checkpoint without SiT becomes the official VAE file with its
+    neighbours for discriminator and latent statistics, which lose some.
+
+    Args:
+        source: Checkpoint that :func:`read_checkpoint` understands.
+        out: ``.safetensors`` for ours, ``.pt`` for the official layout.
+        to: Layout to write.
+        overwrite: Replace existing files.
+        sit_args: As for :func:`read_checkpoint`.
+        encoding: As for :func:`read_checkpoint`.
+
+    Returns:
+        Files, networks and what was not converted, as text.
+
+    Raises:
+        FileNotFoundError: If there is no such source.
+        ValueError: If it cannot be read, has no counterpart in the other layout, or the output
+            exists already.
+    """
+    source, out = Path(source), Path(out)
+    if to not in ("r3dpa", "official"):
+        raise ValueError(f"convert writes 'r3dpa' or 'official' checkpoints, got {to!r}")
+    checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
+    left_out = dict(checkpoint.left_out)
+    if to == "r3dpa":
+        outputs = [save_checkpoint(checkpoint, out, overwrite=overwrite), out.with_suffix(".yaml")]
+    else:
+        outputs = _save_official(checkpoint, out, overwrite)
+        if not {"sit", "ema"} & set(checkpoint.networks):
+            left_out |= dict.fromkeys(_LOST, "official files of a VAE have no place for it")
+    rows = []
+    for name, state in checkpoint.networks.items():
+        size = sum(value.numel() for value in state.state_dict.values())
+        kind = state.class_path.rpartition(".")[2]
+        rows.append((name, kind, str(len(state.state_dict)), f"{size:,}"))
+    lines = [f"{source} -> {', '.join(map(str, outputs))}"]
+    lines.append(text_table(rows, ("network", "class", "tensors", "elements")))
+    return "\n".join(lines + [f"not converted: {k} ({why})" for k, why in left_out.items()])
+
+
+def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[Path]:
+    if out.suffix != ".pt":
+        raise ValueError(f"official checkpoints are called <name>.pt, got {out}")
+    content = to_official(checkpoint)
+    if {"model", "ema"} & set(content):
+        files: dict[Path, Any] = {out: content | facts_of(checkpoint)}
+    else:
+        files = {out: content["vae"]} if "vae" in content else {}
+        if "discriminator" in content:
+            files[_neighbour(out, "discriminator-ckpt")] = content["discriminator"]
+        if "latent_norm" in checkpoint.networks:
+            norm = checkpoint.network("latent_norm").state_dict
+            files[_neighbour(out, "latents-stats")] = statistics_of(norm)
+    _refuse_existing(list(files), overwrite)
+    for path, weights in files.items():
+        with atomic_path(path) as temporary:
+            torch.save(weights, temporary)
+    return list(files)
+
+
+def _refuse_existing(paths: list[Path], overwrite: bool) -> None:
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:
         raise ValueError(f"{', '.join(existing)} exists already; choose another name or overwrite")
 
 
-def official_neighbour(vae: Path, kind: str) -> Path:
+def _neighbour(vae: Path, kind: str) -> Path:
     """Name of the file that belongs to an official VAE file."""
     return vae.with_name(f"{vae.stem}-{kind}.pt")
 
@@ -171,10 +250,10 @@ def _with_neighbours(content: Any, path: Path) -> tuple[Any, dict[str, Any]]:
     """Content with the files that belong to an official VAE, and the options of ``args.json``."""
     if "encoder.conv_in.weight" in content:
         content = {"vae": content}
-        discriminator = official_neighbour(path, "discriminator-ckpt")
+        discriminator = _neighbour(path, "discriminator-ckpt")
         if discriminator.is_file():
             content["discriminator"] = _load_pickle(discriminator)
-        statistics = official_neighbour(path, "latents-stats")
+        statistics = _neighbour(path, "latents-stats")
         if statistics.is_file():
             content |= _load_pickle(statistics)
     folder = path.parent
@@ -241,7 +320,8 @@ def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkSt
             f"it does not say which class and arguments its {name} has (found "
             f"{reprlib.repr(config)}); train with `r3dpa fit`, which records them"
         )
-    return checked(name, NetworkState(config["class_path"], config.get("init_args") or {}, weights))
+    state = NetworkState(config["class_path"], config.get("init_args") or {}, weights)
+    return state.checked(name)
 
 
 def _from_diffusers(path: Path) -> Checkpoint:
@@ -250,7 +330,10 @@ def _from_diffusers(path: Path) -> Checkpoint:
     Widths and depths are read from the weights, ``norm_num_groups`` from ``config.json`` beside the
     file, if there is one.
     """
-    weights = {_renamed(key): value for key, value in load_file(path).items()}
+    weights = {
+        _OLD_KEY.sub(lambda found: f"{found[1]}{_OLD_ATTENTION[found[2]]}.", key): value
+        for key, value in load_file(path).items()
+    }
     if _DIFFUSERS_KEY not in weights:
         raise ValueError(
             f"its description {path.with_suffix('.yaml').name} is not beside it; copy both files"
@@ -268,32 +351,13 @@ def _from_diffusers(path: Path) -> Checkpoint:
         "num_res_blocks": _count(weights, r"encoder\.down_blocks\.0\.resnets\.(\d+)\."),
         "norm_groups": num_groups,
     }
-    vae = checked("vae", NetworkState(path_of(ImageVAE), init_args, weights))
+    vae = NetworkState(path_of(ImageVAE), init_args, weights).checked("vae")
     return Checkpoint(path=path, stage="diffusers", networks={"vae": vae})
-
-
-def _renamed(key: str) -> str:
-    for old, new in _OLD_ATTENTION.items():
-        key = re.sub(rf"(\.attentions\.\d+\.){old}\.", rf"\g<1>{new}.", key)
-    return key
 
 
 def _count(keys: Iterable[str], pattern: str) -> int:
     """Number of different indices that a pattern finds."""
     return len({found[1] for key in keys if (found := re.match(pattern, key))})
-
-
-def _unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Contiguous CPU tensors of which no two share memory, as safetensors wants them."""
-    seen: set[int] = set()
-    result = {}
-    for key, value in weights.items():
-        own = value.detach().cpu().contiguous()
-        if own.untyped_storage().data_ptr() in seen:
-            own = own.clone()
-        seen.add(own.untyped_storage().data_ptr())
-        result[key] = own
-    return result
 
 
 def _sha256(path: Path) -> str:

@@ -5,29 +5,18 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-import itertools
 import reprlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from r3dpa.io import UNPICKLING_ERRORS
 
-__all__ = [
-    "FACTS",
-    "Checkpoint",
-    "NetworkState",
-    "checked",
-    "load_into",
-    "path_of",
-    "weights_sha256",
-]
+__all__ = ["FACTS", "Checkpoint", "NetworkState", "load_into", "path_of", "weights_sha256"]
 
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
 FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
@@ -64,6 +53,11 @@ def _network_class(class_path: str) -> type[nn.Module]:
     return found
 
 
+def shapes_of(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Shape of each tensor by key."""
+    return {key: tuple(value.shape) for key, value in weights.items()}
+
+
 def _tuples(value: Any) -> Any:
     """YAML and JSON know lists only; the networks' sequence arguments are tuples."""
     return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
@@ -84,9 +78,7 @@ class NetworkState:
         Raises:
             ValueError: If the class is not allowed, or the arguments do not rebuild this network.
         """
-        state = cls(path_of(type(network)), init_args, network.state_dict())
-        state.check()
-        return state
+        return cls(path_of(type(network)), init_args, network.state_dict()).checked()
 
     @property
     def config(self) -> dict[str, Any]:
@@ -131,20 +123,23 @@ class NetworkState:
         network.load_state_dict(self.state_dict, strict=True)
         return network
 
-    def check(self) -> None:
-        """Checks that class and arguments fit the weights, without allocating memory.
+    def checked(self, name: str = "") -> NetworkState:
+        """This state, once class and arguments fit the weights; allocates no memory.
 
         Raises:
-            ValueError: As :meth:`build`.
+            ValueError: As :meth:`build`, starting with ``name``.
         """
-        with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
-            network = self.new()
-        self._refuse_problems(network)
+        try:
+            with torch.device("meta"):
+                network = self.new()
+            self._refuse_problems(network)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}" if name else str(error)) from error
+        return self
 
     def problems(self, network: nn.Module) -> list[str]:
         """All keys and shapes that differ between ``network`` and these weights."""
-        own = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-        here = {key: tuple(value.shape) for key, value in self.state_dict.items()}
+        own, here = shapes_of(network.state_dict()), shapes_of(self.state_dict)
         differ = [key for key in own if key in here and own[key] != here[key]]
         return [
             *(f"shape of {key}: checkpoint {here[key]}, network {own[key]}" for key in differ),
@@ -156,15 +151,6 @@ class NetworkState:
         problems = _shortened(self.problems(network))
         if problems:
             raise ValueError("\n  ".join([f"the weights do not fit {self.class_path}:", *problems]))
-
-
-def checked(name: str, state: NetworkState) -> NetworkState:
-    """The state after :meth:`NetworkState.check`, whose errors start with ``name``."""
-    try:
-        state.check()
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    return state
 
 
 @dataclass(frozen=True)
@@ -249,22 +235,6 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
             if own != wanted:
                 differences.append(f"{key}: checkpoint {wanted}, network {own}")
     return differences
-
-
-@contextmanager
-def _at_most(count: int) -> Iterator[None]:
-    """Limits the number of parameters: a damaged file may ask for a billion layers."""
-    left = itertools.count(count, -1)
-
-    def counted(*_: Any) -> None:
-        if next(left) <= 0:
-            raise ValueError(f"more than {count} parameters, far more than its weights are")
-
-    handle = register_module_parameter_registration_hook(counted)
-    try:
-        yield
-    finally:
-        handle.remove()
 
 
 def _shortened(lines: list[str]) -> list[str]:

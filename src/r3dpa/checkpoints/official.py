@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, checked, path_of
+from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.nn.discriminator import PatchDiscriminator
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -38,8 +38,8 @@ _OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
 _STATISTICS = {"latents_scale", "latents_bias"}
 _OURS = "r3dpa"
 _DATASET_CONFIGS: dict[Encoding, str] = {"linear": "kitti.yaml", "log2": "kitti_logscale.yaml"}
-_SIT_SIZES = {(384, 12): "S", (768, 12): "B", (1024, 24): "L", (1152, 28): "XL"}
-_SIT_HEADS = {384: 6, 768: 12, 1024: 16, 1152: 16}  # by token width
+_SIT_SIZES = {384: ("S", 12, 6), 768: ("B", 12, 12), 1024: ("L", 24, 16), 1152: ("XL", 28, 16)}
+"""Name, depth and number of heads by token width."""
 _UNET_NAMES = {256: "UNet_lidm", 160: "UNet_small"}  # by channels
 _UNET_HEAD_CHANNELS = 32  # of both
 _UPSAMPLING = {(1, 5): [1, 2], (3, 3): [2, 2]}  # stride of the VAE by kernel of its decoder
@@ -77,20 +77,20 @@ def from_official(
     """Checkpoint from the content of an official file; every key is translated or left out by name.
 
     Args:
-        content: A training checkpoint, or the weights of a VAE, of a discriminator, or latent
-            statistics alone.
+        content: A training checkpoint, or a VAE, a discriminator or latent statistics alone.
         path: File that held it.
         args: Options of the official training script, where ``content`` has no ``args``.
         sit_args: Arguments of SiT or UNet that override those of the file.
-        encoding: Encoding of the range image. Default: that of the options. Without it the
+        encoding: Encoding of the range image; None takes that of the options. Without either the
             geometry is unknown, unless the file holds :func:`facts_of`.
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
             or UNet can neither be read nor inferred.
     """
+    given = sit_args or {}
     if isinstance(content.get(_OURS), Mapping):
-        return _from_ours(content, path, sit_args or {})
+        return _from_ours(content, path, given)
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
     if _is_vae(content):
@@ -104,7 +104,7 @@ def from_official(
     strides = _vae_strides(content.get("vae", {}), options)
     for key, value in content.items():
         if key in _SIT_NETWORKS:
-            parts = _sit(_weights(key, value), options, sit_args or {}, strides)
+            parts = _sit(_weights(key, value), options, given, strides)
             networks |= dict(zip(_SIT_NETWORKS[key], parts, strict=True))
         elif key == "vae" and _is_vae(value):
             networks[key] = _vae(_weights(key, value))
@@ -119,7 +119,7 @@ def from_official(
     return Checkpoint(
         path=path,
         stage="official",
-        networks={name: checked(name, state) for name, state in networks.items()},
+        networks={name: state.checked(name) for name, state in networks.items()},
         step=content.get("steps"),
         geometry=_geometry(networks, options, encoding) if strides is not None else None,
         official_args=options,
@@ -135,9 +135,8 @@ def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Che
         key = next((key for key, names in _SIT_NETWORKS.items() if name in names), name)
         sit, norm = _split(_weights(key, content.get(key)))
         weights = norm if name.endswith("latent_norm") else sit
-        changes = sit_args if name in ("sit", "ema") else {}
-        state = NetworkState(config["class_path"], {**config["init_args"], **changes}, weights)
-        networks[name] = checked(name, state)
+        init_args = {**config["init_args"], **(sit_args if name in ("sit", "ema") else {})}
+        networks[name] = NetworkState(config["class_path"], init_args, weights).checked(name)
     return Checkpoint(
         path=path,
         networks=networks,
@@ -288,8 +287,8 @@ def _sit_arguments(
     inferred |= {"num_classes": num_classes, "class_dropout": num_rows > num_classes}
     if "encoder_depth" in args:
         inferred["alignment_depth"] = args["encoder_depth"]
-    if hidden_size in _SIT_HEADS:
-        inferred["num_heads"] = _SIT_HEADS[hidden_size]
+    if hidden_size in _SIT_SIZES:
+        inferred["num_heads"] = _SIT_SIZES[hidden_size][2]
     if strides is None:
         rows = columns = patch_size * round(num_tokens**0.5)  # a square image
     else:
@@ -345,13 +344,17 @@ def _vae_strides(vae: StateDict, args: Options) -> Strides:
     ``h2p4d8``: patches of 4 x 4 pixels, twice as long horizontally, 8 channels.
     """
     if _is_vae(vae):
-        strides = _vae(vae).init_args["strides"]
-        return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
+        return _whole(_vae(vae).init_args["strides"])
     name = re.fullmatch(r"h(\d+)(?:p(\d+))?d\d+", str(args.get("vae", "")))
     if name is None:
         return None
     patch = int(name[2] or 1)
     return patch, patch * int(name[1])
+
+
+def _whole(strides: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Rows and columns of the image per latent."""
+    return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
 
 
 def _vae(weights: StateDict) -> NetworkState:
@@ -378,8 +381,7 @@ def _vae(weights: StateDict) -> NetworkState:
 def _discriminator(weights: StateDict) -> NetworkState:
     with _inferring("discriminator"):
         channels, in_channels, _, _ = weights["main.0.weight"].shape
-    num_convolutions = sum(value.dim() == 4 for value in weights.values())
-    num_layers = num_convolutions - 2
+    num_layers = sum(value.dim() == 4 for value in weights.values()) - 2  # less first and last
     init_args = {"in_channels": in_channels, "channels": channels, "num_layers": num_layers}
     return NetworkState(path_of(PatchDiscriminator), init_args, dict(weights))
 
@@ -422,7 +424,7 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
     args: dict[str, Any] = {}
     if "vae" in checkpoint.networks:
         vae = checkpoint.network("vae").arguments
-        rows, columns = (math.prod(stride[axis] for stride in vae["strides"]) for axis in (0, 1))
+        rows, columns = _whole(vae["strides"])
         patch = f"p{rows}" if rows > 1 else ""
         args["vae"] = f"h{columns // rows}{patch}d{vae['latent_channels']}"
     state = checkpoint.networks.get("sit") or checkpoint.networks.get("ema")
@@ -436,8 +438,8 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
             args["cfg_prob"] = 0.1 if sit["class_dropout"] else 0.0
             args["encoder_depth"] = sit["alignment_depth"]
             args["qk_norm"] = sit["qk_norm"]
-            size = _SIT_SIZES.get((sit["hidden_size"], sit["depth"]))
-            model = None if size is None else f"SiT-{size}/{sit['patch_size']}"
+            size, depth, _ = _SIT_SIZES.get(sit["hidden_size"], ("", 0, 0))
+            model = f"SiT-{size}/{sit['patch_size']}" if depth == sit["depth"] else None
         if model is not None:
             args["model"] = model
     if checkpoint.geometry is not None:

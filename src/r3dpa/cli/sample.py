@@ -74,8 +74,7 @@ def sample(
     arguments = dict(locals())
     from dataclasses import asdict
 
-    from r3dpa.checkpoints import read_checkpoint
-    from r3dpa.checkpoints.snapshots import read_snapshot
+    from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
     from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
@@ -155,7 +154,6 @@ def convert(
     overwrite: bool = False,
     sit_args: dict[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
-    into: Path | None = None,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -167,14 +165,12 @@ def convert(
         sit_args: Official files only: SiT arguments that the file lacks, such as
             ``{alignment_depth: 4}``.
         encoding: Official files only: range encoding, if the file lacks it.
-        into: Put RGB weights into the SiT of this YAML, such as ``conf/net/sit_b2.yaml``, and list
-            what was kept, resized and dropped; ``--model.init_args.rgb_weights`` takes ``out``.
     """
     from r3dpa.checkpoints import convert as convert_checkpoint
 
     return convert_checkpoint(
-        source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding, into=into
-    ).table()
+        source, out, to, overwrite=overwrite, sit_args=sit_args, encoding=encoding
+    )
 
 
 def report(run: Path) -> str:

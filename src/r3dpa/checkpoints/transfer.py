@@ -1,0 +1,296 @@
+"""Takes over weights of another model: RGB weights to start from, a weak model to guide by."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from r3dpa.checkpoints.files import read_checkpoint
+from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of, weights_sha256
+from r3dpa.io import text_table
+from r3dpa.nn import LatentNorm, SiT, VelocityNetwork
+
+__all__ = [
+    "NORM_TOLERANCE",
+    "TransferReport",
+    "TransferRow",
+    "WeakModel",
+    "read_snapshot",
+    "transfer_rgb",
+    "vae_fingerprint",
+]
+
+Weights = Mapping[str, Tensor]
+Result = Literal["kept", "fresh", "resized", "truncated", "extended"]
+
+NORM_TOLERANCE = 0.05
+"""Largest difference between channels in how the latent scales of two models differ.
+
+On the latents of a frozen VAE at demo size, two running statistics 100 to 900 steps apart differ by
+up to 0.031 at batch 4 and 0.014 at batch 32. For Gaussian latents a difference d moves what the
+weak model expects by at most 0.77 d standard deviations.
+"""
+
+_NORM = "latent_norm."
+
+
+class TransferRow(NamedTuple):
+    """One group of weights, whose keys start alike.
+
+    ``result`` is ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
+    ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
+    ``extended`` (label table).
+    """
+
+    group: str
+    num_tensors: int  #: in the receiving network
+    result: Result
+    source: str  #: shape of the largest tensor in the RGB checkpoint, ``-`` if absent
+    target: str  #: the same in the receiving network
+    reason: str
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """Result of :func:`transfer_rgb`, one row per group."""
+
+    path: Path
+    rows: tuple[TransferRow, ...]
+
+    def table(self) -> str:
+        """The report as text, one line per group."""
+        heads = ("weights", "tensors", "result", "largest tensor, RGB", "here", "reason")
+        rows = [tuple(map(str, row)) for row in self.rows]
+        return f"RGB weights from {self.path}\n{text_table(rows, heads)}"
+
+
+def transfer_rgb(
+    checkpoint: Checkpoint, sit: SiT, latent_norm: LatentNorm, *, keep_projector: bool
+) -> TransferReport:
+    """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
+
+    ``sit`` and ``latent_norm`` are changed in place. Fresh, that is unchanged, stay: patch
+    embedding, output layer and latent statistics if the number of latent channels differs, the
+    former two also if the patch size does; the position table if the token grid differs; the
+    projector without ``keep_projector``, or if it does not fit; rows of the label table that the
+    file lacks. A longer label table is cut to its first rows, and its last one if this run has a
+    row for "no class". All other weights must fit.
+
+    Source: tuning stages of valeoai/R3DPA, which always cut the label table to one row and keep the
+    position table of another latent size if it has as many tokens.
+
+    Raises:
+        ValueError: If the checkpoint holds no SiT, or anything beside those groups does not fit;
+            nothing is changed then.
+    """
+    rgb, statistics = checkpoint.network("sit"), checkpoint.network("latent_norm")
+    if not issubclass(rgb.kind, SiT):
+        raise ValueError(
+            f"{checkpoint.path} holds a {rgb.kind.__name__}, but RGB weights are those of a SiT: "
+            "give a checkpoint of stage rgb_pretraining, or an official one"
+        )
+    theirs = _grouped(rgb.state_dict, statistics.state_dict)
+    ours = _grouped(sit.state_dict(), latent_norm.state_dict())
+    patch = rgb.arguments["patch_size"]
+    same_grid = tuple(side // patch for side in rgb.arguments["input_size"]) == sit.grid_size
+    init_args = rgb.arguments | {"input_size": sit.input_size}
+    rows: list[TransferRow] = []
+    merged: dict[str, Tensor] = {}
+    for group in dict.fromkeys((*ours, *theirs)):
+        rgb_part, own_part = theirs.get(group, {}), ours.get(group, {})
+        result, reason = _transfer_result(group, theirs, ours, keep_projector, same_grid)
+        if result in ("fresh", "resized"):
+            merged |= own_part
+            if group == "projector":  # a new head may look at another block
+                init_args["alignment_depth"] = sit.alignment_depth
+        elif result == "kept":
+            merged |= rgb_part
+        else:
+            merged |= {key: _label_rows(rgb_part[key], value) for key, value in own_part.items()}
+        source, target = (str(_largest(part) or "-") for part in (rgb_part, own_part))
+        rows.append(TransferRow(group, len(own_part), result, source, target, reason))
+    norm = {k.removeprefix(_NORM): v for k, v in merged.items() if k.startswith(_NORM)}
+    weights = {k: v for k, v in merged.items() if not k.startswith(_NORM)}
+    networks = {
+        "sit": replace(rgb, init_args=init_args, state_dict=weights),
+        "latent_norm": replace(statistics, state_dict=norm),
+    }
+    merged_checkpoint = replace(checkpoint, networks=networks)
+    load_into({"sit": sit, "latent_norm": latent_norm}, merged_checkpoint, stage="RGB transfer")
+    return TransferReport(checkpoint.path, tuple(rows))
+
+
+def _transfer_result(
+    group: str,
+    theirs: Mapping[str, Weights],
+    ours: Mapping[str, Weights],
+    keep_projector: bool,
+    same_grid: bool,
+) -> tuple[Result, str]:
+    """Result of a group of weights and its reason, by the rules of the official tuning stages."""
+    rgb, own = (_largest(groups.get(group, {})) for groups in (theirs, ours))
+    embeddings = [_largest(groups["x_embedder"]) for groups in (theirs, ours)]
+    channels, patches = ([shape[axis] for shape in embeddings] for axis in (1, 2))
+    of_patches = group in ("x_embedder", "final_layer.linear")
+    if (of_patches or group == "latent_norm") and channels[0] != channels[1]:
+        return "fresh", "other number of latent channels"
+    if of_patches and patches[0] != patches[1]:
+        return "fresh", "other patch size"
+    if group == "pos_embed" and not same_grid:
+        return "resized", "other token grid: computed for that of this run"
+    if group == "projector" and not keep_projector:
+        return "fresh", "not requested"
+    if group == "projector" and shapes_of(theirs.get(group, {})) != shapes_of(ours[group]):
+        return "fresh", "requested, but its shapes differ"
+    # Label tables of another width stay as they are: all shapes that differ are listed together.
+    if group != "y_embedder" or rgb[:1] == own[:1] or rgb[1:] != own[1:]:
+        return "kept", "fits"
+    if rgb[0] < own[0]:
+        return "extended", f"{own[0]} rows here: the last {own[0] - rgb[0]} stay fresh"
+    if own[0] == 1:
+        return "truncated", "one row here: the first is taken"
+    return "truncated", f"{own[0]} rows here: the first {own[0] - 1} and the last, of no class"
+
+
+def _label_rows(theirs: Tensor, ours: Tensor) -> Tensor:
+    """Label table as long as ours; our last row, if not the only one, is that of no class."""
+    if len(theirs) < len(ours):
+        return torch.cat([theirs, ours[len(theirs) :].to(theirs)])
+    return theirs[:1] if len(ours) == 1 else torch.cat([theirs[: len(ours) - 1], theirs[-1:]])
+
+
+def _grouped(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
+    """Weights of both networks by the part of their key that decides what happens to them."""
+    groups: dict[str, dict[str, Tensor]] = {}
+    for key, value in {**sit, **{_NORM + k: v for k, v in norm.items()}}.items():
+        parts = key.split(".")
+        group = ".".join(parts[: 2 if parts[0] == "final_layer" else 1])
+        groups.setdefault(group, {})[key] = value
+    return groups
+
+
+def _largest(weights: Weights) -> tuple[int, ...]:
+    """Shape of the largest tensor; empty if there is none."""
+    return max(shapes_of(weights).values(), key=math.prod, default=())
+
+
+@dataclass(frozen=True)
+class WeakModel:
+    """Averaged network in evaluation mode on the CPU, with facts about its training.
+
+    Its normalised latents are ``scale * latents + shift`` of those of the model that it guides,
+    see :func:`r3dpa.flow.renormalised`; ``shift`` is ``(C,)`` float32.
+    """
+
+    path: Path
+    sit: VelocityNetwork
+    scale: float
+    shift: Tensor
+    step: int | None
+    feature_source: str | None
+
+
+def read_snapshot(
+    path: str | Path,
+    strong: Checkpoint,
+    weights: Literal["ema", "last"] = "ema",
+    allow: bool = False,
+) -> WeakModel:
+    """Reads a weak model that may guide a given one; any checkpoint with an average will do.
+
+    If both models have one VAE, which stage ``flow_matching`` freezes, normalisations that drifted
+    apart are converted, up to :data:`NORM_TOLERANCE`. With another VAE, as after a snapshot of
+    stage ``joint``, no conversion exists: the normalised latents of both are equated, which removes
+    the drift of mean and scale only, and is refused unless allowed.
+
+    Args:
+        path: File of :class:`r3dpa.callbacks.EMASnapshots`, or another checkpoint.
+        strong: Checkpoint of the model to be guided.
+        weights: Whose latent statistics it uses, those of the average or of the last step.
+        allow: Warn of latents that differ instead of refusing them.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file has no average or no fitted statistics, or another latent size, path
+            or VAE, or statistics further apart than the tolerance.
+    """
+    weak = read_checkpoint(path)
+    if not {"ema", "ema_latent_norm"} <= set(weak.networks):
+        raise ValueError(
+            f"{path} is of stage {weak.stage} and holds no averaged SiT with its statistics, "
+            f"only {', '.join(weak.networks)}; give a file of a run's snapshots, or a "
+            "checkpoint of stage joint or flow_matching"
+        )
+    sit_name, norm_name = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
+    size, strong_size = _latent_size(weak, "ema"), _latent_size(strong, sit_name)
+    if (size, weak.interpolant) != (strong_size, strong.interpolant):
+        raise ValueError(
+            f"{path} is a model of latents {size} on the {weak.interpolant} path, {strong.path} "
+            f"one of {strong_size} on the {strong.interpolant} path; give a snapshot of a run with "
+            "the same VAE, range images and path"
+        )
+    norm, strong_norm = _norm(weak, "ema_latent_norm"), _norm(strong, norm_name)
+    # A normalised latent is (raw - mean) / deviation. The scale is the geometric mean over the
+    # channels, the spread how far a channel is from it at most, relative to it.
+    deviation = (norm.running_var + norm.eps).double().sqrt()
+    ratios = (strong_norm.running_var + strong_norm.eps).double().sqrt() / deviation
+    scale = ratios.log().mean().exp()
+    spread = (ratios / scale - 1).abs().max().item()
+    shift = ((strong_norm.running_mean - norm.running_mean).double() / deviation).float()
+    problem, vae = None, _vae_note(weak)
+    if vae is None or vae != _vae_note(strong):
+        problem = "its latents are those of another VAE, as within stage joint"
+        scale, shift = torch.ones(()), torch.zeros_like(shift)
+    elif spread > NORM_TOLERANCE:
+        problem = (
+            f"the scales of its latents differ by {spread:.1%} between channels, more than "
+            f"{NORM_TOLERANCE:.0%}"
+        )
+    if problem is not None:
+        problem = f"{path} cannot guide {strong.path} exactly: {problem}"
+        if not allow:
+            raise ValueError(
+                f"{problem}. Give a snapshot of a run of stage flow_matching on this VAE, or allow "
+                "the approximation"
+            )
+        warnings.warn(f"{problem}; allowed: an approximation", stacklevel=2)
+    sit = weak.network("ema").build()
+    assert isinstance(sit, VelocityNetwork)  # _latent_size
+    sit.eval().requires_grad_(False)
+    return WeakModel(Path(path), sit, scale.item(), shift, weak.step, weak.feature_source)
+
+
+def vae_fingerprint(vae: Weights) -> str:
+    """Description of a VAE that a snapshot leaves out: the hash of its weights."""
+    return f"not kept in a snapshot; SHA-256 of its weights: {weights_sha256(vae)}"
+
+
+def _vae_note(checkpoint: Checkpoint) -> str | None:
+    """Fingerprint of the VAE of a checkpoint, None if it has none."""
+    if "vae" in checkpoint.networks:
+        return vae_fingerprint(checkpoint.network("vae").state_dict)
+    return checkpoint.left_out.get("vae")
+
+
+def _latent_size(checkpoint: Checkpoint, name: str) -> tuple[int, ...]:
+    state = checkpoint.network(name)
+    if not issubclass(state.kind, VelocityNetwork):
+        raise ValueError(f"{checkpoint.path}: {name} is a {state.class_path}, no velocity network")
+    return (state.arguments["in_channels"], *state.arguments["input_size"])
+
+
+def _norm(checkpoint: Checkpoint, name: str) -> LatentNorm:
+    norm = checkpoint.network(name).build()
+    if not isinstance(norm, LatentNorm) or not norm.fitted:
+        raise ValueError(
+            f"{checkpoint.path}: {name} holds no fitted latent statistics; give a checkpoint of "
+            "stage joint or flow_matching"
+        )
+    return norm
