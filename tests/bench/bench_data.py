@@ -1,4 +1,4 @@
-"""Scans per second from files to batches: reading, projecting, caches, loaders, feature grids."""
+"""Scans per second from files to batches: reading, projecting, loaders, feature grids."""
 
 from __future__ import annotations
 
@@ -20,18 +20,15 @@ def scans(data_root):
     return kitti360_scans(data_root, "train")
 
 
-@pytest.fixture(scope="module", params=["projected", "cached"])
-def loaded(request, data_root, tmp_path_factory):
-    """A set-up data module that projects each scan, or reads cached range images."""
-    folder = tmp_path_factory.mktemp(request.param)
-    cached = str(folder / "images") if request.param == "cached" else None
+@pytest.fixture(scope="module")
+def loaded(data_root, tmp_path_factory):
+    """A set-up data module."""
     data = LidarDataModule(
         str(data_root),
         extractor=GeometricFeatures(DIM),
-        features_dir=str(folder / "features"),
+        features_dir=str(tmp_path_factory.mktemp("features")),
         batch_size=4,
         val_every=None,
-        images_dir=cached,
     )
     data.prepare_data()
     data.setup("fit")
@@ -92,10 +89,9 @@ class BenchGrid:
 
 @pytest.mark.benchmark(group="read one feature grid")
 class BenchStore:
-    @pytest.mark.parametrize("dtype", ["float16", "int8"])
-    def bench_store(self, benchmark, scans, dtype, tmp_path, alone):
+    def bench_store(self, benchmark, scans, tmp_path, alone):
         extractor = GeometricFeatures(DIM)
-        write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path, dtype=dtype)
+        write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path)
         store = FeatureGrids(tmp_path, scans, PROJECTION, GRID_SIZE, extractor)
         benchmark(lambda: store.read(scans[0]))
 

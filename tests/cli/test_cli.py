@@ -68,7 +68,6 @@ class TestHelp:
         (["edit", "vari"], "r3dpa edit: unknown command 'vari': give one of inpaint"),
         (["sample", "--ckpt", "a", "--out", "b", "--stepz", "3"], "--stepz"),
         (["sample", "--ckpt", "a"], "out"),
-        (["features", "--data", "r3dpa.data.LidarDataModule", "--dtype", "int4"], "dtype"),
         (["features", "--dat", "x"], "dat"),
     ],
 )

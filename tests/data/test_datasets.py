@@ -1,4 +1,3 @@
-import operator
 from contextlib import nullcontext
 
 import numpy as np
@@ -13,13 +12,10 @@ from r3dpa.data import (
     FeatureGrids,
     LidarDataModule,
     LidarDataset,
-    StoreError,
     TensorCache,
     View,
-    datasets,
     find_scans,
 )
-from r3dpa.data.datasets import range_image_cache, write_range_images
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
@@ -96,61 +92,9 @@ def test_a_scan_out_of_range_is_named(tmp_path, projection):
         LidarDataset(scans, projection, RangeCodec())[0]
 
 
-# --- range images and posteriors that are kept on disk
-
-
 @pytest.fixture
 def scans(tmp_path, make_scans):
     return find_scans(make_scans(tmp_path / "scans", 5))
-
-
-@pytest.mark.parametrize("codec", [RangeCodec(), RangeCodec("log2")])
-def test_a_cached_sample_is_the_projected_one(tmp_path, scans, projection, codec):
-    root = tmp_path / "images"
-    assert write_range_images(scans, projection, codec, root) == 5
-    images = CachedTensors(range_image_cache(root, projection, codec), scans)
-    projected = LidarDataset(scans, projection, codec)
-    cached = LidarDataset(scans, projection, codec, images=images)
-    for index in range(5):
-        for key, value in projected[index].items():
-            same = torch.equal if torch.is_tensor(value) else operator.eq
-            assert same(cached[index][key], value), key
-
-
-def test_only_what_is_missing_is_projected(tmp_path, scans, projection, monkeypatch):
-    root, read = tmp_path / "images", []
-    write_range_images(scans[:3], projection, RangeCodec(), root)
-    original = datasets.read_scan
-    monkeypatch.setattr(datasets, "read_scan", lambda path: read.append(path) or original(path))
-    assert write_range_images(scans, projection, RangeCodec(), root) == 2
-    assert read == [scan.path for scan in scans[3:]]
-    assert write_range_images(scans, projection, RangeCodec(), root) == 0
-
-
-@pytest.mark.parametrize(
-    ("columns", "range_max_m", "codec"),
-    [(32, 56, RangeCodec("log2")), (64, 56, RangeCodec()), (32, 40, RangeCodec())],
-)
-def test_other_settings_never_find_these_images(
-    tmp_path, scans, projection, columns, range_max_m, codec
-):
-    write_range_images(scans, projection, RangeCodec(), tmp_path)
-    other = SphericalProjection(LidarSensor(8, columns, range_max_m=range_max_m))
-    assert range_image_cache(tmp_path, other, codec).missing(scans) == scans
-
-
-def test_a_replaced_scan_of_the_same_size_is_noticed_and_made_again(tmp_path, scans, projection):
-    root = tmp_path / "i"
-    write_range_images(scans, projection, RangeCodec(), root)
-    images = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
-    points = np.fromfile(scans[1].path, "<f4").reshape(-1, 4)
-    (2 * points).tofile(scans[1].path)
-    with pytest.raises(StoreError, match=r"0000000001\.bin was replaced"):
-        images.read(scans[1])
-    assert write_range_images(scans, projection, RangeCodec(), root) == 1
-    again = CachedTensors(range_image_cache(root, projection, RangeCodec()), scans)
-    expected = LidarDataset(scans, projection, RangeCodec())[1]["range_image"]
-    assert torch.equal(again.read(scans[1]), expected)
 
 
 @pytest.fixture
@@ -178,16 +122,6 @@ def data(folder, **kwargs):
     module.prepare_data()
     module.setup("fit")
     return module
-
-
-def test_batches_of_the_data_module_are_the_same(tmp_path, scans):
-    folder, augmentation = tmp_path / "scans", Augmentation(rotate=True, flip=True)
-    plain = data(folder, augmentation=augmentation)
-    cached = data(folder, augmentation=augmentation, images_dir=str(tmp_path / "i"), num_workers=1)
-    pairs = zip(plain.train_dataloader(), cached.train_dataloader(), strict=True)
-    for number, (one, other) in enumerate(pairs):
-        assert one["name"] == other["name"], number
-        assert torch.equal(one["range_image"], other["range_image"])
 
 
 def test_the_data_module_refuses_latents_that_do_not_follow(tmp_path, posteriors):

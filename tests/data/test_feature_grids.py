@@ -1,7 +1,6 @@
 import os
 import re
 import resource
-import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
@@ -197,16 +196,14 @@ def test_other_grid_size_is_named_by_the_reader(made, projection, scaled_points)
         assert words in str(caught.value)
 
 
-def test_dtype_and_precision_matter_where_grids_are_missing(
+def test_precision_matters_where_grids_are_missing(
     made, projection, scaled_points, make_scans, folder
 ):
     scans, root = made
-    other = {"dtype": "int8", "precision": "bf16-mixed"}
-    assert not plan(scans, scaled_points(), projection, [GRID], root, **other).missing
+    assert not plan(scans, scaled_points(), projection, [GRID], root, "bf16-mixed").missing
     make_scans(folder / "a", 4)
-    for key, value in other.items():
-        with pytest.raises(StoreError, match=rf"{key} \S+, but {key} {value}"):
-            plan(find_scans(folder), scaled_points(), projection, [GRID], root, **{key: value})
+    with pytest.raises(StoreError, match=r"precision 32-true, but precision bf16-mixed"):
+        plan(find_scans(folder), scaled_points(), projection, [GRID], root, "bf16-mixed")
 
 
 def test_missing_grid_names_the_scan_and_the_command(made, projection, make_scans, folder):
@@ -295,31 +292,6 @@ def test_two_jobs_at_once_make_each_grid_once(
     assert "waiting for another process that makes feature grids in" in caplog.text
 
 
-def test_a_disk_without_space_is_refused_before_the_first_grid(
-    tmp_path, folder, projection, scaled_points, monkeypatch
-):
-    """5 grids of 2 x 4 cells, a hundred million wide: 8 GB of float16, and 4 + 2 + ... of int8."""
-    scans, extractor, free = find_scans(folder), scaled_points(), 8_000_000_000
-    extractor.dim = 10**8
-
-    def usage(path):
-        assert path == tmp_path  # the first folder that exists
-        return shutil._ntuple_diskusage(1, 1, free)
-
-    monkeypatch.setattr(shutil, "disk_usage", usage)
-    root = tmp_path / "g" / "x"
-    todo = plan(scans, extractor, projection, [GRID], root)
-    assert (todo.num_bytes, todo.free_bytes) == (free, free)
-    todo = plan(scans, extractor, projection, [GRID], root, dtype="int8")
-    assert todo.num_bytes == 4_000_000_160
-    free -= 1
-    message = rf"grids of 5 scans need 8\.0 GB, but {root} has 8\.0 GB free: .*features_dir.*int8"
-    with pytest.raises(StoreError, match=message):
-        write_feature_grids(scans, extractor, projection, [GRID], root)
-    assert extractor.calls == 0
-    assert not (tmp_path / "g").exists()
-
-
 def test_a_folder_that_cannot_be_written_is_named(tmp_path, made, projection, scaled_points):
     scans, complete = made
     (tmp_path / "file").touch()
@@ -369,19 +341,16 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
         return GridSettings.of(scaled_points(gain), projection, size, **options)
 
     for other, words in (
-        (settings(dtype="int8"), "dtype float16, but dtype int8"),
         (settings(precision="bf16-mixed"), "precision 32-true, but precision bf16-mixed"),
         (settings(gain=3.0), r"'gain': 1\.0.*, but .*'gain': 3\.0"),
         (settings((4, 4), gain=3.0), r"'gain': 1\.0.*, but .*'gain': 3\.0"),
     ):
         with pytest.raises(StoreError, match=f"{words}.*features_dir .*r3dpa features"):
             other.writer(root)
-    settings((4, 4), dtype="int8").writer(root)  # another size may be stored otherwise
+    settings((4, 4), precision="bf16-mixed").writer(root)  # another size may be made otherwise
     assert any_settings(root).extractor["name"] == "scaled"
     with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
         any_settings(root / "nothing")
-    with pytest.raises(ValueError, match="dtype must be float16 or int8, got 'int4'"):
-        settings(dtype="int4")
 
 
 def test_a_disk_that_fills_up(made, projection, scaled_points):

@@ -14,8 +14,8 @@ import torch
 from PIL import Image
 
 from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder, TarImages
-from r3dpa.data.dead_leaves import dead_leaves
-from r3dpa.data.images import ImageEntry, ImageError, center_crop, latent_statistics
+from r3dpa.data.image_datamodule import latent_statistics
+from r3dpa.data.images import ImageEntry, ImageError, center_crop, dead_leaves
 from r3dpa.data.store import CachedTensors, TensorCache
 
 

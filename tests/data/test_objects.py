@@ -8,9 +8,16 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from r3dpa.data import Scan, ScanError, find_scans, write_bin
-from r3dpa.data.objects import ObjectClass, ObjectLibrary, object_library
+from r3dpa.data import Scan, ScanError, write_bin
+from r3dpa.data.objects import (
+    CLASS_NAMES,
+    ObjectClass,
+    ObjectLibrary,
+    object_library,
+    read_labels,
+)
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
+from r3dpa.simulation import Semantic
 
 CAR, ROAD = 26, 7
 SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
@@ -24,6 +31,37 @@ def write_scan(root, frame, points, labels):
     (folder / "labels").mkdir(exist_ok=True)
     (folder / "labels" / f"{frame}.label").write_bytes(np.array(labels, "<u4").tobytes())
     return Scan("drive", frame, path)
+
+
+def test_names_are_those_of_the_simulator():
+    unnamed = (Semantic.UNLABELED, Semantic.EGO_VEHICLE)
+    assert {s.value: s.name.lower() for s in Semantic if s not in unnamed}.items() <= (
+        CLASS_NAMES.items()
+    )
+
+
+def test_labels_of_the_simulator_come_as_they_are(tmp_path):
+    scan = write_scan(tmp_path, "0", np.ones((2, 4)), [26 | 3 << 16, 0xFFFFFFFF])
+    assert read_labels(scan.path, 2).tolist() == [26 | 3 << 16, 0xFFFFFFFF]
+
+
+def test_semantic_kitti_becomes_kitti_360(tmp_path):
+    scan = tmp_path / "velodyne" / "000001.bin"
+    path = tmp_path / "labels" / "000001.label"
+    path.parent.mkdir()
+    # A car, one that moves, a trunk, a lane marking, an outlier.
+    path.write_bytes(np.array([10 | 5 << 16, 252, 71, 60, 1], dtype="<u4").tobytes())
+    labels = read_labels(scan, 5)
+    assert (labels >> 16).tolist() == [5, 0, 0, 0, 0]
+    names = [CLASS_NAMES.get(label) for label in (labels & 0xFFFF).tolist()]
+    assert names == ["car", "car", "vegetation", "road", None]
+
+    path.write_bytes(np.array([10, 10, 10, 10, 12], dtype="<u4").tobytes())
+    with pytest.raises(ScanError, match=r"000001\.label holds \[12\], which are no classes"):
+        read_labels(scan, 5)
+    path.write_bytes(bytes(12))
+    with pytest.raises(ScanError, match=r"000001\.label holds 3 labels, but its scan 5 points"):
+        read_labels(scan, 5)
 
 
 # Ahead, left, and right of the sensor; one behind that is out of range.
@@ -153,7 +191,7 @@ def test_what_the_scans_do_not_show_is_refused(tmp_path, scaled_points):
     with pytest.raises(ValueError, match=r"no labelled point of .*they show no class at all"):
         make(None)
     scans[0].path.parents[1].joinpath("labels", "1.label").unlink()
-    with pytest.raises(ScanError, match=r"1\.bin has no labels"):
+    with pytest.raises(ScanError, match=r"1\.bin has no labels: looked for labels/1\.label"):
         make(None)
 
 
@@ -187,12 +225,3 @@ def test_a_file_of_something_else_is_named(tmp_path, library):
     save_file({"features": torch.ones(1, 2)}, path)  # without a card
     with pytest.raises(ValueError, match="holds no objects"):
         ObjectLibrary.load(path)
-
-
-def test_objects_of_the_real_scans(real_scans_dir, scaled_points):
-    scans = find_scans(real_scans_dir / "kitti_object_vis" / "velodyne")
-    projection = SphericalProjection(LidarSensor())
-    library = object_library(scans, scaled_points(), projection, (8, 64), ["person", "car"])
-    # The mean place of the pedestrian is that of its box: 8.41 m ahead of the camera, 1.84 m right.
-    x, y, _, _ = library.feature("person").tolist()
-    assert (x, y) == pytest.approx((8.41 + 0.27, -1.84), abs=0.4)

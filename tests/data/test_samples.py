@@ -53,10 +53,6 @@ def write_text(path, points):
     np.savetxt(path, np.hstack([points[:, :3], np.zeros((len(points), 3))]), fmt="%.3f")
 
 
-def write_xyz(path, points):
-    path.write_bytes(points[:, :3].astype("<f4").tobytes())
-
-
 @pytest.mark.parametrize(
     ("suffix", "write", "columns"),
     [("bin", write_bin, 4), ("ply", write_ply, 4), ("txt", write_text, 3)],
@@ -79,14 +75,6 @@ def test_clouds_of_a_folder_in_the_order_of_their_names(tmp_path, suffix, write,
         assert (samples.num_read, samples.bad) == (2, [])
 
 
-def test_rows_of_three_numbers_are_read_by_name(tmp_path):
-    write_xyz(tmp_path / "0.bin", CLOUDS[0])
-    with pytest.raises(SampleError, match=r"0.bin: has 36 bytes, not a multiple of 16"):
-        list(read_samples(tmp_path, SENSOR))
-    (sample,) = read_samples(tmp_path, SENSOR, format="bin_xyz")
-    assert sample.points.tolist() == CLOUDS[0][:, :3].tolist()
-
-
 def test_points_out_of_range_are_left_out(tmp_path):
     points = np.array([[0.5, 0, 0, 1], [10, 0, 0, 0.5], [60, 0, 0, 1]], np.float32)
     write_bin(tmp_path / "a.bin", points)
@@ -100,14 +88,14 @@ def test_folder_of_r3dpa_sample_is_read_once(tmp_path):
         write_bin(tmp_path / "bin" / f"{name}.bin", points[:, :3])
         write_ply(tmp_path / "ply" / f"{name}.ply", points[:, :3])
     write_npz(tmp_path / "scenes.npz", {"000000": CLOUDS[0][:, :3], "000001": CLOUDS[1][:, :3]})
-    with pytest.raises(SampleError, match=r"several formats \(2 bin, 1 npz, 2 ply\).*give the fo"):
+    with pytest.raises(SampleError, match=r"several formats \(2 \.bin, 1 \.npz, 2 \.ply\).*"):
         read_samples(tmp_path, SENSOR)
     (tmp_path / "metadata.json").touch()
     names, points, _, _ = zip(*read_samples(tmp_path, SENSOR), strict=True)
     assert names == ("000000", "000001")
     assert points[1].tolist() == CLOUDS[1][:, :3].tolist()
-    names = [sample.name for sample in read_samples(tmp_path, SENSOR, format="ply")]
-    assert names == ["ply/000000", "ply/000001"]
+    names = [sample.name for sample in read_samples(tmp_path / "ply", SENSOR)]
+    assert names == ["000000", "000001"]
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -242,7 +230,7 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
     else:
         {"npy": np.save, "npz": np.savez}[suffix](file, objects)
     reason = {"pcd": "no known format", "pth": "cannot be read as tensors alone"}
-    with pytest.raises(SampleError, match=f"evil.{suffix}.*{reason.get(suffix, 'not unpickled')}"):
+    with pytest.raises(SampleError, match=rf"evil\.{suffix}.*{reason.get(suffix, '(?i:object)')}"):
         list(read_samples(file, SENSOR))
     assert capsys.readouterr().out == ""
 
@@ -303,7 +291,6 @@ BAD = {
     "no image": (array_file(np.zeros((0, 5, 4, 8), np.float32)), r"a\.npy: no sample .* empty"),
     "bytes": (array_file(np.ones((2, 5, 4, 8), np.uint8)), r"a\.npy: holds uint8 numbers; metres"),
     "vector": (array_file(np.ones(3)), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
-    "Fortran": (array_file(np.ones((8, 4, 5, 2)).T), r"a\.npy: is in Fortran order"),
     "cut .npz": (cut, r"a\.npz: "),
     "damaged .npz": (flipped, r"a\.npz.* is damaged"),
     "no member": (lambda path: np.savez(path / "a.npz"), r"a\.npz: "),
@@ -325,7 +312,7 @@ BAD = {
     "order": (images_file(lambda s: s[:, [1, 2, 3, 0, 4]].abs()), r"channel 0 is not the length"),
     "mixed": (
         lambda path: [write(path) for write in (cut, tensor_file(image()))],
-        r"several formats \(1 npz, 1 pth\)",
+        r"several formats \(1 \.npz, 1 \.pth\)",
     ),
     "nothing": (bytes_file("a.png", b"x"), r"holds no samples; what can be read: clouds"),
 }
@@ -347,11 +334,9 @@ def test_another_format_is_named(tmp_path):
         list(read_samples(tmp_path / "a.pcd", SENSOR))
 
 
-def test_missing_path_and_missing_format_are_named(tmp_path):
+def test_missing_path_is_named(tmp_path):
     with pytest.raises(SampleError, match="there is no such file or folder"):
         read_samples(tmp_path / "gone", SENSOR)
-    with pytest.raises(SampleError, match=r"holds no file with \.pth or \.pt"):
-        read_samples(tmp_path, SENSOR, format="pth")
 
 
 def test_bad_samples_are_counted_and_listed(tmp_path):
@@ -385,20 +370,14 @@ def test_a_stack_cut_short_is_refused(tmp_path):
     file = tmp_path / "a.npy"
     np.save(file, torch.stack([image(0), image(1)]).numpy())
     file.write_bytes(file.read_bytes()[:-300])
-    with pytest.raises(SampleError, match=r"a\.npy: an array .* needs 1280 bytes, but there are"):
+    with pytest.raises(SampleError, match=r"a\.npy: cannot be read as an array \(mmap length"):
         list(read_samples(file, SENSOR))
 
 
-@pytest.mark.parametrize("kind", ["pth", "npz"])
-def test_one_of_many_samples_is_read_at_a_time(tmp_path, monkeypatch, kind):
-    stack = torch.stack([image(seed) for seed in range(3)])
-    if kind == "pth":
-        torch.save(stack, tmp_path / "a.pth")
-    else:
-        np.savez(tmp_path / "a.npz", stack.numpy())
-    module, name = (torch, "cat") if kind == "pth" else (np, "frombuffer")
-    original, calls = getattr(module, name), []
-    monkeypatch.setattr(module, name, lambda *a, **k: calls.append(a) or original(*a, **k))
+def test_one_of_many_samples_is_read_at_a_time(tmp_path, monkeypatch):
+    torch.save(torch.stack([image(seed) for seed in range(3)]), tmp_path / "a.pth")
+    original, calls = torch.cat, []
+    monkeypatch.setattr(torch, "cat", lambda *a, **k: calls.append(a) or original(*a, **k))
     samples = iter(read_samples(tmp_path, SENSOR))
     counts = [(next(samples), len(calls))[1] for _ in range(2)]
     assert counts[1] == 2 * counts[0]

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from r3dpa.data.checks import check
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     ScanError,
+    check,
     find_scans,
     kitti360_scans,
     read_npz,
@@ -130,14 +130,14 @@ def test_ply_of_other_programs(tmp_path):
     (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack("<3dB", 1, 2, 3, 255))
     assert read_ply(tmp_path / "a.ply").tolist() == [[1, 2, 3]]
     (tmp_path / "b.ply").write_bytes(header.encode() + b"12")
-    with pytest.raises(ScanError, match=r"b\.ply: holds 2 bytes for 1 points of 25"):
+    with pytest.raises(ScanError, match=r"b\.ply: .*\(2 bytes for 1 points of 25\)"):
         read_ply(tmp_path / "b.ply")
     (tmp_path / "i.ply").write_bytes(
         header.replace("uchar red", "int label").encode() + struct.pack("<3di", 1, 2, 3, -7)
     )
     assert read_ply(tmp_path / "i.ply").tolist() == [[1, 2, 3]]
     (tmp_path / "l.ply").write_text(header.replace("uchar red", "list uchar int rest"))
-    with pytest.raises(ScanError, match=r"l\.ply: has property list uchar int rest"):
+    with pytest.raises(ScanError, match=r"l\.ply: must hold points alone"):
         read_ply(tmp_path / "l.ply")
     with pytest.raises(ScanError, match=r"gone\.ply: cannot be read"):
         read_ply(tmp_path / "gone.ply")

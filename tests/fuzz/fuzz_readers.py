@@ -31,8 +31,7 @@ from PIL import Image
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.data import FeatureGrids, GridSettings, Scan, read_samples
 from r3dpa.data.images import read_mask
-from r3dpa.data.labels import read_labels
-from r3dpa.data.objects import ObjectClass, ObjectLibrary
+from r3dpa.data.objects import ObjectClass, ObjectLibrary, read_labels
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
 from r3dpa.metrics.official_statistics import OfficialStatistics
@@ -156,7 +155,7 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
         grid_size=(2, 4),
         extractor={"name": "a", "settings": {}},
         dim=3,
-        dtype="int8",
+        dtype="float16",
         precision="32-true",
     )
     scans = [Scan("drive", f"{n}", folder / f"{n}.bin") for n in range(3)]
@@ -242,7 +241,7 @@ def _add_checkpoints(folder: Path, add: Callable[..., None]) -> None:
 
 
 def _add_edits(folder: Path, points: np.ndarray, add: Callable[..., None]) -> None:
-    """Masks, object libraries, and labels of SemanticKITTI and of KITTI's boxes."""
+    """Masks, object libraries, and labels of SemanticKITTI."""
     mask = folder / "mask.png"
     Image.new("L", (SENSOR.columns, SENSOR.beams), 255).save(mask)
     add("mask .png", mask, lambda: read_mask(mask, SENSOR))
@@ -259,21 +258,11 @@ def _add_edits(folder: Path, points: np.ndarray, add: Callable[..., None]) -> No
         assert isinstance(library.source, str)
 
     add("objects .safetensors", objects, load)
-    semantic, boxed = (folder / name / "velodyne" / "0.bin" for name in ("semantic", "boxed"))
+    semantic = folder / "semantic" / "velodyne" / "0.bin"
     label = semantic.parents[1] / "labels" / "0.label"
-    boxes, calib = (boxed.parents[1] / name / "0.txt" for name in ("label_2", "calib"))
-    text = "Car 0.0 0 -1.5 0 0 50 50 1.5 1.6 4.0 1.0 1.5 8.0 0.1\n"
-    matrix = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
-    for file, content in (
-        (label, np.full(len(points), 10, np.uint32).tobytes()),
-        (boxes, text.encode()),
-        (calib, matrix.encode()),
-    ):
-        file.parent.mkdir(parents=True)
-        file.write_bytes(content)
-    add("SemanticKITTI .label", label, lambda: read_labels(semantic, points))
-    add("label_2 .txt", boxes, lambda: read_labels(boxed, points))
-    add("calib .txt", calib, lambda: read_labels(boxed, points))
+    label.parent.mkdir(parents=True)
+    label.write_bytes(np.full(len(points), 10, np.uint32).tobytes())
+    add("SemanticKITTI .label", label, lambda: read_labels(semantic, len(points)))
 
 
 def archive(members: dict[str, bytes]) -> bytes:

@@ -51,9 +51,9 @@ def test_members_of_archives(name, tmp_path):
     np.save(array, POINTS)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr(f"{name}.npy", array.getvalue())
-    with pytest.raises(ValueError, match=r"a\.npz, member .*: its name"):
+    with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
         read_npz(tmp_path / "a.npz")
-    with pytest.raises(ValueError, match=r"a\.npz, member .*: its name"):
+    with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
         list(read_samples(tmp_path / "a.npz", LidarSensor(4, 16)))
 
 
@@ -78,17 +78,14 @@ def test_drives_in_a_manifest(drive, tmp_path):
         expected_scans(tmp_path)
 
 
-def test_few_bytes_that_ask_for_much_memory(tmp_path):
-    head = (
-        b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': '<f4', 'fortran_order': False, 'shape': (%d, 4)}"
-    )
-    for count in (2**40, 2**62):
-        data = head % count
-        data = data.ljust(127) + b"\n" + bytes(64)
-        (tmp_path / "a.npy").write_bytes(data)
-        with pytest.raises(ValueError, match=r"a\.npy.*needs .* bytes, but there are 192"):
-            list(read_samples(tmp_path / "a.npy", LidarSensor(4, 16)))
-        with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-            archive.writestr("a.npy", data)
-        with pytest.raises(ValueError, match=r"a\.npz.*needs .* bytes, but there are 192"):
-            read_npz(tmp_path / "a.npz")
+@pytest.mark.parametrize("count", [2**40, 2**62])
+def test_few_bytes_that_ask_for_much_memory(tmp_path, count):
+    head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({count}, 4)}}"
+    data = b"\x93NUMPY\x01\x00\x76\x00" + head.encode().ljust(117) + b"\n" + bytes(64)
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.npy: cannot be read as an array"):
+        list(read_samples(tmp_path / "a.npy", LidarSensor(4, 16)))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("a.npy", data)
+    with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': is damaged"):
+        read_npz(tmp_path / "a.npz")

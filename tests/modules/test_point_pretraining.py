@@ -5,8 +5,8 @@ import pytest
 import torch
 from lightning import Trainer
 
+from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.datasets import DrawnPoints
-from r3dpa.data.point_datamodule import PointDataModule
 from r3dpa.modules import PointPretraining
 from r3dpa.nn.backbones import Masking, ScanGrid, WaffleIron, WaffleIronS, collate_scans
 

@@ -27,7 +27,7 @@ def check(path: Path) -> None:
     Args:
         path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans.
     """
-    from r3dpa.data.checks import check as check_scans
+    from r3dpa.data.scans import check as check_scans
 
     report = check_scans(path)
     sys.stdout.write(f"{report}\n")
@@ -115,7 +115,7 @@ def objects(
 
     Args:
         data: Folder, file or glob of scans with labels beside them: of ``r3dpa simulate``,
-            KITTI-360, SemanticKITTI, or the boxes of the KITTI object benchmark.
+            KITTI-360 or SemanticKITTI.
         out: File to write, ``.safetensors``.
         like: Checkpoint of a model that the objects are for; gives source, dim, sensor and
             grid_size.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from inspect import signature
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from jsonargparse import Namespace
 from lightning import Trainer
@@ -77,7 +77,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
             data.setup("predict")
             assert data.all_set is not None
             projection = data.geometry.projection
-            arguments = extractor, projection, sizes, folder, config.dtype, trainer.precision
+            arguments = extractor, projection, sizes, folder, trainer.precision
             todo = plan(data.all_set.scans, *arguments)
             if todo.missing:  # complete grids may lie on a read-only disk
                 job.enter_context(features_lock(folder))
@@ -86,10 +86,9 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
             stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.settings)
             _say(
                 f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
-                f"done; {todo.num_bytes / 1e9:.3g} GB needed, {todo.free_bytes / 1e9:.3g} GB "
-                f"free, in {stores}"
+                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}"
             )
-        extraction = FeatureExtraction(extractor, projection, sizes, folder, config.dtype)
+        extraction = FeatureExtraction(extractor, projection, sizes, folder)
         batch_size = data.batch_size if config.batch_size is None else config.batch_size
         missing = MissingScans(scans, extractor, data.sensor, batch_size, data.num_workers)
         started = time.monotonic()
@@ -169,7 +168,6 @@ def _parser() -> StageParser:
     )
     sources = f"one of {', '.join(SOURCES)}; default: that of the data, or scalr if --ckpt is given"
     sizes = "such as '[[8, 64], [16, 128]]', all from one pass; default: grid_size of the data"
-    steps = "int8 takes half the space: 127 steps on either side of zero in each cell"
     options: dict[str, tuple[Any, str]] = {
         "extractor": (str | None, sources),
         "ckpt": (Path | None, "weights of the extractor"),
@@ -179,7 +177,6 @@ def _parser() -> StageParser:
     }
     for name, (kind, text) in options.items():
         parser.add_argument(f"--{name}", type=kind, help=text)
-    parser.add_argument("--dtype", type=Literal["float16", "int8"], default="float16", help=steps)
     skipped: Any = set(signature(Trainer).parameters) - _TRAINER_OPTIONS
     parser.add_class_arguments(
         Trainer, "trainer", fail_untyped=False, instantiate=False, sub_configs=True, skip=skipped

@@ -7,7 +7,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from r3dpa.data.augmentation import Augmentation, View
-from r3dpa.data.checks import check
 from r3dpa.data.datasets import (
     LatentBatch,
     LidarBatch,
@@ -15,7 +14,6 @@ from r3dpa.data.datasets import (
     PointDataset,
     PointSample,
 )
-from r3dpa.data.dead_leaves import DeadLeaves
 from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
@@ -23,12 +21,13 @@ from r3dpa.data.feature_grids import (
     pooled_grids,
     write_feature_grids,
 )
-from r3dpa.data.images import ImageFolder, TarImages
+from r3dpa.data.images import DeadLeaves, ImageFolder, TarImages
 from r3dpa.data.samples import SampleError, Samples, read_samples
 from r3dpa.data.scans import (
     KITTI360_DRIVES,
     Scan,
     ScanError,
+    check,
     find_scans,
     kitti360_scans,
     read_beside,
@@ -42,15 +41,19 @@ from r3dpa.data.scans import (
 from r3dpa.data.store import CachedTensors, Store, StoreError, TensorCache
 
 if TYPE_CHECKING:
-    from r3dpa.data.datamodules import KITTI360DataModule, LidarDataModule, SimulatedDataModule
+    from r3dpa.data.datamodules import (
+        KITTI360DataModule,
+        LidarDataModule,
+        PointDataModule,
+        SimulatedDataModule,
+    )
     from r3dpa.data.image_datamodule import ImageDataModule
-    from r3dpa.data.point_datamodule import PointDataModule
 
 _ON_FIRST_USE = {
     "ImageDataModule": "image_datamodule",
     "KITTI360DataModule": "datamodules",
     "LidarDataModule": "datamodules",
-    "PointDataModule": "point_datamodule",
+    "PointDataModule": "datamodules",
     "SimulatedDataModule": "datamodules",
 }
 

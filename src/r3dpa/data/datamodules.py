@@ -1,7 +1,8 @@
-"""Lightning data modules: scans in, :class:`LidarBatch` out."""
+"""Lightning data modules: scans in, :class:`LidarBatch` or points out."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from glob import has_magic
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -12,11 +13,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import (
-    LidarDataset,
-    range_image_cache,
-    write_range_images,
-)
+from r3dpa.data.datasets import DrawnPoints, LidarDataset, list_collate
 from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
@@ -81,8 +78,6 @@ class LidarDataModule(LoaderModule):
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
-        images_dir: Folder that keeps the range images, which are then projected once, before
-            training: 262 kB a scan of 64 x 1024 pixels, the very same numbers.
 
     Raises:
         ValueError: If an argument is out of its range, or the features do not follow the
@@ -109,7 +104,6 @@ class LidarDataModule(LoaderModule):
         limit: int | None = None,
         prepare_data_per_node: bool = False,
         augmentation: Augmentation = _AUGMENTATION,
-        images_dir: str | None = None,
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
@@ -123,7 +117,7 @@ class LidarDataModule(LoaderModule):
         self.extractor = extractor
         self.features_dir = self._find_features_dir(features_dir)
         self.val_every, self.val_drives, self.limit = val_every, val_drives, limit
-        self.augmentation, self.images_dir = augmentation, images_dir
+        self.augmentation = augmentation
         if self.features_dir is not None:
             augmentation.check_extractor(extractor, self.grid_size[1])
         self.train_set: LidarDataset | None = None
@@ -172,22 +166,13 @@ class LidarDataModule(LoaderModule):
         return evenly(train, self.limit), evenly(val, self.limit)
 
     def prepare_data(self) -> None:
-        """Make the range images and, but to predict, the feature grids that are missing."""
+        """Make the feature grids that are missing, but to predict."""
         predicting = self.trainer is not None and self.trainer.predicting
-        extractor = None if predicting or self.features_dir is None else self.extractor
-        if self.images_dir is None and extractor is None:
+        if predicting or self.features_dir is None or self.extractor is None:
             return
         train, val, projection = self._scans_and_projection()
-        if self.images_dir is not None:
-            num_made = write_range_images(
-                train + val, projection, self.codec, self.images_dir, workers=self.num_workers
-            )
-            rank_zero_info(f"range images: {num_made} made, in {self.images_dir}")
-        if extractor is not None:
-            self._make_grids(train + val, cast(Extractor, extractor.eval()), projection)
-
-    def _make_grids(self, scans: list[Scan], extractor: Extractor, projection: Projection) -> None:
-        arguments = scans, extractor, projection, [self.grid_size], cast(Path, self.features_dir)
+        extractor = cast(Extractor, self.extractor.eval())
+        arguments = train + val, extractor, projection, [self.grid_size], self.features_dir
         todo = plan(*arguments)
         rank_zero_info(
             f"feature grids: {len(todo.missing)} to make, {todo.num_bytes / 1e9:.3g} GB, "
@@ -197,10 +182,10 @@ class LidarDataModule(LoaderModule):
         rank_zero_info(f"feature grids: {num_made} made")
 
     def setup(self, stage: str) -> None:
-        """Index the scans and open the caches, of feature grids not to ``"predict"``."""
+        """Index the scans and open the store of feature grids, but to ``"predict"``."""
         self._posteriors = None  # of another fit, maybe with another VAE
         train, val, self.projection = self._scans_and_projection()
-        scans, grids, images = sorted(train + val), None, None
+        scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
             grids = FeatureGrids(
                 self.features_dir,
@@ -209,12 +194,8 @@ class LidarDataModule(LoaderModule):
                 self.grid_size,
                 cast(Extractor | None, self.extractor),
             )
-        if self.images_dir is not None:
-            cache = range_image_cache(self.images_dir, self.projection, self.codec)
-            images = CachedTensors(cache, scans)
         self.train_set, self.val_set, self.all_set = (
-            LidarDataset(split, self.projection, self.codec, grids, images)
-            for split in (train, val, scans)
+            LidarDataset(split, self.projection, self.codec, grids) for split in (train, val, scans)
         )
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
@@ -233,11 +214,7 @@ class LidarDataModule(LoaderModule):
             raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
         if self._posteriors is not None:
             dataset = LidarDataset(
-                dataset.scans,
-                dataset.projection,
-                dataset.codec,
-                dataset.grids,
-                posteriors=self._posteriors,
+                dataset.scans, dataset.projection, dataset.codec, dataset.grids, self._posteriors
             )
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self.loader(dataset, train=False)
@@ -358,3 +335,59 @@ class SimulatedDataModule(KITTI360DataModule):
             weather=self.weather,
         )
         super().prepare_data()
+
+
+class PointDataModule(LoaderModule):
+    """Points of the scans of another data module, prepared at random in each epoch.
+
+    Batches are lists of what ``prepare`` returns; no range images or feature grids are made.
+
+    Args:
+        source: Scans and their split, simulated where it does that. Give it ``extractor: null``.
+        prepare: Function of the points ``(P, 4)`` and a generator, such as
+            ``r3dpa.nn.backbones.Masking``.
+        batch_size: Scans per batch and process.
+        num_workers: Loader processes per training process.
+        seed: Seed of order and draws.
+
+    Raises:
+        ValueError: If ``source`` has an extractor, or an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        source: LidarDataModule,
+        prepare: Callable[..., Any],
+        batch_size: int = 2,
+        num_workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(batch_size, num_workers, seed)
+        if source.extractor is not None:
+            raise ValueError(
+                "data.init_args.source.init_args.extractor must be null: a network on points is "
+                "trained without feature grids."
+            )
+        self.source, self.prepare = source, prepare
+        self.train_set: DrawnPoints | None = None
+        self.val_set: DrawnPoints | None = None
+
+    def prepare_data(self) -> None:
+        """Simulate the scans, where the source does."""
+        self.source.prepare_data()
+
+    def setup(self, stage: str) -> None:
+        """Index the scans."""
+        self.train_set, self.val_set = (
+            DrawnPoints(scans, self.source.sensor, self.prepare, self.seed)
+            for scans in self.source.limited_split()
+        )
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Shuffled, resumable loader of full batches."""
+        points = ready(self.train_set)
+        return self.loader(points, train=True, with_epoch=True, collate_fn=list_collate)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Held-out scans in order, none twice, each drawn the same every time."""
+        return self.loader(ready(self.val_set), train=False, collate_fn=list_collate)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
-from tqdm import tqdm
+from torch.utils.data import Dataset
 
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
-from r3dpa.data.store import CachedTensors, ItemKey, TensorCache
-from r3dpa.geometry import LidarSensor, Projection, RangeCodec, projection_to_dict, range_image
+from r3dpa.data.store import CachedTensors, ItemKey
+from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
 
 
 class LidarBatch(TypedDict):
@@ -54,7 +51,6 @@ class LidarDataset(Dataset[dict[str, Any]]):
         projection: Points to pixels; its sensor sets the image size and range limits.
         codec: Metres to [-1, 1].
         grids: Feature grids, if any.
-        images: Cached range images of this projection and codec, read in place of the scans.
         posteriors: Moments ``(2C, h, w)`` of a frozen VAE, which replace image and mask.
     """
 
@@ -64,11 +60,10 @@ class LidarDataset(Dataset[dict[str, Any]]):
         projection: Projection,
         codec: RangeCodec,
         grids: CachedTensors[Scan] | None = None,
-        images: CachedTensors[Scan] | None = None,
         posteriors: CachedTensors[Scan] | None = None,
     ) -> None:
         self.scans, self.projection, self.codec = list(scans), projection, codec
-        self.grids, self.images, self.posteriors = grids, images, posteriors
+        self.grids, self.posteriors = grids, posteriors
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -79,7 +74,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
         if self.posteriors is not None:
             sample = {"posterior_moments": self.posteriors.read(scan)}
         else:
-            image = self._project(scan) if self.images is None else self.images.read(scan)
+            image = self._project(scan)
             sample = {"range_image": image, "valid_mask": self.codec.valid_mask(image)}
         sample |= {"index": index, "name": scan.name}
         if self.grids is not None:
@@ -154,46 +149,3 @@ class DrawnPoints(Dataset[Any]):
 def list_collate(samples: Sequence[Any]) -> list[Any]:
     """A batch as a list, for scans, which differ in length."""
     return list(samples)
-
-
-def range_image_cache(
-    root: str | Path, projection: Projection, codec: RangeCodec
-) -> TensorCache[Scan]:
-    """Cache of the encoded range images ``(1, H, W)`` of a projection and codec."""
-    settings = {"projection": projection_to_dict(projection), "codec": asdict(codec)}
-    sensor = projection.sensor
-    return TensorCache(Path(root), "range_images", settings, (1, sensor.beams, sensor.columns))
-
-
-def write_range_images(
-    scans: Sequence[Scan],
-    projection: Projection,
-    codec: RangeCodec,
-    root: str | Path,
-    *,
-    workers: int = 0,
-) -> int:
-    """Project the scans whose range images are missing below ``root``; returns their number.
-
-    Waits for another process that fills the cache.
-
-    Raises:
-        StoreError: If the cache is damaged or cannot be written.
-        ScanError: If a scan cannot be used; names the file.
-    """
-    cache = range_image_cache(root, projection, codec)
-    if not cache.missing(scans):
-        return 0  # a complete cache may lie on a read-only disk
-    with cache.lock():
-        todo = cache.missing(scans)  # another process may have made some
-        keys = [scan.cache_key for scan in todo]
-        loader = DataLoader(
-            LidarDataset(todo, projection, codec),
-            batch_size=8,
-            num_workers=workers,
-            generator=torch.Generator(),  # the default draws from the global random state
-        )
-        with cache.writer() as writer:
-            for batch in tqdm(loader, desc="range images", disable=None):
-                writer.add([keys[index] for index in batch["index"]], batch["range_image"])
-    return len(todo)

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -23,11 +22,11 @@ from tqdm import tqdm
 
 from r3dpa.data.datasets import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import Scan
-from r3dpa.data.store import CachedTensors, Store, StoreError, StoreWriter, store_lock
+from r3dpa.data.store import CachedTensors, Store, StoreError, StoreWriter, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
+from r3dpa.io import only_writer
 
 REMEDY = "with `r3dpa features --data <data YAML or folder>`"
-_SETTINGS = "settings.json"
 
 
 class Extractor(Protocol):
@@ -65,20 +64,19 @@ class GridSettings:
     """Settings of the grids of one store.
 
     ``projection`` and ``extractor`` (its name and settings) are plain values, ``grid_size`` (h, w),
-    ``dim`` the width D; ``dtype`` see :class:`r3dpa.data.store.Store`, an empty cell is zero in
-    both; ``precision`` is that of the extractor, as Lightning names it.
+    ``dim`` the width D; ``precision`` is that of the extractor, as Lightning names it.
     """
 
     projection: dict[str, Any]
     grid_size: tuple[int, int]
     extractor: dict[str, Any]
     dim: int
-    dtype: Literal["float16", "int8"]
+    dtype: str
     precision: str
 
     def __post_init__(self) -> None:
-        if self.dtype not in ("float16", "int8"):
-            raise ValueError(f"dtype must be float16 or int8, got {self.dtype!r}")
+        if self.dtype != "float16":
+            raise ValueError(f"dtype must be float16, got {self.dtype!r}")
 
     @classmethod
     def of(
@@ -86,22 +84,21 @@ class GridSettings:
         extractor: Extractor,
         projection: Projection,
         grid_size: tuple[int, int],
-        dtype: Literal["float16", "int8"] = "float16",
         precision: str = "32-true",
     ) -> Self:
         """Settings of an extractor; ``ValueError`` if the grid does not divide the image."""
         projection.sensor.cell_size(grid_size)
         size = (grid_size[0], grid_size[1])
         wanted = _wanted(projection, extractor)
-        return cls(grid_size=size, dtype=dtype, precision=precision, **wanted)
+        return cls(grid_size=size, dtype="float16", precision=precision, **wanted)
 
-    def store(self, features_dir: str | Path) -> Store[Scan]:
+    def store(self, features_dir: str | Path) -> Store:
         """Store of these grids, each ``(N, D)``."""
         return Store(
             folder=Path(features_dir) / f"{self.grid_size[0]}x{self.grid_size[1]}",
             settings=json.dumps(vars(self), indent=1),
             shape=(math.prod(self.grid_size), self.dim),
-            dtype=self.dtype,
+            dtype="float16",
             what="feature grids",
             remedy=f"{REMEDY}, or give the data module an extractor",
         )
@@ -145,14 +142,14 @@ def _made_otherwise(key: str, stored: Any, wanted: Any, folder: Path) -> StoreEr
 def stored_settings(features_dir: str | Path) -> dict[tuple[int, int], GridSettings]:
     """Settings of the stores of a folder by grid size; ``StoreError`` if damaged."""
     found = {}
-    for path in sorted(Path(features_dir).glob(f"*/{_SETTINGS}")):
+    for path in sorted(Path(features_dir).glob("*/settings.json")):
         try:
             values = json.loads(path.read_text())
             settings = GridSettings(**values | {"grid_size": tuple(values["grid_size"])})
             store = settings.store(features_dir)
             if path.parent != store.folder:
                 raise ValueError(f"it is of grid_size {list(settings.grid_size)}")
-            _ = store.row, settings.extractor["name"]  # raise here if they are damaged
+            _ = store.row_bytes, settings.extractor["name"]  # raise here if they are damaged
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise StoreError(
                 f"{path} is damaged ({error!r:.200}): delete {path.parent} and make its grids "
@@ -201,12 +198,10 @@ class FeatureGrids(CachedTensors[Scan]):
 class GridPlan:
     """Grids to make: settings by size, scans that lack one (sorted), disk space in bytes."""
 
-    features_dir: Path
     settings: Mapping[tuple[int, int], GridSettings]
     missing: Sequence[Scan]
     num_kept: int
     num_bytes: int
-    free_bytes: int
 
 
 def default_features_dir(data_root: str | Path, name: str) -> Path:
@@ -220,21 +215,20 @@ def plan(
     projection: Projection,
     grid_sizes: Sequence[tuple[int, int]],
     features_dir: str | Path,
-    dtype: Literal["float16", "int8"] = "float16",
     precision: str = "32-true",
 ) -> GridPlan:
     """Find the grids that are missing; arguments as for :func:`write_feature_grids`.
 
-    ``dtype`` and ``precision`` must be those of the store only where grids are missing.
-    ``StoreError`` if there are grids of other settings, or too little disk space is left;
-    ``ValueError`` if there are no grid sizes, or one does not divide the range image.
+    ``precision`` must be that of the store only where grids are missing. ``StoreError`` if there
+    are grids of other settings; ``ValueError`` if there are no grid sizes, or one does not divide
+    the range image.
     """
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
     features_dir, scans = Path(features_dir), sorted(scans)
     settings, missing, num_bytes = {}, set(), 0
     for h, w in grid_sizes:
-        own = GridSettings.of(extractor, projection, (h, w), dtype, precision)
+        own = GridSettings.of(extractor, projection, (h, w), precision)
         stored = stored_settings(features_dir).get((h, w), own)
         stored.compare(_wanted(projection, extractor), features_dir)
         new = stored.store(features_dir).missing(scans)
@@ -242,16 +236,8 @@ def plan(
             own.check(features_dir)
         settings[h, w] = own
         missing |= set(new)
-        num_bytes += len(new) * own.store(features_dir).row.itemsize
-    free_bytes = shutil.disk_usage(_existing(features_dir)).free
-    if num_bytes > free_bytes:
-        raise StoreError(
-            f"The feature grids of {len(missing)} scans need {num_bytes / 1e9:.1f} GB, but "
-            f"{features_dir} has {free_bytes / 1e9:.1f} GB free: make space, give a features_dir "
-            "on another disk, use dtype int8, or fewer scans (limit)."
-        )
-    num_kept = len(scans) - len(missing)
-    return GridPlan(features_dir, settings, sorted(missing), num_kept, num_bytes, free_bytes)
+        num_bytes += len(new) * own.store(features_dir).row_bytes
+    return GridPlan(settings, sorted(missing), len(scans) - len(missing), num_bytes)
 
 
 @torch.inference_mode()
@@ -293,7 +279,6 @@ def write_feature_grids(
     *,
     workers: int = 0,
     batch_size: int = 1,
-    dtype: Literal["float16", "int8"] = "float16",
 ) -> int:
     """Make the missing grids of ``scans`` in this process; returns the number of scans.
 
@@ -304,7 +289,7 @@ def write_feature_grids(
     rows and columns (h, w); ``workers`` processes read and prepare the scans, 0 for none.
     ``StoreError`` as for :func:`plan`, ``ScanError`` for a scan that cannot be used.
     """
-    arguments = scans, extractor, projection, grid_sizes, features_dir, dtype
+    arguments = scans, extractor, projection, grid_sizes, features_dir
     if not plan(*arguments).missing:
         return 0  # complete grids may lie on a read-only disk
     with features_lock(features_dir):
@@ -328,12 +313,11 @@ def write_feature_grids(
     return len(todo.missing)
 
 
-def features_lock(features_dir: str | Path) -> AbstractContextManager[None]:
-    """Lock of the job that makes grids in a folder; waits for another one."""
-    return store_lock(Path(features_dir), f"makes feature grids in {features_dir}")
-
-
-def _existing(folder: Path) -> Path:
-    """The folder or its first existing parent."""
-    folder = folder.absolute()
-    return next(parent for parent in (folder, *folder.parents) if parent.exists())
+@contextmanager
+def features_lock(features_dir: str | Path) -> Iterator[None]:
+    """Lock of the job that makes grids in a folder, made if missing; waits for another one."""
+    folder = Path(features_dir)
+    with writing("feature grids", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with only_writer(folder / ".lock", f"makes feature grids in {folder}", wait=True):
+        yield

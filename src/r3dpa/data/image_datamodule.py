@@ -1,14 +1,81 @@
-"""Data module of RGB images."""
+"""Data set and data module of RGB images."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NotRequired, TypedDict
 
-from torch.utils.data import DataLoader
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
-from r3dpa.data.images import ImageDataset, ImageEntry, ImageSource
+from r3dpa.data.images import ImageEntry, ImageSource
 from r3dpa.data.loaders import LoaderModule, at_least, ready
+from r3dpa.data.scans import evenly
 from r3dpa.data.store import CachedTensors
+
+_IMAGES_TO_MEASURE = 10_000
+
+
+class ImageBatch(TypedDict):
+    """Batch of the stages on RGB images.
+
+    ``image`` ``(B, 3, S, S)`` float32 red, green, blue in [-1, 1], absent where posteriors suffice;
+    ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents,
+    where they are cached; ``index`` ``(B,)`` int64; ``name`` B strings.
+    """
+
+    image: NotRequired[Tensor]
+    posterior_moments: NotRequired[Tensor]
+    index: Tensor
+    name: list[str]
+
+
+class ImageDataset(Dataset[dict[str, Any]]):
+    """Square images of some entries of a source, or cached posteriors of a VAE, or both."""
+
+    def __init__(
+        self,
+        source: ImageSource,
+        entries: Sequence[ImageEntry],
+        size: int,
+        posteriors: CachedTensors[ImageEntry] | None = None,
+        with_images: bool = True,
+    ) -> None:
+        self.source, self.entries, self.size = source, list(entries), size
+        self.posteriors, self.with_images = posteriors, with_images
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        entry = self.entries[index]
+        sample: dict[str, Any] = {"index": index, "name": entry.name}
+        if self.with_images:
+            pixels = self.source.read(entry, self.size)
+            if entry.mirrored:
+                pixels = pixels[:, ::-1]
+            values = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+            sample["image"] = values.float() / 127.5 - 1.0
+        if self.posteriors is not None:
+            sample["posterior_moments"] = self.posteriors.read(entry)
+        return sample
+
+
+def latent_statistics(posteriors: CachedTensors[ImageEntry]) -> tuple[Tensor, Tensor]:
+    """Mean and variance ``(C,)`` of the raw latents, samples of the posteriors ``(2C, h, w)``.
+
+    At most 10 000 posteriors, spread evenly, are read.
+    """
+    chosen = evenly(posteriors.items, _IMAGES_TO_MEASURE)
+    channels, rows, columns = posteriors.store.shape
+    sums = torch.zeros(3, channels // 2, dtype=torch.float64)
+    for entry in chosen:
+        mean, logvar = posteriors.read(entry).double().flatten(1).chunk(2)
+        sums += torch.stack([mean.sum(1), mean.square().sum(1), logvar.exp().sum(1)])
+    mean, square, noise = sums / (len(chosen) * rows * columns)
+    return mean.float(), (square - mean.square() + noise).float()
 
 
 class ImageDataModule(LoaderModule):

@@ -1,4 +1,4 @@
-"""Mean feature of each class of objects, from labelled scans.
+"""Labels of scans as classes of KITTI-360, and the mean feature of each class.
 
 Letters: P points, K values before the linear step, N = h * w cells, D feature width, C classes.
 """
@@ -12,25 +12,92 @@ from operator import add
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from r3dpa.data.feature_grids import Extractor
-from r3dpa.data.labels import CLASS_NAMES, read_labels
-from r3dpa.data.scans import Scan, read_scan
+from r3dpa.data.scans import Scan, ScanError, read_beside, read_bytes, read_scan
 from r3dpa.geometry import Projection, in_range, projection_to_dict
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 
 _CARD = "r3dpa_objects"
 _VERSION = 1
+_NAMES = {
+    6: "ground,road,sidewalk,parking,rail track,building,wall,fence,guard rail,bridge,tunnel",
+    17: "pole,polegroup,traffic light,sign,vegetation,terrain",
+    24: "person,rider,car,truck,bus,caravan,trailer,train,motorcycle,bicycle,garage,gate,stop",
+    37: "smallpole,lamp,trash bin,vending machine,box,unknown construction,unknown vehicle",
+    44: "unknown object",
+}
+#: Names by KITTI-360 class id; every other id counts as unlabelled.
+CLASS_NAMES = {
+    first + place: name
+    for first, names in _NAMES.items()
+    for place, name in enumerate(names.split(","))
+}
+_ID = {name: number for number, name in CLASS_NAMES.items()}
+# Ids of SemanticKITTI; those from 252 on are of things that move.
+_SEMANTIC_NAMES = """10 252 car; 11 bicycle; 13 257 bus; 15 motorcycle; 16 256 train; 18 258 truck;
+20 259 unknown vehicle; 30 254 person; 31 32 253 255 rider; 40 60 road; 44 parking; 48 sidewalk;
+49 ground; 50 building; 51 fence; 52 unknown construction; 70 71 vegetation; 72 terrain; 80 pole;
+81 sign; 99 unknown object"""
+_SEMANTIC_KITTI = {0: 0, 1: 0} | {
+    int(word): _ID[" ".join(w for w in entry.split() if not w.isdigit())]
+    for entry in _SEMANTIC_NAMES.split(";")
+    for word in entry.split()
+    if word.isdigit()
+}
+
+
+def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
+    """Class and object of each of the P points of a ``.bin`` scan, from the file beside it.
+
+    ``velodyne_points/labels/F.label`` of KITTI-360, as ``r3dpa simulate`` writes them, for
+    ``velodyne_points/data/F.bin``; ``labels/F.label`` of SemanticKITTI for ``velodyne/F.bin``.
+
+    Returns:
+        ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
+        number of the object in the upper, 0 for none.
+
+    Raises:
+        ScanError: If there are no labels, or a file is damaged or of another scan.
+    """
+    scan = Path(scan)
+    simulated = read_beside(scan, "labels")
+    if simulated is not None:
+        return simulated.astype(np.int64)
+    path = scan.absolute().parents[1] / "labels" / f"{scan.stem}.label"
+    if scan.parent.name == "velodyne" and path.exists():
+        return _semantic_kitti(path, num_points)
+    raise ScanError(
+        f"{scan} has no labels: looked for labels/{scan.stem}.label beside its folder, "
+        "velodyne_points/data as KITTI-360 and `r3dpa simulate` have it, or velodyne as "
+        "SemanticKITTI"
+    )
+
+
+def _semantic_kitti(path: Path, num_points: int) -> NDArray[np.int64]:
+    data = read_bytes(path)
+    if len(data) != 4 * num_points:
+        raise ScanError(f"{path} holds {len(data) / 4:g} labels, but its scan {num_points} points")
+    labels = np.frombuffer(data, dtype="<u4").astype(np.int64)
+    table = np.full(1 << 16, -1)
+    table[list(_SEMANTIC_KITTI)] = list(_SEMANTIC_KITTI.values())
+    classes = table[labels & 0xFFFF]
+    if (classes < 0).any():
+        unknown = sorted(set((labels[classes < 0] & 0xFFFF).tolist()))
+        raise ScanError(f"{path} holds {unknown[:5]}, which are no classes of SemanticKITTI")
+    return classes | labels >> 16 << 16
 
 
 @dataclass(frozen=True)
 class ObjectClass:
-    """Statistics of one class, a name of :data:`r3dpa.data.labels.CLASS_NAMES`.
+    """Statistics of one class, a name of :data:`CLASS_NAMES`.
 
     ``num_cells`` are the feature-grid cells that hold a point of it, ``spread`` the mean of
     ``1 - cosine`` between the feature and those of the cells, in [0, 2].
@@ -171,7 +238,7 @@ def object_library(
     shown: set[int] = set()
     for scan in scans:
         whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
-        labels = torch.from_numpy(read_labels(scan.path, whole.numpy())) & 0xFFFF
+        labels = torch.from_numpy(read_labels(scan.path, len(whole))) & 0xFFFF
         values = extractor.point_features([extractor.prepare(whole)])[0]
         points = whole[:, :3]
         row, column = projection.pixel_of(points)

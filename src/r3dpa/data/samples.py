@@ -1,21 +1,19 @@
 """Samples of any generator from plain files, one scene at a time.
 
-===========  =====================================================================================
-format       content, and who writes it
-===========  =====================================================================================
-``bin``      float32 rows x, y, z, intensity: ``r3dpa sample``, and RangeLDM (``ldm/inference.py``,
-             pixels of 90 m and more left out)
-``bin_xyz``  float32 rows x, y, z: RangeLDM without its intensity channel. Only by name: a file
-             without a head does not say how long its rows are
-``ply``      binary ``.ply``: ``r3dpa sample``
-``txt``      text rows x, y, z, intensity or x, y, z, r, g, b: ``pcd/*.txt`` of R3DPA and
-             LiDAR-Diffusion (three decimals, colours 0)
-``npz``      clouds ``(P, 3)`` or ``(P, 4)`` by name: ``scenes.npz`` of ``r3dpa sample``; or images
-             ``(N, C, H, W)``: ``numpy/img.npz`` of R3DPA (``generate.py``)
-``npy``      one such array, or clouds ``(N, P, 3)`` or ``(N, P, 4)``
-``pth``      an image ``(C, H, W)``: R2DM (``sample_and_save.py``); a dictionary of ``depth``,
-             ``xyz``, ``reflectance`` ``(c, H, W)``: R2Flow (``sample.py``); or stacks of these
-===========  =====================================================================================
+========  ========================================================================================
+suffix    content, and who writes it
+========  ========================================================================================
+``.bin``  float32 rows x, y, z, intensity: ``r3dpa sample``, and RangeLDM (``ldm/inference.py``,
+          pixels of 90 m and more left out)
+``.ply``  binary: ``r3dpa sample``
+``.txt``  text rows x, y, z, intensity or x, y, z, r, g, b: ``pcd/*.txt`` of R3DPA and
+          LiDAR-Diffusion (three decimals, colours 0)
+``.npz``  clouds ``(P, 3)`` or ``(P, 4)`` by name: ``scenes.npz`` of ``r3dpa sample``; or images
+          ``(N, C, H, W)``: ``numpy/img.npz`` of R3DPA (``generate.py``)
+``.npy``  one such array, or clouds ``(N, P, 3)`` or ``(N, P, 4)``
+``.pth``  an image ``(C, H, W)``: R2DM (``sample_and_save.py``); a dictionary of ``depth``, ``xyz``,
+          ``reflectance`` ``(c, H, W)``: R2Flow (``sample.py``); or stacks of these
+========  ========================================================================================
 
 The channels of an image are range; range and intensity; range, x, y, z; or these and intensity, all
 in metres. R3DPA marks empty pixels by ranges outside its limits, R2DM and R2Flow by 0. No file can
@@ -38,13 +36,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.scans import ArrayReader, ScanError, find_scans, npz_members, read_ply, read_scan
+from r3dpa.data.scans import ScanError, find_scans, npz_arrays, read_ply, read_scan
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
 T = TypeVar("T")
 Arrays = Iterator[tuple[str, np.ndarray]]  # name within the file and cloud (P, ...) or (C, H, W)
-SampleFormat = Literal["bin", "bin_xyz", "ply", "txt", "npz", "npy", "pth"]
 READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
 _LENGTH_TOLERANCE = 0.02
@@ -77,7 +74,6 @@ class Samples:
 
     files: list[tuple[str, Path]]
     sensor: LidarSensor
-    format: SampleFormat | None
     corner: bool
     skip_bad: bool
     num_read: int = field(default=0, init=False)
@@ -86,7 +82,7 @@ class Samples:
     def __iter__(self) -> Iterator[Sample]:
         self.num_read, self.bad = 0, []
         for prefix, file in self.files:
-            arrays = _arrays_of(file, self.format)
+            arrays = _arrays_of(file)
             # An error of `next` ends the file, one of `_sample` only costs that sample.
             while entry := self._attempt(next, arrays, None):
                 part, array = entry
@@ -120,20 +116,19 @@ class Samples:
 def read_samples(
     path: str | Path,
     sensor: LidarSensor,
-    format: SampleFormat | None = None,
     unprojection: Literal["corner", "centre"] = "centre",
     skip_bad: bool = False,
 ) -> Samples:
     """Samples of a file, or of all files of one format in a folder and its sub-folders.
 
-    Points and pixels outside the range limits are left out. Never more than one sample is in
-    memory. The folders that ``r3dpa sample`` and the official R3DPA write hold each scene
-    several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are read.
+    Points and pixels outside the range limits are left out. One sample is in memory at a time, of
+    ``.npz`` one array. The folders that ``r3dpa sample`` and the official R3DPA write hold each
+    scene several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are
+    read.
 
     Args:
         path: File or folder, whose files are read in the order of their names.
         sensor: Image size and range limits of the samples.
-        format: See the table of this module; that of the suffix where None.
         unprojection: Which point of a pixel its ray passes, for images without points.
         skip_bad: Leave bad samples out, list them in ``bad`` and warn of them.
 
@@ -142,64 +137,47 @@ def read_samples(
             sample cannot be used.
     """
     path = Path(path)
-    files, chosen = ([("", path)], format) if path.is_file() else _find(path, format)
-    return Samples(files, sensor, chosen, unprojection == "corner", skip_bad)
+    files = [("", path)] if path.is_file() else _find(path)
+    return Samples(files, sensor, unprojection == "corner", skip_bad)
 
 
-def _find(
-    folder: Path, wanted: SampleFormat | None
-) -> tuple[list[tuple[str, Path]], SampleFormat | None]:
-    """Names and paths of the sample files of a folder, and their format where it is given."""
+def _find(folder: Path) -> list[tuple[str, Path]]:
+    """Names and paths of the sample files of a folder."""
     if not folder.is_dir():
         raise SampleError(f"{folder}: there is no such file or folder")
-    if wanted is None:
-        ours = (folder / "metadata.json").is_file()
-        for place, known in (("numpy/img.npz", True), ("scenes.npz", ours)):
-            if known and (folder / place).is_file():
-                return [("", folder / place)], "npz"
-        if ours and (folder / "bin").is_dir():
-            return _find(folder / "bin", "bin")
-    files: dict[SampleFormat, list[Path]] = {}
+    ours = (folder / "metadata.json").is_file()
+    for place, known in (("numpy/img.npz", True), ("scenes.npz", ours)):
+        if known and (folder / place).is_file():
+            return [("", folder / place)]
+    if ours and (folder / "bin").is_dir():
+        folder = folder / "bin"
+    files: dict[str, list[Path]] = {}
     for file in sorted(folder.rglob("*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-        if file.suffix.lower() in _FORMAT_OF and file.is_file() and not hidden:
-            files.setdefault(_FORMAT_OF[file.suffix.lower()], []).append(file)
-    if (folder / "data_3d_raw").is_dir():  # beside the scans KITTI-360 has time stamps
-        files = {"bin": files.get("bin", [])} if wanted is None else files
-    if wanted is None and len(files) > 1:
-        found = ", ".join(f"{len(files[name])} {name}" for name in sorted(files))
+        if file.suffix.lower() in _READERS and file.is_file() and not hidden:
+            files.setdefault(file.suffix.lower(), []).append(file)
+    if not files:
+        raise SampleError(f"{folder}: holds no samples; what can be read: {READABLE}")
+    if ".bin" in files and (len(files) == 1 or (folder / "data_3d_raw").is_dir()):
+        # Named as scans are; beside those of KITTI-360 there are time stamps.
+        return [(scan.name, scan.path) for scan in find_scans(folder)]
+    if len(files) > 1:
+        found = ", ".join(f"{len(files[suffix])} {suffix}" for suffix in sorted(files))
         raise SampleError(
             f"{folder}: holds several formats ({found}), perhaps each scene more than once; "
-            "give the format to read, or one of its sub-folders"
+            "give one file or sub-folder"
         )
-    chosen = wanted or next(iter(files), None)
-    paths = files.get("bin" if chosen == "bin_xyz" else chosen, []) if chosen else []
-    if not paths:
-        suffixes = " or ".join(_READERS[wanted][0]) if wanted else ""
-        kind = f"file with {suffixes}" if wanted else "samples"
-        raise SampleError(f"{folder}: holds no {kind}; what can be read: {READABLE}")
-    if chosen in ("bin", "bin_xyz"):
-        try:
-            return [(scan.name, scan.path) for scan in find_scans(folder)], wanted
-        except ValueError as error:
-            raise SampleError(error) from error
-    return [(p.relative_to(folder).with_suffix("").as_posix(), p) for p in paths], wanted
+    (paths,) = files.values()
+    return [(path.relative_to(folder).with_suffix("").as_posix(), path) for path in paths]
 
 
-def _arrays_of(file: Path, given: SampleFormat | None) -> Arrays:
-    kind = given or _FORMAT_OF.get(file.suffix.lower())
-    if kind is None:
+def _arrays_of(file: Path) -> Arrays:
+    read = _READERS.get(file.suffix.lower())
+    if read is None:
         raise SampleError(f"{file}: is of no known format; what can be read: {READABLE}")
     if not file.stat().st_size:
         raise SampleError(f"{file}: is empty")
-    yield from _READERS[kind][1](file)
-
-
-def _xyz_rows(file: Path) -> Arrays:
-    data = file.read_bytes()
-    if len(data) % 12:
-        raise SampleError(f"{file}: has {len(data)} bytes, not a multiple of 12 (x, y, z)")
-    yield "", np.frombuffer(data, "<f4").reshape(-1, 3)
+    yield from read(file)
 
 
 def _text_rows(file: Path) -> Arrays:
@@ -211,31 +189,34 @@ def _text_rows(file: Path) -> Arrays:
 
 
 def _npy_parts(file: Path) -> Arrays:
-    with file.open("rb") as stream:
-        yield from _parts(ArrayReader(stream, file.stat().st_size, str(file)))
+    try:
+        array = np.lib.format.open_memmap(file, mode="r")
+    except UNPICKLING_ERRORS as error:
+        raise SampleError(f"{file}: cannot be read as an array ({first_line(error)})") from error
+    yield from _parts(str(file), array)
 
 
 def _npz_parts(file: Path) -> Arrays:
-    for number, (key, reader) in enumerate(npz_members(file)):
+    for number, (key, array) in enumerate(npz_arrays(file)):
         unnamed = key == "arr_0" and number == 0  # NumPy's name where none is given
-        for part, array in _parts(reader):
-            yield "/".join(filter(None, ("" if unnamed else key, part))), array
+        for part, values in _parts(f"{file}, array {key}", array):
+            yield "/".join(filter(None, ("" if unnamed else key, part))), values
 
 
-def _parts(reader: ArrayReader) -> Arrays:
+def _parts(where: str, array: np.ndarray) -> Arrays:
     """A cloud, or each cloud or image of a stack; images without a channel axis are ranges."""
-    if reader.dtype.kind != "f":
-        raise SampleError(f"{reader.where}: holds {reader.dtype} numbers; metres must be floats")
-    if len(reader.shape) == 2:
-        yield "", reader.whole()
+    if array.dtype.kind != "f":
+        raise SampleError(f"{where}: holds {array.dtype} numbers; metres must be floats")
+    if array.ndim == 2:
+        yield "", array
         return
-    if len(reader.shape) not in (3, 4) or 0 in reader.shape[1:]:
+    if array.ndim not in (3, 4) or 0 in array.shape[1:]:
         raise SampleError(
-            f"{reader.where}: has shape {reader.shape}; needs (P, 3) or (P, 4) points, "
+            f"{where}: has shape {array.shape}; needs (P, 3) or (P, 4) points, "
             "(N, P, 3) clouds or (N, C, H, W) images"
         )
-    clouds = len(reader.shape) == 3 and reader.shape[2] in (3, 4)
-    for index, part in enumerate(reader.rows()):
+    clouds = array.ndim == 3 and array.shape[2] in (3, 4)
+    for index, part in enumerate(array):
         yield f"{index:06d}", part if clouds or part.ndim == 3 else part[None]
 
 
@@ -268,17 +249,14 @@ def _tensors(file: Path) -> Arrays:
         yield f"{index:06d}", torch.cat(images).detach().float().numpy()
 
 
-_READERS: dict[SampleFormat, tuple[tuple[str, ...], Callable[[Path], Arrays]]] = {
-    "bin": ((".bin",), lambda file: iter([("", read_scan(file))])),
-    "bin_xyz": ((".bin",), _xyz_rows),
-    "ply": ((".ply",), lambda file: iter([("", read_ply(file))])),
-    "txt": ((".txt",), _text_rows),
-    "npz": ((".npz",), _npz_parts),
-    "npy": ((".npy",), _npy_parts),
-    "pth": ((".pth", ".pt"), _tensors),
-}
-_FORMAT_OF: dict[str, SampleFormat] = {
-    suffix: name for name in reversed(_READERS) for suffix in _READERS[name][0]
+_READERS: dict[str, Callable[[Path], Arrays]] = {
+    ".bin": lambda file: iter([("", read_scan(file))]),
+    ".ply": lambda file: iter([("", read_ply(file))]),
+    ".txt": _text_rows,
+    ".npz": _npz_parts,
+    ".npy": _npy_parts,
+    ".pth": _tensors,
+    ".pt": _tensors,
 }
 
 

@@ -1,7 +1,8 @@
-"""LiDAR scans on disk: finding, reading and writing them."""
+"""LiDAR scans on disk: finding, reading, writing and checking them."""
 
 from __future__ import annotations
 
+import io
 import lzma
 import math
 import os
@@ -11,16 +12,18 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import IO, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from r3dpa.data.store import DataError, ItemKey
 from r3dpa.geometry import LidarSensor, in_range
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, refuse_name
-from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name
+from r3dpa.simulation import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
 
 Split = Literal["train", "val"]
 T = TypeVar("T")
@@ -212,31 +215,23 @@ def read_ply(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     head, separator, body = read_bytes(path).partition(b"end_header\n")
-    lines = head.decode("ascii", errors="replace").split("\n")
-    if not separator or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
+    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
+    if not separator or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise ScanError(f"{path}: is not a binary little-endian .ply file")
-    words = [line.split() for line in lines[2:] if line.strip() and not line.startswith("comment")]
-    elements = [word for word in words if word[0] == "element"]
-    properties = [word for word in words if word[0] == "property"]
-    if [word[1:2] for word in elements] != [["vertex"]] or len(elements[0]) != 3:
-        raise ScanError(f"{path}: holds other elements than vertex; export the points alone")
-    unknown = [" ".join(p) for p in properties if len(p) != 3 or p[1] not in _PLY_TYPES]
-    if unknown:
-        raise ScanError(f"{path}: has {', '.join(unknown)}, but only single numbers can be read")
-    names = [word[2] for word in properties]
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+    elements = [words[1:] for words in lines if words[:1] == ["element"]]
+    properties = [words[1:] for words in lines if words[:1] == ["property"]]
+    try:
+        ((_, count),) = elements
+        layout = np.dtype([(name, _PLY_TYPES[kind]) for kind, name in properties])
+        if len(body) != int(count) * layout.itemsize:
+            raise ValueError(f"{len(body)} bytes for {count:.20} points of {layout.itemsize}")
+        table = np.frombuffer(body, layout)
+        wanted = ["x", "y", "z"] + ["intensity"] * ("intensity" in (layout.names or ()))
+        return np.stack([table[name].astype(np.float32) for name in wanted], axis=1)
+    except (KeyError, ValueError) as error:
         raise ScanError(
-            f"{path}: needs properties x, y and z, each name once; found {', '.join(names)}"
-        )
-    layout = np.dtype([(word[2], _PLY_TYPES[word[1]]) for word in properties])
-    count = int(elements[0][2]) if elements[0][2].isdecimal() and len(elements[0][2]) < 20 else -1
-    if count < 0 or len(body) != count * layout.itemsize:
-        raise ScanError(
-            f"{path}: holds {len(body)} bytes for {elements[0][2]:.20} points of {layout.itemsize}"
-        )
-    table = np.frombuffer(body, dtype=layout)
-    wanted = ["x", "y", "z"] + ["intensity"] * ("intensity" in names)
-    return np.stack([table[name].astype(np.float32) for name in wanted], axis=1)
+            f"{path}: must hold points alone, with x, y, z and other single numbers ({error})"
+        ) from error
 
 
 def write_npz(
@@ -261,60 +256,12 @@ def write_npz(
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Scans ``(P, 3)`` or ``(P, 4)`` of a ``.npz`` file by name; ``ScanError`` if it is damaged."""
-    return {name: reader.whole() for name, reader in npz_members(Path(path))}
+    return dict(npz_arrays(Path(path)))
 
 
-class ArrayReader:
-    """Array in NumPy's format, read whole or row by row; objects are refused.
-
-    ``size`` is that of the stream in bytes, so that a few cannot ask for much memory; ``where``
-    stands in the :class:`ScanError` of a damaged array.
-    """
-
-    def __init__(self, stream: IO[bytes], size: int, where: str) -> None:
-        self._stream, self.where = stream, where
-        try:
-            if np.lib.format.read_magic(stream) != (1, 0):
-                raise ValueError("needs version 1.0 of the format")
-            header = np.lib.format.read_array_header_1_0(stream)
-        except zipfile.BadZipFile:  # the archive itself is damaged
-            raise
-        except UNPICKLING_ERRORS as error:
-            raise ScanError(f"{where}: is not an array in NumPy's format ({error})") from error
-        self.shape, self._fortran, self.dtype = header
-        if self.dtype.hasobject:
-            raise ScanError(f"{where}: holds objects, which are not unpickled")
-        needed = math.prod(self.shape) * self.dtype.itemsize
-        if min(self.shape, default=0) < 0 or not self.dtype.itemsize or needed > size:
-            raise ScanError(
-                f"{where}: an array {self.shape} of {self.dtype} needs {needed} bytes, but there "
-                f"are {size}; copy the file again"
-            )
-
-    def whole(self) -> np.ndarray:
-        """The whole array."""
-        return self._next(self.shape, "F" if self._fortran else "C")
-
-    def rows(self) -> Iterator[np.ndarray]:
-        """Each part along the first axis, one at a time."""
-        if self._fortran:
-            raise ScanError(f"{self.where}: is in Fortran order; save np.ascontiguousarray of it")
-        for _ in range(self.shape[0]):
-            yield self._next(self.shape[1:], "C")
-
-    def _next(self, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
-        size = math.prod(shape) * self.dtype.itemsize
-        try:
-            data = self._stream.read(size)
-        except ARCHIVE_ERRORS as error:
-            raise ScanError(f"{self.where}: is damaged ({error})") from error
-        if len(data) < size:
-            raise ScanError(f"{self.where}: ends after {len(data)} of {size} bytes; copy it again")
-        return np.frombuffer(data, self.dtype).reshape(shape, order=order)
-
-
-def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
-    """Name and reader of each array of a ``.npz`` file, each to be read before the next."""
+def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Name and content of each array of a ``.npz`` file; ``ScanError`` if it is damaged."""
+    where = str(path)
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
@@ -322,16 +269,22 @@ def npz_members(path: Path) -> Iterator[tuple[str, ArrayReader]]:
                 if not info.filename.endswith(".npy"):
                     continue
                 if reason := refuse_name(info.filename):
-                    raise ScanError(f"{where}: its name {reason}; save it with another name")
-                # A damaged directory may claim more than the whole file holds.
-                packed = info.compress_size <= path.stat().st_size
-                with archive.open(info) as stream:
-                    size = info.file_size if packed else 0
-                    yield info.filename.removesuffix(".npy"), ArrayReader(stream, size, where)
-    except ScanError:
-        raise
+                    raise ValueError(f"its name {reason}")
+                if info.compress_size > path.stat().st_size:  # before so much memory is asked for
+                    raise ValueError("it is larger than the file")
+                yield info.filename.removesuffix(".npy"), _array(archive.read(info))
     except ARCHIVE_ERRORS as error:
-        raise ScanError(f"{path}: is damaged or no .npz file of scans ({error})") from error
+        raise ScanError(f"{where}: is damaged, or not an array of numbers ({error})") from error
+
+
+def _array(data: bytes) -> np.ndarray:
+    """Array in NumPy's format, objects refused; a view, so that no header asks for more memory."""
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError("needs version 1.0 of the format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    values = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+    return values.reshape(shape, order="F" if fortran else "C")
 
 
 def scan_files(entry: str | Path) -> Iterator[Path]:
@@ -395,3 +348,94 @@ def _rows(points: np.ndarray | torch.Tensor) -> np.ndarray:
     if not np.isfinite(rows).all():
         raise ValueError("A scan to write holds NaN or infinite values; drop these points first.")
     return rows
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """Result of :func:`check`; ``str`` gives the text that the command prints.
+
+    ``num_scans`` counts by drive, bad ones included; ``bad`` holds ``(file, reason)`` of unusable
+    scans, ``missing`` folders that should exist or hold scans; ``intensity`` the smallest and
+    largest intensity of the usable scans.
+    """
+
+    root: Path
+    num_scans: dict[str, int]
+    bad: tuple[tuple[Path, str], ...]
+    missing: tuple[Path, ...]
+    intensity: tuple[float, float] | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether every scan is usable and no folder is missing."""
+        return not self.bad and not self.missing
+
+    def __str__(self) -> str:
+        lines = [f"{drive}: {count} scans" for drive, count in self.num_scans.items()]
+        lines += [f"missing: {folder}" for folder in self.missing]
+        lines += [f"bad: {file}: {reason}" for file, reason in self.bad]
+        if self.intensity is not None:
+            low, high = self.intensity
+            outside = " (expected 0..1: divide by 255)" if low < 0 or high > 1 else ""
+            lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
+        total = sum(self.num_scans.values())
+        problems = f"{len(self.bad)} bad, {len(self.missing)} folders missing or without scans"
+        verdict = "all usable" if self.ok else problems
+        return "\n".join(
+            [*lines, f"{self.root}: {total} scans in {len(self.num_scans)} drives, {verdict}"]
+        )
+
+
+def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
+    """Read every scan of a data set, folder or file, and report all that is wrong with it.
+
+    A folder with ``data_3d_raw``, or without any scan, is compared with the KITTI-360 layout and
+    its nine LiDAR drives; a simulated one with its manifest (``ValueError`` if that is damaged).
+    Every scan needs a point within the range limits of ``sensor``.
+    """
+    root = Path(path).absolute()
+    sensor = sensor or LidarSensor()
+    scans = find_scans(root) if any(scan_files(root)) else []
+    counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
+    missing, bad = _compare_layout(root, counts)
+    scales = []
+
+    def examine(scan: Scan) -> str | tuple[float, float]:
+        try:
+            intensity = read_scan(scan.path, sensor)[:, 3]
+        except ScanError as error:
+            return str(error).removeprefix(f"{scan.path}: ")
+        return float(intensity.min()), float(intensity.max())
+
+    with ThreadPool(workers) as pool:
+        results = tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None)
+        for scan, found in zip(scans, results, strict=True):
+            if isinstance(found, str):
+                bad.append((scan.path, found))
+            else:
+                scales.append(found)
+    scale = (min(low for low, _ in scales), max(high for _, high in scales)) if scales else None
+    return CheckReport(root, counts, tuple(bad), tuple(missing), scale)
+
+
+def _compare_layout(
+    root: Path, counts: dict[str, int]
+) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """Missing folders, and incomplete drives with the reason."""
+    raw, simulated = root / RAW, expected_scans(root)
+    if not root.exists():
+        return [root], []
+    if not raw.is_dir():
+        return ([] if counts and simulated is None else [raw]), []
+    missing, incomplete = [], []
+    official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
+    for drive, expected in sorted((simulated or official).items()):
+        folder, count = raw / drive, counts.get(drive, 0)
+        if not folder.is_dir():
+            missing.append(folder)
+        elif not count:
+            missing.append(folder / VELODYNE)
+        elif count < expected:
+            reason = f"holds {count} of {expected} scans; simulate again to complete it"
+            incomplete.append((folder, reason))
+    return missing, incomplete

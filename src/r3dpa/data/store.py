@@ -8,7 +8,7 @@ A store is a folder::
 
 A line of the journal is written after its row is on disk; rows without a line and a torn last line
 do not count. Every writer makes a shard of its own. A row belongs to the name, size and time of
-change of its file; in older journals, which have no times, to name and size.
+change of its file.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ import math
 import mmap
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from io import FileIO
 from itertools import count
 from pathlib import Path
@@ -31,12 +30,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.io import atomic_path, only_writer, refuse_name
+from r3dpa.io import atomic_path, refuse_name
 
 ItemKey = tuple[str, int, int]
 """Name, size in bytes and time of change (ns) of the file that a row is made from."""
 _VERSION = 1  # to be raised when the same settings give other numbers
-_LARGEST_CODE = 127
+_DTYPES: dict[str, np.dtype[Any]] = {"float16": np.dtype("<f2"), "float32": np.dtype("<f4")}
 
 
 class DataError(ValueError):
@@ -70,16 +69,14 @@ Item = TypeVar("Item", bound=Cacheable)
 
 
 @dataclass(frozen=True)
-class Store(Generic[Item]):
+class Store:
     """Store of one tensor of ``shape`` per item.
 
     Args:
         folder: Its folder.
         settings: All that the tensors depend on beside the item, as JSON text.
         shape: Shape of each tensor.
-        dtype: ``"float16"`` clamps larger values; ``"int8"`` holds codes -127..127 and a float32
-            scale per row of the last axis, its largest magnitude / 127, so that a value is off by
-            at most half the scale.
+        dtype: ``"float16"`` clamps larger values.
         what: Name of the rows, for messages.
         remedy: How rows are made again, for messages.
     """
@@ -87,17 +84,14 @@ class Store(Generic[Item]):
     folder: Path
     settings: str
     shape: tuple[int, ...]
-    dtype: Literal["float32", "float16", "int8"] = "float32"
+    dtype: Literal["float32", "float16"] = "float32"
     what: str = "cached tensors"
     remedy: str = "by starting the run again"
 
-    @cached_property
-    def row(self) -> np.dtype[Any]:
-        """Layout of a row: ``values``, or ``scale`` and ``codes``."""
-        if self.dtype == "int8":
-            return np.dtype([("scale", "<f4", self.shape[:-1]), ("codes", "i1", self.shape)])
-        kind = {"float16": "<f2", "float32": "<f4"}[self.dtype]
-        return np.dtype([("values", kind, self.shape)])
+    @property
+    def row_bytes(self) -> int:
+        """Size of a row in bytes."""
+        return math.prod(self.shape) * _DTYPES[self.dtype].itemsize
 
     def places(self) -> dict[ItemKey, tuple[int, int]]:
         """Shard and row of each key; ``StoreError`` if a journal is damaged."""
@@ -110,11 +104,7 @@ class Store(Generic[Item]):
     def missing(self, items: Sequence[Item]) -> list[Item]:
         """Items without a row; ``StoreError`` if a journal is damaged."""
         places = self.places()
-        return [item for item in items if find_place(places, item.cache_key) is None]
-
-    def lock(self) -> AbstractContextManager[None]:
-        """Lock of the process that fills the store; waits for another one."""
-        return store_lock(self.folder, f"fills {self.folder}")
+        return [item for item in items if item.cache_key not in places]
 
     def writer(self, shard: int = 0) -> StoreWriter:
         """Writer of a new shard, the first free one from this number on."""
@@ -122,32 +112,14 @@ class Store(Generic[Item]):
 
     def pack(self, tensors: Tensor) -> bytes:
         """Bytes of the rows of tensors ``(B, *shape)``."""
-        values = tensors.float().cpu().numpy()
-        rows = np.empty(len(values), self.row)
-        if self.dtype == "int8":
-            scale = np.abs(values).max(axis=-1) / np.float32(_LARGEST_CODE)
-            scale[scale < np.finfo(np.float32).tiny] = 0  # too small to be exact
-            rows["scale"] = scale
-            divisor = np.where(scale > 0, scale, np.float32(np.inf))[..., None]
-            rows["codes"] = np.rint(values / divisor)
-        else:
-            largest = np.finfo(self.row["values"].base).max
-            rows["values"] = values.clip(-largest, largest)
-        return rows.tobytes()
+        values, dtype = tensors.float().cpu().numpy(), _DTYPES[self.dtype]
+        largest = np.finfo(dtype).max
+        return values.clip(-largest, largest).astype(dtype).tobytes()
 
     def unpack(self, data: mmap.mmap, start: int) -> Tensor:
         """Float32 copy of the row that starts at a byte."""
-
-        def field(name: str) -> Tensor:
-            fields = self.row.fields
-            assert fields is not None
-            dtype, offset = fields[name][:2]
-            values = np.frombuffer(data, dtype.base, math.prod(dtype.shape), start + offset)
-            return torch.from_numpy(values.reshape(dtype.shape).copy()).float()
-
-        if self.dtype == "int8":
-            return field("codes").mul_(field("scale")[..., None])
-        return field("values")
+        values = np.frombuffer(data, _DTYPES[self.dtype], math.prod(self.shape), start)
+        return torch.from_numpy(values.astype(np.float32).reshape(self.shape))
 
     def damaged(self, journal: Path, what: str) -> StoreError:
         """Error that names a shard, what is wrong, and the remedy."""
@@ -170,26 +142,20 @@ class Store(Generic[Item]):
                     raise ValueError(f"{where} is of row {entry['row']}")
                 if reason := refuse_name(entry["scan"]):
                     raise ValueError(f"name of scan in {where} {reason}")
-                num_bytes, time = entry["bytes"], entry.get("mtime_ns", 0)
+                num_bytes, time = entry["bytes"], entry["mtime_ns"]
                 if not isinstance(num_bytes, int) or not isinstance(time, int):
                     raise TypeError(f"size or time in {where} is no whole number")
                 keys.append((entry["scan"], num_bytes, time))
-            if keys and rows.stat().st_size < len(keys) * self.row.itemsize:
+            if keys and rows.stat().st_size < len(keys) * self.row_bytes:
                 raise ValueError(f"{rows.name} has fewer than its {len(keys)} rows")
         except (LookupError, TypeError, ValueError, RecursionError, OSError) as error:
             raise self.damaged(path, f"{path} is damaged ({error!r:.200})") from error
         return keys
 
 
-def store_lock(folder: Path, what: str) -> AbstractContextManager[None]:
-    """Lock of a folder of rows, made if missing; waits for another process that holds it."""
-    with _writing("rows", folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    return only_writer(folder / ".lock", what, wait=True)
-
-
 @contextmanager
-def _writing(what: str, folder: Path) -> Iterator[None]:
+def writing(what: str, folder: Path) -> Iterator[None]:
+    """Turn an ``OSError`` of the block into a ``StoreError`` that names the folder."""
     try:
         yield
     except OSError as error:
@@ -199,12 +165,7 @@ def _writing(what: str, folder: Path) -> Iterator[None]:
         ) from error
 
 
-def find_place(places: Mapping[ItemKey, tuple[int, int]], key: ItemKey) -> tuple[int, int] | None:
-    """Shard and row of a key, or of its name and size in journals without times."""
-    return places.get(key) or places.get((*key[:2], 0))
-
-
-class TensorCache(Store[Item]):
+class TensorCache(Store):
     """Store whose folder ``root/<name>_<hash>`` follows from its settings.
 
     ``settings`` are all that the float32 tensors depend on beside the item, as JSON values.
@@ -225,14 +186,14 @@ class StoreWriter:
     ``StoreError`` if the store is damaged or cannot be written.
     """
 
-    def __init__(self, store: Store[Any], shard: int = 0) -> None:
+    def __init__(self, store: Store, shard: int = 0) -> None:
         self._store, self._shard = store, shard
         self._files: tuple[FileIO, FileIO] | None = None
         self._num_rows = 0
         self._known = store.places()
         settings = store.folder / "settings.json"
         if not settings.exists():
-            with _writing(store.what, store.folder), atomic_path(settings) as temporary:
+            with writing(store.what, store.folder), atomic_path(settings) as temporary:
                 temporary.write_text(store.settings)
 
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
@@ -244,7 +205,7 @@ class StoreWriter:
         expected = (len(keys), *self._store.shape)
         if tuple(tensors.shape) != expected:
             raise ValueError(f"{self._store.what} must be {expected}, got {tuple(tensors.shape)}")
-        new = {key: row for row, key in enumerate(keys) if find_place(self._known, key) is None}
+        new = {key: row for row, key in enumerate(keys) if key not in self._known}
         if not new:
             return
         kept = tensors[list(new.values())]
@@ -257,7 +218,7 @@ class StoreWriter:
             json.dumps({"scan": name, "bytes": size, "mtime_ns": time, "row": row}) + "\n"
             for row, (name, size, time) in enumerate(new, start=self._num_rows)
         ]
-        with _writing(self._store.what, self._store.folder):
+        with writing(self._store.what, self._store.folder):
             try:
                 rows, journal = self._open()
                 append(rows, self._store.pack(kept))
@@ -301,7 +262,7 @@ class CachedTensors(Generic[Item]):
     ``StoreError`` if a row is missing, or the store is damaged.
     """
 
-    def __init__(self, store: Store[Item], items: Sequence[Item]) -> None:
+    def __init__(self, store: Store, items: Sequence[Item]) -> None:
         self.store, self.items = store, list(items)
         names = {item.name: item for item in items}
         self._places = {key: at for key, at in store.places().items() if key[0] in names}
@@ -314,7 +275,7 @@ class CachedTensors(Generic[Item]):
 
         ``StoreError`` if its file was replaced since the row was made, or the store was damaged.
         """
-        place = find_place(self._places, item.cache_key)
+        place = self._places.get(item.cache_key)
         if place is None and item.name not in {key[0] for key in self._places}:
             raise self._missing([item])
         if place is None:
@@ -323,7 +284,7 @@ class CachedTensors(Generic[Item]):
                 f"{self.store.folder} was made: make it again {self.store.remedy}"
             )
         shard, row = place
-        size = self.store.row.itemsize
+        size = self.store.row_bytes
         start, mapping = row * size, self._mapped(shard)
         # The size of the file now: to touch what was cut off since would kill the process.
         if mapping.size() < start + size:

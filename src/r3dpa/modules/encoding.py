@@ -55,7 +55,7 @@ def encoded_once(
     trainer = module.trainer
     datamodule = cast(Any, trainer).datamodule
     about = {**settings, "vae": weights_sha256(vae.state_dict())}
-    cache: TensorCache[Item] = TensorCache(root, "posterior", about, shape)
+    cache = TensorCache(root, "posterior", about, shape)
     own = missing = cache.missing(items)
     trainer.strategy.barrier("cached latents: all have looked")
     if shared:

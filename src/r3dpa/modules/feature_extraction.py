@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningDataModule, LightningModule
@@ -29,7 +29,6 @@ class FeatureExtraction(LightningModule):
             give None.
         grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
         features_dir: Folder of the grids of this extractor.
-        dtype: ``"float16"`` or ``"int8"``, see :class:`r3dpa.data.FeatureGrids`.
 
     Raises:
         StoreError: While it runs, if the store was made with other settings or cannot be
@@ -42,14 +41,12 @@ class FeatureExtraction(LightningModule):
         projection: Projection | None,
         grid_sizes: Sequence[tuple[int, int]],
         features_dir: str | Path,
-        dtype: Literal["float16", "int8"] = "float16",
     ) -> None:
         super().__init__()
         self.extractor = extractor
         self.projection = projection
         self.grid_sizes = list(grid_sizes)
         self.features_dir = Path(features_dir)
-        self.storage = dtype
         self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
@@ -66,8 +63,7 @@ class FeatureExtraction(LightningModule):
         """Opens a shard for each grid size; not called in a process that has nothing to do."""
         extractor, projection = self._parts()
         for size in self.grid_sizes:
-            precision = self.trainer.precision
-            settings = GridSettings.of(extractor, projection, size, self.storage, precision)
+            settings = GridSettings.of(extractor, projection, size, self.trainer.precision)
             self._writers[size] = settings.writer(self.features_dir, self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:

@@ -108,9 +108,7 @@ class FlowMatching(GenerativeModule):
             {"projection": geometry["projection"], "codec": geometry["codec"]},
             (2 * self.vae.latent_channels, *self.sit.input_size),
             self._scans_of_this_run(dataset),
-            lambda scans: LidarDataset(
-                scans, dataset.projection, dataset.codec, images=dataset.images
-            ),
+            lambda scans: LidarDataset(scans, dataset.projection, dataset.codec),
             "range_image",
             shared=not self._trial_batches,
         )

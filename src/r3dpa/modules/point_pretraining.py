@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from r3dpa.data.point_datamodule import PointDataModule
+from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.scans import evenly
 from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
 from r3dpa.nn.backbones.point_features import save_weights

@@ -10,8 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.data.image_datamodule import ImageDataModule
-from r3dpa.data.images import ImageBatch, ImageDataset, ImageEntry, latent_statistics
+from r3dpa.data.image_datamodule import (
+    ImageBatch,
+    ImageDataModule,
+    ImageDataset,
+    latent_statistics,
+)
+from r3dpa.data.images import ImageEntry
 from r3dpa.data.store import CachedTensors
 from r3dpa.flow import Interpolant
 from r3dpa.losses import alignment_loss, flow_matching_loss
