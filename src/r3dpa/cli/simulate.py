@@ -25,8 +25,8 @@ def simulate(
 ) -> Any:
     """Write simulated scans in the KITTI-360 layout.
 
-    The same command completes an interrupted run. Prints the cost of each effect, which
-    ``report.json`` keeps; ``sim/*.json`` has it for each scan.
+    The same command completes an interrupted run. Prints what each effect did and cost;
+    ``report.json`` and, for each scan, ``sim/*.json`` keep what it did.
 
     Args:
         out: Root of the data set to write.

@@ -2,10 +2,15 @@
 
 from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.drive_files import drive_name
-from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate, split_scans
+from r3dpa.simulation.drives import (
+    TRAIN_DRIVES,
+    VAL_DRIVES,
+    SimulationReport,
+    expected_scans,
+    simulate,
+    split_scans,
+)
 from r3dpa.simulation.effects import EFFECTS
-from r3dpa.simulation.effects.base import Effect, Switch
-from r3dpa.simulation.report import SimulationReport
 from r3dpa.simulation.scan import EffectRecord, SimulatedScan, Simulator, effect_name, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
@@ -17,11 +22,10 @@ from r3dpa.simulation.scene import (
     Semantic,
     Shape,
     Weather,
-    WeatherPrior,
 )
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, hdl64e, load_sensor
 from r3dpa.simulation.street import Street
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 __all__ = [
     "EFFECTS",
@@ -45,9 +49,7 @@ __all__ = [
     "SpinningLidar",
     "Street",
     "Sweep",
-    "Switch",
     "Weather",
-    "WeatherPrior",
     "drive_name",
     "effect_name",
     "expected_scans",

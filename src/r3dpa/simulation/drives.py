@@ -4,34 +4,33 @@
 
     simulation.json                     the request
     data_3d_raw/, data_poses/           the scans and their poses, see ``drive_files``
-    report.json                         effects and costs, see ``report``
+    report.json                         what each effect did
 
-Except for the report, which holds measured times, equal requests give the same bytes, for any
-number of workers and after any number of interruptions.
+Equal requests give the same bytes, for any number of workers and after any number of
+interruptions.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
-import logging
 import multiprocessing
 import os
 import signal
+import statistics
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from r3dpa.io import only_writer, text_table
 from r3dpa.simulation.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
-from r3dpa.simulation.report import Cost, SimulationReport, make_report
 from r3dpa.simulation.scan import Simulator, check_switches
 from r3dpa.simulation.scene import Weather
 from r3dpa.simulation.sensor import SpinningLidar, load_sensor, sensor_to_dict
@@ -47,8 +46,62 @@ _LOCK = ".lock"
 _SIMULATOR_VERSION = 2
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
+# Steps of a scan besides its effects.
+_PARTS = ("scene", "rays", "cast", "points", "write")
 
-_log = logging.getLogger(__name__)
+
+class EffectTotal(NamedTuple):
+    """An effect in all scans of a data set: counts by status, reason, and rays."""
+
+    ran: int
+    not_called: int
+    off: int
+    why: str  # reason in the first scan in which it ran, or in the first scan of all
+    rays_per_scan: float  # selected rays, mean over all scans
+
+
+@dataclass(frozen=True)
+class SimulationReport:
+    """Contents of a data set, and the scans added by a call of ``simulate``."""
+
+    scans_per_drive: dict[str, int]  # by four-digit number
+    num_empty: int  # without a single point
+    effects: dict[str, EffectTotal]  # in the order in which they are applied
+    num_written: int  # by this call; the others existed before
+    mean_ms: dict[str, float]  # a scan, by effect and part, and in total; empty if none was written
+
+    def to_dict(self) -> dict[str, Any]:
+        """What does not depend on the call, as plain values."""
+        effects = {name: total._asdict() for name, total in self.effects.items()}
+        return {
+            "scans_per_drive": self.scans_per_drive,
+            "num_empty": self.num_empty,
+            "effects": effects,
+        }
+
+    def __str__(self) -> str:
+        heads = ["effect", "ran", "not called", "off", "rays/scan", "ms/scan", "share"]
+        rows = []
+        for name, total in self.effects.items():
+            counts = [str(count) for count in (total.ran, total.not_called, total.off)]
+            rays = f"{total.rays_per_scan:.0f}"
+            rows.append([name, *counts, rays, *self._costs(name), total.why])
+        rows.append([])
+        rows += [[name, *[""] * 4, *self._costs(name), ""] for name in (*_PARTS, "total")]
+        table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrrrl", "plain")
+        per_drive = ", ".join(f"{drive} {num}" for drive, num in self.scans_per_drive.items())
+        num_scans = sum(self.scans_per_drive.values())
+        lines = [f"{num_scans} scans ({per_drive}), {self.num_written} of them simulated now"]
+        if self.num_empty:
+            lines.append(
+                f"{self.num_empty} of them hold no points: in this weather the sensor sees nothing"
+            )
+        return "\n".join([table, "", *lines])
+
+    def _costs(self, name: str) -> list[str]:
+        if name not in self.mean_ms:
+            return ["-", "-"]
+        return [f"{self.mean_ms[name]:.2f}", f"{self.mean_ms[name] / self.mean_ms['total']:.1%}"]
 
 
 def simulate(
@@ -81,7 +134,7 @@ def simulate(
         weather: Of all scans; drawn for each stretch of street if None.
 
     Returns:
-        Contents of the data set by effect, and simulation times; also written to ``report.json``.
+        Contents of the data set by effect, also written to ``report.json``, and simulation times.
 
     Raises:
         ValueError: If a value is out of range, an effect or a drive is unknown, a drive is named
@@ -108,9 +161,9 @@ def simulate(
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
     read_only = out.is_dir() and not os.access(out, os.W_OK)
     if read_only and not any(drive.missing(count) for drive, count in files.items()):
-        return _report(out, [one for drive in files for one in drive.summaries(files[drive])], [])
+        return make_report([one for drive in files for one in drive.summaries(files[drive])], [])
     out.mkdir(parents=True, exist_ok=True)
-    with _locked(out):
+    with only_writer(out / _LOCK, f"simulates into {out}", wait=True):
         _check_folder(out, request)  # again: another process may have written meanwhile
         write(out / _MANIFEST, to_json(request))
         tasks = []
@@ -228,18 +281,6 @@ def _read_json(path: Path) -> dict[str, Any]:
     return values
 
 
-@contextmanager
-def _locked(out: Path) -> Iterator[None]:
-    """Lock of the folder, which the system releases when the process dies."""
-    with (out / _LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            _log.warning("waiting for another process that simulates into %s", out)
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 def _run_all(tasks: list[_Task], workers: int) -> Iterator[list[dict[str, float]]]:
     """Milliseconds of the scans of each task, as it ends, in any order."""
     if workers == 1 or len(tasks) < 2:
@@ -305,21 +346,36 @@ def _finish(
         drive.delete_unfinished()
     for path in out.glob(".*.partial.json"):
         path.unlink(missing_ok=True)
-    report = _report(out, summaries, timings)
+    report = make_report(summaries, timings)
     write(out / _REPORT, to_json(report.to_dict()))
     return report
 
 
-def _report(
-    out: Path, summaries: list[dict[str, Any]], timings: list[dict[str, float]]
+def make_report(
+    summaries: Sequence[Mapping[str, Any]], timings: Sequence[Mapping[str, float]]
 ) -> SimulationReport:
-    """Report on the data set; a call that wrote nothing keeps the costs of the last one."""
-    report = make_report(summaries, timings)
-    if timings:
-        return report
-    try:
-        stored = json.loads((out / _REPORT).read_text())
-        costs = {name: Cost(**cost) for name, cost in stored["costs"].items()}
-        return replace(report, num_timed=stored["num_timed"], costs=costs)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return report
+    """Report from ``sim/*.json`` of all scans and the milliseconds of the written ones."""
+    effects = {
+        name: _effect_total([summary["effects"][name] for summary in summaries])
+        for name in summaries[0]["effects"]
+    }
+    names = timings[0] if timings else ()
+    return SimulationReport(
+        scans_per_drive=dict(Counter(summary["drive"] for summary in summaries)),
+        num_empty=sum(summary["points"] == 0 for summary in summaries),
+        effects=effects,
+        num_written=len(timings),
+        mean_ms={name: statistics.fmean(row[name] for row in timings) for name in names},
+    )
+
+
+def _effect_total(records: Sequence[Mapping[str, Any]]) -> EffectTotal:
+    counts = Counter(record["status"] for record in records)
+    ran = (record["reason"] for record in records if record["status"] == "ran")
+    return EffectTotal(
+        ran=counts["ran"],
+        not_called=counts["not_called"],
+        off=counts["off"],
+        why=next(ran, records[0]["reason"]),
+        rays_per_scan=statistics.fmean(record["rays"] for record in records),
+    )

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import ECHO_EFFECTS, EFFECTS, RAY_EFFECTS
-from r3dpa.simulation.effects.base import Effect, Switch
-from r3dpa.simulation.scene import Scene, Weather, WeatherPrior
+from r3dpa.simulation.scene import Scene, Weather
 from r3dpa.simulation.sensor import SpinningLidar, load_sensor
 from r3dpa.simulation.street import Street
-from r3dpa.simulation.sweep import Echoes, Origin, Sweep
+from r3dpa.simulation.sweep import Echoes, Effect, Origin, Sweep
+
+Switch = Literal["auto", "on", "off"]
 
 # Smallest distance of two echoes of one shot, metres.
 _SECOND_RETURN_M = 1.0
@@ -122,7 +123,7 @@ class Simulator:
     Args:
         seed: Seed of street and instrument, 0 or greater.
         drive: Number of the drive; each leads through a street of its own.
-        weather: Weather of all scans, or the prior that is sampled every 100 scans.
+        weather: Weather of all scans; None draws another one every 100 scans.
         sensor: Instrument, or an argument of ``load_sensor``.
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
 
@@ -142,7 +143,7 @@ class Simulator:
         self,
         seed: int = 0,
         drive: int = 0,
-        weather: Weather | WeatherPrior | None = None,
+        weather: Weather | None = None,
         sensor: str | SpinningLidar = "hdl64e",
         effects: Mapping[str, str | bool] | None = None,
     ) -> None:

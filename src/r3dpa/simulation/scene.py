@@ -15,13 +15,16 @@ import numpy as np
 
 MAX_INSTANCE = 0xFFFF
 Interval = tuple[float, float]
-Rule = Literal["be finite", "be positive", "be 0 or greater", "lie in [0, 1]"]
+# Shares of scenes in clear air over a dry and a wet road; and, in the first, of a clear sky.
+_CLEAR_DRY, _CLEAR_WET = 0.85, 0.10
+_CLEAR_SKY = 0.6
+
+Rule = Literal["be finite", "be positive", "be 0 or greater"]
 
 _RULES: dict[Rule, Callable[[float], bool]] = {
     "be finite": math.isfinite,
     "be positive": lambda value: 0 < value < math.inf,
     "be 0 or greater": lambda value: 0 <= value < math.inf,
-    "lie in [0, 1]": lambda value: 0 <= value <= 1,
 }
 
 
@@ -196,73 +199,29 @@ class Weather:
             raise ValueError(f"sun_elevation_deg must lie in -90..90, got {self.sun_elevation_deg}")
 
 
-@dataclass(frozen=True)
-class WeatherPrior:
-    """Prior distribution of the weather of a scene.
+def draw_weather(generator: np.random.Generator) -> Weather:
+    """Random weather: clear over a dry road (85 %), clear over a wet one (10 %), or bad air.
 
-    The remaining probability is fog, rain or snow, a third each. Visibility and rates are
-    log-uniform, the other values uniform. In rain the road is wet; a sun below the horizon is
-    night.
-
-    Args:
-        clear_dry: Probability of clear air and a dry road.
-        wet: Probability of clear air over a wet road.
-        visibility_m: Meteorological optical range in fog.
-        rain_mm_h: Rain rate in rain.
-        snow_mm_h: Snow rate in snow, as millimetres of water.
-        water_film_mm: Depth of the water on a wet road.
-        sun_elevation_deg: Height of the sun.
-        clear_sky: Probability that nothing covers the sun in clear air over a dry road.
+    Bad air is fog, rain or snow, a third each. Visibility and rates are log-uniform, the other
+    values uniform. In rain the road is wet; a sun below the horizon is night.
     """
-
-    clear_dry: float = 0.85
-    wet: float = 0.10
-    visibility_m: Interval = (30.0, 1000.0)
-    rain_mm_h: Interval = (1.0, 30.0)
-    snow_mm_h: Interval = (0.5, 3.0)
-    water_film_mm: Interval = (0.1, 1.5)
-    sun_elevation_deg: Interval = (-18.0, 62.0)
-    clear_sky: float = 0.6
-
-    def __post_init__(self) -> None:
-        check_fields(self, "lie in [0, 1]", "clear_dry", "wet", "clear_sky")
-        if self.clear_dry + self.wet > 1:
-            raise ValueError(
-                f"clear_dry and wet must add up to 1 or less, got {self.clear_dry} and {self.wet}"
-            )
-        rates = ("visibility_m", "rain_mm_h", "snow_mm_h", "water_film_mm")
-        for name in (*rates, "sun_elevation_deg"):
-            low, high = getattr(self, name)
-            if not (low <= high < math.inf and (low > 0 or name not in rates)):
-                raise ValueError(
-                    f"{name} must be a finite interval (low, high), positive for depths, rates "
-                    f"and visibility, got {(low, high)}"
-                )
-
-    def draw(self, generator: np.random.Generator) -> Weather:
-        """Sample the prior."""
-        air, third, sky = generator.random(3)
-        film_mm = generator.uniform(*self.water_film_mm)
-        elevation_deg = generator.uniform(*self.sun_elevation_deg)
-        azimuth_deg = generator.uniform(-180.0, 180.0)
-        if air < self.clear_dry:
-            return Weather(
-                clear_sky=sky < self.clear_sky,
-                sun_elevation_deg=elevation_deg,
-                sun_azimuth_deg=azimuth_deg,
-            )
-        visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
-        if air >= self.clear_dry + self.wet:
-            kind = int(3 * third)
-            if kind == 0:
-                visibility_m, film_mm = _even_logarithm(generator, self.visibility_m), 0.0
-            elif kind == 1:
-                rain_mm_h = _even_logarithm(generator, self.rain_mm_h)
-            else:
-                snow_mm_h, film_mm = _even_logarithm(generator, self.snow_mm_h), 0.0
-        return Weather(
-            visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg
-        )
+    air, third, sky = generator.random(3)
+    film_mm = generator.uniform(0.1, 1.5)
+    elevation_deg = generator.uniform(-18.0, 62.0)
+    azimuth_deg = generator.uniform(-180.0, 180.0)
+    if air < _CLEAR_DRY:
+        sun = elevation_deg, azimuth_deg
+        return Weather(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, *sun)
+    visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
+    if air >= _CLEAR_DRY + _CLEAR_WET:
+        kind = int(3 * third)
+        if kind == 0:
+            visibility_m, film_mm = _even_logarithm(generator, (30.0, 1000.0)), 0.0
+        elif kind == 1:
+            rain_mm_h = _even_logarithm(generator, (1.0, 30.0))
+        else:
+            snow_mm_h, film_mm = _even_logarithm(generator, (0.5, 3.0)), 0.0
+    return Weather(visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg)
 
 
 def _even_logarithm(generator: np.random.Generator, interval: Interval) -> float:

@@ -21,8 +21,8 @@ from r3dpa.simulation.scene import (
     Puddle,
     Scene,
     Weather,
-    WeatherPrior,
     check_fields,
+    draw_weather,
 )
 from r3dpa.simulation.vehicles import Body, cyclist, person, recording_car, vehicle
 
@@ -58,14 +58,12 @@ class Street:
     Args:
         seed: Seed of the data set, 0 or greater.
         drive: Number of the drive, 0 or greater; each has a street of its own.
-        weather: Weather of all scans, or the prior that is sampled every 100 scans; None for the
-            default prior.
-
+        weather: Weather of all scans; None draws another one every 100 scans.
     """
 
     seed: int
     drive: int
-    weather: Weather | WeatherPrior | None = None
+    weather: Weather | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, "be 0 or greater", "seed", "drive")
@@ -111,11 +109,10 @@ class Street:
         """The weather of one scan."""
         if scan < 0:
             raise ValueError(f"scan must be 0 or greater, got {scan}")
-        if isinstance(self.weather, Weather):
+        if self.weather is not None:
             return self.weather
         stretch = scan // _SCANS_PER_WEATHER
-        prior = self.weather or WeatherPrior()
-        return prior.draw(generator_for(self.seed, "weather", self.drive, stretch))
+        return draw_weather(generator_for(self.seed, "weather", self.drive, stretch))
 
 
 @lru_cache(maxsize=256)

@@ -1,10 +1,11 @@
-"""State of one simulated turn: rays, hits and echoes.
+"""State of one simulated turn (rays, hits and echoes), and the interface of its effects.
 
 Letters: R shots of the turn, beam after beam (R = H * W); M chosen rays.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
@@ -12,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.simulation.draws import RayIndex
+from r3dpa.simulation.draws import Draws, RayIndex
 from r3dpa.simulation.raycast import cast, normals
 from r3dpa.simulation.scene import GROUND_MATERIALS, Material, Scene, Semantic
 from r3dpa.simulation.sensor import SpinningLidar
@@ -262,3 +263,23 @@ class Sweep:
         coded = self.of_surface(codes, Semantic.ROAD, np.uint32, surface, Semantic.EGO_VEHICLE)
         coded[np.isin(origin, IN_THE_AIR)] = Semantic.UNLABELED
         return coded
+
+
+class Effect(ABC):
+    """One physical effect: the condition under which it runs, its rays, and the change to them.
+
+    ``apply`` depends on the scene and the sensor only: an effect that is switched on in a scene
+    that does not call for it changes no bit of the scan.
+    """
+
+    @abstractmethod
+    def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
+        """Reason why the scene or the instrument calls for the effect; None if neither does."""
+
+    def rays(self, sweep: Sweep) -> RayIndex:
+        """Rays that the effect may change, by default all."""
+        return slice(None)
+
+    @abstractmethod
+    def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
+        """Change these rays of the sweep."""

@@ -4,7 +4,6 @@ Each effect is a frozen dataclass with its equation in the docstring. It decides
 whether it runs, selects its rays, and changes nothing else.
 """
 
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.edges import MixedPixels
 from r3dpa.simulation.effects.glare import Blooming, SunGlare
 from r3dpa.simulation.effects.instrument import (
@@ -29,6 +28,7 @@ from r3dpa.simulation.effects.surface import (
     SurfaceTexture,
     surface_power,
 )
+from r3dpa.simulation.sweep import Effect
 
 #: Effects on the rays, in the order in which they are applied before the rays are cast.
 RAY_EFFECTS: tuple[Effect, ...] = (

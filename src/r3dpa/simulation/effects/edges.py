@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.surface import surface_power
 from r3dpa.simulation.raycast import normals, surface_distance
 from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import EGO_BODY, GROUND, Floats
-from r3dpa.simulation.sweep import IS_GROUND, Echoes, Origin, Sweep
+from r3dpa.simulation.sweep import IS_GROUND, Echoes, Effect, Origin, Sweep
 
 Indices = NDArray[np.int64]
 Surfaces = NDArray[np.int32]

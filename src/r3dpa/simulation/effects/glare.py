@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.surface import sheets
 from r3dpa.simulation.raycast import cast_single
 from r3dpa.simulation.scene import Material, Scene, Weather
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 _SUN_REACH_DEG = 10.0
 # Optical depth of the clear air overhead at 905 nm.

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
-from r3dpa.simulation.sweep import Echoes, Sweep
+from r3dpa.simulation.sweep import Echoes, Effect, Sweep
 
 #: No threshold is farther from its middle than this many spreads.
 MAX_SPREADS = 4.0

@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.raycast import surface_distance
 from r3dpa.simulation.scene import Primitive, Scene, Semantic, Shape
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats, Solids, solids_of
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 # Backscatter over extinction of clouds of water droplets, see Fog.
 _BACKSCATTER = 0.046 / math.log(20)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.raycast import cast, normals
 from r3dpa.simulation.scene import Pose, Primitive, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import EGO_BODY, NO_SURFACE, Floats, level, solids_of, subset
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 
 class RollingShutter(Effect):

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.surface import surface_power
 from r3dpa.simulation.raycast import cast_single, normals, surface_distance
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 # Largest distance of a pane from the wall that it belongs to.
 _ATTACHED_M = 0.25

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.effects.instrument import MAX_SPREADS
 from r3dpa.simulation.effects.medium import (
     all_rays,
@@ -23,7 +22,7 @@ from r3dpa.simulation.effects.medium import (
 from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE
-from r3dpa.simulation.sweep import Origin, Sweep
+from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
 _STEP_M = 0.2
 _POWERS = 64

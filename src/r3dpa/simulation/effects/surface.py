@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.effects.base import Effect
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import Floats
-from r3dpa.simulation.sweep import Sweep
+from r3dpa.simulation.sweep import Effect, Sweep
 
 # Oren-Nayar coefficients of each material by the standard deviation of its facets' slope: fitted
 # to the intensity of KITTI's scans for all but paint, glass, metal and sheeting, which are smooth.
