@@ -222,19 +222,18 @@ def test_batches_change_nothing():
             torch.testing.assert_close(*values, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("pooling", ["rings", "sectors", "all"])
-def test_pooled_features_do_not_depend_on_the_order_of_voxels(pooling):
+def test_pooled_features_do_not_depend_on_the_order_of_voxels():
     """The mean of the coordinates is exact, so that no voxel changes its ring."""
     generator = torch.Generator().manual_seed(0)
     xyz = torch.randint(2000, (20_000, 3), generator=generator)
     coordinates = torch.cat([xyz, torch.randint(2, (20_000, 1), generator=generator)], dim=1)
     features = drawn(1, 20_000, 2)
-    pooled = pool_voxels(features, coordinates, 2, pooling)
+    pooled = pool_voxels(features, coordinates, 2)
     order = torch.randperm(20_000, generator=generator)
-    again = pool_voxels(features[order], coordinates[order], 2, pooling)
+    again = pool_voxels(features[order], coordinates[order], 2)
     torch.testing.assert_close(again, pooled, rtol=0, atol=1e-7)
     moved = coordinates + torch.tensor([30_000, -30_000, 11, 0])  # float32 sums would round by 0.1
-    torch.testing.assert_close(pool_voxels(features, moved, 2, pooling), pooled, rtol=0, atol=1e-6)
+    torch.testing.assert_close(pool_voxels(features, moved, 2), pooled, rtol=0, atol=1e-6)
 
 
 def test_distances_have_their_largest_values_on_disjoint_sets():

@@ -225,7 +225,5 @@ def test_liploc_refuses_what_is_no_picture():
         network(torch.ones(0, 16, 64))
     with pytest.raises(ValueError, match="finite"):
         network(torch.full((1, 16, 64), float("nan")))
-    with pytest.raises(ValueError, match=r"\(B, 3, 32, 32\), got shape \(1, 3, 16, 64\)"):
-        network.encode(torch.ones(1, 3, 16, 64))
     with pytest.raises(ValueError, match="patches of 7"):
         LIPLoc(picture_side=32, patch_side=7)

@@ -180,13 +180,7 @@ def test_pooling_by_hand():
     assert rings[0, 0].tolist() == [2, 20]
     assert rings[2, 1].tolist() == [7, 60]  # 7.25 <= 10 < 10.5
     assert rings.count_nonzero() == 4
-    sectors = pool_voxels(features, coordinates, 3, "sectors").view(3, 16, 2)
-    assert sectors[0, 8].tolist() == [1, 10]  # azimuth 0 opens the ninth sector
-    assert sectors[2, [4, 12], 0].tolist() == [9, 5]  # azimuths -89 and +91 degrees
-    assert pool_voxels(features, coordinates, 3, "all").tolist() == [[2, 20], [0, 0], [7, 60]]
     beyond = torch.tensor([[1200, 0, 0, 0], [-1200, 0, 0, 0]])  # 60 m
     assert not pool_voxels(features[:2], beyond, 1).any()
     above = torch.tensor([[120, 0, 160, 0], [-120, 0, -160, 0]])  # 6 m aside, 10 m in space
     assert pool_voxels(features[:2], above, 1).view(16, 2)[1].tolist() == [2, 20]
-    with pytest.raises(ValueError, match="rings, sectors or all, got 'depth'"):
-        pool_voxels(features, coordinates, 3, "depth")

@@ -13,8 +13,6 @@ from torch import Tensor
 from r3dpa.geometry.projection import Projection, in_range
 from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of
 
-__all__ = ["Gaps", "check_view", "filled", "range_error_m", "refined"]
-
 Gaps = Literal["inverse", "linear", "nearest"]
 _LEAST_ROWS = 0.5  # of the field of view, that a scan of the same sensor fills
 _LEAST_COLUMNS = 0.75

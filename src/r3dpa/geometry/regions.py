@@ -20,19 +20,6 @@ from torch import Tensor
 from r3dpa.geometry.projection import Projection
 from r3dpa.geometry.sensor import column_azimuths
 
-__all__ = [
-    "angle_box",
-    "box3d",
-    "check_mask",
-    "dilated",
-    "dropped_beams",
-    "mask_of_tokens",
-    "sector",
-    "sector_weights",
-    "sensor_pair",
-    "token_mask",
-]
-
 _TURN_DEG = 360.0
 _LEAST_BLEND_DEG = 1e-6  # a narrower seam is hard: its shares would be rounding alone
 _DECIMALS = 9  # of degrees, so that rounding moves no ray across a border it lies on

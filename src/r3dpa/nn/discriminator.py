@@ -6,8 +6,6 @@ from torch import Tensor, nn
 
 from r3dpa.nn.layers import SyncedBatchNorm2d
 
-__all__ = ["PatchDiscriminator"]
-
 
 class PatchDiscriminator(nn.Module):
     """Convolutional discriminator of overlapping patches of a range image.

@@ -9,19 +9,18 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.vae import Posterior
-
-__all__ = ["ImageVAE"]
+from r3dpa.nn.vae import Autoencoder
 
 _NORM_EPS = 1e-6
 _RGB = 3
 
 
-class ImageVAE(nn.Module):
+class ImageVAE(Autoencoder):
     """Convolutional autoencoder of RGB images; the defaults are Stable Diffusion's, f8d4.
 
-    Level i has ``channels[i]`` channels and half the rows and columns of level i - 1. Latents are
-    not scaled: :class:`r3dpa.nn.LatentNorm` replaces the usual factor 0.18215.
+    Images are red, green and blue. Level i has ``channels[i]`` channels and half the rows and
+    columns of level i - 1. Latents are not scaled: :class:`r3dpa.nn.LatentNorm` replaces the usual
+    factor 0.18215.
 
     Source: Rombach et al., "High-resolution image synthesis with latent diffusion models" (CVPR
     2022). State-dict keys are those of ``AutoencoderKL`` in diffusers, whose safetensors files
@@ -41,39 +40,17 @@ class ImageVAE(nn.Module):
         num_res_blocks: int = 2,
         norm_groups: int = 32,
     ) -> None:
-        super().__init__()
         if not channels or any(width % norm_groups for width in channels):
             raise ValueError(
                 f"channels must be multiples of norm_groups {norm_groups}, got {channels}"
             )
-        self.latent_channels = latent_channels
-        self.stride = 2 ** (len(channels) - 1)
-        self.encoder = _Encoder(2 * latent_channels, list(channels), num_res_blocks, norm_groups)
-        self.decoder = _Decoder(latent_channels, list(channels), num_res_blocks + 1, norm_groups)
-        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
-        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
-
-    def latent_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image."""
-        rows, columns = image_size
-        if rows % self.stride or columns % self.stride:
-            raise ValueError(f"image sides must be multiples of {self.stride}, got {image_size}")
-        return rows // self.stride, columns // self.stride
-
-    def encode(self, image: Tensor) -> Posterior:
-        """Posterior of the raw latents of images ``(B, 3, H, W)`` in [-1, 1], red, green, blue.
-
-        Raises:
-            ValueError: If the image has another shape, or the stride does not divide its sides.
-        """
-        if image.dim() != 4 or image.shape[1] != _RGB:
-            raise ValueError(f"image must be (B, 3, H, W), got {tuple(image.shape)}")
-        self.latent_size((image.shape[-2], image.shape[-1]))
-        return Posterior(self.quant_conv(self.encoder(image)))
-
-    def decode(self, latents: Tensor) -> Tensor:
-        """Images ``(B, 3, H, W)`` of raw latents ``(B, C, h, w)``, not limited to [-1, 1]."""
-        return self.decoder(self.post_quant_conv(latents))
+        super().__init__(
+            _Encoder(2 * latent_channels, list(channels), num_res_blocks, norm_groups),
+            _Decoder(latent_channels, list(channels), num_res_blocks + 1, norm_groups),
+            _RGB,
+            latent_channels,
+            (2 ** (len(channels) - 1), 2 ** (len(channels) - 1)),
+        )
 
 
 class _Encoder(nn.Module):

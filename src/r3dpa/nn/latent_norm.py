@@ -6,12 +6,9 @@ Letters: B batch, C latent channels, h x w latent size.
 from __future__ import annotations
 
 import torch
-import torch.distributed as dist
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import at_least_float32, sum_over_processes
-
-__all__ = ["LatentNorm"]
+from r3dpa.nn.layers import at_least_float32, num_processes, sum_over_processes
 
 
 class LatentNorm(nn.Module):
@@ -87,8 +84,7 @@ class LatentNorm(nn.Module):
         """
         latents = self._widen(latents)
         positions = latents.numel() // self.channels
-        distributed = dist.is_available() and dist.is_initialized()
-        if positions * (dist.get_world_size() if distributed else 1) < 2:
+        if positions * num_processes() < 2:
             raise ValueError(
                 "batch statistics need at least two values per channel, got latents of shape "
                 f"{tuple(latents.shape)}; use a larger batch, or normalise() with the running "
@@ -99,14 +95,11 @@ class LatentNorm(nn.Module):
         # Two passes in float64: the sum of squares minus the squared mean would cancel.
         wide = self._repair(latents).double()
         counts = torch.stack([num_broken.new_tensor(positions), num_broken])
-        totals = torch.cat([counts, wide.sum(dim=(0, 2, 3))])
-        if distributed:
-            totals = sum_over_processes(totals)
+        totals = sum_over_processes(torch.cat([counts, wide.sum(dim=(0, 2, 3))]))
         count, num_broken = totals[0].detach(), totals[1].detach()
         mean = totals[2:] / count
         squares = (wide - _per_channel(mean, wide)).square().sum(dim=(0, 2, 3))
-        if distributed:
-            squares = sum_over_processes(squares)
+        squares = sum_over_processes(squares)
         normalised = (wide - _per_channel(mean, wide)) * _per_channel(
             torch.rsqrt(squares / count + self.eps), wide
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -15,23 +15,8 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-__all__ = [
-    "AttentionBlock",
-    "CircularConv2d",
-    "Downsample",
-    "GroupNorm",
-    "Mlp",
-    "ResBlock",
-    "SelfAttention",
-    "SyncedBatchNorm2d",
-    "Upsample",
-    "WideCircularConv2d",
-    "at_least_float32",
-    "no_autocast",
-    "sum_over_processes",
-]
-
 Size = tuple[int, int]
+_Layer = TypeVar("_Layer", bound=nn.Module)
 
 # stride -> kernel and (left, right, top, bottom) pads of the official weights
 _DOWNSAMPLE = {
@@ -54,6 +39,13 @@ def no_autocast(device: torch.device) -> AbstractContextManager[Any]:
     if device.type == "meta":
         return nullcontext()
     return torch.autocast(device.type, enabled=False)
+
+
+def zeroed(layer: _Layer) -> _Layer:
+    """The layer with all parameters set to 0, so that its block starts as its shortcut."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
 
 
 class CircularConv2d(nn.Conv2d):
@@ -286,7 +278,7 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
         momentum = self.momentum
         if momentum is None:
             momentum = 1.0 / (int(self.num_batches_tracked) + 1)
-        if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
+        if num_processes() > 1:
             mean, variance, count = _global_moments(image)
             unbiased = variance * (count / (count - 1))
             for running, value in zip(moved, (mean, unbiased), strict=True):
@@ -307,21 +299,18 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
         self.num_batches_tracked += usable
 
 
-class _SumOverProcesses(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor) -> Tensor:
-        total = values.clone()
-        dist.all_reduce(total)
-        return total
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        return _SumOverProcesses.apply(gradient.contiguous())
+def num_processes() -> int:
+    """Number of processes that train together."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def sum_over_processes(values: Tensor) -> Tensor:
     """Elementwise sum over all processes, differentiable; every process must call it."""
-    return _SumOverProcesses.apply(values)
+    if num_processes() == 1:
+        return values
+    from torch.distributed.nn.functional import all_reduce  # absent where dist is not available
+
+    return all_reduce(values)
 
 
 def _global_moments(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,15 +16,13 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32
+from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32, zeroed
 from r3dpa.nn.velocity_network import (
     TIME_WIDTH,
     VelocityNetwork,
     WideLinear,
     time_frequencies,
 )
-
-__all__ = ["SiT", "sincos_position_embedding"]
 
 _MAX_PERIOD = 10_000.0
 _TOKEN_NORM_EPS = 1e-6
@@ -224,13 +222,6 @@ def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
     return layer
 
 
-def _zero(layer: nn.Linear) -> nn.Linear:
-    """Zero initialisation: every block starts as the identity, the velocity as 0."""
-    nn.init.zeros_(layer.weight)
-    nn.init.zeros_(layer.bias)
-    return layer
-
-
 class _PatchEmbedding(nn.Module):
     def __init__(self, in_channels: int, hidden_size: int, patch_size: int) -> None:
         super().__init__()
@@ -266,7 +257,7 @@ class _ClassEmbedding(nn.Module):
 
 
 def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:
-    return nn.Sequential(nn.SiLU(), _zero(nn.Linear(hidden_size, num_vectors * hidden_size)))
+    return nn.Sequential(nn.SiLU(), zeroed(nn.Linear(hidden_size, num_vectors * hidden_size)))
 
 
 def _modulated_norm(tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
@@ -298,7 +289,7 @@ class _Block(nn.Module):
 class _FinalLayer(nn.Module):
     def __init__(self, hidden_size: int, patch_values: int) -> None:
         super().__init__()
-        self.linear = _zero(nn.Linear(hidden_size, patch_values))
+        self.linear = zeroed(nn.Linear(hidden_size, patch_values))
         self.adaLN_modulation = _modulation(hidden_size, 2)
 
     def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:

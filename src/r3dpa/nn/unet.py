@@ -8,22 +8,24 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self, TypeVar
+from typing import Self
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import CircularConv2d, GroupNorm, WideCircularConv2d, at_least_float32
+from r3dpa.nn.layers import (
+    CircularConv2d,
+    GroupNorm,
+    WideCircularConv2d,
+    at_least_float32,
+    zeroed,
+)
 from r3dpa.nn.velocity_network import VelocityNetwork, WideLinear, time_frequencies
-
-__all__ = ["UNet"]
 
 _KERNEL = (3, 3)
 _NORM_EPS = 1e-5  # the VAE of the same authors has 1e-6
-
-_Layer = TypeVar("_Layer", nn.Conv1d, CircularConv2d)
 
 
 class UNet(VelocityNetwork):
@@ -134,7 +136,7 @@ class UNet(VelocityNetwork):
                     layers.append(_DoubleSize(width))
                 self.output_blocks.append(_Layers(*layers))
         self.out = nn.Sequential(
-            _norm(width), nn.SiLU(), _zeroed(WideCircularConv2d(width, in_channels, _KERNEL))
+            _norm(width), nn.SiLU(), zeroed(WideCircularConv2d(width, in_channels, _KERNEL))
         )
 
     @property
@@ -197,13 +199,6 @@ def _norm(channels: int) -> GroupNorm:
     return GroupNorm(channels, _NORM_EPS)
 
 
-def _zeroed(layer: _Layer) -> _Layer:
-    """Zero initialisation: every block starts as its shortcut, the velocity as 0."""
-    for parameter in layer.parameters():
-        nn.init.zeros_(parameter)
-    return layer
-
-
 class _Layers(nn.ModuleList):
     """Sequential layers, of which residual blocks receive the time embedding."""
 
@@ -231,7 +226,7 @@ class _TimedResBlock(nn.Module):
             _norm(out_channels),
             nn.SiLU(),
             nn.Identity(),  # a dropout of 0 in the official code, which counts in the names
-            _zeroed(CircularConv2d(out_channels, out_channels, _KERNEL)),
+            zeroed(CircularConv2d(out_channels, out_channels, _KERNEL)),
         )
         self.skip_connection = (
             nn.Identity()
@@ -252,7 +247,7 @@ class _HeadsAttention(nn.Module):
         self.num_heads = channels // head_channels
         self.norm = _norm(channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
-        self.proj_out = _zeroed(nn.Conv1d(channels, channels, 1))
+        self.proj_out = zeroed(nn.Conv1d(channels, channels, 1))
 
     def forward(self, hidden: Tensor) -> Tensor:
         pixels = self.norm(hidden).flatten(2)

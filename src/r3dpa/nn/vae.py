@@ -25,8 +25,6 @@ from r3dpa.nn.layers import (
     at_least_float32,
 )
 
-__all__ = ["VAE", "Posterior"]
-
 Size = tuple[int, int]
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
@@ -75,13 +73,60 @@ class Posterior:
         terms = self.mean.square() + self.logvar.exp() - 1.0 - self.logvar
         return 0.5 * terms.flatten(1).sum(dim=1)
 
-    def nll(self, latents: Tensor) -> Tensor:
-        """Negative log-likelihood of raw latents, ``(B,)`` nats summed over C, h and w."""
-        squares = (latents - self.mean).square() * torch.exp(-self.logvar)
-        return 0.5 * (math.log(2 * math.pi) + self.logvar + squares).flatten(1).sum(dim=1)
+
+class Autoencoder(nn.Module):
+    """Encoder to a posterior, and decoder, with 1 x 1 convolutions on both sides of the latents.
+
+    Attributes:
+        in_channels: Channels of the image.
+        latent_channels: Channels C of the latents.
+        stride: Reduction of rows and columns.
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        decoder: nn.Module,
+        in_channels: int,
+        latent_channels: int,
+        stride: Size,
+    ) -> None:
+        super().__init__()
+        self.in_channels = in_channels
+        self.latent_channels = latent_channels
+        self.stride = stride
+        self.encoder, self.decoder = encoder, decoder
+        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
+
+    def latent_size(self, image_size: Size) -> Size:
+        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image."""
+        rows, columns = image_size
+        if rows % self.stride[0] or columns % self.stride[1]:
+            raise ValueError(
+                f"image size (rows, columns) must be a multiple of {self.stride}, got {image_size}"
+            )
+        return rows // self.stride[0], columns // self.stride[1]
+
+    def encode(self, image: Tensor) -> Posterior:
+        """Posterior of the raw latents of images ``(B, in_channels, H, W)`` in [-1, 1].
+
+        Raises:
+            ValueError: If the channels differ, or the strides do not divide the size.
+        """
+        if image.dim() != 4 or image.shape[1] != self.in_channels:
+            raise ValueError(
+                f"image must be (B, {self.in_channels}, H, W), got {tuple(image.shape)}"
+            )
+        self.latent_size((image.shape[-2], image.shape[-1]))
+        return Posterior(self.quant_conv(self.encoder(image)))
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Images ``(B, in_channels, H, W)`` of raw latents, not limited to [-1, 1]."""
+        return self.decoder(self.post_quant_conv(latents))
 
 
-class VAE(nn.Module):
+class VAE(Autoencoder):
     """Convolutional autoencoder whose columns wrap around, with the architecture of LiDM.
 
     Level i of the encoder has ``channels * channel_multipliers[i]`` channels and is followed by
@@ -124,7 +169,6 @@ class VAE(nn.Module):
         attention_levels: tuple[int, ...] = (),
         legacy_upsample: bool = False,
     ) -> None:
-        super().__init__()
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
             raise ValueError(
@@ -135,50 +179,19 @@ class VAE(nn.Module):
             raise ValueError(
                 f"attention_levels must be among 0..{num_levels - 1}, got {attention_levels}"
             )
-        self.in_channels = in_channels
-        self.latent_channels = latent_channels
-        self.stride = (math.prod(s[0] for s in strides), math.prod(s[1] for s in strides))
         widths = [channels * multiplier for multiplier in channel_multipliers]
         steps = [(rows, columns) for rows, columns in strides]
         attention = [level in attention_levels for level in range(num_levels)]
         shallower, deeper = [widths[0], *widths[:-1]], [*widths[1:], widths[-1]]
         down = list(zip(shallower, widths, attention, [*steps, None], strict=True))
         up = list(zip(deeper, widths, attention, [None, *steps], strict=True))
-        self.encoder = _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks)
-        self.decoder = _Decoder(
-            latent_channels, in_channels, up, num_res_blocks + 1, legacy_upsample
+        super().__init__(
+            _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks),
+            _Decoder(latent_channels, in_channels, up, num_res_blocks + 1, legacy_upsample),
+            in_channels,
+            latent_channels,
+            (math.prod(rows for rows, _ in steps), math.prod(columns for _, columns in steps)),
         )
-        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
-        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
-
-    def latent_size(self, image_size: Size) -> Size:
-        """Rows and columns ``(h, w)`` of the latents of an ``(H, W)`` image."""
-        rows, columns = image_size
-        if rows % self.stride[0] or columns % self.stride[1]:
-            raise ValueError(
-                f"image size (rows, columns) must be a multiple of {self.stride}, got {image_size}"
-            )
-        return rows // self.stride[0], columns // self.stride[1]
-
-    def encode(self, image: Tensor) -> Posterior:
-        """Posterior of the raw latents.
-
-        Args:
-            image: ``(B, in_channels, H, W)`` encoded range in [-1, 1].
-
-        Raises:
-            ValueError: If the channels differ, or the strides do not divide the size.
-        """
-        if image.shape[1] != self.in_channels:
-            raise ValueError(
-                f"image must be (B, {self.in_channels}, H, W), got {tuple(image.shape)}"
-            )
-        self.latent_size((image.shape[-2], image.shape[-1]))
-        return Posterior(self.quant_conv(self.encoder(image)))
-
-    def decode(self, latents: Tensor) -> Tensor:
-        """Encoded range ``(B, in_channels, H, W)`` of raw latents, not limited to [-1, 1]."""
-        return self.decoder(self.post_quant_conv(latents))
 
     def halve_decoder_(self) -> Self:
         """Casts the convolutions of the decoder, but for the last, to bfloat16 for sampling.

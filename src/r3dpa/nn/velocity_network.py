@@ -20,16 +20,6 @@ from torch import Tensor, nn
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.layers import at_least_float32, no_autocast
 
-__all__ = [
-    "EMA",
-    "TIME_WIDTH",
-    "AlignedPass",
-    "VelocityNetwork",
-    "VelocityOutput",
-    "WideLinear",
-    "time_frequencies",
-]
-
 TIME_WIDTH = 256
 _MAX_PERIOD = 10_000.0
 

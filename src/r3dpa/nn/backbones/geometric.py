@@ -233,16 +233,9 @@ def _symmetric_eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
     values = torch.stack([largest, 3 * mean - largest - smallest, smallest])
     # The rows of A - smallest * I span the plane across the eigenvector: take their largest
     # cross product.
-    row_x = torch.stack([xx - smallest, xy, xz])
-    row_y = torch.stack([xy, yy - smallest, yz])
-    row_z = torch.stack([xz, yz, zz - smallest])
-    products = torch.stack(
-        [
-            torch.linalg.cross(row_x, row_y, dim=0),
-            torch.linalg.cross(row_x, row_z, dim=0),
-            torch.linalg.cross(row_y, row_z, dim=0),
-        ]
-    )
+    x, y, z = xx - smallest, yy - smallest, zz - smallest
+    rows = torch.stack([x, xy, xz, xy, y, yz, xz, yz, z]).unflatten(0, (3, 3))
+    products = torch.linalg.cross(rows[[0, 0, 1]], rows[[1, 2, 2]], dim=1)
     lengths = torch.linalg.vector_norm(products, dim=1)
     best = lengths.argmax(dim=0)
     columns = torch.arange(best.shape[0], device=best.device)

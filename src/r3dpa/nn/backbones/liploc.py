@@ -97,18 +97,7 @@ class LIPLoc(nn.Module):
 
     def forward(self, range_m: Tensor) -> Tensor:
         """Features ``(B, dim)`` of range images ``(B, H, W)`` in metres, -1 without a return."""
-        return self.encode(wrapped_picture(range_m, (self.picture_side, self.picture_side)))
-
-    def encode(self, pictures: Tensor) -> Tensor:
-        """Features ``(B, dim)`` of pictures ``(B, 3, picture_side, picture_side)``.
-
-        Pictures are normalised with the constants of ImageNet.
-        """
-        side = self.picture_side
-        if pictures.shape[1:] != (3, side, side):
-            raise ValueError(
-                f"pictures must be (B, 3, {side}, {side}), got shape {tuple(pictures.shape)}"
-            )
+        pictures = wrapped_picture(range_m, (self.picture_side, self.picture_side))
         tokens = self.encoder(self.embedding(pictures))
         return self.norm(tokens[:, 1:].mean(dim=1))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -77,12 +78,15 @@ def load_strictly(
 
 
 def renamed(names: Mapping[str, str]) -> Callable[[str], str]:
-    """Function that replaces the prefix of a key by the first entry of the table that fits."""
+    """Function that replaces the beginning of a key by the first entry of the table that fits.
+
+    Keys of the table are regular expressions, and ``{}`` in their values stands for a group.
+    """
 
     def official_name(key: str) -> str:
         for ours, official in names.items():
-            if key.startswith(ours):
-                return official + key.removeprefix(ours)
+            if match := re.match(ours, key):
+                return official.format(*match.groups()) + key[match.end() :]
         raise KeyError(key)
 
     return official_name

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 from r3dpa.nn.backbones.geometric import GeometricFeatures, random_basis
-from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.official import load_strictly, read_released, renamed
 from r3dpa.nn.backbones.voxels import (
     PointCloudBatch,
     PreparedScan,
@@ -29,8 +29,6 @@ from r3dpa.nn.backbones.voxels import (
     prepare_scan,
 )
 from r3dpa.nn.backbones.waffleiron import WaffleIron
-
-__all__ = ["SOURCES", "ScaLR", "TokenFeatures", "WaffleIronS", "feature_source", "sha256"]
 
 #: Names that :func:`feature_source` accepts.
 SOURCES = ("scalr", "waffleiron-s", "geometric")
@@ -66,8 +64,7 @@ class TokenFeatures(nn.Module):
 
     Args:
         network: Trained network; its head is removed.
-        grid: Preparation of scans, as in its training.
-        workers: Threads of the neighbour search, -1 for all cores.
+        grid: Preparation of scans, as in its training. Default: that of the release of ScaLR.
 
     Attributes:
         name: Short name of the source.
@@ -81,14 +78,15 @@ class TokenFeatures(nn.Module):
 
     name: str
 
-    def __init__(self, network: WaffleIron, grid: ScanGrid, workers: int = 1) -> None:
+    def __init__(self, network: WaffleIron, grid: ScanGrid | None = None) -> None:
         super().__init__()
+        grid = grid or ScanGrid()
         if network.cells != grid.cells:
             raise ValueError(f"network has cells {network.cells}, but grid has {grid.cells}.")
         network.head = nn.Identity()
         self.network = network.requires_grad_(False)
         self.grid = grid
-        self.prepare = partial(_prepare_points, grid=grid, workers=workers)
+        self.prepare = partial(_prepare_points, grid=grid)
         self.dim = network.width
         self.settings: dict[str, Any] = {"weights": sha256(network), "version": 1}
         self.eval()
@@ -138,30 +136,17 @@ class ScaLR(TokenFeatures):
 
     Source: Puy et al., "Three Pillars Improving Vision Foundation Model Distillation for Lidar"
     (CVPR 2024); as used by R3DPA.
-
-    Args:
-        network: Trained network; its head is removed.
-        grid: Preparation of scans, as in its training. Default: that of the release.
-        workers: Threads of the neighbour search, -1 for all cores.
     """
 
     name = "scalr"
 
-    def __init__(
-        self, network: WaffleIron, grid: ScanGrid | None = None, *, workers: int = 1
-    ) -> None:
-        super().__init__(network, grid or ScanGrid(), workers)
-
     @classmethod
-    def from_checkpoint(
-        cls, path: str | Path, grid: ScanGrid | None = None, *, workers: int = 1
-    ) -> ScaLR:
+    def from_checkpoint(cls, path: str | Path, grid: ScanGrid | None = None) -> ScaLR:
         """Extractor with the weights of a ScaLR checkpoint, which determines width and depth.
 
         Args:
             path: ``ckpt_last.pth`` of the release.
             grid: Preparation of scans, as in its training. Default: that of the release.
-            workers: Threads of the neighbour search, -1 for all cores.
 
         Raises:
             ValueError: If the file cannot be read or does not hold this network, naming the file.
@@ -173,20 +158,15 @@ class ScaLR(TokenFeatures):
             load_official(network, weights)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return cls(network, grid, workers=workers)
+        return cls(network, grid)
+
+
+official_name = renamed(_OFFICIAL_NAMES)
 
 
 def load_official(network: WaffleIron, weights: Mapping[str, Tensor]) -> None:
     """Loads every key of an official state dict of WaffleIron into a network with a head."""
     load_strictly(network, weights, official_name)
-
-
-def official_name(key: str) -> str:
-    """Official name of a weight of :class:`WaffleIron`."""
-    for ours, official in _OFFICIAL_NAMES.items():
-        if match := re.match(rf"{ours}(?=\.|$)", key):
-            return official.format(*match.groups()) + key[match.end() :]
-    raise KeyError(key)
 
 
 def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
@@ -220,7 +200,6 @@ class WaffleIronS(TokenFeatures):
     Args:
         weights: File written by that training. Default: the one that comes with the package.
         dim: Width D of the features, at least that of the tokens (128 for those shipped).
-        workers: Threads of the neighbour search, -1 for all cores.
 
     Raises:
         ValueError: If the file cannot be read, or ``dim`` is below the width of the tokens.
@@ -232,9 +211,9 @@ class WaffleIronS(TokenFeatures):
 
     name = "waffleiron-s"
 
-    def __init__(self, weights: Path | None = None, dim: int = 768, workers: int = 1) -> None:
+    def __init__(self, weights: Path | None = None, dim: int = 768) -> None:
         state, network, grid = _read_weights(Path(weights) if weights else _SHIPPED)
-        super().__init__(network, grid, workers)
+        super().__init__(network, grid)
         if dim < network.width:
             raise ValueError(f"dim must be at least {network.width}, got {dim}.")
         self.dim = dim
@@ -336,5 +315,5 @@ def sha256(network: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def _prepare_points(points: Tensor, grid: ScanGrid, workers: int = 1) -> PreparedScan:
-    return prepare_scan(points.detach().cpu().numpy(), grid, workers=workers)
+def _prepare_points(points: Tensor, grid: ScanGrid) -> PreparedScan:
+    return prepare_scan(points.detach().cpu().numpy(), grid)

@@ -12,10 +12,9 @@ kernel, F channels of the features.
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -43,10 +42,6 @@ VOXEL_M = 0.05
 NO_INTENSITY = -1.0
 NUM_BINS = 16
 _RINGS_FROM_M, _RINGS_TO_M = 4.0, 56.0
-# Added at both ends of the circle, as in the official code: moves sector borders by 1e-4 at most.
-_SECTOR_MARGIN_RAD = 1e-4
-
-Pooling = Literal["rings", "sectors", "all"]
 
 
 def kernel_offsets(size: int) -> list[tuple[int, int, int]]:
@@ -304,47 +299,31 @@ def voxelize(
 
 
 def pool_voxels(
-    features: Tensor,
-    coordinates: Tensor,
-    num_clouds: int,
-    pooling: Pooling = "rings",
-    voxel_m: float = VOXEL_M,
+    features: Tensor, coordinates: Tensor, num_clouds: int, voxel_m: float = VOXEL_M
 ) -> Tensor:
-    """One feature per cloud: means over its voxels, in bins around the mean of its coordinates.
+    """One feature per cloud: means over its voxels in 16 rings around the mean of its coordinates.
 
-    ``rings``: 16 distances in space with borders at 0, 7.25, 10.5, ..., 56 m; voxels beyond are
-    left out. ``sectors``: 16 azimuths, counter-clockwise from behind. ``all``: a single bin. FSVD
-    and FPVD use rings.
+    Rings are distances in space with borders at 0, 7.25, 10.5, ..., 56 m; voxels beyond are left
+    out.
 
     Args:
         features: ``(N, F)``.
         coordinates: ``(N, 4)`` x, y, z in voxels, batch.
         num_clouds: B; a cloud without voxels gives zeros.
-        pooling: Kind of bins.
         voxel_m: Edge of a voxel in metres.
 
     Returns:
-        ``(B, bins * F)`` at least float32, bin after bin; zeros where a bin is empty.
+        ``(B, 16 * F)`` at least float32, ring after ring; zeros where a ring is empty.
     """
     features = at_least_float32(features)
     # In float64 the mean of whole numbers is exact: it does not depend on the order of the voxels.
     cloud, xyz = coordinates[:, 3].long(), coordinates[:, :3].double()
     centred = xyz - _means(xyz, cloud, num_clouds)[cloud]
-    if pooling == "rings":
-        edges = torch.linspace(_RINGS_FROM_M, _RINGS_TO_M, NUM_BINS + 1).to(xyz)
-        edges[0] = 0
-        values = centred.norm(dim=1) * voxel_m
-    elif pooling == "sectors":
-        end = math.pi + _SECTOR_MARGIN_RAD
-        edges = torch.linspace(-end, end, NUM_BINS + 1).to(xyz)
-        values = torch.atan2(centred[:, 1], centred[:, 0])
-    elif pooling == "all":
-        return _means(features, cloud, num_clouds).to(features)
-    else:
-        raise ValueError(f"pooling must be rings, sectors or all, got {pooling!r}.")
-    bins = torch.bucketize(values, edges, right=True) - 1
-    inside = bins < NUM_BINS
-    place = cloud[inside] * NUM_BINS + bins[inside]
+    edges = torch.linspace(_RINGS_FROM_M, _RINGS_TO_M, NUM_BINS + 1).to(xyz)
+    edges[0] = 0
+    rings = torch.bucketize(centred.norm(dim=1) * voxel_m, edges, right=True) - 1
+    inside = rings < NUM_BINS
+    place = cloud[inside] * NUM_BINS + rings[inside]
     means = _means(features[inside], place, num_clouds * NUM_BINS).to(features)
     return means.reshape(num_clouds, -1)
 

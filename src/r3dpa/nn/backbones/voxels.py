@@ -117,9 +117,7 @@ class PointCloudBatch(NamedTuple):
         return type(self)(*(values.to(device, non_blocking=True) for values in self))
 
 
-def prepare_scan(
-    points: np.ndarray, grid: ScanGrid | None = None, *, workers: int = 1
-) -> PreparedScan:
+def prepare_scan(points: np.ndarray, grid: ScanGrid | None = None) -> PreparedScan:
     """Thinned, cropped and indexed scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
@@ -133,7 +131,6 @@ def prepare_scan(
     Args:
         points: ``(P, 4)`` x, y, z in metres, intensity 0..1, finite.
         grid: Settings. Default: those of ScaLR.
-        workers: Threads of the neighbour search, -1 for all cores.
     """
     grid = grid or ScanGrid()
     points = np.asarray(points, dtype=np.float32)
@@ -158,9 +155,9 @@ def prepare_scan(
 
     tree = cKDTree(xyz)
     nearest = np.arange(1, min(grid.num_neighbors + 1, max(len(xyz), 1)) + 1)
-    _, neighbors = tree.query(xyz, k=nearest, workers=workers)
+    _, neighbors = tree.query(xyz, k=nearest)
     neighbors = np.pad(neighbors, ((0, 0), (0, grid.num_neighbors + 1 - len(nearest))), mode="edge")
-    _, upsample = tree.query(points[:, :3], workers=workers)
+    _, upsample = tree.query(points[:, :3])
     return PreparedScan(
         features=torch.from_numpy(np.column_stack([intensity, xyz, radius])),
         neighbors=torch.from_numpy(neighbors[:, 1:].astype(np.int64)),
