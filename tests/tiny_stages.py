@@ -109,7 +109,21 @@ STAGES = {
 }
 
 
-def stage_module(stage, **kwargs):
+def tiny_sit():
+    return SiT(
+        input_size=(4, 8),
+        in_channels=4,
+        hidden_size=8,
+        depth=2,
+        num_heads=2,
+        alignment_depth=1,
+        feature_dim=FEATURE_DIM,
+        projector_dim=8,
+    )
+
+
+def stage_module(stage, sit=tiny_sit, **kwargs):
+    """A stage with networks for :class:`TinyData`: latents of 4 x 8, grids of 2 x 4."""
     torch.manual_seed(0)
     networks = {
         "vae": VAE(
@@ -119,16 +133,7 @@ def stage_module(stage, **kwargs):
             strides=((2, 2),),
             num_res_blocks=1,
         ),
-        "sit": SiT(
-            input_size=(4, 8),
-            in_channels=4,
-            hidden_size=8,
-            depth=2,
-            num_heads=2,
-            alignment_depth=1,
-            feature_dim=FEATURE_DIM,
-            projector_dim=8,
-        ),
+        "sit": sit(),
     }
     if stage != "flow_matching":
         networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 import yaml
-from tiny_stages import FEATURE_DIM, QUIET, STAGES, TinyData, train
-from torch import nn
+from tiny_stages import FEATURE_DIM, QUIET, stage_module, train
 
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.modules import LossWeights
-from r3dpa.nn import VAE, PatchDiscriminator, UNet
+from r3dpa.nn import UNet
 
 pytestmark = QUIET
 # In place of the SiT of conf/smoke.yaml: the same latents, grid and features.
@@ -27,35 +26,16 @@ SMOKE = {
 }
 
 
-def module_of(stage, **weights):
-    """A stage on the data of test_gradients: latents of 4 x 8, grids of 2 x 4."""
-    torch.manual_seed(0)
-    networks = {
-        "vae": VAE(
-            latent_channels=4,
-            channels=32,
-            channel_multipliers=(1, 1),
-            strides=((2, 2),),
-            num_res_blocks=1,
-        ),
-        "sit": UNet(
-            input_size=(4, 8),
-            in_channels=4,
-            channels=32,
-            channel_multipliers=(1, 2),
-            num_res_blocks=1,
-            feature_dim=FEATURE_DIM,
-            projector_dim=8,
-        ),
-    }
-    if stage != "flow_matching":
-        networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)
-    for parameter in networks["sit"].parameters():
-        if not parameter.any():
-            nn.init.normal_(parameter, std=0.1)
-    module = STAGES[stage](**networks, weights=LossWeights(**weights))
-    module.separates_losses = True
-    return module
+def tiny_unet():
+    return UNet(
+        input_size=(4, 8),
+        in_channels=4,
+        channels=32,
+        channel_multipliers=(1, 2),
+        num_res_blocks=1,
+        feature_dim=FEATURE_DIM,
+        projector_dim=8,
+    )
 
 
 VAE_PARTS = {"vae.encoder", "vae.quant_conv"}
@@ -76,8 +56,9 @@ REACH = {
 
 @pytest.mark.parametrize("stage", REACH)
 def test_each_loss_reaches_exactly_its_part_of_the_unet(stage):
-    module = train(module_of(stage), TinyData())
-    (reached,) = module.reached
+    module = stage_module(stage, tiny_unet, weights=LossWeights())
+    module.separates_losses = True
+    (reached,) = train(module).reached
     for part, expected in REACH[stage].items():
         assert {".".join(name.split(".")[:2]) for name in reached[part]} == expected, part
     trained = {name for name, p in module.sit.named_parameters() if p.requires_grad}

@@ -62,7 +62,6 @@ class GenerativeModule(L.LightningModule):
             random values.
         keep_projector: Keep the RGB model's projection head where its shape fits.
         seed: Key of the training draws.
-        guards: Ignored; given by configurations and checkpoints of earlier versions.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
         compile: Compile the networks for training with ``torch.compile``: VAE, discriminator and
@@ -91,7 +90,6 @@ class GenerativeModule(L.LightningModule):
         rgb_weights: str | None = None,
         keep_projector: bool = False,
         seed: int = 0,
-        guards: Any = None,
         channels_last: bool = False,
         compile: bool = False,
     ) -> None:

@@ -30,8 +30,6 @@ def encoded_once(
     items: Sequence[Item],
     dataset_of: Callable[[Sequence[Item]], Dataset[Any]],
     image: str,
-    *,
-    shared: bool,
 ) -> CachedTensors[Item]:
     """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
 
@@ -44,10 +42,9 @@ def encoded_once(
         root: Folder of caches.
         settings: What else the moments depend on, as JSON values.
         shape: ``(2C, h, w)``.
-        items: Scans or images, in any order.
+        items: Scans or images, the same in all processes, which share the work.
         dataset_of: Dataset of some items, whose samples hold their ``index`` and an image.
         image: Name of the image in a sample, ``(C', H, W)``.
-        shared: Whether all processes ask for the same items, so that they can share the work.
 
     Raises:
         StoreError: If the cache cannot be written or is damaged, or moments are not finite.
@@ -56,16 +53,13 @@ def encoded_once(
     datamodule = cast(Any, trainer).datamodule
     about = {**settings, "vae": weights_sha256(vae.state_dict())}
     cache = TensorCache(root, "posterior", about, shape)
-    own = missing = cache.missing(items)
+    missing = cache.missing(items)
     trainer.strategy.barrier("cached latents: all have looked")
-    if shared:
-        # Where each node has a disk of its own, its processes encode everything.
-        place, processes = (
-            (trainer.local_rank, trainer.num_devices)
-            if datamodule.prepare_data_per_node
-            else (trainer.global_rank, trainer.world_size)
-        )
-        own = missing[place::processes]
+    # Where each node has a disk of its own, its processes encode everything.
+    if datamodule.prepare_data_per_node:
+        own = missing[trainer.local_rank :: trainer.num_devices]
+    else:
+        own = missing[trainer.global_rank :: trainer.world_size]
     if own:
         rank_zero_info(f"encoding {len(missing)} of {len(items)} once, into {cache.folder}")
         loader = DataLoader(

@@ -88,9 +88,12 @@ class FlowMatching(GenerativeModule):
             self.augmentation.check_latents(self.sit.input_size[1], self._datamodule.grid_size[1])
 
     def on_fit_start(self) -> None:
-        """Loads the VAE, and encodes the training scans that are not encoded yet."""
+        """Loads the VAE, and encodes the training scans that are not encoded yet.
+
+        A ``fast_dev_run`` encodes its few scans in each step.
+        """
         super().on_fit_start()
-        if self.cache_latents:
+        if self.cache_latents and not cast(Any, self.trainer).fast_dev_run:
             self._datamodule.use_posteriors(self._cached_posteriors())
 
     @property
@@ -107,26 +110,10 @@ class FlowMatching(GenerativeModule):
             Path(self.trainer.default_root_dir) / "latents",
             {"projection": geometry["projection"], "codec": geometry["codec"]},
             (2 * self.vae.latent_channels, *self.sit.input_size),
-            self._scans_of_this_run(dataset),
+            dataset.scans,
             lambda scans: LidarDataset(scans, dataset.projection, dataset.codec),
             "range_image",
-            shared=not self._trial_batches,
         )
-
-    @property
-    def _trial_batches(self) -> int:
-        """Batches of a ``fast_dev_run``, 0 for a training."""
-        return int(cast(Any, self.trainer).fast_dev_run)
-
-    def _scans_of_this_run(self, dataset: LidarDataset) -> list[Scan]:
-        """All training scans; of ``fast_dev_run`` those that this process will ask for."""
-        num_batches = self._trial_batches
-        if not num_batches or self.trainer.ckpt_path:  # a resumed run starts anywhere
-            return dataset.scans
-        loader = self._datamodule.train_dataloader()
-        indices = list(loader.sampler)[: num_batches * self._datamodule.batch_size]
-        # With augmentation the epoch comes with the index.
-        return [dataset.scans[one[-1] if isinstance(one, tuple) else one] for one in indices]
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""

@@ -29,7 +29,6 @@ class ImageVAETraining(L.LightningModule):
         weights: Loss weights; those of reconstruction and KL count.
         optimizer: Optimiser settings.
         seed: Key of the training draws.
-        guards: Ignored; given by configurations and checkpoints of earlier versions.
     """
 
     stage = "image_vae"
@@ -41,7 +40,6 @@ class ImageVAETraining(L.LightningModule):
         weights: LossWeights = LossWeights(),
         optimizer: OptimizerConfig = OptimizerConfig(),
         seed: int = 0,
-        guards: Any = None,
     ) -> None:
         super().__init__()
         with steps.networks_as_settings():

@@ -67,7 +67,6 @@ class RGBPretraining(L.LightningModule):
         latents_dir: Folder of the encoded images, which runs may share: 33 kB each at 4 x 32 x 32;
             ``<run_dir>/latents`` where None.
         seed: Key of the training draws.
-        guards: Ignored; given by configurations and checkpoints of earlier versions.
 
     Raises:
         ValueError: If networks, teacher and weights do not belong together.
@@ -89,7 +88,6 @@ class RGBPretraining(L.LightningModule):
         ema_buffers: Literal["copy", "decay"] = "copy",
         latents_dir: str | None = None,
         seed: int = 0,
-        guards: Any = None,
     ) -> None:
         super().__init__()
         with steps.networks_as_settings():
@@ -183,7 +181,6 @@ class RGBPretraining(L.LightningModule):
             entries,
             lambda some: ImageDataset(datamodule.source, some, datamodule.image_size),
             "image",
-            shared=True,
         )
 
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
