@@ -37,4 +37,5 @@ def tiny_file(tmp_path_factory):
     """Checkpoint of random weights for images of 16 x 64, without a training."""
     projection = SphericalProjection(LidarSensor(beams=16, columns=64))
     geometry = ScanGeometry(projection, RangeCodec(), (2, 8))
-    return tiny_checkpoint(tmp_path_factory.mktemp("tiny") / "tiny.safetensors", geometry, step=3)
+    path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
+    return tiny_checkpoint(path, geometry, step=3, feature_source="geometric")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_networks import SIT_ARGS
 
 from r3dpa.cli import main
 from r3dpa.cli.data import objects, view
@@ -152,31 +153,35 @@ def test_check_names_missing_folders(tmp_path, capsys):
 
 
 class TestObjects:
-    def test_writes_a_library_and_says_what_it_holds(self, simulated, tmp_path):
+    def test_writes_a_library_and_says_what_it_holds(self, simulated, tiny_file, tmp_path):
         out = tmp_path / "objects.safetensors"
-        text = objects(data=str(simulated), out=out, dim=32, device="cpu")
+        text = objects(data=str(simulated), ckpt=tiny_file, out=out, device="cpu")
         library = ObjectLibrary.load(out)
         assert {"road", "car"} <= set(library.names)
         assert library.source == GeometricFeatures.name
-        library.check_source("geometric", 32)
+        library.check_source("geometric", SIT_ARGS["feature_dim"])
         for name in library.names:
             assert name in text
         assert "4 scans" in text
         # What is found does not depend on what else is looked for.
-        objects(data=str(simulated), out=out, classes=["car"], dim=32, device="cpu")
+        objects(data=str(simulated), ckpt=tiny_file, out=out, classes=["car"], device="cpu")
         assert ObjectLibrary.load(out).feature("car").equal(library.feature("car"))
 
-    def test_what_cannot_be_made_leaves_no_file(self, simulated, tmp_path):
-        for arguments, message in (
-            ({"out": tmp_path / "objects.npz"}, r"\.safetensors file, got .*objects\.npz"),
-            ({"source": "none"}, "no feature source 'none'"),
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"out": Path("objects.npz")}, r"\.safetensors file, got .*objects\.npz"),
             ({"classes": ["tram"]}, "no class tram"),
             ({"limit": 0}, "limit must be at least 1, got 0"),
-            ({"grid_size": (7, 64)}, "does not divide"),
-        ):
-            given = {"out": tmp_path / "a.safetensors", "dim": 32, "device": "cpu"} | arguments
-            with pytest.raises(ValueError, match=message):
-                objects(data=str(simulated), **given)
+        ],
+    )
+    def test_what_cannot_be_made_leaves_no_file(
+        self, arguments, message, simulated, tiny_file, tmp_path
+    ):
+        out = tmp_path / "a.safetensors"
+        given = {"data": str(simulated), "ckpt": tiny_file, "out": out, "device": "cpu"}
+        with pytest.raises(ValueError, match=message):
+            objects(**given | arguments)
         assert not list(tmp_path.iterdir())
 
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.parser import check_folder
+from r3dpa.cli.options import check_folder
 
 __all__ = ["ablate"]
 

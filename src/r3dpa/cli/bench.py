@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.cli.options import check_file, check_folder
 
 __all__ = ["sampling", "training"]
 

@@ -1,24 +1,61 @@
-"""``r3dpa data``: checks and views of data sets, and mean features of object classes."""
+"""``r3dpa data``: simulated scans, checks and views, and mean features of object classes."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from r3dpa.cli.parser import check_file, check_folder, check_least
+from r3dpa.cli.options import check_file, check_folder, check_least
 
+if TYPE_CHECKING:  # read by jsonargparse for the options of the weather
+    from r3dpa.simulation import Weather
 MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
 if MYPY:
     from collections.abc import Callable
 
     from r3dpa import viz
-    from r3dpa.data.objects import ObjectLibrary
 
-__all__ = ["check", "objects", "view"]
+__all__ = ["check", "objects", "simulate", "view"]
+
+
+def simulate(
+    *,
+    out: Path,
+    scans: int = 100,
+    seed: int = 0,
+    workers: int = 1,
+    drives: list[str] | None = None,
+    sensor: str = "hdl64e",
+    return_mode: Literal["strongest", "dual"] = "strongest",
+    effects: dict[str, str | bool] | None = None,
+    weather: Weather | None = None,
+) -> Any:
+    """Write simulated scans in the KITTI-360 layout.
+
+    The same command completes an interrupted run. Prints what each effect did and cost;
+    ``report.json`` and, for each scan, ``sim/*.json`` keep what it did.
+
+    Args:
+        out: Root of the data set to write.
+        scans: Number of scans over all drives.
+        seed: Seed of streets and instrument.
+        workers: Processes; the bytes written do not depend on it.
+        drives: Four-digit drives to fill, such as ``0000 0003``; default: all official ones.
+        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
+            reads, for an HDL-64E.
+        return_mode: Strongest return of each shot, or the two strongest.
+        effects: ``auto``, ``on`` or ``off`` by effect, such as ``--effects.fog off``; default: an
+            effect runs where the scene calls for it.
+        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: random.
+    """
+    from r3dpa.simulation import load_sensor
+    from r3dpa.simulation import simulate as write
+
+    lidar = load_sensor(sensor, return_mode=return_mode)
+    return write(out, scans, seed, workers, drives, lidar, effects, weather)
 
 
 def check(path: Path) -> None:
@@ -101,14 +138,11 @@ def _readers(source: Path) -> list[Callable[[], viz.PageScan]]:
 def objects(
     *,
     data: str,
+    ckpt: Path,
     out: Path,
-    like: Path | None = None,
-    source: str = "geometric",
     features_ckpt: Path | None = None,
     classes: list[str] | None = None,
     limit: int = 200,
-    dim: int = 768,
-    grid_size: tuple[int, int] = (8, 64),
     device: str = "auto",
 ) -> str:
     """Write the mean feature of each class of labelled scans, for ``r3dpa edit inpaint``.
@@ -116,63 +150,43 @@ def objects(
     Args:
         data: Folder, file or glob of scans with labels beside them: of ``r3dpa simulate``,
             KITTI-360 or SemanticKITTI.
+        ckpt: Checkpoint of the model that the objects are for; gives feature source, its width,
+            sensor and grid.
         out: File to write, ``.safetensors``.
-        like: Checkpoint of a model that the objects are for; gives source, dim, sensor and
-            grid_size.
-        source: Feature source: ``geometric``, ``waffleiron-s`` or ``scalr``.
         features_ckpt: Weights of the feature source, if it has none of its own.
         classes: Names of classes; default: all in the scans.
         limit: Number of scans at most, evenly spread.
-        dim: Width of the features.
-        grid_size: Rows and columns of the cells.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     from tqdm import tqdm
 
     from r3dpa.checkpoints import read_checkpoint
-    from r3dpa.cli.edit_session import source_of
+    from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.data import find_scans
     from r3dpa.data.objects import object_library
     from r3dpa.data.scans import evenly
     from r3dpa.generation import SceneGenerator
-    from r3dpa.geometry import LidarSensor, SphericalProjection
-    from r3dpa.io import usable_device
+    from r3dpa.io import text_table, usable_device
     from r3dpa.nn.backbones import feature_source
 
     check_file(out)
     if out.suffix != ".safetensors":
         raise ValueError(f"the library is a .safetensors file, got {out}")
     check_least(1, limit=limit)
-    sensor = LidarSensor()
-    if like is not None:
-        generator = SceneGenerator.from_checkpoint(like, device="cpu")
-        source = source_of(read_checkpoint(like))
-        dim, grid_size = generator.sit.feature_dim, generator.sit.grid_size
-        sensor = generator.geometry.projection.sensor
+    source = feature_source_of(read_checkpoint(ckpt))
+    generator = SceneGenerator.from_checkpoint(ckpt, device="cpu")
+    projection, sit = generator.geometry.projection, generator.sit
+    extractor: Any = feature_source(source, features_ckpt, sit.feature_dim)
+    extractor = extractor.to(usable_device(device))
     scans = evenly(find_scans(data), limit)
-    extractor: Any = feature_source(source, features_ckpt, dim).to(usable_device(device))
     shown = tqdm(scans, unit="scan", desc="objects", disable=None)
-    projection = SphericalProjection(sensor)
-    library = object_library(iter(shown), extractor, projection, grid_size, classes)
+    library = object_library(iter(shown), extractor, projection, sit.grid_size, classes)
     library.save(out)
-    return f"{_table(library)}\n\n{len(scans)} scans, features of {source}, written to {out}"
-
-
-def _table(library: ObjectLibrary) -> str:
-    """Classes with their counts, and the nearest other class of each."""
-    import torch.nn.functional as F
-
-    from r3dpa.io import text_table
-
-    directions = F.normalize(library.features, dim=1)
-    cosines = (directions @ directions.T).fill_diagonal_(-1)
-    rows: list[Sequence[Any]] = []
-    for index, entry in enumerate(library.classes):
-        other = int(cosines[index].argmax())
-        nearest = f"{library.names[other]} ({cosines[index, other]:.2f})"
+    rows = []
+    for entry in library.classes:
         counts = entry.num_scans, entry.num_cells, entry.num_points
-        alone = len(library.names) == 1
-        rows.append([entry.name, *counts, f"{entry.spread:.3f}", "-" if alone else nearest])
-    head = ["class", "scans", "cells", "points", "spread", "nearest class (cosine)"]
-    table = text_table(rows, head, "rrrrrr", "plain")
-    return f"{table}\n\nSpread: mean of 1 - cosine between the class's feature and its cells."
+        rows.append([entry.name, *map(str, counts), f"{entry.spread:.3f}"])
+    head = ["class", "scans", "cells", "points", "spread"]
+    table = text_table(rows, head, "rrrrr", "plain")
+    spread = "Spread: mean of 1 - cosine between the class's feature and its cells."
+    return f"{table}\n{spread}\n{len(scans)} scans, features of {source}, written to {out}"

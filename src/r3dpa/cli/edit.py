@@ -2,45 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-__all__ = ["EditJob", "complete", "inpaint", "interpolate", "mix", "vary"]
+from r3dpa.cli.options import EditOptions
 
-
-@dataclass(frozen=True, kw_only=True)
-class EditJob:
-    """Options of all edits.
-
-    Args:
-        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
-        out: Folder for scenes, pictures, page, mask and metadata; must not hold other scenes.
-        seed: Scene i depends on (seed, i) alone, not on the batch size.
-        solver: ODE solver, to noise and back; ``midpoint`` loses least on that way.
-        steps: Solver steps of a whole way.
-        shift: Finer steps near noise (above 1) or data (below 1).
-        batch_size: Scenes made together.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        weights: Averaged (``ema``) or last weights of the SiT.
-        formats: Files of points: ``bin``, ``ply``, ``npz``.
-        pictures: Number of scenes to draw.
-        overwrite: Write into a folder that holds scenes already.
-    """
-
-    ckpt: Path
-    out: Path
-    seed: int = 0
-    solver: Literal["midpoint", "heun", "euler", "ab2", "ab3", "dpmpp_2m", "unipc"] = "midpoint"
-    steps: int = 32
-    shift: float = 1.0
-    batch_size: int = 8
-    device: str = "auto"
-    weights: Literal["ema", "last"] = "ema"
-    formats: tuple[str, ...] = ("bin",)
-    pictures: int = 8
-    overwrite: bool = False
+__all__ = ["complete", "inpaint", "interpolate", "mix", "vary"]
 
 
 def inpaint(
@@ -51,10 +19,6 @@ def inpaint(
     mask: Path | None = None,
     objects: Path | None = None,
     object: str | None = None,
-    features_from: Path | None = None,
-    label: str | None = None,
-    features_box3d: tuple[float, float, float, float, float, float, float] | None = None,
-    features_ckpt: Path | None = None,
     strength: float | None = None,
     window: tuple[float, float] | None = None,
     start: float = 1.0,
@@ -65,8 +29,7 @@ def inpaint(
     """Generate a part of a scan anew, as an object if one is named.
 
     The part is one of --box, --box3d and --mask; pixels outside it stay those of the scan. The
-    object is a class of a library (--objects FILE --object car) or a part of another scan
-    (--features_from SCAN with --label or --features_box3d); without either the edit is unguided.
+    object is a class of a library (--objects FILE --object car); without one the edit is unguided.
     Azimuth 0 looks forward and grows to the left; 180 is behind.
 
     Args:
@@ -74,36 +37,27 @@ def inpaint(
         box: Azimuth from and to (leftwards), inclination from and to: degrees, ``-10 10 -20 0``.
         box3d: Centre x y z, length, width, height (metres, frame of the sensor), yaw (degrees).
         mask: Picture of H x W pixels as the range image, bright where it is to change.
-        objects: File of ``r3dpa objects``, made with the feature source of the checkpoint.
+        objects: File of ``r3dpa data objects``, made with the feature source of the checkpoint.
         object: Class of that file.
-        features_from: Scan that shows the object.
-        label: Class of its points, from the labels beside the scan.
-        features_box3d: Box around its points, as ``box3d``.
-        features_ckpt: Weights of the feature source, if it has none of its own.
         strength: Guidance in velocities, 0 to 1; default: 0.5.
         window: First and last guided time; 0 data, 1 noise; default: all.
         start: First time of the edit; below 1 keeps some of the original part.
         dilation: Rings of tokens around the part to generate too; pixels outside are restored.
         num: Number of results, one per seed index.
-        **options: See :class:`EditJob`.
+        **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession, Parts
     from r3dpa.data.objects import ObjectLibrary
     from r3dpa.geometry import regions
 
-    guided = objects is not None or features_from is not None
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
     if (objects is None) != (object is None):
         raise ValueError("--objects FILE and --object NAME go together; `r3dpa objects` writes one")
-    if objects is not None and features_from is not None:
-        raise ValueError("give --object or --features_from, not both")
-    if (label is not None) + (features_box3d is not None) != (features_from is not None):
-        raise ValueError("--features_from needs one of --label and --features_box3d")
-    if not guided and (strength, window) != (None, None):
-        raise ValueError("--strength and --window need --object or --features_from")
-    session = EditSession(EditJob(**options), num, strength, window)
+    if objects is None and (strength, window) != (None, None):
+        raise ValueError("--strength and --window need --object")
+    session = EditSession(EditOptions(**options), num, strength, window)
     source = session.read(scan)
     if mask is not None:
         region = session.read_mask(mask)
@@ -114,16 +68,13 @@ def inpaint(
     feature = None
     if objects is not None and object is not None:
         library = ObjectLibrary.load(objects)
-        library.check_source(session.feature_name, session.feature_dim)
+        library.check_source(session.feature_source, session.feature_dim)
         feature = library.feature(object)
-    elif features_from is not None and label is not None:
-        feature = session.feature_of_class(features_from, label, features_ckpt)
-    elif features_from is not None and features_box3d is not None:
-        feature = session.feature_in_box(features_from, features_box3d, features_ckpt)
-    run = partial(session.editor.inpaint, source.range_m, region, num, session.job.seed)
+    run = partial(session.editor.inpaint, source.range_m, region, num, session.options.seed)
     run = partial(run, feature=feature, start=start, dilation=dilation)
-    parts = Parts(region, ("kept", object or label or "generated anew"))
-    return session.write("inpaint", arguments, {f"scan {scan.stem}": source}, run, parts, guided)
+    parts = Parts(region, ("kept", object or "generated anew"))
+    scans = {f"scan {scan.stem}": source}
+    return session.write("inpaint", arguments, scans, run, parts, feature is not None)
 
 
 def mix(
@@ -133,7 +84,6 @@ def mix(
     split: float = 0.0,
     blend: float = 20.0,
     layout: list[str] | None = None,
-    mask: Path | None = None,
     features_ckpt: Path | None = None,
     strength: float = 0.5,
     window: tuple[float, float] = (0.0, 1.0),
@@ -151,57 +101,40 @@ def mix(
         split: Azimuth in degrees where the left half starts; it ends half a turn further.
         blend: Width of the seams in degrees.
         layout: Start of each sector and its scan, not two scans: ``0 a.bin 120 b.bin 240 c.bin``.
-        mask: Instead of split and blend: picture of H x W pixels, bright where right is followed.
         features_ckpt: Weights of the feature source, if it has none of its own.
         strength: Guidance in velocities, 0 to 1.
         window: First and last guided time; 0 data, 1 noise.
         num: Number of results, one per seed index.
-        **options: See :class:`EditJob`.
+        **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    import torch
-    import torch.nn.functional as F
-
     from r3dpa.cli.edit_session import EditSession, Parts
     from r3dpa.geometry.regions import mask_of_tokens, sector_weights
 
     if (left is None) != (right is None) or (left is None) == (layout is None):
         raise ValueError("give --left and --right, or a --layout of sectors and scans")
-    if mask is not None and layout is not None:
-        raise ValueError("--mask separates --left from --right; drop it or --layout")
-    if left is not None and right is not None:
-        sectors = [(split, left), (split + 180, right)]
-    else:
-        sectors = _sectors(layout or [])
+    words = layout or [str(split), str(left), str(split + 180), str(right)]
+    try:
+        sectors = [
+            (float(azimuth), Path(path))
+            for azimuth, path in zip(words[::2], words[1::2], strict=True)
+        ]
+    except ValueError as error:
+        raise ValueError(
+            f"--layout {' '.join(words)}: give pairs of azimuth and scan, such as 0 a.bin 120 b.bin"
+        ) from error
     paths = list(dict.fromkeys(path for _, path in sectors))
     if len(paths) < 2:
         raise ValueError(f"there is nothing to mix: give two scans or more, got {paths}")
-    session = EditSession(EditJob(**options), num, strength, window)
-    grid_size, sensor = session.grid_size, session.sensor
-    if mask is not None:
-        share = session.read_mask(mask).float()[None, None]
-        right_share = F.avg_pool2d(share, sensor.cell_size(grid_size)).flatten()
-        weights = torch.stack([1 - right_share, right_share])
-    else:
-        numbered = [(azimuth, paths.index(path)) for azimuth, path in sectors]
-        weights = sector_weights(numbered, grid_size, blend)
+    session = EditSession(EditOptions(**options), num, strength, window)
     scans = {f"{number}: {path.stem}": session.read(path) for number, path in enumerate(paths)}
-    extractor = session.extractor(features_ckpt)
-    grids = [session.grid(scan, extractor) for scan in scans.values()]
-    numbers = mask_of_tokens(weights.argmax(dim=0), grid_size, (sensor.beams, sensor.columns))
-    run = partial(session.editor.mix, grids, weights, num, session.job.seed)
+    grids = session.feature_grids(scans.values(), features_ckpt)
+    numbered = [(azimuth, paths.index(path)) for azimuth, path in sectors]
+    weights = sector_weights(numbered, session.grid_size, blend)
+    size = session.sensor.beams, session.sensor.columns
+    numbers = mask_of_tokens(weights.argmax(dim=0), session.grid_size, size)
+    run = partial(session.editor.mix, grids, weights, num, session.options.seed)
     return session.write("mix", arguments, scans, run, Parts(numbers, list(scans)), guided=True)
-
-
-def _sectors(layout: list[str]) -> list[tuple[float, Path]]:
-    """Pairs of azimuth and scan from the words of ``--layout``."""
-    try:
-        return [(float(a), Path(path)) for a, path in zip(layout[::2], layout[1::2], strict=True)]
-    except ValueError as error:
-        raise ValueError(
-            f"--layout {' '.join(layout)}: give pairs of azimuth and scan, such as 0 a.bin 120 "
-            "b.bin"
-        ) from error
 
 
 def complete(
@@ -209,7 +142,6 @@ def complete(
     scan: Path,
     sector: tuple[float, float] | None = None,
     keep_every: int | None = None,
-    beams: list[int] | None = None,
     empty_beams: bool = False,
     other_sensor: tuple[int, float, float] | None = None,
     mask: Path | None = None,
@@ -226,13 +158,12 @@ def complete(
         scan: Scan to complete: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         sector: Azimuth from and to, counted to the left, degrees.
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
-        beams: Rows of the range image to keep, such as ``0 4 8``.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
         other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
-        **options: See :class:`EditJob`.
+        **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
     from dataclasses import replace
@@ -242,7 +173,7 @@ def complete(
     from r3dpa.cli.edit_session import EditSession, Parts, held_out_errors
     from r3dpa.geometry import SphericalProjection, regions
 
-    session = EditSession(EditJob(**options), num)
+    session = EditSession(EditOptions(**options), num)
     projection, rows = session.projection, session.sensor.beams
     masks = []
     if sector is not None:
@@ -254,8 +185,6 @@ def complete(
                 f"remain; got {keep_every}"
             )
         masks.append(regions.dropped_beams(projection, range(0, rows, keep_every)))
-    if beams is not None:
-        masks.append(regions.dropped_beams(projection, beams))
     if other_sensor is not None:
         count, low, high = other_sensor
         sensor = replace(
@@ -270,13 +199,13 @@ def complete(
         masks.append(empty.expand_as(source.range_m))
     if not masks:
         raise ValueError(
-            "nothing is missing: give --sector, --keep_every, --beams, --empty_beams, "
-            "--other_sensor or --mask"
+            "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
+            "--mask"
         )
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
-    run = partial(session.editor.complete, source.range_m, missing, num, session.job.seed)
+    run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
     return session.write(
         "complete",
         arguments,
@@ -294,15 +223,15 @@ def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str
         scan: Scan to vary: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         start: Time of the noise, in (0, 1]; larger values differ more from the scan.
         num: Number of results, one per seed index.
-        **options: See :class:`EditJob`.
+        **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
 
-    session = EditSession(EditJob(**options), num)
+    session = EditSession(EditOptions(**options), num)
     session.settings.times(start)
     source = session.read(scan)
-    run = partial(session.editor.vary, source.range_m, num, session.job.seed, start=start)
+    run = partial(session.editor.vary, source.range_m, num, session.options.seed, start=start)
     return session.write("vary", arguments, {f"scan {scan.stem}": source}, run)
 
 
@@ -313,14 +242,14 @@ def interpolate(*, left: Path, right: Path, frames: int = 8, **options: Any) -> 
         left: Scan of the first frame: ``.bin``, ``.ply``, or ``.npz`` of one scan.
         right: Scan of the last frame.
         frames: Number of scenes, both ends among them.
-        **options: See :class:`EditJob`.
+        **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
 
     if frames < 2:
         raise ValueError(f"frames must be at least 2, the two scans; got {frames}")
-    session = EditSession(EditJob(**options), frames)
+    session = EditSession(EditOptions(**options), frames)
     first, last = session.read(left), session.read(right)
     run = partial(session.editor.interpolate, first.range_m, last.range_m, frames)
     scans = {f"left: {left.stem}": first, f"right: {right.stem}": last}

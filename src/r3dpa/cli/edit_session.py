@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,12 +20,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from r3dpa import viz
-from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.cli.parser import check_folder, check_least
-from r3dpa.cli.scene_files import draw_scene, provenance, read_clouds
-from r3dpa.data import Extractor, PointSample, Scan, ScanError, pooled_grids
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.cli.options import EditOptions, check_least
+from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
+from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
-from r3dpa.data.objects import object_library
 from r3dpa.data.scans import out_of_range
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
@@ -36,10 +35,7 @@ from r3dpa.geometry.regions import check_mask
 from r3dpa.io import atomic_path, usable_device
 from r3dpa.nn.backbones import feature_source
 
-if TYPE_CHECKING:
-    from r3dpa.cli.edit import EditJob
-
-__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors", "source_of"]
+__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors"]
 
 _SHOWN = 8  # results on the sheet and the page
 
@@ -64,25 +60,23 @@ class EditSession:
 
     def __init__(
         self,
-        job: EditJob,
+        options: EditOptions,
         num: int,
         strength: float | None = None,
         window: tuple[float, float] | None = None,
     ) -> None:
         check_least(1, num=num)
-        check_least(0, seed=job.seed, pictures=job.pictures)
-        check_folder(job.out)
-        self.job, self.num = job, num
+        self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
-        self.settings = EditSettings(job.solver, job.steps, job.shift, strength, window)
-        self.device = usable_device(job.device)
-        self.checkpoint = read_checkpoint(job.ckpt)
+        self.settings = EditSettings(options.solver, options.steps, options.shift, strength, window)
+        self.device = usable_device(options.device)
+        self.checkpoint = read_checkpoint(options.ckpt)
         self.editor = SceneEditor.from_checkpoint(
             self.checkpoint,
             self.settings,
-            weights=job.weights,
+            weights=options.weights,
             device=self.device,
-            batch_size=job.batch_size,
+            batch_size=options.batch_size,
         )
         generator = self.editor.generator
         self.geometry, self.projection = generator.geometry, generator.geometry.projection
@@ -90,18 +84,16 @@ class EditSession:
         self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
 
     @property
-    def feature_name(self) -> str:
+    def feature_source(self) -> str:
         """Feature source of the checkpoint; ``ValueError`` if it has none."""
-        return source_of(self.checkpoint)
+        return feature_source_of(self.checkpoint)
 
     def read(self, path: Path, check: bool = True) -> ScanView:
         """A scan; with ``check``, one that fills the field of view."""
         clouds = read_clouds(path)
         if len(clouds) > 1:
-            raise ScanError(
-                f"{path}: holds {len(clouds)} scans ({', '.join(list(clouds)[:3])}); give a file "
-                "of one"
-            )
+            names = ", ".join(list(clouds)[:3])
+            raise ScanError(f"{path}: holds {len(clouds)} scans ({names}); give a file of one")
         (cloud,) = clouds.values()
         points = torch.zeros(len(cloud), 4)  # intensity 0 if the file has none
         points[:, : cloud.shape[1]] = torch.from_numpy(cloud.copy())
@@ -125,44 +117,17 @@ class EditSession:
         """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""
         return check_mask(read_mask(path, self.sensor), str(path))
 
-    def extractor(self, ckpt: Path | None) -> Extractor:
-        """The feature source that the checkpoint was aligned with."""
-        source: Any = feature_source(self.feature_name, ckpt, self.feature_dim)
-        return source.to(self.device)
-
-    def grid(self, scan: ScanView, extractor: Extractor) -> Tensor:
-        """Feature grid ``(N, F)`` of a scan, as ``r3dpa features`` writes it."""
-        file = Scan(scan.path.parent.name, scan.path.stem, scan.path)
-        prepared = extractor.prepare(scan.points)
-        sample = PointSample(file, file.cache_key, scan.points, prepared)
-        grids = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
-        return grids[self.grid_size][0].clone()
-
-    def feature_of_class(self, path: Path, label: str, ckpt: Path | None) -> Tensor:
-        """Mean feature ``(F,)`` of a class of one scan."""
-        scan = Scan(path.parent.name, path.stem, path)
-        extractor = self.extractor(ckpt)
-        library = object_library([scan], extractor, self.projection, self.grid_size, [label])
-        return library.feature(label)
-
-    def feature_in_box(self, path: Path, box: Sequence[float], ckpt: Path | None) -> Tensor:
-        """Mean feature ``(F,)`` of the points of a scan in a box: centre, size, yaw in degrees."""
-        if min(box[3:6]) <= 0:
-            raise ValueError(f"features_box3d needs a size above 0 on every axis, got {list(box)}")
-        points = self.read(path).points
-        x, y, z = (points[:, :3] - torch.tensor(box[:3])).unbind(1)
-        yaw = torch.tensor(box[6]).deg2rad()
-        along, across = x * yaw.cos() + y * yaw.sin(), y * yaw.cos() - x * yaw.sin()
-        distance = torch.stack([along, across, z], dim=1).abs()
-        inside = (distance <= torch.tensor(box[3:6]) / 2).all(dim=1)
-        inside &= in_range(points[:, :3], self.sensor)
-        if not inside.any():
-            raise ValueError(f"{path}: has no point in the box {list(box)}")
-        extractor = self.extractor(ckpt)
-        with torch.no_grad():
-            values = extractor.point_features([extractor.prepare(points)])[0]
-            mean = values[inside.to(values.device)].float().mean(dim=0, keepdim=True)
-            return getattr(extractor, "lift", torch.nn.Identity())(mean)[0].cpu()
+    def feature_grids(self, scans: Iterable[ScanView], ckpt: Path | None) -> list[Tensor]:
+        """Feature grid ``(N, F)`` of each scan, as ``r3dpa features`` writes them."""
+        extractor: Any = feature_source(self.feature_source, ckpt, self.feature_dim)
+        extractor = extractor.to(self.device)
+        grids = []
+        for path, points, _ in scans:
+            file = Scan(path.parent.name, path.stem, path)
+            sample = PointSample(file, file.cache_key, points, extractor.prepare(points))
+            found = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
+            grids.append(found[self.grid_size][0].clone())
+        return grids
 
     def write(
         self,
@@ -185,26 +150,26 @@ class EditSession:
             guided: Whether features guide it.
             measure: Errors of results ``(B, H, W)`` by method, where the scan was held out.
         """
-        job, settings = self.job, asdict(self.settings)
+        options, settings = self.options, asdict(self.settings)
         if not guided:
             del settings["strength"], settings["window"]
         own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
-        request = provenance(self.checkpoint, job.ckpt, self.geometry) | own
+        request = provenance(self.checkpoint, options.ckpt, self.geometry) | own
         request |= {
             "command": command,
             "scans": {name: scan.path for name, scan in scans.items()},
             "guided": guided,
-            "weights": job.weights,
+            "weights": options.weights,
             "num": self.num,
-            "seed": job.seed,
+            "seed": options.seed,
             "settings": settings,
             "device": self.device,
-            "batch_size": job.batch_size,
-            "formats": job.formats,
+            "batch_size": options.batch_size,
+            "formats": options.formats,
         }
         request = json.loads(json.dumps(request, default=str))  # paths as text
         with SceneWriter(
-            job.out, self.num, self.projection, job.formats, request, job.overwrite
+            options.out, self.num, self.projection, options.formats, request, options.overwrite
         ) as writer:
             seconds = -time.perf_counter()
             with self._progress(command):
@@ -213,23 +178,24 @@ class EditSession:
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
             self._show(command, scans, result.range_m, parts)
-            figures = {
+            figures: dict[str, Any] = {
                 "nfe": result.nfe,
                 "seconds": seconds,
                 "cosine": None if result.cosine is None else result.cosine.tolist(),
                 "vae_error_m": result.vae_error_m,
                 "round_trip_m": result.round_trip_m,
             }
-            held_out = measure(result.range_m) if measure else {}
-            writer.finish(request | figures | ({"held_out": held_out} if held_out else {}))
-        return _summary(command, job.out, result, seconds, held_out)
+            if held_out := measure(result.range_m) if measure else {}:
+                figures["held_out"] = held_out
+            writer.finish(request | figures)
+        return _summary(command, options.out, result, seconds, held_out)
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
         """Bar of network evaluations of whole batches; the total is that of a full way and back."""
-        steps = evaluations(self.job.solver, self.job.steps)
-        batches = math.ceil(self.num / self.job.batch_size)
-        total = self.num * self.job.steps if command == "complete" else steps * (batches + 1)
+        steps = evaluations(self.options.solver, self.options.steps)
+        batches = math.ceil(self.num / self.options.batch_size)
+        total = self.num * self.options.steps if command == "complete" else steps * (batches + 1)
         first = next(self.editor.generator.sit.children())  # called once in each evaluation
         with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
 
@@ -243,12 +209,12 @@ class EditSession:
         self, command: str, scans: Mapping[str, ScanView], made: Tensor, parts: Parts | None
     ) -> None:
         """Pictures of each scene, the sheet, the page, the mask and the scans before the edit."""
-        out = self.job.out
+        out = self.options.out
         before = {name: scan.range_m for name, scan in scans.items()}
         images = torch.stack(list(before.values()))
         with atomic_path(out / "before.npy") as temporary, temporary.open("wb") as file:
             np.save(file, images.numpy())
-        for index, range_m in enumerate(made[: self.job.pictures]):
+        for index, range_m in enumerate(made[: self.options.pictures]):
             draw_scene(out, index, range_m, self.geometry)
         after = {f"{command} {index}": image for index, image in enumerate(made[:_SHOWN])}
         rows = [viz.EditRow(name, image) for name, image in before.items()]
@@ -288,16 +254,6 @@ def _summary(
     return "\n".join([*lines, f"open {out / 'edit.png'} and {out / 'edit.html'}"])
 
 
-def source_of(checkpoint: Checkpoint) -> str:
-    """Feature source of a checkpoint; ``ValueError`` if it was trained without."""
-    if checkpoint.feature_source is None:
-        raise ValueError(
-            f"{checkpoint.path} was trained without 3D features, so that none can guide it; give a "
-            "checkpoint of a run with an extractor"
-        )
-    return checkpoint.feature_source
-
-
 def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
     """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
 
@@ -310,9 +266,9 @@ def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str,
         "nearest": filled(range_m, missing, "nearest")[None],
         "linear": filled(range_m, missing, "linear")[None],
     }
-    common = missing
+    common = missing.clone()
     for images in methods.values():
-        common = common & (images > 0).all(dim=0)
+        common &= (images > 0).all(dim=0)
     errors = {}
     for name, images in methods.items():
         same = ((images > 0) == (range_m > 0))[:, missing]

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.parser import check_file, check_folder, check_least
+from r3dpa.cli.options import check_file, check_folder, check_least
 
 MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
 if MYPY:

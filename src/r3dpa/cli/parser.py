@@ -8,21 +8,12 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from inspect import cleandoc
-from pathlib import Path
 from types import UnionType
 from typing import Any, NoReturn, Union, get_args, get_origin
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
-__all__ = [
-    "OneLineErrors",
-    "Parser",
-    "check_file",
-    "check_folder",
-    "check_least",
-    "load",
-    "run_function",
-]
+__all__ = ["OneLineErrors", "Parser", "function_parser", "load", "run_function"]
 
 # jsonargparse denies os.system and its like already when a YAML file names them.
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
@@ -134,25 +125,3 @@ def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) 
         raise
     arguments.pop("config", None)
     return function(**arguments)
-
-
-def check_least(least: int, **values: int | None) -> None:
-    """Refuses a number below ``least``; None is none."""
-    for name, value in values.items():
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}")
-
-
-def check_folder(out: Path | None) -> None:
-    """Refuses an output folder whose place is taken by a file, before the work starts."""
-    for folder in () if out is None else (out, *out.parents):
-        if folder.exists() and not folder.is_dir():
-            raise ValueError(f"{folder} is a file; give another --out")
-
-
-def check_file(out: Path | None) -> None:
-    """Refuses an output file whose place is taken by a folder, before the work starts."""
-    if out is not None:
-        if out.is_dir():
-            raise ValueError(f"{out} is a folder; give --out the name of a file")
-        check_folder(out.parent)

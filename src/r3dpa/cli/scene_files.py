@@ -27,8 +27,8 @@ from r3dpa.io import atomic_path, source_commit
 from r3dpa.simulation import Origin, Semantic
 
 __all__ = [
-    *("draw_all", "draw_scene", "generate_all", "provenance", "read_clouds", "write_page"),
-    "written",
+    *("draw_all", "draw_scene", "feature_source_of", "generate_all", "provenance"),
+    *("read_clouds", "write_page", "written"),
 ]
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
@@ -73,6 +73,16 @@ def written(path: Path) -> str:
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
 
 
+def feature_source_of(checkpoint: Checkpoint) -> str:
+    """Feature source of a checkpoint; ``ValueError`` if it was trained without."""
+    if checkpoint.feature_source is None:
+        raise ValueError(
+            f"{checkpoint.path} was trained without 3D features, so that none can guide it; give a "
+            "checkpoint of a run with an extractor"
+        )
+    return checkpoint.feature_source
+
+
 def provenance(checkpoint: Checkpoint, path: Path, geometry: ScanGeometry) -> dict[str, Any]:
     """Checkpoint, geometry and versions, as the metadata of scenes holds them."""
     return {
@@ -92,17 +102,14 @@ def provenance(checkpoint: Checkpoint, path: Path, geometry: ScanGeometry) -> di
 def generate_all(
     generator: SceneGenerator, writer: SceneWriter, batch_size: int, seed: int
 ) -> dict[str, Any]:
-    """Generates and writes the missing scenes; returns evaluations and times."""
-    first_index, times = writer.num_done, []
-    start = time.perf_counter()
+    """Generates and writes the missing scenes; returns evaluations and time."""
+    first_index, start = writer.num_done, time.perf_counter()
     with tqdm(
         total=writer.num, initial=first_index, unit="scene", desc="sampling", disable=None
     ) as progress:
         for first in range(first_index, writer.num, batch_size):
             indices = range(first, min(first + batch_size, writer.num))
-            before = _mark(generator.device)
             batch = generator.generate(indices, seed)
-            times.append((before, _mark(generator.device)))
             writer.put(batch.range_m, batch.nfe)
             progress.update(len(indices))
     writer.close()
@@ -111,27 +118,9 @@ def generate_all(
     return {
         "nfe": int(nfe) if nfe.is_integer() else nfe,
         "drawn_by_last_run": drawn,
-        "device_seconds_per_scene": sum(map(_seconds, times)) / drawn if drawn else None,
         "seconds_per_scene": elapsed / drawn if drawn else None,
         "threads": torch.get_num_threads(),
     }
-
-
-def _mark(device: torch.device) -> float | torch.cuda.Event:
-    """Now; on a GPU as an event of its stream, without a synchronisation."""
-    if device.type != "cuda":
-        return time.perf_counter()
-    event = torch.cuda.Event(enable_timing=True)
-    event.record()
-    return event
-
-
-def _seconds(marks: tuple[Any, Any]) -> float:
-    before, after = marks
-    if isinstance(before, float):
-        return after - before
-    after.synchronize()
-    return before.elapsed_time(after) / 1000
 
 
 def draw_scene(out: Path, index: int, range_m: Tensor, geometry: ScanGeometry) -> None:

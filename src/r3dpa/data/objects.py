@@ -158,7 +158,7 @@ class ObjectLibrary:
             raise ValueError(
                 f"the objects have features of {self.source!r} of width {own}, but the network is "
                 f"aligned with those of {source!r} of width {dim}: make them again with `r3dpa "
-                f"objects --source {source} --dim {dim}`"
+                "objects --ckpt` for its checkpoint"
             )
 
     def save(self, path: str | Path) -> None:
