@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import tarfile
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePath
@@ -23,9 +20,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from r3dpa.data.scans import files_below
 from r3dpa.data.store import DataError, ItemKey
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import refuse_name
+from r3dpa.io import first_line, refuse_name
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 # A SyntaxError is what Pillow makes of a damaged PNG.
@@ -75,15 +73,25 @@ class ImageSource(ABC):
     def entries(self) -> list[ImageEntry]:
         """All images, sorted by name; ``ImageError`` if there is none, or a file is damaged."""
 
-    @abstractmethod
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
         """Square image ``(S, S, 3)`` of an entry, not mirrored; ``ImageError`` names a bad file."""
+        try:
+            with entry.path.open("rb") as file:
+                file.seek(entry.offset)
+                data = file.read(entry.num_bytes)
+            with Image.open(io.BytesIO(data)) as image:
+                return center_crop(image.convert("RGB"), size)
+        except _DECODING_ERRORS as error:
+            raise ImageError(
+                f"{entry.path}: {entry.name} is no image that can be read ({error}); remove it."
+            ) from error
 
     def settings(self) -> dict[str, Any]:
         """Settings that the pixels depend on beside the entry, as JSON values."""
         return {}
 
 
+@dataclass(frozen=True)
 class ImageFolder(ImageSource):
     """Images below a folder, at any depth: ImageNet's ``<split>/<class>/<image>.JPEG`` or others.
 
@@ -91,24 +99,24 @@ class ImageFolder(ImageSource):
         root: The folder; links are followed, hidden files (``.name``) left out.
     """
 
-    def __init__(self, root: str) -> None:
-        self.root = root
+    root: str
 
     def entries(self) -> list[ImageEntry]:
         """All images, by their path relative to the folder."""
         root = Path(self.root)
         if not root.is_dir():
             raise ImageError(f"no folder {root}: give one that holds images.")
-        found = [_entry(path, str(path.relative_to(root))) for path in _files(root, _SUFFIXES)]
+        found = [
+            _entry(path, str(path.relative_to(root)))
+            for path in files_below(root)
+            if path.suffix.lower() in _SUFFIXES
+        ]
         if not found:
             raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}).")
         return sorted(found, key=lambda entry: entry.name)
 
-    def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
-        """Square image ``(S, S, 3)`` of a file."""
-        return _decoded(entry, str(entry.path), size)
 
-
+@dataclass(frozen=True)
 class TarImages(ImageSource):
     """Images of uncompressed tar files, as WebDataset writes them.
 
@@ -119,17 +127,17 @@ class TarImages(ImageSource):
             files and members (``.name``) are left out.
     """
 
-    def __init__(self, root: str) -> None:
-        self.root = root
+    root: str
 
     def entries(self) -> list[ImageEntry]:
         """All images of all shards, as ``<shard>/<member>``."""
         root = Path(self.root)
-        shards = [root] if root.is_file() else sorted(_files(root, (".tar",)))
+        shards = [root] if root.is_file() else sorted(files_below(root))
         base = root.parent if root.is_file() else root
         found = [
             entry
             for shard in shards
+            if shard.suffix.lower() == ".tar"
             for entry in _members(shard, str(shard.relative_to(base).with_suffix("")))
         ]
         if not found:
@@ -139,27 +147,6 @@ class TarImages(ImageSource):
             if before.name == entry.name:
                 raise ImageError(f"{entry.path} holds {entry.name!r} twice: pack it again.")
         return found
-
-    def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
-        """Square image ``(S, S, 3)`` of a member."""
-        return _decoded(entry, f"{entry.path}: {entry.name}", size)
-
-
-def _files(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
-    """Files below a folder by their suffix, also through links, without hidden ones."""
-    for folder, names, files in os.walk(root, followlinks=True):
-        here = Path(folder).resolve()
-        # A link to a folder above leads to the same files again, without end.
-        names[:] = [
-            name
-            for name in names
-            if not _hidden(name) and not here.is_relative_to(Path(folder, name).resolve())
-        ]
-        for path in (Path(folder, name) for name in files if not _hidden(name)):
-            if path.suffix.lower() in suffixes:
-                yield path
-            elif path.is_symlink() and not path.exists():  # such as a folder of images
-                raise ImageError(f"{path} is a link to nothing: mend or remove it.")
 
 
 def _hidden(name: str) -> bool:
@@ -201,23 +188,6 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
     return found
 
 
-def _decoded(entry: ImageEntry, name: str, size: int) -> NDArray[np.uint8]:
-    try:
-        with entry.path.open("rb") as file:
-            file.seek(entry.offset)
-            data = file.read(entry.num_bytes)
-    except OSError as error:
-        raise ImageError(f"{name}: cannot be read ({error.strerror or error})") from error
-    try:
-        with Image.open(io.BytesIO(data)) as opened:
-            image: Image.Image = opened
-            if image.mode.startswith("I"):  # 16 bits of grey, which convert() would clip at 255
-                image = Image.fromarray((np.asarray(image) // 256).astype(np.uint8))
-            return center_crop(image.convert("RGB"), size)
-    except _DECODING_ERRORS as error:
-        raise ImageError(f"{name}: is no image that can be read ({error}); remove it.") from error
-
-
 def center_crop(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """Largest centred square ``(S, S, 3)`` uint8 of an RGB image, resized.
 
@@ -241,23 +211,20 @@ def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
     ``ValueError`` if the file is no picture of 8 bits a colour, or of another size.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # refused by size below
-            with Image.open(path) as picture:
-                if picture.size != (sensor.columns, sensor.beams):
-                    width, height = picture.size
-                    raise ValueError(
-                        f"{path}: has {height} x {width} pixels (rows x columns), but the range "
-                        f"image {sensor.beams} x {sensor.columns}: draw one pixel for each"
-                    )
-                if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
-                    raise ValueError(
-                        f"{path}: has pixels of type {picture.mode}; save it with 8 bits a colour"
-                    )
-                pixels = np.asarray(picture.convert("RGBA"))
+        with Image.open(path) as picture:
+            if picture.size != (sensor.columns, sensor.beams):
+                width, height = picture.size
+                raise ValueError(
+                    f"{path}: has {height} x {width} pixels (rows x columns), but the range image "
+                    f"{sensor.beams} x {sensor.columns}: draw one pixel for each"
+                )
+            if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+                raise ValueError(
+                    f"{path}: has pixels of type {picture.mode}; save it with 8 bits a colour"
+                )
+            pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"{path}: cannot be read as a picture ({reason})") from error
+        raise ValueError(f"{path}: cannot be read as a picture ({first_line(error)})") from error
     bright = pixels[..., :3].max(axis=2) >= _BRIGHT
     return torch.from_numpy(bright & (pixels[..., 3] >= _BRIGHT))
 

@@ -26,7 +26,6 @@ kazuto1011/r2flow 819d7d3, WoodwindHu/RangeLDM 4358507.
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +35,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.scans import ScanError, find_scans, npz_arrays, read_ply, read_scan
+from r3dpa.data.scans import (
+    ScanError,
+    files_below,
+    find_scans,
+    npz_arrays,
+    out_of_range,
+    read_ply,
+    read_scan,
+)
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
@@ -122,9 +129,9 @@ def read_samples(
     """Samples of a file, or of all files of one format in a folder and its sub-folders.
 
     Points and pixels outside the range limits are left out. One sample is in memory at a time, of
-    ``.npz`` one array. The folders that ``r3dpa sample`` and the official R3DPA write hold each
-    scene several times; of these ``scenes.npz``, else ``bin/*.bin``, and ``numpy/img.npz`` are
-    read.
+    ``.npz`` one array, of ``.pth`` one file. The folders that ``r3dpa sample`` and the official
+    R3DPA write hold each scene several times; of these ``scenes.npz``, else ``bin/*.bin``, and
+    ``numpy/img.npz`` are read.
 
     Args:
         path: File or folder, whose files are read in the order of their names.
@@ -152,9 +159,8 @@ def _find(folder: Path) -> list[tuple[str, Path]]:
     if ours and (folder / "bin").is_dir():
         folder = folder / "bin"
     files: dict[str, list[Path]] = {}
-    for file in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-        if file.suffix.lower() in _READERS and file.is_file() and not hidden:
+    for file in sorted(files_below(folder)):
+        if file.suffix.lower() in _READERS:
             files.setdefault(file.suffix.lower(), []).append(file)
     if not files:
         raise SampleError(f"{folder}: holds no samples; what can be read: {READABLE}")
@@ -221,32 +227,20 @@ def _parts(where: str, array: np.ndarray) -> Arrays:
 
 
 def _tensors(file: Path) -> Arrays:
-    """Images or a cloud of a file of ``torch.save``; stacks stay on disk until they are read."""
+    """Images or a cloud of a file of ``torch.save``; the parts of R2Flow become channels."""
     try:
-        mapped = zipfile.is_zipfile(file)  # not before torch 1.6
-        content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+        content = torch.load(file, map_location="cpu", weights_only=True)
+        parts = [content]
+        if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
+            parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
+        values = torch.cat([part.detach().float() for part in parts], dim=-3 if parts[1:] else 0)
     except UNPICKLING_ERRORS as error:
         raise SampleError(
-            f"{file}: cannot be read as tensors alone ({first_line(error)})"
+            f"{file}: cannot be read as tensors alone ({first_line(error)}); needs a tensor "
+            "(C, H, W) or (N, C, H, W), or a dictionary of depth, xyz and reflectance"
         ) from error
-    parts = [content]
-    if isinstance(content, dict) and {"depth", "xyz"} <= content.keys():
-        parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
-    if not all(isinstance(part, Tensor) and part.is_floating_point() for part in parts):
-        found = f"keys {', '.join(map(str, content))}" if isinstance(content, dict) else "no tensor"
-        raise SampleError(
-            f"{file}: holds {found}; needs a float tensor (C, H, W) or (N, C, H, W), or a "
-            "dictionary of depth, xyz and reflectance"
-        )
-    sizes = [tuple(part.shape) for part in parts]
-    agree = len({(*s[:-3], *s[-2:]) for s in sizes}) == 1
-    if len(sizes[0]) not in (2, 3, 4) or not agree or (len(parts) > 1 and len(sizes[0]) == 2):
-        raise SampleError(f"{file}: holds tensors {sizes}; needs (C, H, W) or (N, C, H, W)")
-    if len(sizes[0]) < 4:
-        yield "", torch.cat(parts).detach().float().numpy()
-        return
-    for index, images in enumerate(zip(*parts, strict=True)):
-        yield f"{index:06d}", torch.cat(images).detach().float().numpy()
+    array = values.numpy()
+    yield from [("", array)] if array.ndim == 3 else _parts(str(file), array)
 
 
 _READERS: dict[str, Callable[[Path], Arrays]] = {
@@ -263,23 +257,20 @@ _READERS: dict[str, Callable[[Path], Arrays]] = {
 def _sample(name: str, where: str, array: np.ndarray, sensor: LidarSensor, corner: bool) -> Sample:
     """Sample of a cloud ``(P, ...)`` or an image ``(C, H, W)``; ``where`` is for messages."""
     values = torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
-    limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
     if values.ndim == 3:
-        return _image_sample(name, where, values, sensor, limits, corner)
+        return _image_sample(name, where, values, sensor, corner)
     if values.shape[1] not in (3, 4):
         raise SampleError(f"{where}: has rows of {values.shape[1]} numbers; needs 3 or 4 (x, y, z)")
-    if not len(values):
-        raise SampleError(f"{where}: is an empty cloud")
     if bad := int((~values.isfinite().all(dim=1)).sum()):
         raise SampleError(f"{where}: has NaN or infinite values in {bad} of {len(values)} points")
     kept = in_range(values[:, :3], sensor)
     if not kept.any():
-        raise SampleError(f"{where}: has no point within the sensor's range {limits}")
+        raise SampleError(out_of_range(where, sensor))
     return Sample(name, values[kept])
 
 
 def _image_sample(
-    name: str, where: str, image: Tensor, sensor: LidarSensor, limits: str, corner: bool
+    name: str, where: str, image: Tensor, sensor: LidarSensor, corner: bool
 ) -> Sample:
     channels, *size = image.shape
     if size != [sensor.beams, sensor.columns]:
@@ -293,19 +284,18 @@ def _image_sample(
             "z without or with intensity"
         )
     distance = image[0]
-    if bad := int((~distance.isfinite()).sum()):
-        raise SampleError(f"{where}: has NaN or infinite ranges in {bad} pixels")
     valid = (distance > sensor.range_min_m) & (distance < sensor.range_max_m)
+    intensity = torch.where(valid, image[-1], 0.0) if channels in (2, 5) else None
+    read = distance if intensity is None else torch.stack([distance, intensity])
+    if bad := int((~read.isfinite()).sum()):
+        raise SampleError(f"{where}: has NaN or infinite ranges or intensities in {bad} pixels")
     if not valid.any():
         span = f"{distance.min():g} to {distance.max():g}"
         raise SampleError(
-            f"{where}: has no pixel within the sensor's range {limits}; values go from {span}, "
-            "and must be metres, not an encoded image"
+            f"{out_of_range(where, sensor)}; values go from {span}, and must be metres, not an "
+            "encoded image"
         )
     range_m = torch.where(valid, distance, EMPTY_RANGE_M)
-    intensity = torch.where(valid, image[-1], 0.0) if channels in (2, 5) else None
-    if intensity is not None and not intensity.isfinite().all():
-        raise SampleError(f"{where}: has NaN or infinite intensities where there is a return")
     if channels < 4:
         points = points_of(range_m, SphericalProjection(sensor), corner)
     else:

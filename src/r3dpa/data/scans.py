@@ -156,7 +156,7 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     return points
 
 
-def out_of_range(path: Path, sensor: LidarSensor) -> ScanError:
+def out_of_range(path: str | Path, sensor: LidarSensor) -> ScanError:
     """Error of a scan without a point within the range limits."""
     limits = f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m"
     return ScanError(f"{path}: has no point within the sensor's range {limits}")
@@ -294,20 +294,24 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
         for drive in (path / RAW).iterdir():
             yield from _drive_files(drive)
     elif path.is_dir():
-        seen = set()
-        for folder, below, names in os.walk(path, followlinks=True):
-            real = os.path.realpath(folder)
-            if real in seen:
-                below.clear()
-            else:
-                below.sort()  # of a folder and a link to it, the same one on every machine
-                seen.add(real)
-                yield from filter(_is_scan, (Path(folder, name) for name in names))
+        yield from filter(_is_scan, files_below(path))
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):
         root = Path(path.absolute().anchor)
         yield from filter(_is_scan, root.glob(str(path.absolute().relative_to(root))))
+
+
+def files_below(root: Path) -> Iterator[Path]:
+    """Files of a folder and its sub-folders, links followed, without hidden ones."""
+    seen = set()
+    for folder, below, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        # Of a folder and a link to it, the same one on every machine; of a link upwards, none.
+        below[:] = [] if real in seen else sorted(name for name in below if name[0] != ".")
+        if real not in seen:
+            yield from (Path(folder, name) for name in names if name[0] != ".")
+        seen.add(real)
 
 
 def _drive_files(drive: Path) -> Iterator[Path]:
