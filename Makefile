@@ -52,8 +52,8 @@ test: $(READY) ## default tests, a few minutes on two cores
 test-all: $(READY) ## every test that this machine can run
 	$(BIN)/pytest
 
-test-numerics: $(READY) ## hard numerical cases, and the table of them
-	$(BIN)/pytest -m numerics --numerics-list runs/numerics.md
+test-numerics: $(READY) ## hard numerical cases
+	$(BIN)/pytest -m numerics
 
 test-faults: $(READY) ## kill, fill, cut: what is lost, and what the user sees
 	$(BIN)/pytest tests/faults

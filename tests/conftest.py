@@ -18,12 +18,6 @@ def pytest_addoption(parser):
         help="folder with cases.json and the .npz files of golden numbers "
         "(default: the shared folder where it is present, else the synthetic files)",
     )
-    parser.addoption(
-        "--numerics-list",
-        type=Path,
-        default=None,
-        help="file for the table of hard numerical cases (with -m numerics)",
-    )
 
 
 def pytest_ignore_collect(collection_path, config):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 import torch.distributed as dist
+from scipy.stats import wasserstein_distance
 
 from r3dpa.geometry import LidarSensor, points_of
 from r3dpa.metrics.bootstrap import Resampling
@@ -29,7 +30,6 @@ from r3dpa.metrics.functional import (
     frechet_distance_of,
     polynomial_mmd,
     precision_recall,
-    wasserstein_1_of_values,
 )
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.scene import DEFAULT
@@ -95,25 +95,18 @@ def expected(name):
         mean, std = polynomial_mmd(real, made, generator, 100, 10)
         return {"kid_mean": mean, "kid_std": std}
     if name == "prdc":
-        return vars(precision_recall(real, made))
+        return precision_recall(real, made)
     if name == "ranges":
-        return {"w1_m": wasserstein_1_of_values(real[real > 0], made[made > 0])}
+        return {"w1_m": wasserstein_distance(real[real > 0].numpy(), made[made > 0].numpy())}
     if name == "bev":
-        return vars(histogram_distance(GRID.histogram(real), GRID.histogram(made)))
+        return histogram_distance(GRID.histogram(real), GRID.histogram(made))._asdict()
     parts = [clouds(real) for real in (True, False)]
     found = minimum_matching(*([GRID.cells(c) for c in part] for part in parts), GRID)
     pairs = zip(parts[0], found.nearest, strict=True)
     chamfer = torch.tensor([chamfer_squared(c, parts[1][i]) for c, i in pairs])
-    outside = [
-        sum(int((~GRID.inside(c)).sum()) for c in part) / sum(map(len, part)) for part in parts
-    ]
-    value = found.mmd_squared_normalised
     return {
-        "mmd_squared_normalised": value,
-        "mmd_m2": value * 100**2,
+        "mmd_squared_normalised": found.mmd_squared_normalised,
         "chamfer_m2": chamfer.double().mean().item(),
-        "real_outside_share": outside[0],
-        "generated_outside_share": outside[1],
     }
 
 
@@ -242,24 +235,6 @@ def test_few_samples():
     assert frechet(6, draw(3, 6), draw(6, 6, seed=1), **few).compute().isfinite()
     with pytest.raises(ValueError, match=r"real: 1 samples .* at least 2"):
         frechet(6, draw(1, 6), draw(6, 6), **few).compute()
-
-
-@pytest.mark.numerics
-def test_stream_of_float32():
-    """Mean 5 and deviation 0.02 break sums of squares in float32 (numerics: 53 % off)."""
-    generator = torch.Generator().manual_seed(0)
-    factor = torch.randn(48, generator=generator).abs() + 0.1
-    features = 5 + 0.02 * factor * torch.randn(4000, 48, generator=generator)
-    metric = FrechetDistance(48)
-    for part in features.split(1000):
-        metric.update(part, real=True)
-        metric.update(part + 0.25, real=False)  # 0.25: sums with it are exact in float32
-    exact = features.double()
-    exact -= exact.mean(dim=0)
-    covariance = Moments.unpack(metric.real_moments).covariance()
-    expected = exact.T @ exact / 3999
-    assert (covariance - expected).abs().max() < 1e-6 * expected.abs().max()
-    assert metric.compute().item() == pytest.approx(48 * 0.25**2, rel=1e-6)
 
 
 def test_no_copy_of_the_empty_histograms_is_kept():

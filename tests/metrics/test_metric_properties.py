@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 import pytest
 import torch
 
-from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.feature_distances import (
-    metrics_of,
-    scene_metrics,
-    update_with,
-    with_features,
-)
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -23,7 +15,6 @@ from r3dpa.metrics.functional import (
     precision_recall,
     shared_balls,
     squared_mmd,
-    wasserstein_1_of_values,
 )
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
@@ -31,12 +22,10 @@ from r3dpa.metrics.functional_bev import (
     histogram_distance,
     minimum_matching,
 )
-from r3dpa.metrics.scene import DEFAULT, EvaluationScene, usable_scenes
-from r3dpa.metrics.scene_features import scene_features
 from r3dpa.nn.backbones.sparse import pool_voxels
 
-SEEDS = range(4)
-GRID = BEVGrid((-10.0, 10.0), (-10.0, 10.0), 0.5)
+SEEDS = range(2)
+GRID = BEVGrid(10.0, 0.5)
 
 
 def drawn(seed, *shape):
@@ -77,23 +66,18 @@ def of_features(distance):
     return lambda seed: (distance, *feature_sets(seed))
 
 
-def of_values(distance):
-    return lambda seed: (distance, drawn(seed, 50), 2 * drawn(seed + 1, 31) + 1)
-
-
 def of_points(distance):
     return lambda seed: (distance, *clouds(seed, 2))
 
 
-SYMMETRIC = {
+DISTANCES = {
     "frechet": of_features(frechet_distance_of),
     "kernel": of_features(lambda a, b: squared_mmd(a, b).item()),
-    "w1": of_values(wasserstein_1_of_values),
     "chamfer": of_points(chamfer_squared),
     "jsd": of_clouds(jsd),
     "tv": of_clouds(total_variation),
+    "mmd": of_clouds(matching),
 }
-DISTANCES = SYMMETRIC | {"mmd": of_clouds(matching)}
 
 
 def shuffled(samples, seed):
@@ -102,28 +86,17 @@ def shuffled(samples, seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("case", SYMMETRIC)
-def test_distances_are_symmetric(case, seed):
-    distance, a, b = SYMMETRIC[case](seed)
-    assert distance(a, b) == pytest.approx(distance(b, a), rel=1e-9)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("case", DISTANCES)
 def test_order_does_not_count_and_other_samples_do(case, seed):
     distance, a, b = DISTANCES[case](seed)
-    assert distance(shuffled(a, seed), shuffled(b, seed + 1)) == pytest.approx(
-        distance(a, b), rel=1e-9
-    )
+    apart = pytest.approx(distance(a, b), rel=1e-9)
+    assert distance(shuffled(a, seed), shuffled(b, seed + 1)) == apart
     assert distance(a, b[:-5]) != pytest.approx(distance(a, b), rel=1e-6)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("case", [name for name in DISTANCES if name != "kernel"])
-def test_a_set_is_at_no_distance_from_itself_and_from_others_it_is(case, seed):
-    distance, a, b = DISTANCES[case](seed)
-    assert distance(a, shuffled(a, seed)) == pytest.approx(0, abs=1e-9)
-    assert distance(a, b) > 1e-3
+    if case != "mmd":
+        assert distance(b, a) == apart
+    if case != "kernel":  # unbiased: below 0 for a set with itself
+        assert distance(a, shuffled(a, seed)) == pytest.approx(0, abs=1e-9)
+        assert distance(a, b) > 1e-3
 
 
 @pytest.mark.parametrize("case", ["jsd", "tv"])
@@ -147,10 +120,6 @@ def test_scale_and_motion(seed):
     assert precision_recall(*moved) == precision_recall(a, b) == precision_recall(2 * a, 2 * b)
     x, y = clouds(seed, 2)
     assert chamfer_squared(2 * x, 2 * y) == pytest.approx(4 * chamfer_squared(x, y), rel=1e-6)
-    values = drawn(seed, 40), drawn(seed + 9, 33)
-    assert wasserstein_1_of_values(*(2 * v for v in values)) == pytest.approx(
-        2 * wasserstein_1_of_values(*values), rel=1e-6
-    )
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -165,12 +134,11 @@ def test_more_samples_match_no_worse(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_precision_of_one_is_recall_of_the_other(seed):
     a, b = feature_sets(seed)
-    assert precision_recall(a, b).precision == precision_recall(b, a).recall
+    assert precision_recall(a, b)["precision"] == precision_recall(b, a)["recall"]
     balls, shares = shared_balls(a, b), precision_recall(a, b)
-    assert (len(balls.in_real), len(balls.recalled)) == (len(b), len(a))
-    assert shares.precision == balls.precise.double().mean().item()
-    assert 0 < shares.precision <= 1
-    assert shares.density * balls.num_neighbors >= shares.precision  # a ball at least, where in one
+    assert [len(balls[name]) for name in ("precision", "recall")] == [len(b), len(a)]
+    assert 0 < shares["precision"] <= 1
+    assert shares["density"] * 5 >= shares["precision"]  # at least one ball, where in one
 
 
 @pytest.mark.parametrize(
@@ -190,38 +158,6 @@ def test_features_of_other_widths_do_not_compare(compare):
             compare(drawn(0, 60, first), drawn(1, 60, second))
 
 
-def test_batches_change_nothing():
-    """Of one scene, of 3 or of all 7: the same histograms, and moments to rounding."""
-    protocol = DEFAULT.with_sensor(LidarSensor(beams=16, columns=64))
-    images = [
-        3 + 40 * torch.rand(16, 64, generator=torch.Generator().manual_seed(i)) for i in SEEDS
-    ]
-    scenes = [EvaluationScene(f"{i}", None, image) for i, image in enumerate(2 * images)][:7]
-    space = scene_features("fgeo", None, protocol)
-    sets = []
-    for batch_size in (1, 3, 7):
-        metrics = scene_metrics(
-            protocol, {"fgeo": ("FGEO", space.dim)}, 2, max_rows=(None, 5), max_images=(None, 4)
-        )
-        for batch, features in with_features(usable_scenes(scenes, protocol), [space], batch_size):
-            update_with(metrics, batch, features, real=False)
-        sets.append(metrics_of(metrics))
-    for one, other in pairwise(sets):
-        for name in ("cells", "ranges"):
-            assert torch.equal(one[name].generated_bins, other[name].generated_bins)
-        for a, b in zip(
-            *(part["matching"].kept("generated") for part in (one, other)), strict=True
-        ):
-            assert torch.equal(a, b)
-        rows = [part["fgeo_kid"].rows("generated") for part in (one, other)]
-        torch.testing.assert_close(*rows, rtol=1.3e-6, atol=1e-5)
-        for key in ("count", "mean", "scatter"):
-            values = [
-                getattr(part["fgeo_frechet"].moments("generated"), key) for part in (one, other)
-            ]
-            torch.testing.assert_close(*values, rtol=1e-6, atol=1e-9)
-
-
 def test_pooled_features_do_not_depend_on_the_order_of_voxels():
     """The mean of the coordinates is exact, so that no voxel changes its ring."""
     generator = torch.Generator().manual_seed(0)
@@ -234,10 +170,3 @@ def test_pooled_features_do_not_depend_on_the_order_of_voxels():
     torch.testing.assert_close(again, pooled, rtol=0, atol=1e-7)
     moved = coordinates + torch.tensor([30_000, -30_000, 11, 0])  # float32 sums would round by 0.1
     torch.testing.assert_close(pool_voxels(features, moved, 2), pooled, rtol=0, atol=1e-6)
-
-
-def test_distances_have_their_largest_values_on_disjoint_sets():
-    near, far = [torch.tensor([[-9.0, -9.0, 0.0]])], [torch.tensor([[9.0, 9.0, 0.0]])]
-    assert jsd(near, far) == pytest.approx(math.sqrt(math.log(2)))
-    assert total_variation(near, far) == 1
-    assert matching(near, far) == pytest.approx(2 * (18 / 20) ** 2)

@@ -22,8 +22,8 @@ def normalised_loss(projected, grid):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.numerics(section=6, case="vectors of length zero")
-def test_gradient_at_zero_is_bounded_and_empty_cells_have_none(dtype, naive):
+@pytest.mark.numerics("vectors of length zero")
+def test_gradient_at_zero_is_bounded_and_empty_cells_have_none(dtype):
     """Tokens of length zero beside targets, and targets of length zero beside tokens."""
     projected = torch.zeros(2, 4, 768, dtype=dtype)
     grid = torch.randn(2, 4, 768, generator=torch.Generator().manual_seed(0)).to(dtype)
@@ -44,23 +44,21 @@ def test_gradient_at_zero_is_bounded_and_empty_cells_have_none(dtype, naive):
         assert (both == 0).all()
     wrong = gradient_of(normalised_loss, projected, grid).float().norm(dim=-1).max()
     assert wrong > 1e11
-    naive(f"gradient of normalize at zero: {wrong:.0e}")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16])
-@pytest.mark.numerics(section=6, case="vectors of length zero")
-def test_loss_of_float16_zeros_is_zero(dtype, naive):
+@pytest.mark.numerics("vectors of length zero")
+def test_loss_of_float16_zeros_is_zero(dtype):
     """Inference only, a gradient of 1 / eps is beyond float16."""
     zeros = torch.zeros(2, 4, 768, dtype=dtype)
     assert (alignment_loss(zeros, torch.ones_like(zeros)) == 0).all()
     eps = torch.tensor(1e-12, dtype=dtype)
     assert (zeros / zeros.norm(dim=-1, keepdim=True).clamp_min(eps.item())).isnan().all()
-    naive("an eps of 1e-12 is 0 in float16: 0 / 0 is NaN")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *HALF])
-@pytest.mark.numerics(section=6, case="cosine in half precision")
-def test_cosine_is_exact_to_float32(dtype, naive):
+@pytest.mark.numerics("cosine in half precision")
+def test_cosine_is_exact_to_float32(dtype):
     generator = torch.Generator().manual_seed(0)
     projected, grid = torch.randn(2, 8, 128, 768, generator=generator).to(dtype)
     grid = (grid + projected).to(dtype)
@@ -78,16 +76,11 @@ def test_cosine_is_exact_to_float32(dtype, naive):
     assert error > 1e-4
     above = ((a * a).sum(dim=-1) > 1).float().mean()
     assert above > 0
-    name = str(half).removeprefix("torch.")
-    naive(
-        f"{name}: off by {error:.1e}, {len(cosines.unique())} distinct of {cosines.numel()}, "
-        f"{above:.0%} of self-cosines above 1"
-    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *HALF])
-@pytest.mark.numerics(section=6, case="scale of the features")
-def test_large_and_small_features_have_the_cosine_of_their_directions(dtype, naive):
+@pytest.mark.numerics("scale of the features")
+def test_large_and_small_features_have_the_cosine_of_their_directions(dtype):
     """Also beyond 2^64 in float32 and bfloat16, where squares are infinite, and at small scales."""
     generator = torch.Generator().manual_seed(0)
     projected, grid = torch.randn(2, 4, 16, 768, generator=generator).to(dtype)
@@ -103,12 +96,11 @@ def test_large_and_small_features_have_the_cosine_of_their_directions(dtype, nai
         assert gradient_of(alignment_loss, scaled, grid).isfinite().all()
     square = (projected * scales[-1 if dtype != torch.float16 else 0]).square().sum(dim=-1)
     assert square.isinf().all()
-    naive("the sum of squares is infinite")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.numerics(section=6, case="collapse of the gradients")
-def test_a_zeroed_network_has_no_gradient(dtype, naive):
+@pytest.mark.numerics("collapse of the gradients")
+def test_a_zeroed_network_has_no_gradient(dtype):
     """All weights are zero: the loss is 0, finite, and no layer before the last learns anything.
 
     The logged ``grad_norm/<network>`` shows it.
@@ -133,4 +125,3 @@ def test_a_zeroed_network_has_no_gradient(dtype, naive):
     assert norm == 0
     assert loss.isfinite()
     assert norm.isfinite()
-    naive("loss and gradient norms are finite: a check of isfinite sees nothing")

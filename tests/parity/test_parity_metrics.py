@@ -23,8 +23,8 @@ def case(load_case):
 
 def grid_of(case, cell_m=None):
     window = case.config["DATA_CONFIG"]
-    cell_m = cell_m or case.config["VOXEL_SIZE"]
-    return BEVGrid(tuple(map(float, window["x"])), tuple(map(float, window["y"])), cell_m)
+    assert window["x"] == window["y"] == [-window["x"][1], window["x"][1]]
+    return BEVGrid(window["x"][1], cell_m or case.config["VOXEL_SIZE"])
 
 
 def clouds(case, which):

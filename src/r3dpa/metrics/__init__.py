@@ -25,7 +25,6 @@ from r3dpa.metrics.functional import (
     precision_recall,
     squared_mmd,
     wasserstein_1,
-    wasserstein_1_of_values,
 )
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
@@ -97,5 +96,4 @@ __all__ = [
     "scene_metrics",
     "squared_mmd",
     "wasserstein_1",
-    "wasserstein_1_of_values",
 ]

@@ -18,7 +18,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa.geometry import points_of
-from r3dpa.metrics.bootstrap import Ends, Resampling
+from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.functional import wasserstein_1
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
@@ -33,8 +33,6 @@ from r3dpa.metrics.scene import Protocol
 #: Width of the bins of ranges, metres.
 RANGE_BIN_M = 0.1
 SIDES = ("real", "generated")
-#: Generated scenes and real scans; None if unknown.
-Counts = tuple[int, int | None]
 
 #: Powers of ten that the published table prints its columns in.
 _SCALES = {"FLD": -1, "JSD": -2, "MMD": -5}
@@ -49,8 +47,6 @@ class SceneMetric(Metric):
     that is as good as a random one but does not depend on order, batches or interruptions.
     """
 
-    is_differentiable = False
-    higher_is_better = False
     full_state_update = False
     real_count: Tensor
     generated_count: Tensor
@@ -76,18 +72,17 @@ class SceneMetric(Metric):
 
     def adopt_real(self, *others: SceneMetric) -> None:
         """Takes over the real scans of other metrics of this kind, one after the other."""
+        if self._empty:
+            for other in others:
+                other._prune("real")
+        self.limits["real"] = None  # each of the others kept as many as it should
         for name in self._defaults:
-            if not name.startswith("real_"):
-                continue
-            if name in self._empty:
-                for other in others:
-                    other._prune("real")
-                setattr(self, name, [other._joined(name) for other in others])
-            else:
+            if name in self._empty and name.startswith("real_"):
+                setattr(self, name, [part for other in others for part in getattr(other, name)])
+            elif name.startswith("real_"):
                 reduction = cast(Callable[[Tensor], Tensor], self._reductions[name])
                 parts = torch.stack([getattr(other, name) for other in others])
                 setattr(self, name, reduction(parts))
-        self.limits["real"] = None  # each of the others kept as many as it should
 
     def kept(self, side: str) -> tuple[Tensor, Tensor]:
         """Places ``(n,)`` among all scenes, and values ``(n, ...)``, of those that are kept."""
@@ -153,6 +148,20 @@ class SceneMetric(Metric):
                     f"no {side} scenes given yet; call update(..., real=...) with them"
                 )
 
+    def _row(
+        self,
+        name: str,
+        value: float | None,
+        counts: tuple[int, int | None] | None = None,
+        **fields: Any,
+    ) -> MetricResult:
+        """A number of ``counts`` generated and real scenes, by default of all."""
+        generated, real = counts or (self.count("generated"), self.count("real") or None)
+        scale = _SCALES.get(name.removesuffix(" inf"), 0)
+        return MetricResult(
+            name, value, scale=scale, num_samples=generated, num_references=real, **fields
+        )
+
 
 class _Histograms(SceneMetric):
     """Sums of histograms of scenes; the generated ones in groups, which a bootstrap resamples."""
@@ -180,25 +189,22 @@ class _Histograms(SceneMetric):
         count += num
         return bins, groups
 
-    def _row(
+    def _resampled_row(
         self,
         name: str,
         distance: Callable[[Tensor], float],
         resampling: Resampling,
         groups: Tensor,
-        unit: str = "",
-        note: str = "",
+        **fields: Any,
     ) -> MetricResult:
-        """Distance of the sum of the groups ``(G, bins)``."""
+        """Row of the distance of the sum of the groups ``(G, bins)``."""
 
         def resampled(drawn: Tensor) -> float:
             weights = torch.bincount(drawn, minlength=len(groups)).to(groups)
             return distance(weights @ groups)
 
-        counts = (self.count("generated"), self.count("real") or None)
-        ends = resampling.interval(resampled, min(counts[0], len(groups)))
-        value = distance(groups.sum(dim=0))
-        return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
+        ends = resampling.interval(resampled, min(self.count("generated"), len(groups)))
+        return self._row(name, distance(groups.sum(dim=0)), interval=ends, **fields)
 
 
 class BEVHistogramDistance(_Histograms):
@@ -225,7 +231,7 @@ class BEVHistogramDistance(_Histograms):
     def compute(self) -> dict[str, float]:
         """Fields of :class:`HistogramDistance`; the published "JSD" is ``jsd_distance``."""
         self._need_both()
-        return dict(vars(histogram_distance(self.real_bins, self.generated_bins.sum(dim=0))))
+        return histogram_distance(self.real_bins, self.generated_bins.sum(dim=0))._asdict()
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """JSD and TV."""
@@ -240,8 +246,8 @@ class BEVHistogramDistance(_Histograms):
 
         half = "half of what the official code calls TV"
         return [
-            self._row("JSD", jsd, resampling, groups),
-            self._row("TV", total_variation, resampling, groups, note=half),
+            self._resampled_row("JSD", jsd, resampling, groups),
+            self._resampled_row("TV", total_variation, resampling, groups, note=half),
         ]
 
 
@@ -273,7 +279,7 @@ class RangeHistogramDistance(_Histograms):
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """W1."""
         groups = self.generated_bins.double()
-        return [self._row("W1 range", self._distance, resampling, groups, "m")]
+        return [self._resampled_row("W1 range", self._distance, resampling, groups, unit="m")]
 
     def _distance(self, counted: Tensor) -> float:
         real = self.real_bins.double().cpu().numpy()
@@ -283,8 +289,8 @@ class RangeHistogramDistance(_Histograms):
 class MinimumMatchingDistance(SceneMetric):
     """Published "MMD" on occupied cells seen from above, and 3D Chamfer distance of its matches.
 
-    Points beyond the grid do not count in MMD, by its definition. The 3D distance is the mean over
-    up to 200 real scans, each with the generated scene that is nearest to it by its cells.
+    Points beyond the grid do not count in MMD, by its definition. The 3D distance, in square
+    metres, is the mean over up to 200 real scans, each with the nearest generated scene by cells.
 
     Args:
         protocol: Cells, sensor, and which point of a pixel stands for it.
@@ -318,50 +324,37 @@ class MinimumMatchingDistance(SceneMetric):
         projection, corner = self.protocol.projection, self.protocol.corner
         return [points_of(image, projection, corner) for image in images]
 
-    def matching(self) -> tuple[Matching, dict[str, float]]:
-        """Nearest generated scene of each real one, and the shares of points beyond the grid."""
-        if self.reference_cells:
-            samples, _ = self._cells("generated")
-            return minimum_matching(self.reference_cells, samples, self.protocol.grid), {}
-        self._need_both()
-        (references, beyond_real), (samples, beyond) = map(self._cells, SIDES)
-        shares = {"real": beyond_real, "generated": beyond}
-        return minimum_matching(references, samples, self.protocol.grid), shares
+    def matching(self) -> Matching:
+        """Nearest generated scene of each real one."""
+        if not self.reference_cells:
+            self._need_both()
+        grid = self.protocol.grid
+        real, made = (
+            [grid.cells(cloud) for cloud in self.clouds(self.kept(side)[1])] for side in SIDES
+        )
+        return minimum_matching(self.reference_cells or real, made, grid)
 
     def compute(self) -> dict[str, float]:
-        """The published number, in square metres too, and ``*_outside_share`` of the points."""
-        matching, shares = self.matching()
-        grid, value = self.protocol.grid, matching.mmd_squared_normalised
-        values = {
-            "mmd_squared_normalised": value,
-            "mmd_m2": value * (grid.shape[0] * grid.cell_m) ** 2,
+        """The published number, and the 3D distance."""
+        matching = self.matching()
+        return {
+            "mmd_squared_normalised": matching.mmd_squared_normalised,
             "chamfer_m2": self._chamfer(matching).mean().item(),
         }
-        return values | {f"{side}_outside_share": share for side, share in shares.items()}
 
     def results(
-        self, resampling: Resampling, known: tuple[Matching, dict[str, float]] | None = None
+        self, resampling: Resampling, matching: Matching | None = None
     ) -> list[MetricResult]:
-        """MMD and CD; intervals are over the real scans. ``known`` is of :meth:`matching`."""
-        matching, shares = known or self.matching()
-        kept, note = len(self.kept("generated")[0]), ""
-        if any(shares.values()):
-            real, made = (f"{shares[side]:.2%}" for side in SIDES)
-            note = f"{made} of the points, {real} of the real ones, lie beyond the grid"
-
-        def row(name: str, values: Tensor, unit: str = "", note: str = "") -> MetricResult:
-            ends, value = resampling.of_mean(values), values.mean().item()
-            counts = (kept, len(values))
-            return distance_row(name, name, value, counts, interval=ends, unit=unit, note=note)
-
-        mmd = row("MMD", matching.squared_normalised, note=note)
-        return [mmd] if self.reference_cells else [mmd, row("CD 3D", self._chamfer(matching), "m2")]
-
-    def _cells(self, side: str) -> tuple[list[Tensor], float]:
-        """Occupied cells of the kept scenes, and the share of their points beyond the grid."""
-        grid, clouds = self.protocol.grid, self.clouds(self.kept(side)[1])
-        beyond = sum(int((~grid.inside(cloud)).sum()) for cloud in clouds)
-        return [grid.cells(c) for c in clouds], beyond / max(sum(map(len, clouds)), 1)
+        """MMD and CD of :meth:`matching`; intervals are over the real scans."""
+        matching = matching or self.matching()
+        distances = {"MMD": (matching.squared_normalised, "")}
+        if not self.reference_cells:
+            distances["CD 3D"] = self._chamfer(matching), "m2"
+        kept, rows = len(self.kept("generated")[0]), []
+        for name, (values, unit) in distances.items():
+            mean, ends = values.mean().item(), resampling.of_mean(values)
+            rows.append(self._row(name, mean, (kept, len(values)), interval=ends, unit=unit))
+        return rows
 
     def _chamfer(self, matching: Matching) -> Tensor:
         nearest = matching.nearest[:_CHAMFER_PAIRS]
@@ -372,29 +365,6 @@ class MinimumMatchingDistance(SceneMetric):
             strict=True,
         )
         return torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)
-
-
-def distance_row(
-    name: str,
-    scaled_as: str,
-    value: float | None,
-    counts: Counts,
-    *,
-    interval: Ends | None = None,
-    unit: str = "",
-    note: str = "",
-) -> MetricResult:
-    """Row of a distance, where lower is better."""
-    return MetricResult(
-        name,
-        value,
-        interval=interval,
-        unit=unit,
-        scale=_SCALES.get(scaled_as, 0),
-        num_samples=counts[0],
-        num_references=counts[1],
-        note=note,
-    )
 
 
 def _rank(name: str) -> int:

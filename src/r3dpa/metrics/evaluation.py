@@ -93,7 +93,7 @@ class Comparison:
             pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
         return {
             "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
-            "limits_m": (protocol.grid.x_m, protocol.grid.y_m),
+            "limits_m": ((-protocol.grid.half_m, protocol.grid.half_m),) * 2,
             "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
             "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
             "halves": torch.stack([h.real_bins for h in halves if h.count("real")]).numpy(),
@@ -204,7 +204,7 @@ def evaluate(
     if bad:
         extra["bad_samples"] = bad
     evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    return Comparison(evaluation, metrics, reference, known[0] if known else None, names)
+    return Comparison(evaluation, metrics, reference, known, names)
 
 
 def scene_distance(

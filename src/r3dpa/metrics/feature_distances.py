@@ -6,6 +6,7 @@ computed once. Letters: N scenes, F feature width.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -21,7 +22,6 @@ from r3dpa.metrics.distances import (
     MinimumMatchingDistance,
     RangeHistogramDistance,
     SceneMetric,
-    distance_row,
 )
 from r3dpa.metrics.functional import (
     Moments,
@@ -38,6 +38,7 @@ from r3dpa.metrics.scene_features import SceneFeatures
 
 _KID_SUBSETS, _KID_SUBSET_SIZE = 100, 1000
 _NORMAL_95 = 1.96  # deviations of a normal distribution that hold 95 % of it, to each side
+_NEIGHBORS = 5  # of the balls of precision and recall
 _BATCH = 8
 
 
@@ -150,16 +151,14 @@ class FrechetDistance(FeatureMetric):
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distance, with a bootstrap interval over the generated scenes that are kept."""
-        rows = self.rows("generated")
-        counts = (int(self.moments("generated").count), int(self.moments("real").count) or None)
-        width, fewest = self.num_features, min(count for count in counts if count is not None)
-        few = f"{fewest} scenes for {width} features: tells mostly how few they are"
+        rows, width = self.rows("generated"), self.num_features
         ends = resampling.interval(
             lambda drawn: self._distance(Moments.of(rows[drawn])).item(), len(rows)
         )
+        fewest = min(self.count(side) or math.inf for side in SIDES)
+        few = f"{fewest} scenes for {width} features: tells mostly how few they are"
         value = self._distance(self.moments("generated")).item()
-        note = few if fewest <= width else ""
-        return [distance_row(self.label, self.label, value, counts, interval=ends, note=note)]
+        return [self._row(self.label, value, interval=ends, note=few * (fewest <= width))]
 
     def _distance(self, generated: Moments) -> Tensor:
         real = self.moments("real")
@@ -183,41 +182,37 @@ class FrechetInfinity(FeatureMetric):
         counts = (len(generated), len(real))
         name, needed = f"{self.label} inf", 4 * (self.num_features + 1)
         if min(counts) < needed:
-            note = f"needs {needed} scenes of both kinds"
-            return [distance_row(name, self.label, None, counts, note=note)]
-        found = fd_infinity(real, generated, resampling.generator())
-        error = _NORMAL_95 * found.standard_error
-        ends = (found.value - error, found.value + error)
-        return [distance_row(name, self.label, found.value, counts, interval=ends)]
+            return [self._row(name, None, counts, note=f"needs {needed} scenes of both kinds")]
+        value, standard_error = fd_infinity(real, generated, resampling.generator())
+        error = _NORMAL_95 * standard_error
+        return [self._row(name, value, counts, interval=(value - error, value + error))]
 
 
 class PolynomialMMD(FeatureMetric):
     """Kernel distance (KID) of features: unbiased at any number of samples.
 
-    Subsets have at most ``subset_size`` scenes and half of the smaller set.
+    Subsets have at most 1000 scenes and half of the smaller set.
     """
-
-    num_subsets, subset_size, seed = _KID_SUBSETS, _KID_SUBSET_SIZE, 0
 
     def compute(self) -> dict[str, float]:
         """``kid_mean`` and ``kid_std`` over the subsets."""
-        mean, std = self._kid(torch.Generator().manual_seed(self.seed))
+        mean, std = self._kid(torch.Generator().manual_seed(0))
         return {"kid_mean": mean, "kid_std": std}
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The mean with the spread of the subsets, wider than a 95 % interval."""
         counts, name = (len(self.rows("generated")), len(self.rows("real"))), f"{self.label} KID"
         if min(counts) < 4:
-            return [distance_row(name, "", None, counts, note="needs 4 scenes of both kinds")]
+            return [self._row(name, None, counts, note="needs 4 scenes of both kinds")]
         mean, std = self._kid(resampling.generator())
         ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
-        return [distance_row(name, "", mean, counts, interval=ends)]
+        return [self._row(name, mean, counts, interval=ends)]
 
     def _kid(self, generator: torch.Generator) -> tuple[float, float]:
         real, generated = self._rows()
         # Subsets as large as a set would all be one.
-        size = min(self.subset_size, min(len(real), len(generated)) // 2)
-        return polynomial_mmd(real, generated, generator, self.num_subsets, size)
+        size = min(_KID_SUBSET_SIZE, min(len(real), len(generated)) // 2)
+        return polynomial_mmd(real, generated, generator, _KID_SUBSETS, size)
 
 
 class PrecisionRecall(FeatureMetric):
@@ -227,36 +222,26 @@ class PrecisionRecall(FeatureMetric):
     recall and coverage), not the balls.
     """
 
-    higher_is_better = True
-    num_neighbors = 5
-
     def compute(self) -> dict[str, float]:
         """``precision``, ``recall``, ``density`` and ``coverage``."""
-        return dict(vars(precision_recall(*self._rows(), self.num_neighbors)))
+        return precision_recall(*self._rows(), _NEIGHBORS)
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The four shares."""
         real, generated = self._rows()
-        values: dict[str, Tensor | None] = dict.fromkeys(
-            ("precision", "recall", "density", "coverage")
-        )
-        if min(len(real), len(generated)) > self.num_neighbors:
-            balls = shared_balls(real, generated, self.num_neighbors)
-            values["precision"], values["recall"] = balls.precise.double(), balls.recalled.double()
-            values["density"], values["coverage"] = balls.density, balls.covered.double()
-        few = f"needs {self.num_neighbors + 1} scenes of both kinds"
-        return [
-            MetricResult(
-                f"{self.label} {name}",
-                None if by_scene is None else by_scene.mean().item(),
-                interval=None if by_scene is None else resampling.of_mean(by_scene),
-                direction="higher",
-                num_samples=len(generated),
-                num_references=len(real),
-                note=few if by_scene is None else "",
-            )
-            for name, by_scene in values.items()
-        ]
+        counts = (len(generated), len(real))
+        if min(counts) <= _NEIGHBORS:
+            note = f"needs {_NEIGHBORS + 1} scenes of both kinds"
+            return [
+                self._row(f"{self.label} {name}", None, counts, direction="higher", note=note)
+                for name in ("precision", "recall", "density", "coverage")
+            ]
+        rows = []
+        for name, by_scene in shared_balls(real, generated, _NEIGHBORS).items():
+            share, ends = by_scene.mean().item(), resampling.of_mean(by_scene)
+            fields = {"interval": ends, "direction": "higher"}
+            rows.append(self._row(f"{self.label} {name}", share, counts, **fields))
+        return rows
 
 
 _OF_SPACE = {

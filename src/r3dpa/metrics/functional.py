@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -59,16 +59,11 @@ class Moments:
         scatter = scatter_a + scatter_b + outer(mean_b - mean_a) * n_a * n_b / n
 
     Source: Chan, Golub, LeVeque, 1979.
-
-    Args:
-        count: ``()`` float64, number of samples N.
-        mean: ``(F,)`` float64.
-        scatter: ``(F, F)`` float64.
     """
 
-    count: Tensor
-    mean: Tensor
-    scatter: Tensor
+    count: Tensor  # () float64, number of samples N
+    mean: Tensor  # (F,) float64
+    scatter: Tensor  # (F, F) float64
 
     @classmethod
     def of(cls, features: Tensor, name: str = "features") -> Self:
@@ -157,22 +152,15 @@ def frechet_distance_of(real: Tensor, generated: Tensor) -> float:
     ).item()
 
 
-@dataclass(frozen=True)
-class FDInfinity:
+class FDInfinity(NamedTuple):
     """Fréchet distance for infinitely many samples.
 
-    Args:
-        value: Intercept of the line through the distances over 1/N; may be slightly negative.
-        standard_error: Of the intercept, from the scatter around the line; too low, since the
-            subsets overlap.
-        sizes: Samples N of each set behind each distance.
-        distances: Fréchet distances.
+    ``value`` is the intercept of the line through the distances over 1/N, and may be slightly
+    negative. Its ``standard_error`` is too low, since the subsets overlap.
     """
 
     value: float
     standard_error: float
-    sizes: tuple[int, ...]
-    distances: tuple[float, ...]
 
 
 def fd_infinity(
@@ -212,7 +200,7 @@ def fd_infinity(
     value = y.mean() - slope * over.mean()
     noise = (y - value - slope * over).square().sum() / (num_sizes - 2)
     error = (noise * (1 / num_sizes + over.mean().square() / spread)).sqrt()
-    return FDInfinity(value.item(), error.item(), tuple(sizes), tuple(distances))
+    return FDInfinity(value.item(), error.item())
 
 
 def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
@@ -266,22 +254,6 @@ def polynomial_mmd(
     return mean.item(), std.item()
 
 
-def wasserstein_1_of_values(values_a: Tensor, values_b: Tensor) -> float:
-    """Earth mover's distance of ``(N,)`` and ``(M,)`` numbers, in their unit; exact.
-
-    It is the area between the two quantile functions. NaN or an empty set is a ``ValueError``.
-    """
-    a = checked_features(values_a.reshape(-1, 1), "values_a")[:, 0].sort().values
-    b = checked_features(values_b.reshape(-1, 1), "values_b")[:, 0].sort().values
-    steps = len(a) * len(b)  # integers, so that equal places are equal
-    ends_a = torch.arange(1, len(a) + 1, device=a.device) * len(b)
-    ends_b = torch.arange(1, len(b) + 1, device=a.device) * len(a)
-    ends = torch.cat([ends_a, ends_b]).unique()
-    widths = ends.diff(prepend=ends.new_zeros(1))
-    apart = (a[torch.searchsorted(ends_a, ends)] - b[torch.searchsorted(ends_b, ends)]).abs()
-    return ((apart * widths).sum() / steps).item()
-
-
 def wasserstein_1(
     counts_a: NDArray[np.float64], counts_b: NDArray[np.float64], bin_width: float
 ) -> float:
@@ -315,74 +287,32 @@ def curve_rmse(curve_a: NDArray[np.float64], curve_b: NDArray[np.float64]) -> fl
     return float(np.sqrt(np.mean((curve_a[both] - curve_b[both]) ** 2))) if both.any() else np.nan
 
 
-@dataclass(frozen=True)
-class PRDC:
-    """Overlap of two sets of samples.
-
-    ``precision`` is the share of generated samples inside the ball of a real one, ``recall`` that
-    of real samples inside the ball of a generated one, ``density`` the mean number of real balls
-    around a generated sample divided by k (may exceed 1), and ``coverage`` the share of real
-    samples whose ball holds a generated sample.
-    """
-
-    precision: float
-    recall: float
-    density: float
-    coverage: float
+def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dict[str, float]:
+    """Precision, recall, density and coverage: the means of :func:`shared_balls`."""
+    balls = shared_balls(real, generated, num_neighbors)
+    return {name: by_sample.mean().item() for name, by_sample in balls.items()}
 
 
-@dataclass(frozen=True)
-class SharedBalls:
-    """Membership of each sample in the balls of the other set; PRDC are its means.
+def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dict[str, Tensor]:
+    """Samples in the balls of the other set; a ball reaches to the k-th neighbour in its own set.
 
-    ``in_real`` ``(M,)`` int64 counts the real balls that a generated sample is in, ``recalled``
-    ``(N,)`` bool says whether a real sample is in a generated ball, and ``covered`` ``(N,)`` bool
-    whether the ball of a real sample holds a generated one.
-    """
+    A sample on the edge of a ball is outside.
 
-    in_real: Tensor
-    recalled: Tensor
-    covered: Tensor
-    num_neighbors: int
-
-    @property
-    def precise(self) -> Tensor:
-        """``(M,)`` bool, whether a generated sample is in a real ball."""
-        return self.in_real > 0
-
-    @property
-    def density(self) -> Tensor:
-        """``(M,)`` float64, real balls that a generated sample is in, divided by k."""
-        return self.in_real.double() / self.num_neighbors
-
-
-def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> PRDC:
-    """Precision, recall, density and coverage: the means of :func:`shared_balls`.
+    Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
 
     Args:
         real: ``(N, F)``.
         generated: ``(M, F)``.
         num_neighbors: k, below N and M.
 
+    Returns:
+        float64, in this order: ``precision`` ``(M,)``, 1 for a generated sample in a real ball;
+        ``recall`` ``(N,)``, 1 for a real sample in a generated ball; ``density`` ``(M,)``, real
+        balls around a generated sample divided by k; ``coverage`` ``(N,)``, 1 for a real sample
+        whose ball holds a generated one.
+
     Raises:
         ValueError: If a set has k samples or fewer or holds NaN, or if widths differ.
-    """
-    balls = shared_balls(real, generated, num_neighbors)
-    return PRDC(
-        precision=balls.precise.double().mean().item(),
-        recall=balls.recalled.double().mean().item(),
-        density=balls.density.mean().item(),
-        coverage=balls.covered.double().mean().item(),
-    )
-
-
-def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> SharedBalls:
-    """Samples in the balls of the other set; a ball reaches to the k-th neighbour in its own set.
-
-    A sample on the edge of a ball is outside.
-
-    Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
-    Arguments and errors are those of :func:`precision_recall`.
     """
     real, generated = checked_pair(real, generated, num_neighbors + 1)
     centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances
@@ -392,15 +322,21 @@ def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> Sha
     real_radius = _kth_neighbor(real, num_neighbors) - edge
     generated_radius = _kth_neighbor(generated, num_neighbors) - edge
 
-    inside = []
+    counts = []
     recalled = torch.zeros(len(real), dtype=torch.bool, device=real.device)
     covered = torch.zeros_like(recalled)
     for rows, squared in _squared_distances(generated, real):
         in_real = squared < real_radius
-        inside.append(in_real.sum(dim=1))
+        counts.append(in_real.sum(dim=1))
         covered |= in_real.any(dim=0)
         recalled |= (squared < generated_radius[rows, None]).any(dim=0)
-    return SharedBalls(torch.cat(inside), recalled, covered, num_neighbors)
+    num_real = torch.cat(counts)
+    return {
+        "precision": (num_real > 0).double(),
+        "recall": recalled.double(),
+        "density": num_real.double() / num_neighbors,
+        "coverage": covered.double(),
+    }
 
 
 def _squared_distances(x: Tensor, y: Tensor) -> Iterator[tuple[slice, Tensor]]:

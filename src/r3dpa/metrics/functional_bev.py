@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,29 +28,25 @@ MAX_SIDE = 2048
 
 @dataclass(frozen=True)
 class BEVGrid:
-    """Cells of the bird's-eye view; the defaults are those of the published JSD and MMD.
+    """Square grid around the sensor seen from above; by default that of the published JSD and MMD.
 
     Args:
-        x_m: Limits of x in metres; points on or beyond a limit are outside.
-        y_m: Limits of y in metres.
+        half_m: Limit of x and y to both sides in metres; points on or beyond it are outside.
         cell_m: Edge of a cell in metres.
     """
 
-    x_m: tuple[float, float] = (-50.0, 50.0)
-    y_m: tuple[float, float] = (-50.0, 50.0)
+    half_m: float = 50.0
     cell_m: float = 0.05
+
+    @property
+    def side(self) -> int:
+        """Cells along a side."""
+        return math.ceil(2 * self.half_m / self.cell_m)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Cells along x and y."""
-        sides = (self.x_m, self.y_m)
-        rows, columns = (math.ceil((high - low) / self.cell_m) for low, high in sides)
-        return rows, columns
-
-    def inside(self, points: Tensor) -> Tensor:
-        """Which points ``(P, 2 or more)`` lie on the grid: ``(P,)`` bool."""
-        low, high = points.new_tensor([self.x_m, self.y_m]).T
-        return ((points[:, :2] > low) & (points[:, :2] < high)).all(dim=1)
+        return self.side, self.side
 
     def kept(self, points: Tensor, name: str = "cloud") -> Tensor:
         """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one.
@@ -57,16 +54,17 @@ class BEVGrid:
         Raises:
             ValueError: If a coordinate is NaN or infinite, or no point is inside the limits.
         """
-        found = _checked_points(points, name)[self.inside(points)]
+        found = _checked_points(points, name)
+        found = found[(found[:, :2].abs() < self.half_m).all(dim=1)]
         if len(found) == 0:
             raise ValueError(
-                f"{name}: none of {len(points)} points has x in {self.x_m} and y in {self.y_m} m; "
+                f"{name}: none of {len(points)} points has x and y within {self.half_m:g} m; "
                 "check the unit and the frame, or leave the cloud out and say so"
             )
         return found
 
     def cells(self, points: Tensor, name: str = "cloud") -> Tensor:
-        """Cells ``(n,)`` int64 that hold a point, ``x index * columns + y index``, ascending.
+        """Cells ``(n,)`` int64 that hold a point, ``x index * side + y index``, ascending.
 
         Index 0 is at the lower limit. The division has the precision of the points, as in the
         official code, which decides on points between two cells. Errors are those of :meth:`kept`.
@@ -74,11 +72,8 @@ class BEVGrid:
         inside = self.kept(points, name)[:, :2]
         # A tensor, not a number: division by a number may become a product with its inverse.
         indices = torch.floor(inside / inside.new_full((), self.cell_m)).long()
-        first = [math.ceil(side[0] / self.cell_m) for side in (self.x_m, self.y_m)]
-        indices -= torch.tensor(first).to(indices.device)
-        rows, columns = self.shape
-        row, column = indices[:, 0].clamp(0, rows - 1), indices[:, 1].clamp(0, columns - 1)
-        return (row * columns + column).unique()
+        indices = (indices - math.ceil(-self.half_m / self.cell_m)).clamp(0, self.side - 1)
+        return (indices[:, 0] * self.side + indices[:, 1]).unique()
 
     def histogram(self, clouds: Iterable[Tensor]) -> Tensor:
         """Number of clouds that occupy each cell: ``shape`` int64."""
@@ -102,21 +97,13 @@ def _checked_points(points: Tensor, name: str) -> Tensor:
     return points
 
 
-@dataclass(frozen=True)
-class HistogramDistance:
-    """Distances of two normalised histograms, under the published names and the true ones.
+class HistogramDistance(NamedTuple):
+    """Distances of two normalised histograms, under the published names and the true ones."""
 
-    Args:
-        jsd_distance: Root of the divergence, 0 to sqrt(ln 2) = 0.8326: **the published "JSD"**.
-        jsd_divergence: Jensen-Shannon divergence in nats, 0 to ln 2 = 0.6931.
-        l1: Sum of absolute differences, 0 to 2: the official code's "TV".
-        total_variation: Half of it, 0 to 1.
-    """
-
-    jsd_distance: float
-    jsd_divergence: float
-    l1: float
-    total_variation: float
+    jsd_distance: float  # root of the divergence, 0 to sqrt(ln 2) = 0.8326: the published "JSD"
+    jsd_divergence: float  # Jensen-Shannon divergence in nats, 0 to ln 2 = 0.6931
+    l1: float  # sum of absolute differences, 0 to 2: the official code's "TV"
+    total_variation: float  # half of it, 0 to 1
 
 
 def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
@@ -154,18 +141,11 @@ def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
     return float((there**2).mean() + (back**2).mean()) / 2
 
 
-@dataclass(frozen=True)
-class Matching:
-    """The nearest sample of each reference.
+class Matching(NamedTuple):
+    """The nearest sample of each reference."""
 
-    ``squared_normalised`` ``(R,)`` float64 is the squared Chamfer distance in units of the squared
-    width of the grid, ``nearest`` ``(R,)`` int64 the index of the sample, and ``num_compared`` the
-    number of pairs whose second direction was computed.
-    """
-
-    squared_normalised: Tensor
-    nearest: Tensor
-    num_compared: int
+    squared_normalised: Tensor  # (R,) float64, squared Chamfer distance over squared grid width
+    nearest: Tensor  # (R,) int64, index of the sample
 
     @property
     def mmd_squared_normalised(self) -> float:
@@ -178,7 +158,7 @@ def minimum_matching(
 ) -> Matching:
     """Smallest Chamfer distance from each reference to any sample, on occupied cells.
 
-    Clouds are vectors of :meth:`BEVGrid.cells` on one square grid. The distance of two is
+    Clouds are vectors of :meth:`BEVGrid.cells` on one grid. The distance of two is
     ``(mean_x min_y |x - y|^2 + mean_y min_x |x - y|^2) / 2`` over the indices of their cells
     divided by the cells along a side: squared, without a unit.
 
@@ -189,9 +169,9 @@ def minimum_matching(
     Source: Achlioptas et al., ICML 2018; in this form LiDM, CVPR 2024.
 
     Raises:
-        ValueError: If a set or a vector is empty, or the grid is not square.
+        ValueError: If a set or a vector is empty.
     """
-    side = _side(grid)
+    side = grid.side
     for name, clouds in (("references", references), ("samples", samples)):
         if len(clouds) == 0 or any(len(cells) == 0 for cells in clouds):
             raise ValueError(f"{name}: no cloud, or one without an occupied cell; leave it out")
@@ -202,38 +182,21 @@ def minimum_matching(
         table = _distance_table(cells, side)
         return [_mean_lookup(table, other) for other in reference_cells]
 
-    def match(job: tuple[Cells, NDArray[np.float64]]) -> tuple[float, int, int]:
-        cells, there = job
+    def match(cells: Cells, there: NDArray[np.float64]) -> tuple[float, int]:
         table = _distance_table(cells, side)
-        best, nearest, compared = math.inf, -1, 0
+        best, nearest = math.inf, -1
         for index in np.argsort(there, kind="stable"):
             if there[index] >= best:  # the way back only adds to it
                 break
-            compared += 1
             both = there[index] + _mean_lookup(table, sample_cells[index])
             if both < best:
                 best, nearest = both, int(index)
-        return best, nearest, compared
+        return best, nearest
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         there = np.array(list(pool.map(to_sample, sample_cells))).T
-        found = list(pool.map(match, zip(reference_cells, there, strict=True)))
-    best, nearest, compared = zip(*found, strict=True)
-    return Matching(
-        torch.tensor(best, dtype=torch.float64) / (2 * side**2),
-        torch.tensor(nearest),
-        sum(compared),
-    )
-
-
-def _side(grid: BEVGrid) -> int:
-    rows, columns = grid.shape
-    if rows != columns or rows > MAX_SIDE:
-        raise ValueError(
-            f"matching needs a square grid of at most {MAX_SIDE} x {MAX_SIDE} cells, got {rows} x "
-            f"{columns}; change x_m, y_m or cell_m"
-        )
-    return rows
+        best, nearest = zip(*pool.map(match, reference_cells, there), strict=True)
+    return Matching(torch.tensor(best, dtype=torch.float64) / (2 * side**2), torch.tensor(nearest))
 
 
 def _distance_table(cells: Cells, side: int) -> NDArray[np.int32]:

@@ -61,11 +61,11 @@ class Protocol:
         for key in ("voxel_m", "num_samples", "num_mmd_samples", "num_mmd_references"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be above 0, got {getattr(self, key)}")
-        side, (low, high) = max(self.grid.shape), self.grid.x_m
+        side = self.grid.side
         if side > MAX_SIDE:  # here, and not by MMD at the end of an evaluation
             raise ValueError(
                 f"voxel_m = {self.voxel_m} makes a grid of {side} cells along a side, but MMD can "
-                f"match {MAX_SIDE}; give at least {(high - low) / MAX_SIDE:.4f}"
+                f"match {MAX_SIDE}; give at least {2 * self.grid.half_m / MAX_SIDE:.4f}"
             )
 
     @property
