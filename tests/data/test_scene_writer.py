@@ -130,7 +130,7 @@ def test_lost_range_images_are_not_made_up(tmp_path, damage):
             file.truncate(images.stat().st_size - 4)
     before = files(tmp_path)
     with pytest.raises(
-        ValueError, match=rf"\.npy .*{damage}, but .* of 2 scenes.*--overwrite true"
+        ValueError, match=r"\.npy is gone or cut short, but .* of 2 scenes.*--overwrite true"
     ):
         writer(tmp_path, 4)
     assert files(tmp_path) == before
@@ -150,21 +150,11 @@ def test_evaluations_of_all_scenes_outlive_an_interrupt(tmp_path):
         assert third.evaluations == 0
 
 
-def test_an_error_of_the_thread_is_told_beside_another_one(tmp_path, caplog):
-    """Drawing fails while a batch that cannot be written is still waiting."""
-    broken = torch.full((1, 4, 8), torch.nan)
-
-    def draw(error=None):
-        with writer(tmp_path, 3) as open_writer:
-            open_writer.put(broken)
-            if error is not None:
-                raise error
-
-    with pytest.raises(RuntimeError, match="out of memory"):
-        draw(RuntimeError("out of memory"))
-    assert "scene 000000" in caplog.text
-    with pytest.raises(ValueError, match=r"scene 000000 .* holds NaN: the networks diverged"):
-        draw()  # the block ends, and nobody asks for the result
+def test_an_error_of_the_thread_ends_the_block(tmp_path):
+    """Nobody asks for the result of a batch that cannot be written."""
+    message = r"scene 000000 .* holds NaN: the networks diverged"
+    with pytest.raises(ValueError, match=message), writer(tmp_path, 3) as open_writer:
+        open_writer.put(torch.full((1, 4, 8), torch.nan))
     assert not (tmp_path / "metadata.json").exists()
 
 

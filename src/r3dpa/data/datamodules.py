@@ -18,7 +18,6 @@ from r3dpa.data.feature_grids import (
     Extractor,
     FeatureGrids,
     any_settings,
-    default_features_dir,
     plan,
     write_feature_grids,
 )
@@ -251,7 +250,7 @@ class LidarDataModule(LoaderModule):
                 f"features_dir is needed for scans given as {self.scans!r}: only a single folder "
                 "has a default place for its feature grids."
             )
-        return default_features_dir(scans, cast(Extractor, self.extractor).name)
+        return Path(scans) / "feature_grids" / cast(Extractor, self.extractor).name
 
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         """Training and held-out scans within ``limit``, and the projection."""

@@ -204,11 +204,6 @@ class GridPlan:
     num_bytes: int
 
 
-def default_features_dir(data_root: str | Path, name: str) -> Path:
-    """``data_root/feature_grids/<name>``, the folder of an extractor unless another is given."""
-    return Path(data_root) / "feature_grids" / name
-
-
 def plan(
     scans: Sequence[Scan],
     extractor: Extractor,

@@ -274,7 +274,7 @@ def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                     raise ValueError("it is larger than the file")
                 yield info.filename.removesuffix(".npy"), _array(archive.read(info))
     except ARCHIVE_ERRORS as error:
-        raise ScanError(f"{where}: is damaged, or not an array of numbers ({error})") from error
+        raise ScanError(f"{where}: is damaged or no .npz file of numbers ({error})") from error
 
 
 def _array(data: bytes) -> np.ndarray:
@@ -385,9 +385,8 @@ class CheckReport:
         total = sum(self.num_scans.values())
         problems = f"{len(self.bad)} bad, {len(self.missing)} folders missing or without scans"
         verdict = "all usable" if self.ok else problems
-        return "\n".join(
-            [*lines, f"{self.root}: {total} scans in {len(self.num_scans)} drives, {verdict}"]
-        )
+        lines.append(f"{self.root}: {total} scans in {len(self.num_scans)} drives, {verdict}")
+        return "\n".join(lines)
 
 
 def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
@@ -402,24 +401,20 @@ def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8)
     scans = find_scans(root) if any(scan_files(root)) else []
     counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
     missing, bad = _compare_layout(root, counts)
-    scales = []
+    scales: list[float] = []
 
-    def examine(scan: Scan) -> str | tuple[float, float]:
+    def examine(scan: Scan) -> None:
         try:
             intensity = read_scan(scan.path, sensor)[:, 3]
+            scales.extend((float(intensity.min()), float(intensity.max())))
         except ScanError as error:
-            return str(error).removeprefix(f"{scan.path}: ")
-        return float(intensity.min()), float(intensity.max())
+            bad.append((scan.path, str(error).removeprefix(f"{scan.path}: ")))
 
     with ThreadPool(workers) as pool:
-        results = tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None)
-        for scan, found in zip(scans, results, strict=True):
-            if isinstance(found, str):
-                bad.append((scan.path, found))
-            else:
-                scales.append(found)
-    scale = (min(low for low, _ in scales), max(high for _, high in scales)) if scales else None
-    return CheckReport(root, counts, tuple(bad), tuple(missing), scale)
+        for _ in tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None):
+            pass
+    scale = (min(scales), max(scales)) if scales else None
+    return CheckReport(root, counts, tuple(sorted(bad)), tuple(missing), scale)
 
 
 def _compare_layout(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import logging
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from io import SEEK_END, FileIO
+from io import BytesIO, FileIO
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,8 +21,6 @@ from r3dpa.data.store import append
 from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
 from r3dpa.io import atomic_path, delete_unfinished, only_writer
-
-_log = logging.getLogger(__name__)
 
 SCENE_FORMATS = ("bin", "ply", "npz")
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
@@ -47,9 +44,9 @@ class SceneWriter:
 
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
     request and the number of scenes written. At most three batches are in memory. An error of the
-    thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block; where
-    that ends with another error, it is logged. ``ValueError`` if a format is unknown, another
-    process writes to ``out``, or it holds scenes, or unfinished ones of another request.
+    thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block.
+    ``ValueError`` if a format is unknown, another process writes to ``out``, or it holds scenes, or
+    unfinished ones of another request.
 
     Args:
         out: Folder; one process at a time writes to it.
@@ -111,8 +108,6 @@ class SceneWriter:
         failed = next(filter(None, (one.exception() for one in self._waiting)), None)
         if failed is not None and error is None:
             raise failed
-        if failed is not None:  # two things went wrong: the other one is on its way up
-            _log.error("scenes were not written to %s: %s", self.out, failed)
 
     @property
     def range_path(self) -> Path:
@@ -170,29 +165,19 @@ class SceneWriter:
                     f"{found.get(key)!r}, not {self._request.get(key)!r}; its own command goes on, "
                     "--overwrite true starts anew"
                 )
-        if num_done and not self._unfinished.exists():  # stopped between the two last files
-            if not self.range_path.exists():
-                raise ValueError(self._lost(num_done, "is gone"))
-            self.range_path.replace(self._unfinished)
+        if num_done and not self._unfinished.exists() and self.range_path.exists():
+            self.range_path.replace(self._unfinished)  # stopped between the two last files
         return num_done, evaluations
-
-    def _lost(self, num_done: int, what: str) -> str:
-        return (
-            f"{self._unfinished} {what}, but {self._state} tells of {num_done} scenes: give "
-            "--overwrite true to start anew"
-        )
 
     def _clear(self) -> None:
         """Remove the output of earlier runs, and nothing else."""
         metadata = self.out / "metadata.json"
-        written = [self.out / name for name in _WRITTEN]
-        if not metadata.exists() and not self._state.exists():
-            for path in written:
-                if path.exists():
-                    raise ValueError(
-                        f"{path} is in the way and no scenes of this command lie in {self.out}; "
-                        "give another --out"
-                    )
+        written = [path for name in _WRITTEN if (path := self.out / name).exists()]
+        if written and not metadata.exists() and not self._state.exists():
+            raise ValueError(
+                f"{written[0]} is in the way and no scenes of this command lie in {self.out}; "
+                "give another --out"
+            )
         # Marks the folder as ours, should this be interrupted.
         self.out.mkdir(parents=True, exist_ok=True)
         self._save_state(0, 0)
@@ -207,13 +192,18 @@ class SceneWriter:
         """File of the range images, positioned after those that are written."""
         sensor = self._projection.sensor
         shape = (self.num, sensor.beams, sensor.columns)
+        header = BytesIO()
+        layout = {"descr": "<f4", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(header, layout)
+        end = header.tell() + 4 * self.num_done * sensor.beams * sensor.columns
+        size = self._unfinished.stat().st_size if self._unfinished.exists() else 0
+        if self.num_done and size < end:  # to extend it would make scenes of zeros
+            raise ValueError(
+                f"{self._unfinished} is gone or cut short, but {self._state} tells of "
+                f"{self.num_done} scenes: give --overwrite true to start anew"
+            )
         file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
-        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        end = file.tell() + 4 * self.num_done * sensor.beams * sensor.columns
-        if file.seek(0, SEEK_END) < end:  # to extend it would make scenes of zeros
-            file.close()
-            raise ValueError(self._lost(self.num_done, "was cut short"))
+        file.write(header.getvalue())
         file.truncate(end)
         file.seek(end)
         return file

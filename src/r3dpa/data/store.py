@@ -19,7 +19,7 @@ import math
 import mmap
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
 from itertools import count
@@ -190,7 +190,7 @@ class StoreWriter:
         self._store, self._shard = store, shard
         self._files: tuple[FileIO, FileIO] | None = None
         self._num_rows = 0
-        self._known = store.places()
+        self._known = set(store.places())
         settings = store.folder / "settings.json"
         if not settings.exists():
             with writing(store.what, store.folder), atomic_path(settings) as temporary:
@@ -209,11 +209,10 @@ class StoreWriter:
         if not new:
             return
         kept = tensors[list(new.values())]
-        for key, finite in zip(new, kept.isfinite().flatten(1).all(dim=1).tolist(), strict=True):
-            if not finite:
-                raise StoreError(
-                    f"{self._store.what} of {key[0]} are not finite; leave this file out"
-                )
+        finite = kept.isfinite().flatten(1).all(dim=1).tolist()
+        if not all(finite):
+            name = [*new][finite.index(False)][0]
+            raise StoreError(f"{self._store.what} of {name} are not finite; leave this file out")
         lines = [
             json.dumps({"scan": name, "bytes": size, "mtime_ns": time, "row": row}) + "\n"
             for row, (name, size, time) in enumerate(new, start=self._num_rows)
@@ -228,7 +227,7 @@ class StoreWriter:
                 self.close()  # what is unfinished is at the end, and does not count
                 raise
         self._num_rows += len(new)
-        self._known |= dict.fromkeys(new, (self._shard, 0))
+        self._known |= new.keys()
 
     def close(self) -> None:
         """Close the files; rows added later go to another shard."""
@@ -244,14 +243,13 @@ class StoreWriter:
 
     def _open(self) -> tuple[FileIO, FileIO]:
         """Rows and journal; without buffers, which would be written after an error."""
-        for shard in () if self._files else count(self._shard):
+        for shard in count(self._shard):
+            if self._files is not None:
+                break
             rows = self._store.folder / f"shard_{shard:05d}.rows"
-            try:
+            with suppress(FileExistsError):
                 file = rows.open("xb", buffering=0)
-            except FileExistsError:
-                continue
-            self._files = file, rows.with_suffix(".jsonl").open("ab", buffering=0)
-            break
+                self._files = file, rows.with_suffix(".jsonl").open("ab", buffering=0)
         assert self._files is not None
         return self._files
 
@@ -276,13 +274,8 @@ class CachedTensors(Generic[Item]):
         ``StoreError`` if its file was replaced since the row was made, or the store was damaged.
         """
         place = self._places.get(item.cache_key)
-        if place is None and item.name not in {key[0] for key in self._places}:
-            raise self._missing([item])
         if place is None:
-            raise StoreError(
-                f"{item.path} was replaced, or copied without its time of change, after its row in "
-                f"{self.store.folder} was made: make it again {self.store.remedy}"
-            )
+            raise self._missing([item])
         shard, row = place
         size = self.store.row_bytes
         start, mapping = row * size, self._mapped(shard)
@@ -312,8 +305,9 @@ class CachedTensors(Generic[Item]):
     def _missing(self, items: Sequence[Cacheable]) -> StoreError:
         more = f" and {len(items) - 1} more" if len(items) > 1 else ""
         return StoreError(
-            f"No {self.store.what} of {items[0].path}{more} in {self.store.folder}: make what is "
-            f"missing {self.store.remedy}"
+            f"No {self.store.what} of {items[0].path}{more} in {self.store.folder}, or the file "
+            "was replaced, or copied without its time of change, since: make what is missing "
+            f"{self.store.remedy}"
         )
 
     def __getstate__(self) -> dict[str, Any]:
