@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from matplotlib.collections import LineCollection
+from matplotlib.contour import ContourSet
 
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.viz import EditRow, edit_sheet
@@ -14,25 +14,25 @@ PROJECTION = SphericalProjection(LidarSensor(beams=8, columns=16))
 RANGE_M = torch.full((8, 16), 10.0)
 
 
-def lines(parts):
+def contours(parts):
+    """Places ``(x, y)`` of the outline of parts; pixel centres have whole numbers."""
     sheet = edit_sheet([EditRow("after", RANGE_M, outline=parts)], ("kept", "new"), PROJECTION)
-    (found,) = (c for c in sheet.axes[0].collections if isinstance(c, LineCollection))
-    return {tuple(map(tuple, segment.astype(int).tolist())) for segment in found.get_segments()}
+    found = [c for c in sheet.axes[0].collections if isinstance(c, ContourSet)]
+    return {
+        tuple(place) for c in found for path in c.get_paths() for place in path.vertices.tolist()
+    }
 
 
-def test_the_outline_of_one_pixel_is_its_four_sides():
+def test_the_outline_of_one_pixel_goes_around_it():
     parts = np.zeros((8, 16), np.uint8)
     parts[3, 5] = 1
-    assert lines(parts) == {
-        *(((5, 3), (5, 4)), ((6, 3), (6, 4))),
-        *(((5, 3), (6, 3)), ((5, 4), (6, 4))),
-    }
+    assert contours(parts) == {(4.5, 3), (5.5, 3), (5, 2.5), (5, 3.5)}
 
 
 def test_no_outline_hides_a_picture_of_dropped_beams():
     parts = np.zeros((8, 16), np.uint8)
     parts[1::2] = 1
-    assert not lines(parts)
+    assert not contours(parts)
 
 
 def test_azimuths_stand_below_their_columns():
@@ -42,9 +42,9 @@ def test_azimuths_stand_below_their_columns():
     places = dict(
         zip([t.get_text() for t in axes.get_xticklabels()], axes.get_xticks(), strict=True)
     )
-    assert places["0°"] == pytest.approx(8, abs=0.5)
-    assert places["135°"] == pytest.approx(2, abs=0.5)
-    assert places["-90°"] == pytest.approx(12, abs=0.5)
+    assert places["0°"] == pytest.approx(7.5, abs=0.5)
+    assert places["135°"] == pytest.approx(1.5, abs=0.5)
+    assert places["-90°"] == pytest.approx(11.5, abs=0.5)
 
 
 def test_a_mask_is_drawn_on_grey_and_colours_its_part_alone():

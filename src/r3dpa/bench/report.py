@@ -15,7 +15,7 @@ from r3dpa.bench.measure import Comparison
 from r3dpa.bench.rows import Row, front_of, quality_levels, sentences
 from r3dpa.io import atomic_path, one_line, text_table
 
-#: NFE of the rows where there is time for all; the picture shows the least time of each.
+#: NFE of the rows where there is time for all.
 EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
 
 _TITLES = {
@@ -104,17 +104,15 @@ def _record(found: Finding) -> dict[str, Any]:
 
 
 def _picture(name: str, found: Finding) -> Figure:
-    """Error against time, with the least time of some NFE at the peak of the device."""
+    """Error against time."""
     front = front_of(found.rows, found.timing.tolerance)
     bf16 = [row for row in found.rows if row.way.precision == "bf16" and row.precision_error]
-    counts = sorted({row.way.nfe for row in found.rows if row.way.nfe in EVALUATIONS})
     return viz.pareto_figure(
         f"What accuracy costs in time: {_TITLES[name]}",
         "RMSE of the latents from the converged solution",
         _points(found.rows),
         _points(front),
         {"bf16 against fp32": bf16[0].precision_error or 0.0} if bf16 else {},
-        {nfe: (nfe * found.flop[0] + found.flop[1]) / found.peak_flop_s for nfe in counts},
         sentences(front),
     )
 

@@ -6,17 +6,16 @@ Colours are perceptually uniform and safe for colour-blind readers, on scales fi
 pictures of different scenes can be compared. Dark means that there is no return.
 """
 
-from r3dpa.viz.curves import Series, loss_curves, read_metrics
-from r3dpa.viz.edits import EditRow, edit_page, edit_sheet
-from r3dpa.viz.evaluation import MatchedPair, bev_histograms, matches_figure, range_histogram
-from r3dpa.viz.features import (
-    FeatureColours,
-    feature_figure,
-    feature_grid_picture,
-    latents_picture,
-    pca_colours,
-    similarity_picture,
+from r3dpa.viz.curves import (
+    ParetoPoint,
+    Series,
+    discretisation_figure,
+    loss_curves,
+    pareto_figure,
+    read_metrics,
 )
+from r3dpa.viz.edits import EditRow, edit_page, edit_sheet
+from r3dpa.viz.features import feature_figure, latents_picture, pca_colours, similarity_picture
 from r3dpa.viz.figures import (
     birds_eye_sheet,
     birds_eye_view,
@@ -25,19 +24,21 @@ from r3dpa.viz.figures import (
     scenes_sheet,
 )
 from r3dpa.viz.page import Category, PageScan, scan_page
-from r3dpa.viz.pareto import ParetoPoint, discretisation_figure, pareto_figure
-from r3dpa.viz.pixels import palette_image, save
-from r3dpa.viz.scans import birds_eye_picture, encoded_picture, range_image_picture, scene_3d
+from r3dpa.viz.pictures import (
+    birds_eye_picture,
+    encoded_picture,
+    palette_image,
+    range_image_picture,
+    save,
+    scene_3d,
+)
 
 __all__ = [
     "Category",
     "EditRow",
-    "FeatureColours",
-    "MatchedPair",
     "PageScan",
     "ParetoPoint",
     "Series",
-    "bev_histograms",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
@@ -46,14 +47,11 @@ __all__ = [
     "edit_sheet",
     "encoded_picture",
     "feature_figure",
-    "feature_grid_picture",
     "latents_picture",
     "loss_curves",
-    "matches_figure",
     "palette_image",
     "pareto_figure",
     "pca_colours",
-    "range_histogram",
     "range_image_picture",
     "range_strips",
     "read_metrics",

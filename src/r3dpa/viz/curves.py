@@ -1,35 +1,45 @@
-"""Logged quantities of a training run as curves."""
+"""Logged quantities of a run as curves, and what accuracy costs in time."""
 
 from __future__ import annotations
 
 import csv
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 Series = tuple[Sequence[float], Sequence[float]]
 
+#: Safe for colour-blind readers (Okabe and Ito, then Tol), in the order of the solvers.
+COLOURS = (
+    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7f7f7f", "#332288"),
+    *("#882255", "#117733", "#999933", "#000000"),
+)
+_MARKERS = "osD^vPX<>hpd"
+_WRAP = 150  # characters of a sentence under the picture
 
-def loss_curves(curves: str | Path | Mapping[str, Series]) -> Figure:
+
+def loss_curves(curves: Mapping[str, Series]) -> Figure:
     """One panel per logged quantity: every value, faint, and a centred running mean.
 
     The title of a panel gives the first and the last value. The axis is logarithmic where all
     values are positive and differ. Quantities with a single value are no curve and left out.
 
     Args:
-        curves: ``metrics.csv`` of Lightning's ``CSVLogger``, or name -> (steps, values).
+        curves: Steps and values by name, as from :func:`read_metrics`.
 
     Raises:
-        ValueError: If there is nothing to draw or the file is not such a table.
+        ValueError: If there is nothing to draw.
     """
-    series = curves if isinstance(curves, Mapping) else read_metrics(curves)
-    series = {name: pair for name, pair in series.items() if len(pair[1]) > 1}
+    series = {name: pair for name, pair in curves.items() if len(pair[1]) > 1}
     if not series:
         raise ValueError("no quantity with two values or more; train with a CSVLogger for longer")
     columns = min(4, len(series))
@@ -53,27 +63,24 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
         ValueError: If there is no column ``step``, or a cell is not a number.
     """
     with Path(path).open(newline="", encoding="utf-8") as file:
-        lines = [line for line in file if line.endswith("\n")]
-    rows = csv.DictReader(lines, restval="")
-    if "step" not in (rows.fieldnames or ()):
+        table = csv.DictReader([line for line in file if line.endswith("\n")], restval="")
+    names = [name for name in table.fieldnames or () if name not in ("step", "epoch")]
+    if "step" not in (table.fieldnames or ()):
         raise ValueError(
-            f"{path} has no column 'step' but {rows.fieldnames}; give metrics.csv of a CSVLogger"
+            f"{path} has no column 'step' but {names}; give metrics.csv of a CSVLogger"
         )
-    series: dict[str, tuple[list[float], list[float]]] = {}
-    for row in rows:
-        for name in rows.fieldnames or ():
-            if name in ("step", "epoch") or not row[name].strip():
+    series: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in names}
+    for row in table:
+        for name in names:
+            if not row[name].strip():
                 continue
             try:
-                step, value = float(row["step"]), float(row[name])
+                series[name][0].append(float(row["step"]))
+                series[name][1].append(float(row[name]))
             except ValueError as error:
-                raise ValueError(
-                    f"{path}, line {rows.line_num}, column {name!r}: {error}"
-                ) from None
-            steps, values = series.setdefault(name, ([], []))
-            steps.append(step)
-            values.append(value)
-    return {name: series[name] for name in rows.fieldnames or () if name in series}
+                where = f"{path}, line {table.line_num}, column {name!r}"
+                raise ValueError(f"{where}: {error}") from None
+    return {name: pair for name, pair in series.items() if pair[0]}
 
 
 def _draw_curve(
@@ -112,3 +119,136 @@ def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64
     total = np.convolve(np.where(finite, values, 0.0), window, mode="same")
     count = np.convolve(finite.astype(np.float64), window, mode="same")
     return np.where(finite, total / np.maximum(count, 1.0), np.nan)
+
+
+class ParetoPoint(NamedTuple):
+    """One way to sample: its label, the solver that gives its colour, and its numbers.
+
+    ``seconds`` per scene and ``value`` (better when lower, in ``interval``) are above 0; open
+    markers run in fp32.
+    """
+
+    label: str
+    solver: str
+    nfe: int
+    seconds: float
+    value: float
+    interval: tuple[float, float]
+    filled: bool = False
+
+
+def pareto_figure(
+    title: str,
+    value_name: str,
+    points: Sequence[ParetoPoint],
+    front: Sequence[ParetoPoint],
+    levels: Mapping[str, float],
+    sentences: Sequence[str],
+) -> Figure:
+    """Error against seconds per scene, both logarithmic, with the front as a line.
+
+    Args:
+        title: Above the picture.
+        value_name: Label of the vertical axis, with unit.
+        points: All ways to sample, at least one.
+        front: Points of the Pareto front, from the fastest on.
+        levels: Horizontal lines by name, such as the error of bf16; at most three.
+        sentences: Under the picture: one for each step along the front.
+    """
+    styles = _styles(points)
+    lines = ["Error and time along the front"]
+    for sentence in sentences:
+        lines += textwrap.wrap(sentence, _WRAP, subsequent_indent="    ")
+    below = 0.19 * len(lines)
+    figure = Figure(figsize=(12.0, 6.8 + below), dpi=110, layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(6.8, below))[:, 0]
+    axes = upper.subplots()
+    for point in points:
+        colour, marker = styles[point.solver]
+        low, high = point.interval
+        axes.errorbar(
+            point.seconds,
+            point.value,
+            yerr=[[max(point.value - low, 0)], [max(high - point.value, 0)]],
+            color=colour,
+            marker=marker,
+            markerfacecolor=colour if point.filled else "white",
+            elinewidth=0.8,
+            linestyle="none",
+            zorder=3,
+        )
+    axes.plot([p.seconds for p in front], [p.value for p in front], color="#222222", lw=1.4)
+    for point in front:
+        place = (point.seconds, point.value)
+        axes.annotate(point.label, place, (7, 7), textcoords="offset points", fontsize=8, zorder=4)
+    entries = [
+        Line2D([], [], color=colour, marker=marker, linestyle="none", label=solver)
+        for solver, (colour, marker) in styles.items()
+    ]
+    entries.append(Line2D([], [], color="#222222", label="Pareto front (95 %)"))
+    for style, (name, value) in zip(("--", "-.", ":"), levels.items(), strict=False):
+        line = axes.axhline(value, color="#555555", linewidth=1.0, linestyle=style, zorder=1)
+        line.set_label(f"{name}: {value:.3g}")
+        entries.append(line)
+    entries.append(Line2D([], [], linestyle="none", label="open: fp32; filled: bf16"))
+    axes.legend(handles=entries, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    values = [*(p.value for p in points), *levels.values()]
+    axes.set(xscale="log", yscale="log", xlabel="seconds per scene", ylabel=value_name)
+    axes.set_ylim(min(values) / (max(values) / min(values)) ** 0.13 / 1.1, None)
+    axes.grid(alpha=0.25, which="major")
+    upper.suptitle(title, fontsize=12, x=0.02, ha="left")
+    text = "\n".join(lines)
+    lower.text(0.02, 0.98, text, ha="left", va="top", fontsize=8.5, parse_math=False)
+    return figure
+
+
+def discretisation_figure(
+    panels: Mapping[str, Sequence[ParetoPoint]], references: Mapping[str, float]
+) -> Figure:
+    """Error of the solvers against network evaluations, with slopes of order 1 and 2.
+
+    Args:
+        panels: Points by title of the panel; their ``value`` is the error.
+        references: Error of the converged reference by title; errors below ten times of it cannot
+            be resolved.
+    """
+    figure = Figure(figsize=(6.6 * len(panels) + 0.4, 5.6), dpi=110, layout="constrained")
+    cells = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (title, points) in zip(cells, panels.items(), strict=True):
+        for solver, (colour, marker) in _styles(points).items():
+            own = sorted((p for p in points if p.solver == solver), key=lambda p: p.nfe)
+            counts, errors = [p.nfe for p in own], [p.value for p in own]
+            axes.plot(counts, errors, color=colour, marker=marker, ms=5, lw=1.2, label=solver)
+        _draw_orders(axes, points, 10 * references.get(title, 0.0))
+        axes.set_title(title, fontsize=11)
+        axes.legend(fontsize=7.5, frameon=False)
+    return figure
+
+
+def _draw_orders(axes: Axes, points: Sequence[ParetoPoint], unsure: float) -> None:
+    """Guides, the range that the reference cannot resolve, and the scales."""
+    counts = np.array(sorted({point.nfe for point in points}), dtype=float)
+    lowest, highest = (f(point.value for point in points) for f in (min, max))
+    for order, style in ((1, ":"), (2, "--")):
+        guide = 1.3 * highest * (counts / counts[0]) ** -order
+        axes.plot(counts, guide, color="#888888", linestyle=style, label=f"order {order}")
+    if unsure > 0:
+        label = "not converged: reference unsure"
+        axes.axhspan(1e-300, unsure, color="#cc3311", alpha=0.12, linewidth=0, label=label)
+    axes.set(xscale="log", yscale="log")
+    axes.set_ylim(min(lowest, max(unsure, lowest / 3)) / 1.6, 2.2 * highest)
+    axes.set_xlabel("network evaluations per sample (NFE)")
+    axes.set_ylabel("RMSE of the latents from the converged solution")
+    axes.xaxis.set_major_locator(LogLocator(2))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.grid(alpha=0.25, which="major")
+
+
+def _styles(points: Sequence[ParetoPoint]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each solver, in order of appearance."""
+    solvers = dict.fromkeys(point.solver for point in points)
+    return {
+        solver: (COLOURS[place % len(COLOURS)], _MARKERS[place % len(_MARKERS)])
+        for place, solver in enumerate(solvers)
+    }

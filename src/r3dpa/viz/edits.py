@@ -12,34 +12,27 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from r3dpa.geometry import Projection, points_of
-from r3dpa.viz.figures import range_bar
+from r3dpa.viz.figures import draw_panorama, range_bar
 from r3dpa.viz.page import PALETTE, Category, PageScan, scan_page
-from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy
-from r3dpa.viz.scans import range_image_picture
+from r3dpa.viz.pictures import Array, Pixels, as_bytes, range_image_picture
 
 _TINT = 0.55  # share of the colour of a part
 _GREY_SHARES = (0.299, 0.587, 0.114)  # of red, green and blue in their brightness
 _MOST_BORDERS = 0.2  # of the pixels: lines between every few beams would hide the picture
 _KEPT, _GREY = "kept", "#8a8f98"
-_AXES = ("H", "W")
 
 
 class EditRow(NamedTuple):
-    """A range image of a sheet.
+    """A range image of a sheet, ``(H, W)`` metres, and its name.
 
-    Attributes:
-        name: Shown above it.
-        range_m: ``(H, W)`` metres, not above 0 without a return.
-        parts: ``(H, W)`` part number of each pixel, shown as a tint of a grey picture.
-        outline: ``(H, W)`` likewise; only the borders between parts are drawn, over the range
-        colours.
+    ``parts`` is the part number of each pixel, ``(H, W)``, shown as a tint of a grey picture;
+    ``outline`` likewise, but only the borders between parts are drawn, over the range colours.
     """
 
     name: str
@@ -63,12 +56,7 @@ def edit_sheet(
         rows: At least one. Azimuths are written below the last.
         part_names: Names of the parts by number; empty where no row has any.
         projection: Gives the limits of the colour scale.
-
-    Raises:
-        ValueError: If there is no row, or an image has other than two axes.
     """
-    if not rows:
-        raise ValueError("edit_sheet got no range image; give at least one")
     height_in = 1.2 * len(rows) + (0.9 if part_names else 0.6)
     figure = Figure(figsize=(13.0, height_in), dpi=110, layout="constrained")
     sensor = projection.sensor
@@ -78,13 +66,10 @@ def edit_sheet(
         picture = range_image_picture(row.range_m, sensor)
         if row.parts is not None:
             picture = _tinted(picture, row.parts, part_names)
-        # One pixel is a unit wide, so that borders of pixels have whole numbers.
-        size = (0, picture.shape[1], picture.shape[0], 0)
-        axes.imshow(picture, aspect="auto", interpolation="nearest", extent=size)
-        if row.outline is not None:
-            axes.add_collection(LineCollection(_borders(row.outline), colors="white", lw=1.2))
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(row.name, loc="left", fontsize=10, parse_math=False)
+        draw_panorama(axes, picture, row.name)
+        if row.outline is not None and (np.diff(row.outline, axis=0) != 0).mean() < _MOST_BORDERS:
+            for part in np.unique(row.outline)[1:]:
+                axes.contour(row.outline == part, [0.5], colors="white", linewidths=1.2)
     _azimuth_ticks(cells[-1], projection)
     range_bar(figure, sensor, ax=list(cells), pad=0.01, aspect=9 * len(rows))
     if part_names:
@@ -114,24 +99,16 @@ def edit_page(
     Raises:
         ValueError: If nothing holds a return.
     """
-    order = projection.column_order().numpy()
-
-    def scan(name: str, range_m: Array) -> PageScan:
+    order = projection.column_order()
+    shown = []
+    for name, range_m in {**after, **before}.items():
         image = torch.as_tensor(range_m)
-        labels = None
-        if parts is not None:
-            labels = parts[:, order][(image[:, order] > 0).numpy()].astype(np.uint32)
-        return PageScan(name, points_of(image, projection), labels)
-
-    images = {**after, **before}
-    shown = [
-        scan(name, image) for name, image in images.items() if (as_numpy(image, _AXES) > 0).any()
-    ]
-    colours = _part_colours(part_names)
-    categories = {
-        number: Category(name, colour)
-        for number, (name, colour) in enumerate(zip(part_names, colours, strict=True))
-    }
+        filled = (image[:, order] > 0).numpy()
+        labels = None if parts is None else parts[:, order.numpy()][filled].astype(np.uint32)
+        if filled.any():
+            shown.append(PageScan(name, points_of(image, projection), labels))
+    named = zip(part_names, _part_colours(part_names), strict=True)
+    categories = {number: Category(*part) for number, part in enumerate(named)}
     first = next((one for one in shown if one.name in before), None)
     reference = None if first is None else replace(first, name=f"before: {first.name}")
     return scan_page(shown, title, categories, {}, reference, projection.sensor)
@@ -142,18 +119,8 @@ def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
     azimuth = projection.ray_angles()[1].rad2deg().numpy()
     wanted = np.arange(135, -180, -45)
     apart = (azimuth[:, None] - wanted + 180) % 360 - 180
-    columns = np.abs(apart).argmin(axis=0) + 0.5
-    axes.set_xticks(columns, [f"{value}°" for value in wanted], fontsize=8)
+    axes.set_xticks(np.abs(apart).argmin(axis=0), [f"{value}°" for value in wanted], fontsize=8)
     axes.tick_params(length=2, pad=2)
-
-
-def _borders(parts: NDArray[np.integer]) -> list[list[tuple[int, int]]]:
-    """Lines ``(x, y)`` between pixels of different parts; none if there are too many."""
-    upright, level = parts[:, 1:] != parts[:, :-1], parts[1:] != parts[:-1]
-    if level.mean() > _MOST_BORDERS:
-        return []
-    lines = [[(x + 1, y), (x + 1, y + 1)] for y, x in np.argwhere(upright).tolist()]
-    return lines + [[(x, y + 1), (x + 1, y + 1)] for y, x in np.argwhere(level).tolist()]
 
 
 def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:

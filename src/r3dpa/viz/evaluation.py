@@ -1,14 +1,12 @@
 """Figures of an evaluation: where samples and real scans differ, and which scans match.
 
-Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view. Shapes other than
-documented and histograms without counts raise a ``ValueError``.
+Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -18,21 +16,15 @@ from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.viz.figures import draw_panorama, range_bar
-from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part, save
-from r3dpa.viz.scans import range_image_picture
+from r3dpa.viz.pictures import BACKGROUND, Array, as_numpy, bright_part, range_image_picture, save
+
+Match = tuple[str, Array, Array]
+"""Title, generated range image ``(H, W)`` in metres, and that of the nearest real scan."""
 
 SAMPLES, REFERENCES = "tab:orange", "tab:blue"
 MAX_CELLS = 250  # drawn along a side; finer histograms are summed over squares of cells
 SHARE_MAP = bright_part("viridis", 0.1)
 DECADES = 4  # of the logarithmic scales
-
-
-class MatchedPair(NamedTuple):
-    """Title, generated range image ``(H, W)`` in metres, and that of the nearest real scan."""
-
-    title: str
-    sample_m: Array
-    reference_m: Array
 
 
 def bev_histograms(
@@ -47,17 +39,12 @@ def bev_histograms(
     have the dark background. The difference is linear near 0.
 
     Args:
-        samples: ``(X, Y)`` counts; index 0 is at the lower limit of x and of y.
+        samples: ``(X, Y)`` counts, not all 0; index 0 is at the lower limit of x and of y.
         references: The same of real scans.
         x_m: Limits of x (forward) in metres.
         y_m: Limits of y (left) in metres.
     """
-    drawn = _shares(samples, "samples", ("X", "Y"))
-    real = _shares(references, "references", ("X", "Y"))
-    if drawn.shape != real.shape:
-        raise ValueError(
-            f"samples are {drawn.shape} but references {real.shape}; give histograms of one grid"
-        )
+    drawn, real = (_shares(as_numpy(counts, ("X", "Y"))) for counts in (samples, references))
     steps = [-(-size // MAX_CELLS) for size in drawn.shape]
     height_m, width_m = (
         step * (high - low) / size
@@ -76,25 +63,23 @@ def bev_histograms(
 
     figure = Figure(figsize=(16.0, 5.4), layout="constrained")
     panels = figure.subplots(1, 3)
-    background = tuple(channel / 255 for channel in BACKGROUND)
-    for axes, values, colours, scale, title in (
-        (panels[0], drawn, SHARE_MAP, share_scale, "samples"),
-        (panels[1], real, SHARE_MAP, share_scale, "references"),
-        (panels[2], difference, "RdBu_r", difference_scale, "samples - references"),
+    empty = (drawn == 0) & (real == 0)
+    for axes, values, hidden, colours, scale, title in (
+        (panels[0], drawn, drawn == 0, SHARE_MAP, share_scale, "samples"),
+        (panels[1], real, real == 0, SHARE_MAP, share_scale, "references"),
+        (panels[2], difference, empty, "RdBu_r", difference_scale, "samples - references"),
     ):
-        empty = (drawn == 0) & (real == 0) if values is difference else values == 0
-        axes.set_facecolor(background)
+        axes.set_facecolor(tuple(channel / 255 for channel in BACKGROUND))
         axes.imshow(
-            np.ma.array(values, mask=empty)[:, ::-1],
+            np.ma.array(values, mask=hidden)[:, ::-1],
             cmap=colours,
             norm=scale,
             extent=drawn_to,  # +y is to the left
             origin="lower",
             interpolation="nearest",
         )
-        axes.set(xlim=y_m[::-1], ylim=x_m)
+        axes.set(xlim=y_m[::-1], ylim=x_m, xlabel="y, left (m)")
         axes.set_title(title, fontsize=11)
-        axes.set_xlabel("y, left (m)")
     panels[0].set_ylabel("x, forward (m)")
     label = f"share of all counts in a cell of {height_m:.3g} x {width_m:.3g} m"
     figure.colorbar(ScalarMappable(share_scale, SHARE_MAP), ax=panels[:2], label=label, shrink=0.8)
@@ -103,9 +88,7 @@ def bev_histograms(
     return figure
 
 
-def range_histogram(
-    edges_m: Array, samples: Array, references: Array, halves: Array | None = None
-) -> Figure:
+def range_histogram(edges_m: Array, samples: Array, references: Array, halves: Array) -> Figure:
     """Returns per metre of range, and the ratio of samples to real scans.
 
     The band is the floor: the range of parts of the real scans. Bins without a real return have no
@@ -113,23 +96,17 @@ def range_histogram(
 
     Args:
         edges_m: ``(K + 1,)`` ascending borders of the bins in metres.
-        samples: ``(K,)`` counts.
+        samples: ``(K,)`` counts, not all 0.
         references: ``(K,)`` counts of real scans.
-        halves: ``(S, K)`` counts of parts of the real scans; None for a figure without the band.
+        halves: ``(S, K)`` counts of parts of the real scans.
     """
     edges = as_numpy(edges_m, ("K + 1",))
-    if len(edges) < 2 or not (np.diff(edges) > 0).all():
-        raise ValueError("edges_m does not ascend; give the borders of the bins from near to far")
-    parts = [] if halves is None else list(as_numpy(halves, ("S", "K")))
-    named = {"samples": samples, "references": references}
-    named |= {f"halves[{number}]": part for number, part in enumerate(parts)}
-    densities = {}
-    for name, counts in named.items():
-        shares = _shares(counts, name, ("K",))
-        if len(shares) != len(edges) - 1:
-            raise ValueError(f"{name} has {len(shares)} bins but edges_m {len(edges) - 1}")
-        densities[name] = shares / np.diff(edges)
-    drawn, real, *floor = densities.values()
+    counts = [
+        as_numpy(samples, ("K",)),
+        as_numpy(references, ("K",)),
+        *as_numpy(halves, ("S", "K")),
+    ]
+    drawn, real, *floor = (_shares(values) / np.diff(edges) for values in counts)
 
     figure = Figure(figsize=(9.0, 6.2), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -137,17 +114,16 @@ def range_histogram(
         with np.errstate(divide="ignore", invalid="ignore"):  # bins without any real return
             lines = [np.where(base > 0, values / base, np.nan) for values in (real, drawn)]
             ends = [np.where(base > 0, values / base, np.nan) for values in floor]
-        if ends:
-            limits = [limit(ends, axis=0) for limit in (np.min, np.max)]
-            axes.fill_between(
-                edges,
-                *(np.append(values, values[-1]) for values in limits),  # the last step has an end
-                step="post",
-                color=REFERENCES,
-                alpha=0.3,
-                linewidth=0,
-                label="floor: parts of the references",
-            )
+        limits = [limit(ends, axis=0) for limit in (np.min, np.max)]
+        axes.fill_between(
+            edges,
+            *(np.append(values, values[-1]) for values in limits),  # the last step has an end
+            step="post",
+            color=REFERENCES,
+            alpha=0.3,
+            linewidth=0,
+            label="floor: parts of the references",
+        )
         for values, colour, label in zip(
             lines, (REFERENCES, SAMPLES), ("references", "samples"), strict=True
         ):
@@ -156,35 +132,25 @@ def range_histogram(
         axes.grid(alpha=0.3)
     upper.set_ylabel("share of the returns per metre")
     upper.legend(frameon=False)
-    lower.set_ylabel("ratio to the references")
-    lower.set_xlabel("range (m)")
-    top = 10.0 ** np.clip(np.ceil(np.log10(_largest_factor(drawn, real))), 0.5, 2)
-    lower.set_ylim(1 / top, top)
-    lower.set_xlim(edges[0], edges[-1])
+    both = (drawn > 0) & (real > 0)
+    largest_factor = np.exp(np.abs(np.log(drawn[both] / real[both])).max(initial=0.0))
+    top = 10.0 ** np.clip(np.ceil(np.log10(largest_factor)), 0.5, 2)
+    lower.set(ylim=(1 / top, top), xlim=edges[[0, -1]])
+    lower.set(ylabel="ratio to the references", xlabel="range (m)")
     return figure
 
 
-def matches_figure(
-    best: Sequence[MatchedPair], worst: Sequence[MatchedPair], sensor: LidarSensor
-) -> Figure:
-    """The best and the worst matches: each sample above the nearest real scan."""
-    pairs = [("best", pair) for pair in best] + [("worst", pair) for pair in worst]
-    if not pairs:
-        raise ValueError("got no pair to draw; give at least one of the best or the worst")
-    figure = Figure(figsize=(13.0, 1.9 * len(pairs) + 0.3), dpi=110, layout="constrained")
-    blocks = figure.subfigures(len(pairs), 1, squeeze=False).ravel()
-    for block, (kind, pair) in zip(blocks, pairs, strict=True):
-        images = [as_numpy(image, ("H", "W")) for image in (pair.sample_m, pair.reference_m)]
-        if images[0].shape != images[1].shape:
-            raise ValueError(
-                f"{pair.title}: sample_m is {images[0].shape} but reference_m {images[1].shape}; "
-                "give two range images of the same sensor"
-            )
+def matches_figure(best: Sequence[Match], worst: Sequence[Match], sensor: LidarSensor) -> Figure:
+    """The best and the worst matches, at least one: each sample above the nearest real scan."""
+    matches = [("best", *match) for match in best] + [("worst", *match) for match in worst]
+    figure = Figure(figsize=(13.0, 1.9 * len(matches) + 0.3), dpi=110, layout="constrained")
+    blocks = figure.subfigures(len(matches), 1, squeeze=False).ravel()
+    for block, (kind, title, *images) in zip(blocks, matches, strict=True):
         cells = block.subplots(2, 1)
         for axes, image, name in zip(cells, images, ("sample", "nearest"), strict=True):
             draw_panorama(axes, range_image_picture(image, sensor))
             axes.set_ylabel(name, fontsize=9)
-        cells[0].set_title(f"{kind}: {pair.title}", loc="left", fontsize=10, parse_math=False)
+        cells[0].set_title(f"{kind}: {title}", loc="left", fontsize=10, parse_math=False)
         range_bar(block, sensor, ax=list(cells), pad=0.01, aspect=12)
     return figure
 
@@ -197,36 +163,27 @@ def save_figures(
     edges_m: Array,
     ranges: tuple[Array, Array],
     halves: Array,
-    best: Sequence[tuple[str, Array, Array]],
-    worst: Sequence[tuple[str, Array, Array]],
+    best: Sequence[Match],
+    worst: Sequence[Match],
     sensor: LidarSensor,
 ) -> None:
     """Writes ``birds_eye.png``, ``ranges.png`` and ``matches.png`` of an evaluation to ``folder``.
 
     Arguments are those of :func:`bev_histograms` (``cells``, ``limits_m``), :func:`range_histogram`
-    (``edges_m``, ``ranges``, ``halves``) and fields of :class:`MatchedPair` (``best``, ``worst``).
+    (``edges_m``, ``ranges``, ``halves``) and :func:`matches_figure`.
     """
     save(bev_histograms(*cells, *limits_m), folder / "birds_eye.png")
     save(range_histogram(edges_m, *ranges, halves), folder / "ranges.png")
-    near, far = ([MatchedPair(*pair) for pair in part] for part in (best, worst))
-    save(matches_figure(near, far, sensor), folder / "matches.png")
+    save(matches_figure(best, worst, sensor), folder / "matches.png")
 
 
-def _shares(counts: Array, name: str, axes: tuple[str, ...]) -> NDArray[np.float64]:
-    """Counts divided by their sum."""
-    values = as_numpy(counts, axes)
-    if not np.isfinite(values).all() or (values < 0).any() or values.sum() == 0:
-        raise ValueError(f"{name} holds no counts; give numbers of at least 0 that are not all 0")
-    return values / values.sum()
+def _shares(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    if not counts.sum() > 0:
+        raise ValueError("samples or references hold no point; there is no distribution to draw")
+    return counts / counts.sum()
 
 
 def _summed(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
     """Sums over blocks of rows x columns; the last blocks may be cut off by the border."""
     by_row = np.add.reduceat(values, range(0, values.shape[0], rows), axis=0)
     return np.add.reduceat(by_row, range(0, values.shape[1], columns), axis=1)
-
-
-def _largest_factor(drawn: NDArray[np.float64], real: NDArray[np.float64]) -> float:
-    """Largest ratio of two densities over the bins where both are positive."""
-    both = (drawn > 0) & (real > 0)
-    return float(np.exp(np.abs(np.log(drawn[both] / real[both])).max(initial=0.0)))

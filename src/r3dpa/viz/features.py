@@ -1,13 +1,12 @@
 """Features and latents as colours.
 
-Letters: P points, N tokens = feature-grid cells, D feature width, F width of point features,
-C latent channels, h w latent size. Shapes other than documented and values that are not finite
-raise a ``ValueError``.
+Letters: P points, N tokens = feature-grid cells, D feature width, C latent channels, h w latent
+size. Shapes other than documented and values that are not finite raise a ``ValueError``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -17,8 +16,16 @@ from numpy.typing import NDArray
 
 from r3dpa.geometry import Projection, range_image
 from r3dpa.viz.figures import draw_birds_eye, draw_panorama
-from r3dpa.viz.pixels import Array, Pixels, as_bytes, as_numpy, bright_part, enlarge, paint
-from r3dpa.viz.scans import scene_3d
+from r3dpa.viz.pictures import (
+    Array,
+    Pixels,
+    as_bytes,
+    as_numpy,
+    bright_part,
+    enlarge,
+    paint,
+    scene_3d,
+)
 
 Rows = NDArray[np.floating]
 
@@ -27,80 +34,47 @@ SIMILARITY_MAP = bright_part("viridis", 0.1)
 FRAME = (255, 60, 60)  # a colour that the map does not hold
 
 
-@dataclass(frozen=True)
-class FeatureColours:
-    """Principal components of one set of features as colours of any set of that width.
+def fit_colours(features: Array) -> Callable[[Array], NDArray[np.float64]]:
+    """Colours by the principal components of features ``(N, D)``, in float32 or wider.
 
-    Rows of zeros are empty cells: they are left out of the fit and drawn black. The 1st to 99th
-    percentile of each component becomes 0.15 to 1, clipped; a component without variance is 0.575.
-    The sign makes the largest loading of a component positive.
+    The result maps any features of that width to RGB in [0, 1]. Rows of zeros are empty cells: they
+    are left out of the fit and drawn black. The 1st to 99th percentile of each component becomes
+    0.15 to 1, clipped; a component without variance is 0.575. The sign makes the largest loading of
+    a component positive.
 
     Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
-
-    Attributes:
-        mean: ``(D,)`` of the fitted rows.
-        loadings: ``(D, K)`` directions of the components, K = 3 at most.
-        low: ``(K,)`` component values that become 0.15.
-        high: ``(K,)`` component values that become 1.
     """
-
-    mean: Rows
-    loadings: Rows
-    low: Rows
-    high: Rows
-
-    @classmethod
-    def fit(cls, features: Array) -> FeatureColours:
-        """Components of features ``(N, D)``, in float32 or wider."""
-        rows = _checked_rows(features)
-        rows = rows[_filled(rows)]
-        if not len(rows):
-            width, none = rows.shape[1], np.zeros(0)
-            return cls(np.zeros(width), np.zeros((width, 0)), none, none)
-        mean = rows.mean(axis=0, dtype=np.float64).astype(rows.dtype)
-        centred = rows - mean
+    fitted = _checked_rows(features)
+    width = fitted.shape[1]
+    fitted = fitted[_filled(fitted)]
+    mean, loadings = np.zeros(width, fitted.dtype), np.zeros((width, 0), fitted.dtype)
+    low = high = np.zeros(0)
+    if len(fitted):
+        mean = fitted.mean(axis=0, dtype=np.float64).astype(fitted.dtype)
+        centred = fitted - mean
         _, vectors = np.linalg.eigh((centred.T @ centred).astype(np.float64))
         loadings = vectors[:, ::-1][:, :3]  # eigh sorts upwards
         largest = np.take_along_axis(loadings, np.abs(loadings).argmax(axis=0)[None], axis=0)
-        loadings = (loadings * np.sign(largest)).astype(rows.dtype)
+        loadings = (loadings * np.sign(largest)).astype(fitted.dtype)
         low, high = np.percentile(centred @ loadings, [1, 99], axis=0)
         # Below the rounding of float32 a component holds no variance but noise.
-        flat = high - low <= 1e-6 * np.abs(rows).max()
+        flat = high - low <= 1e-6 * np.abs(fitted).max()
         loadings[:, flat], low[flat], high[flat] = 0.0, -1.0, 1.0
-        return cls(mean, loadings, low, high)
 
-    def __call__(self, features: Array) -> NDArray[np.float64]:
-        """RGB in [0, 1] ``(N, 3)`` of features ``(N, D)`` of the width that was fitted."""
+    def colours_of(features: Array) -> NDArray[np.float64]:
         rows = _checked_rows(features)
-        if rows.shape[1] != len(self.mean):
-            raise ValueError(
-                f"features are {rows.shape[1]} wide but the components {len(self.mean)}; fit and "
-                "draw features of one extractor"
-            )
         share = np.full((len(rows), 3), 0.5)
-        components = (rows - self.mean) @ self.loadings
-        share[:, : len(self.low)] = (components - self.low) / (self.high - self.low)
+        share[:, : len(low)] = ((rows - mean) @ loadings - low) / (high - low)
         colours = DARKEST_FEATURE + (1 - DARKEST_FEATURE) * np.clip(share, 0, 1)
         colours[~_filled(rows)] = 0.0
         return colours
 
+    return colours_of
+
 
 def pca_colours(features: Array) -> NDArray[np.float64]:
-    """RGB ``(N, 3)`` of features ``(N, D)`` by their own :class:`FeatureColours`."""
-    return FeatureColours.fit(features)(features)
-
-
-def feature_grid_picture(
-    grid: Array, grid_size: tuple[int, int], scale: int = 12, colours: FeatureColours | None = None
-) -> Pixels:
-    """Feature grid ``(N, D)`` as a picture: principal components as colours, empty cells black.
-
-    ``colours`` are the components of other features, such as those of the points. Returns
-    ``(rows * scale, columns * scale, 3)`` uint8.
-    """
-    _check_grid(grid, grid_size)
-    colours = colours or FeatureColours.fit(grid)
-    return enlarge(as_bytes(colours(grid)).reshape(*grid_size, 3), scale)
+    """RGB ``(N, 3)`` in [0, 1] of features ``(N, D)`` by their own :func:`fit_colours`."""
+    return fit_colours(features)(features)
 
 
 def similarity_picture(
@@ -111,11 +85,9 @@ def similarity_picture(
     Cosine 1 is bright, 0 and below dark, empty cells black; the cell itself has a red frame.
     The result is ``(rows * scale, columns * scale, 3)`` uint8.
     """
+    values = _checked_rows(grid)
     _check_grid(grid, grid_size)
     (row, column), (rows, columns) = cell, grid_size
-    if not (0 <= row < rows and 0 <= column < columns):
-        raise ValueError(f"cell {cell} is none of a grid of {rows} x {columns}")
-    values = _checked_rows(grid)
     filled = _filled(values)
     chosen = row * columns + column
     if not filled[chosen]:
@@ -148,35 +120,33 @@ def feature_figure(
 
     Args:
         points: ``(P, 3+)`` x forward, y left, z up, metres.
-        features: ``(P, F)`` of the points.
-        grid: ``(N, F)`` means over the cells, row by row, zeros where a cell is empty.
+        features: ``(P, D)`` of the points.
+        grid: ``(N, D)`` means over the cells, row by row, zeros where a cell is empty.
         projection: Projection of the range image below the grid.
         grid_size: Rows and columns of the grid, with product N.
         extent_m: Half side of the square shown from above.
     """
-    colours = FeatureColours.fit(features)
+    _check_grid(grid, grid_size)
+    colours = fit_colours(features)
     of_points = colours(features)
     xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
     _, nearest = range_image(xyz, projection, torch.from_numpy(of_points))
     assert nearest is not None
+    panorama = as_bytes(nearest.movedim(0, -1).numpy())
+    beams, columns = panorama.shape[:2]
     figure = Figure(figsize=(13.0, 7.6), dpi=110, layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(4.5, 3.1))[:, 0]
     behind, above = upper.subplots(1, 2, width_ratios=(8.6, 4.4))
     image, cells = lower.subplots(2, 1)
-    draw_panorama(behind, scene_3d(points, of_points, size=(480, 920)))
+    picture = scene_3d(points, of_points, size=(480, 920))
+    draw_panorama(behind, picture, f"{len(xyz):,} points, from behind")
     draw_birds_eye(above, points, extent_m, 480, of_points)
-    panorama = as_bytes(nearest.movedim(0, -1).numpy())
-    draw_panorama(image, panorama)
-    draw_panorama(cells, feature_grid_picture(grid, grid_size, 1, colours))
-    beams, columns = panorama.shape[:2]
-    for axes, title in (
-        (behind, f"{len(xyz):,} points, from behind"),
-        (above, f"from above, {2 * extent_m:g} m wide"),
-        (image, f"range image, {beams} x {columns} pixels: feature of the nearest point"),
-        (cells, f"feature grid, {grid_size[0]} x {grid_size[1]} cells: mean of their points"),
-    ):
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(title, loc="left", fontsize=10)
+    above.set(xticks=[], yticks=[])
+    above.set_title(f"from above, {2 * extent_m:g} m wide", loc="left", fontsize=10)
+    title = f"range image, {beams} x {columns} pixels: feature of the nearest point"
+    draw_panorama(image, panorama, title)
+    title = f"feature grid, {grid_size[0]} x {grid_size[1]} cells: mean of their points"
+    draw_panorama(cells, as_bytes(colours(grid)).reshape(*grid_size, 3), title)
     return figure
 
 

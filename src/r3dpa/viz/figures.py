@@ -1,7 +1,7 @@
 """Figures of scans and scenes with axes, scales and names.
 
-Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``, and so
-does an empty collection of scans or images.
+Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``; a
+collection holds one scan or image at least.
 """
 
 from __future__ import annotations
@@ -18,12 +18,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
 
 from r3dpa.geometry import LidarSensor, Projection, points_of, range_image
-from r3dpa.viz.pixels import BACKGROUND, Array, Pixels, as_numpy, bright_part, paint
-from r3dpa.viz.scans import (
+from r3dpa.viz.pictures import (
+    BACKGROUND,
     HEIGHT_LIMITS_M,
     HEIGHT_MAP,
     RANGE_MAP,
+    Array,
+    Pixels,
+    as_numpy,
     birds_eye_picture,
+    bright_part,
+    paint,
     range_image_picture,
     range_scale,
     range_ticks,
@@ -42,8 +47,7 @@ def birds_eye_view(points: Array, extent_m: float = 50.0) -> Figure:
     figure = Figure(figsize=(7.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
     draw_birds_eye(axes, points, extent_m)
-    axes.set_xlabel("y, left (m)")
-    axes.set_ylabel("x, forward (m)")
+    axes.set(xlabel="y, left (m)", ylabel="x, forward (m)")
     axes.set_title(f"{len(points):,} points, seen from above")
     _height_bar(figure, ax=axes, extend="both", shrink=0.85)
     return figure
@@ -57,8 +61,6 @@ def scenes_sheet(
     Each row shows the range image, the points from above (``extent_m`` to each side) and in 3D.
     """
     count = len(range_images_m)
-    if count == 0:
-        raise ValueError("scenes_sheet got no scene; give at least one range image (H, W)")
     top_in, bottom_in = 0.4, 0.75
     height_in = top_in + count * 1.85 + bottom_in
     figure = Figure(figsize=(17.5, height_in))
@@ -74,7 +76,7 @@ def scenes_sheet(
         image.set_ylabel(str(number), rotation=0, ha="right", va="center", fontsize=11)
         draw_birds_eye(above, points, extent_m, pixels=180)
         scene.imshow(scene_3d(points, size=(310, 550)), aspect="auto")
-        for axes in row:
+        for axes in (above, scene):
             axes.set(xticks=[], yticks=[])
     titles = ("range image", f"from above, {2 * extent_m:g} m wide", "from behind")
     for axes, title in zip(cells[0], titles, strict=True):
@@ -102,16 +104,12 @@ def reconstruction_figure(
         valid_agreement: Share in [0, 1] of pixels valid in both or empty in both, for the title.
     """
     before, after = as_numpy(range_m, ("H", "W")), as_numpy(reconstruction_m, ("H", "W"))
-    if before.shape != after.shape:
-        raise ValueError(
-            f"range_m is {before.shape} but reconstruction_m is {after.shape}; "
-            "give two range images of the same sensor"
-        )
     error_scale = Normalize(0.0, ERROR_LIMIT_M)
     error = paint(np.abs(before - after), ERROR_MAP, error_scale)
-    error[~(before > 0) & ~(after > 0)] = BACKGROUND
-    error[(before > 0) & ~(after > 0)] = np.array(ONLY_INPUT) * 255
-    error[~(before > 0) & (after > 0)] = np.array(ONLY_RECONSTRUCTION) * 255
+    returns = before > 0, after > 0
+    error[~returns[0] & ~returns[1]] = BACKGROUND
+    error[returns[0] & ~returns[1]] = np.array(ONLY_INPUT) * 255
+    error[~returns[0] & returns[1]] = np.array(ONLY_RECONSTRUCTION) * 255
     figure = Figure(figsize=(13.0, 6.6), layout="constrained")
     figure.suptitle(
         f"mean absolute range error {mean_absolute_error_m:.3f} m over pixels valid in both, "
@@ -135,7 +133,9 @@ def reconstruction_figure(
 
 def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
     """Range images of scans ``(P, 3+)`` by name, one below the other, with the range scale."""
-    figure, rows = _figure_of(scans, (13.0, 1.2 * len(scans) + 0.6), 1)
+    size_in = (13.0, 1.2 * len(scans) + 0.6)
+    figure = Figure(figsize=size_in, dpi=110, layout="constrained")
+    rows = figure.subplots(len(scans), 1, squeeze=False).ravel()
     for (name, points), axes in zip(scans.items(), rows, strict=True):
         xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
         range_m, _ = range_image(xyz, projection)
@@ -151,12 +151,14 @@ def birds_eye_sheet(scans: Mapping[str, Array], extent_m: float = 50.0) -> Figur
     count = len(scans)
     columns = count if count <= 4 else min((4, 3), key=lambda width: -count % width)  # fewest gaps
     side_in = 7.0 if columns == 1 else 4.0
-    size_in = (columns * side_in + 0.9, math.ceil(count / max(1, columns)) * (side_in + 0.3))
-    figure, cells = _figure_of(scans, size_in, columns)
+    size_in = (columns * side_in + 0.9, math.ceil(count / columns) * (side_in + 0.3))
+    figure = Figure(figsize=size_in, dpi=110, layout="constrained")
+    cells = figure.subplots(math.ceil(count / columns), columns, squeeze=False).ravel()
     for axes in cells[count:]:
         axes.set_visible(False)
     for (name, points), axes in zip(scans.items(), cells, strict=False):
         draw_birds_eye(axes, points, extent_m, round(95 * side_in))
+        axes.set(xticks=[], yticks=[])
         axes.set_title(name, loc="left", fontsize=10, parse_math=False)
         axes.set_xlabel(f"{2 * extent_m:g} m, {len(points):,} points", fontsize=9)
     _height_bar(figure, ax=list(cells), extend="both", shrink=0.8, pad=0.02)
@@ -193,16 +195,3 @@ def range_bar(figure: Figure, sensor: LidarSensor, **place: object) -> None:
 def _height_bar(figure: Figure, sensor: LidarSensor | None = None, **place: object) -> None:
     mappable = ScalarMappable(Normalize(*HEIGHT_LIMITS_M), HEIGHT_MAP)
     figure.colorbar(mappable, label="height above the sensor (m)", **place)  # type: ignore[arg-type]
-
-
-def _figure_of(
-    scans: Mapping[str, Array], size_in: tuple[float, float], columns: int
-) -> tuple[Figure, np.ndarray]:
-    """Figure with a cell without ticks for each scan; cells row by row."""
-    if not scans:
-        raise ValueError("got no scan to draw; give at least one")
-    figure = Figure(figsize=size_in, dpi=110, layout="constrained")
-    cells = figure.subplots(math.ceil(len(scans) / columns), columns, squeeze=False).ravel()
-    for axes in cells:
-        axes.set(xticks=[], yticks=[])
-    return figure, cells

@@ -23,8 +23,15 @@ from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.viz.figures import EGO_OUTLINE_M
-from r3dpa.viz.pixels import BACKGROUND, Array, as_numpy, bright_part
-from r3dpa.viz.scans import HEIGHT_LIMITS_M, HEIGHT_MAP, range_ticks
+from r3dpa.viz.pictures import (
+    BACKGROUND,
+    HEIGHT_LIMITS_M,
+    HEIGHT_MAP,
+    Array,
+    as_numpy,
+    bright_part,
+    range_ticks,
+)
 
 #: Step of the coordinates in a page, metres; larger only for a scan that int16 could not hold.
 STEP_M = 0.005
@@ -79,22 +86,22 @@ def scan_page(
 
     Args:
         scans: At least one.
-        title: Title of the page.
+        title: Shown on top.
         semantics: Categories of the labels by number; other numbers are shown as such.
         origins: Categories of the origins by number, likewise.
         reference: Scan that stays beside the others, seen by the same camera.
         sensor: Gives the limits of the range colours; the default sensor if None.
 
     Raises:
-        ValueError: If there is no scan, or a scan is empty, of another shape than above, not
-        finite,
+        ValueError: If there is no scan, or one is empty, of another shape than above, not finite,
             or has another number of labels or origins than of points.
     """
     if not scans:
         raise ValueError("scan_page got no scan; give at least one")
     shown = [*scans, *([] if reference is None else [reference])]
     packed = [pack_scan(scan) for scan in shown]
-    sensor = sensor or LidarSensor()
+    labels = [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
+    made_by = [scan.origins for scan in shown if scan.origins is not None]
     heights_m = np.arange(HEIGHT_LIMITS_M[0], HEIGHT_LIMITS_M[1] + 1).tolist()
     brightest = max(header["intensity_max"] for header, _ in packed)
     page = {
@@ -104,34 +111,29 @@ def scan_page(
         "mode": "height",
         "scales": {
             "height": _scale("height above the sensor (m)", HEIGHT_MAP, 1.0, heights_m),
-            "range": _scale("range (m)", PAGE_RANGE_MAP, 0.5, range_ticks(sensor)),
+            "range": _scale("range (m)", PAGE_RANGE_MAP, 0.5, range_ticks(sensor or LidarSensor())),
             "intensity": _scale("intensity", INTENSITY_MAP, 0.5, [0, brightest / 4, brightest]),
         },
         "categories": {
-            "semantic": _category_rows(
-                semantics, [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
-            ),
-            "origin": _category_rows(
-                origins, [scan.origins for scan in shown if scan.origins is not None]
-            ),
+            "semantic": _category_rows(semantics, labels),
+            "origin": _category_rows(origins, made_by),
         },
         "scans": [header for header, _ in packed],
         "reference": None if reference is None else len(scans),
     }
     # JSON may hold "<" within strings only, where its escape means the same: no name ends a script.
     text = json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    points = "\n".join(
+    points = (
         f'<script type="text/plain" id="points-{number}">{data}</script>'
         for number, (_, data) in enumerate(packed)
     )
     folder = files("r3dpa.viz")
-    script = "\n".join((folder / name).read_text("utf-8") for name in _SCRIPTS)
     parts = {
         "title": html.escape(title),
         "background": "#{:02x}{:02x}{:02x}".format(*BACKGROUND),
         "page": text,
-        "points": points,
-        "script": script,
+        "points": "\n".join(points),
+        "script": "\n".join((folder / name).read_text("utf-8") for name in _SCRIPTS),
     }
     template = (folder / "page.html").read_text("utf-8")
     # In one pass, so that a part that holds such a placeholder stays as it is.
@@ -142,9 +144,8 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
     """Header and data of a scan as the page holds it.
 
     The data are little-endian columns, deflated (zlib), in base64: x, y and z as int16 steps, each
-    the
-    difference from the point before; then, where known, semantic and instance as uint16, intensity
-    and origin as uint8.
+    the difference from the point before; then, where known, semantic and instance as uint16,
+    intensity and origin as uint8.
     """
     points = as_numpy(scan.points, ("P", "3 or 4"))
     count = len(points)
@@ -157,7 +158,7 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
     columns = ["x", "y", "z"]
     data = [column.tobytes() for column in np.diff(steps, axis=0, prepend=np.int16(0)).T]
     if scan.labels is not None:
-        labels = _checked(scan, "labels", scan.labels, 0xFFFFFFFF)
+        labels = _checked(scan, scan.labels, 0xFFFFFFFF)
         columns += ["semantic", "instance"]
         data += [(labels & 0xFFFF).astype("<u2").tobytes(), (labels >> 16).astype("<u2").tobytes()]
     intensity_max = 1.0
@@ -168,29 +169,18 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
         data.append(np.rint(255 * share).astype(np.uint8).tobytes())
     if scan.origins is not None:
         columns.append("origin")
-        data.append(_checked(scan, "origins", scan.origins, 0xFF).astype(np.uint8).tobytes())
-    header = {
-        "name": scan.name,
-        "count": count,
-        "step_m": step_m,
-        "intensity_max": intensity_max,
-        "columns": columns,
-    }
+        data.append(_checked(scan, scan.origins, 0xFF).astype(np.uint8).tobytes())
+    header = {"name": scan.name, "count": count, "step_m": step_m}
+    header |= {"intensity_max": intensity_max, "columns": columns}
     return header, base64.b64encode(zlib.compress(b"".join(data), 9)).decode("ascii")
 
 
-def _checked(
-    scan: PageScan, what: str, values: NDArray[np.integer], largest: int
-) -> NDArray[np.int64]:
-    """The numbers of the points, one for each and within 0 to ``largest``."""
-    if values.shape != (len(scan.points),):
+def _checked(scan: PageScan, values: NDArray[np.integer], largest: int) -> NDArray[np.int64]:
+    """Labels or origins, one for each point and within 0 to ``largest``."""
+    if values.shape != (len(scan.points),) or values.min() < 0 or values.max() > largest:
         raise ValueError(
-            f"{scan.name}: {what} are {values.shape} but points {tuple(scan.points.shape)}; give "
-            "one number per point"
-        )
-    if values.min() < 0 or values.max() > largest:
-        raise ValueError(
-            f"{scan.name}: {what} go from {values.min()} to {values.max()}; give 0 to {largest}"
+            f"{scan.name}: labels and origins must be a number from 0 to {largest} for each of "
+            f"{len(scan.points)} points, got {values.shape} from {values.min()} to {values.max()}"
         )
     return values.astype(np.int64)
 
@@ -212,12 +202,11 @@ def _category_rows(
     categories: Mapping[int, Category], used: Sequence[NDArray[np.integer]]
 ) -> list[tuple[int, str, str]]:
     """Number, name and colour of the categories that occur; missing colours from the palette."""
-    present = sorted({int(number) for values in used for number in np.unique(values)})
+    present = {int(number) for values in used for number in np.unique(values)}
     taken = {category.colour for category in categories.values()}
     free = cycle([colour for colour in PALETTE if colour not in taken] or PALETTE)
-    colours = {}
+    rows = []
     for number in sorted({*categories, *present}):
-        given = categories.get(number, Category("")).colour
-        colours[number] = given or next(free)
-    names = {number: category.name for number, category in categories.items()}
-    return [(n, names.get(n, f"number {n}"), colours[n]) for n in present]
+        name, colour = categories.get(number, Category(f"number {number}"))
+        rows.append((number, name, colour or next(free)))
+    return [row for row in rows if row[0] in present]

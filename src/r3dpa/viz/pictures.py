@@ -1,28 +1,36 @@
-"""Range images and points as pixels.
+"""Range images and points as pixels, and pixels as files.
 
 Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``.
 """
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
+from pathlib import Path
 
+import matplotlib
 import numpy as np
-from matplotlib.colors import Normalize, PowerNorm
+from matplotlib.colors import Colormap, ListedColormap, Normalize, PowerNorm
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.viz.pixels import (
-    BACKGROUND,
-    Array,
-    Pixels,
-    as_bytes,
-    as_numpy,
-    bright_part,
-    enlarge,
-    paint,
-)
+from r3dpa.io import atomic_path
+
+Array = Tensor | NDArray[np.generic]
+Pixels = NDArray[np.uint8]
+
+BACKGROUND = (10, 10, 14)  # RGB of "no return"; darker than every colour of the maps
+
+
+def bright_part(name: str, start: float) -> Colormap:
+    """The part of a named colour map from ``start`` in [0, 1] on, to stand out from the dark."""
+    return ListedColormap(matplotlib.colormaps[name](np.linspace(start, 1.0, 256)))
+
 
 HEIGHT_LIMITS_M = (-2.0, 3.0)  # relative to the sensor, which stands about 1.7 m above the road
 CAMERA_EYE_M = (-20.0, 0.0, 10.5)
@@ -37,9 +45,8 @@ HEIGHT_MAP = bright_part("viridis", 0.3)
 def range_image_picture(range_m: Array, sensor: LidarSensor, scale: int = 1) -> Pixels:
     """Colours ``(H * scale, W * scale, 3)`` uint8 of a range image, bright where near.
 
-    ``range_m`` is ``(H, W)`` metres, not above 0 without a return (dark background). The scale is
-    the
-    square root of the range between the limits of the sensor.
+    ``range_m`` is ``(H, W)`` metres, not above 0 without a return (dark background). Colours follow
+    the square root of the range between the limits of the sensor.
     """
     ranges = as_numpy(range_m, ("H", "W"))
     picture = paint(ranges, RANGE_MAP, range_scale(sensor))
@@ -113,6 +120,51 @@ def scene_3d(
     return np.rint(picture).astype(np.uint8)
 
 
+def save(picture: Figure | Pixels, path: str | Path) -> Path:
+    """Writes a figure, or pixels ``(rows, columns[, 3])``, atomically; returns ``path``.
+
+    The suffix names the format; another than the known ones raises a ``ValueError``.
+    """
+    with atomic_path(path := Path(path)) as temporary:
+        if isinstance(picture, Figure):
+            picture.savefig(temporary)
+        else:
+            Image.fromarray(picture).save(temporary)
+    return path
+
+
+def palette_image(picture: Figure | Pixels, colours: int = 64) -> Image.Image:
+    """The picture with few colours, a third of the size as PNG: for notebooks."""
+    if isinstance(picture, Figure):
+        picture.savefig(file := io.BytesIO(), format="png")
+        return Image.open(file).convert("RGB").quantize(colours)
+    return Image.fromarray(picture).quantize(colours)
+
+
+def as_numpy(array: Array, axes: tuple[str, ...]) -> NDArray[np.float64]:
+    """The array in float64 on the CPU, checked to have the named axes."""
+    if array.ndim != len(axes):
+        raise ValueError(f"expected shape ({', '.join(axes)}), got {tuple(array.shape)}")
+    if isinstance(array, Tensor):
+        return array.detach().double().cpu().numpy()
+    return array.astype(np.float64)
+
+
+def paint(values: NDArray[np.float64], colour_map: Colormap, scale: Normalize) -> Pixels:
+    """RGB bytes of values; values outside the scale take the end colours."""
+    return colour_map(scale(values), bytes=True)[..., :3]
+
+
+def as_bytes(colours: NDArray[np.float64]) -> Pixels:
+    """RGB in [0, 1] as uint8."""
+    return np.rint(np.clip(colours, 0, 1) * 255).astype(np.uint8)
+
+
+def enlarge(picture: Pixels, scale: int) -> Pixels:
+    """Every pixel as a square of ``scale`` x ``scale``."""
+    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
 def range_scale(sensor: LidarSensor) -> Normalize:
     """Square-root scale between the range limits of a sensor."""
     return PowerNorm(0.5, sensor.range_min_m, sensor.range_max_m)
@@ -128,16 +180,15 @@ def _coloured_points(
     points: Array, colours: Array | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Finite points ``(P, 3)`` and their RGB ``(P, 3)`` from 0 to 255, by default from height."""
-    given = as_numpy(points, ("P", "3+"))
-    if given.shape[1] < 3:
-        raise ValueError(f"points need columns x, y, z, got shape {given.shape}")
-    xyz = given[:, :3]
+    xyz = as_numpy(points, ("P", "3+"))[:, :3]
     if colours is None:
-        rgb = paint(xyz[:, 2], HEIGHT_MAP, Normalize(*HEIGHT_LIMITS_M))
+        rgb = paint(xyz[:, -1], HEIGHT_MAP, Normalize(*HEIGHT_LIMITS_M))
     else:
         rgb = as_bytes(as_numpy(colours, ("P", "3")))
     if rgb.shape != xyz.shape:
-        raise ValueError(f"colours are {rgb.shape} but points {xyz.shape}; give one RGB per point")
+        raise ValueError(
+            f"colours are {rgb.shape} but points {xyz.shape}: give x, y, z and one RGB"
+        )
     finite = np.isfinite(xyz).all(axis=1)
     return xyz[finite], rgb[finite].astype(np.float64)
 

@@ -1,0 +1,104 @@
+"""Curves of a run, and accuracy against time: lines, labels and scales are where they belong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from r3dpa import viz
+
+RAGGED = (
+    "epoch,step,train/kl,train/flow,val/error,unused\n"
+    "0,0,4.0,,,\n"
+    "0,0,,-1.5\n"
+    "0,50,2.0,nan,,\n"
+    "1,100,,,0.25,\n"
+    "1,150,1.0"
+)
+
+
+def test_read_metrics_skips_blanks_missing_cells_and_the_unfinished_line(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text(RAGGED)
+    series = viz.read_metrics(path)
+    assert list(series) == ["train/kl", "train/flow", "val/error"]
+    assert series["train/kl"] == ([0, 50], [4, 2])
+    assert series["val/error"] == ([100], [0.25])
+    assert series["train/flow"][0] == [0, 50]
+    assert series["train/flow"][1] == pytest.approx([-1.5, float("nan")], nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "no column 'step'"),
+        ("step,loss\n1,2\n3,oops\n", "line 3, column 'loss'"),
+    ],
+)
+def test_read_metrics_names_what_is_wrong(tmp_path, text, message):
+    path = tmp_path / "metrics.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        viz.read_metrics(path)
+
+
+def test_loss_curves_draws_a_panel_per_quantity_and_logs_where_positive(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text(RAGGED)
+    figure = viz.loss_curves(viz.read_metrics(path))
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title().split("\n")[0] for axes in panels] == ["train/kl", "train/flow"]
+    assert panels[0].get_title().endswith("4 → 2")
+    assert [axes.get_yscale() for axes in panels] == ["log", "linear"]
+    figure.draw_without_rendering()  # with NaN; a single value is no curve
+
+
+def test_loss_curves_mean_is_centred_and_keeps_gaps():
+    values = np.arange(100.0)  # a centred mean does not move a straight line
+    values[40] = np.nan
+    figure = viz.loss_curves({"loss": (np.arange(100), values)})
+    raw, mean = (line.get_ydata() for line in figure.axes[0].lines)
+    assert raw == pytest.approx(values, nan_ok=True)
+    assert np.isnan(mean[40])
+    assert mean[10:30] == pytest.approx(values[10:30])
+    assert mean[60:90] == pytest.approx(values[60:90])
+
+
+def test_loss_curves_refuses_nothing():
+    with pytest.raises(ValueError, match="two values or more"):
+        viz.loss_curves({})
+
+
+POINTS = [
+    viz.ParetoPoint("euler 4", "euler", 4, 0.1, 0.5, (0.4, 0.6)),
+    viz.ParetoPoint("euler 8", "euler", 8, 0.2, 0.25, (0.2, 0.3)),
+    viz.ParetoPoint("ab2 8", "ab2", 8, 0.21, 0.05, (0.04, 0.06), filled=True),
+]
+
+
+def test_pareto_picture_has_its_front_labels_and_sentences():
+    front = [POINTS[0], POINTS[2]]
+    text = "From $0.1 to 0.21 s"
+    found = viz.pareto_figure("title", "RMSE", POINTS, front, {"bf16": 0.01}, [text])
+    axes = found.subfigs[0].axes[0]
+    lines = [line.get_xydata().tolist() for line in axes.lines]
+    assert [[0.1, 0.5], [0.21, 0.05]] in lines  # the front
+    assert {text.get_text() for text in axes.texts} == {"euler 4", "ab2 8"}
+    legend = {text.get_text() for text in axes.get_legend().get_texts()}
+    assert {"euler", "ab2", "bf16: 0.01"} <= legend
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert axes.get_ylim()[0] < 0.01
+    faces = [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"]
+    assert faces.count("white") == 2  # in fp32
+    assert text in found.subfigs[1].texts[0].get_text()
+
+
+def test_errors_and_slopes_against_evaluations():
+    found = viz.discretisation_figure({"toy": POINTS}, {"toy": 0.001})
+    (axes,) = found.axes
+    lines = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+    assert lines["euler"] == [[4, 0.5], [8, 0.25]]
+    assert lines["order 1"][1][1] == pytest.approx(lines["order 1"][0][1] / 2)
+    assert lines["order 2"][1][1] == pytest.approx(lines["order 2"][0][1] / 4)
+    (unsure,) = axes.patches
+    assert unsure.get_height() == pytest.approx(0.01)
