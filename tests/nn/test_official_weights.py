@@ -22,20 +22,11 @@ from r3dpa.nn.backbones import (
     point_features,
     rangevit,
 )
+from r3dpa.nn.backbones.official import renamed
 
 SENSOR = LidarSensor(beams=16, columns=64)
 TRAINED = (16, 32)
 WIDTHS = minkowski.scaled_widths(0.125)
-
-
-def prefixed(names, prefix=""):
-    """Official name of a key by a table of prefixes."""
-
-    def official_name(key):
-        ours = next(name for name in names if key.startswith(name))
-        return prefix + names[ours] + key.removeprefix(ours)
-
-    return official_name
 
 
 @dataclass
@@ -59,7 +50,7 @@ VIT = {"width": 24, "depth": 2, "num_heads": 3}
 RELEASES = {
     "rangevit": Release(
         lambda: RangeViT(SENSOR, 4, **VIT, skip_channels=6, trained_size=TRAINED),
-        prefixed(rangevit._NAMES),
+        renamed(rangevit._NAMES),
         lambda path: RangeViT.from_checkpoint(path, SENSOR, num_heads=3, trained_size=TRAINED),
         "state_dict",
         "rangevit.encoder.blocks.1.norm2.bias",
@@ -67,7 +58,7 @@ RELEASES = {
     ),
     "liploc": Release(
         lambda: LIPLoc(picture_side=32, patch_side=8, **VIT),
-        prefixed(liploc._NAMES, liploc._ENCODER),
+        lambda key: liploc._ENCODER + renamed(liploc._NAMES)(key),
         lambda path: LIPLoc.from_checkpoint(path, num_heads=3),
         "state_dict",
         "encoder_lidar.model.blocks.1.norm2.bias",

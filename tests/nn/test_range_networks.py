@@ -1,10 +1,9 @@
-import math
 
 import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
+from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels
 from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
 from r3dpa.nn.backbones.vit import TransformerTrunk
 
@@ -47,21 +46,6 @@ def scans(count, seed=1):
     return torch.where(torch.rand(shape, generator=generator) < 0.25, -1.0, range_m)
 
 
-# --- input of RangeViT ---
-
-
-def test_points_lie_on_the_corners_of_their_pixels():
-    """Row 0 starts at 3 degrees, column 0 at the back, column W / 4 on the left."""
-    range_m = torch.full((1, 16, 64), 10.0)
-    distance, x, y, z = range_channels(range_m, SENSOR)[0]
-    up, flat = 10 * math.sin(math.radians(3)), 10 * math.cos(math.radians(3))
-    assert (distance == 10.0).all()
-    assert z[0].tolist() == pytest.approx([up] * 64, rel=1e-6)
-    assert (x[0, 0].item(), x[0, 32].item()) == pytest.approx((-flat, flat), rel=1e-6)
-    assert (y[0, 16].item(), y[0, 48].item()) == pytest.approx((flat, -flat), rel=1e-6)
-    assert z[8, 0].item() == pytest.approx(10 * math.sin(math.radians(3 - 28 / 2)), rel=1e-6)
-
-
 def test_pixels_out_of_range_have_no_point():
     """Both limits, 1 and 56 m, are out of range; what the pixel holds is left as it is."""
     values = [-1.0, 0.0, 0.5, 1.0, 1.001, 55.999, 56.0, 80.0]
@@ -71,9 +55,6 @@ def test_pixels_out_of_range_have_no_point():
     assert distance.tolist() == pytest.approx(values)
     no_point = [all(value == -1.0 for value in point) for point in zip(*xyz, strict=True)]
     assert no_point == [True, True, True, True, False, False, True, True]
-
-
-# --- transformer ---
 
 
 def test_positions_are_resized_bilinearly_between_cell_centres():
@@ -86,9 +67,6 @@ def test_positions_are_resized_bilinearly_between_cell_centres():
     assert same.tolist() == [7.0, 10.0, 14.0]
 
 
-# --- RangeViT ---
-
-
 def test_features_are_means_of_bands_channel_by_channel(monkeypatch):
     network = rangevit()
     rows = torch.arange(16.0)[:, None].expand(16, 64)
@@ -96,19 +74,6 @@ def test_features_are_means_of_bands_channel_by_channel(monkeypatch):
     monkeypatch.setattr(network, "feature_map", lambda range_m, intensity: map_)
     assert network(scans(1)).tolist() == [[3.5, 11.5, 103.5, 111.5]]
     assert (network.dim, rangevit(band_rows=4).dim) == (5 * 2, 5 * 4)
-
-
-def test_patch_is_the_mean_over_one_pixel_more_than_its_size():
-    """Patches of 2 x 8 average 3 x 9 pixels, of which zeros beyond the border are part."""
-    network = rangevit(skip_channels=1, width=3)
-    network.embedding.weight.data.fill_(1.0)
-    network.embedding.bias.data.zero_()
-    patches = network.embed(torch.ones(1, 1, 16, 64))[0, 0]
-    assert patches.shape == (8, 8)
-    assert patches[1:, 1:].unique().tolist() == pytest.approx([1.0])
-    assert patches[0, 1:].unique().tolist() == pytest.approx([2 / 3])
-    assert patches[1:, 0].unique().tolist() == pytest.approx([5 / 9])
-    assert patches[0, 0].item() == pytest.approx(2 / 3 * 5 / 9)
 
 
 def test_scans_of_a_batch_do_not_see_each_other():
@@ -136,70 +101,12 @@ def test_network_without_intensity_ignores_it():
         with_intensity(range_m)
 
 
-# --- pictures of LIP-Loc ---
-
-
 def test_bytes_wrap():
     """5.1 * 50.2 = 256.02 is black again; -5.1 is cut to -5, which is 251 modulo 256."""
     range_m = torch.tensor([-1.0, -0.1, 0.0, 0.19, 0.2, 50.1, 50.2, 56.0, 100.4])
     levels = wrapped_grey_levels(range_m)
     assert levels.dtype == torch.uint8
     assert levels.tolist() == [251, 0, 0, 0, 1, 255, 0, 285 - 256, 0]
-
-
-def test_picture_of_a_constant_image():
-    """10 m are 51 grey levels, a fifth of white; so are 60.2 m, which wrap (307 - 256)."""
-    for value in (10.0, 60.2):
-        picture = wrapped_picture(torch.full((2, 16, 64), value), (5, 7))
-        assert picture.shape == (2, 3, 5, 7)
-        expected = [(0.2 - mean) / std for mean, std in COLOURS]
-        assert picture[0, :, 0, 0].tolist() == pytest.approx(expected, rel=1e-5)
-        assert (picture - picture[:1, :, :1, :1]).abs().max() < 1e-6
-
-
-COLOURS = [(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)]
-
-
-def test_picture_is_antialiased():
-    """Halving: triangle of 4 pixels with weights 1 3 3 1, where bilinear alone takes 1 1."""
-    range_m = torch.zeros(1, 2, 16)
-    range_m[:, :, 7] = 50.0  # white, 255 levels
-    red = wrapped_picture(range_m, (2, 8))[0, 0] * 0.229 + 0.485
-    assert red[0].tolist() == pytest.approx([0, 0, 0, 3 / 8, 1 / 8, 0, 0, 0], abs=1e-6)
-
-
-# --- LIP-Loc ---
-
-
-def test_feature_is_the_mean_of_the_patch_tokens_normalised():
-    """Without blocks a token is its patch plus its position; the class token has no part."""
-    network = LIPLoc(picture_side=4, patch_side=2, width=2, depth=0, num_heads=1)
-    network.embedding.weight.data.zero_()
-    network.embedding.bias.data.copy_(torch.tensor([1.0, 2.0]))
-    network.encoder.cls_token.data.fill_(1e3)
-    positions = torch.tensor([[1e3, -1e3], [4.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    network.encoder.pos_embed.data.copy_(positions[None])
-    network.norm.weight.data.copy_(torch.tensor([1.0, 10.0]))
-    # Mean (1 + 4 / 4, 2) has no variance: all of it is the bias of the norm.
-    network.norm.bias.data.copy_(torch.tensor([0.5, 0.25]))
-    assert network(torch.full((1, 3, 5), 10.0))[0].tolist() == [0.5, 0.25]
-    network.encoder.pos_embed.data[0, 2, 0] = 8.0  # mean (4, 2): normalised to 1, -1
-    feature = network(torch.full((1, 3, 5), 10.0))[0]
-    assert feature.tolist() == pytest.approx([1.5, -9.75], rel=1e-5)
-
-
-# --- refusals ---
-
-
-@pytest.mark.parametrize("shape", [(16, 64), (2, 16, 32), (2, 1, 16, 64)])
-def test_rangevit_refuses_images_of_another_size(shape):
-    with pytest.raises(ValueError, match=r"range image.* must be .* got shape"):
-        rangevit()(torch.ones(shape))
-
-
-def test_rangevit_refuses_an_intensity_of_another_size():
-    with pytest.raises(ValueError, match=r"intensity must have the shape .*\(1, 16, 64\)"):
-        range_channels(scans(1), SENSOR, torch.ones(16, 64))
 
 
 @pytest.mark.parametrize(
@@ -215,6 +122,14 @@ def test_rangevit_refuses_an_intensity_of_another_size():
 def test_rangevit_refuses_sizes(settings, message):
     with pytest.raises(ValueError, match=message):
         rangevit(**settings)
+
+
+def test_rangevit_refuses_images_of_another_size():
+    for shape in ((16, 64), (2, 16, 32), (2, 1, 16, 64)):
+        with pytest.raises(ValueError, match=r"range image.* must be .* got shape"):
+            rangevit()(torch.ones(shape))
+    with pytest.raises(ValueError, match=r"intensity must have the shape .*\(1, 16, 64\)"):
+        range_channels(scans(1), SENSOR, torch.ones(16, 64))
 
 
 def test_liploc_refuses_what_is_no_picture():

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from r3dpa.nn import SiT
+from r3dpa.nn import VAE, SiT
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "xl": (1152, 28, 16)}
@@ -38,7 +38,8 @@ def test_parameters_of_the_paper_configuration():
     with_position = count(sit) + sit.pos_embed.numel()
     assert with_position == 137_298_208
     assert with_position - count(sit.projector) == 129_953_312
-    assert count(vae) == 59_660_649
+    with torch.device("meta"):
+        assert count(vae) == count(VAE()) == 59_660_649
     assert (sit.in_channels, *sit.input_size) == LATENTS["vae_h2p4d8"]
 
 
@@ -55,6 +56,19 @@ def test_sit_sizes(size, patch):
     projector = width * 2048 + 2048 + 2048**2 + 2048 + 2048 * 768 + 768
     assert count(sit) == depth * block + embedders + head + projector
     assert sit.grid_size == (16 // patch, 128 // patch)
+
+
+@pytest.mark.parametrize(
+    ("name", "total", "head", "grid_size"),
+    [
+        ("unet_lidm", 266_146_056, 7_869_184, (4, 32)),
+        ("unet_small", 108_141_000, 7_082_752, (4, 32)),
+        ("unet_demo", 3_164_488, 296_192, (4, 16)),
+    ],
+)
+def test_unet_config(name, total, head, grid_size):
+    unet = build(name)
+    assert (count(unet), count(unet.projector), unet.grid_size) == (total, head, grid_size)
 
 
 @pytest.mark.parametrize("name", LATENTS)

@@ -59,7 +59,11 @@ def run_process(rank, folder):
 @pytest.fixture(scope="module")
 def processes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("two_processes")
-    torch.multiprocessing.spawn(run_process, (str(folder),), nprocs=2)
+    # A fork starts at once, but cannot run a backward pass where a GPU has threads for it.
+    method = "spawn" if torch.cuda.is_available() else "fork"
+    torch.multiprocessing.start_processes(
+        run_process, (str(folder),), nprocs=2, start_method=method
+    )
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
@@ -78,7 +82,7 @@ def test_latent_norm(processes):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize(("offset", "tolerance"), zip(OFFSETS, (1e-6, 1e-3), strict=True))
+@pytest.mark.parametrize(("offset", "tolerance"), [(OFFSETS[0], 1e-6), (OFFSETS[1], 1e-3)])
 def test_synced_batch_norm(processes, offset, tolerance):
     first, second = (part[offset] for part in processes)
     image = torch.cat(batches(offset)).double()

@@ -17,13 +17,6 @@ def vae():
     return VAE(**SMALL, num_res_blocks=1, attention_levels=(2,))
 
 
-def test_latents_are_smaller_by_the_product_of_the_strides(vae):
-    posterior = vae.encode(torch.randn(2, 1, 8, 64))
-    assert posterior.mean.shape == posterior.std.shape == (2, vae.latent_channels, 2, 8)
-    assert vae.latent_size((8, 64)) == (2, 8)
-    assert vae.decode(posterior.mean).shape == (2, 1, 8, 64)
-
-
 @pytest.mark.parametrize("columns", [1, 3, 7])
 @torch.no_grad()
 def test_rotating_the_scan_rotates_the_latents_and_back(vae, columns):
@@ -39,18 +32,12 @@ def test_rotating_the_scan_rotates_the_latents_and_back(vae, columns):
 def test_every_parameter_learns(vae):
     image = torch.randn(2, 1, 8, 64)
     posterior = vae.encode(image)
+    assert posterior.std.shape == (2, vae.latent_channels, *vae.latent_size((8, 64)))
     reconstruction = vae.decode(posterior.sample(torch.randn_like(posterior.mean)))
     ((reconstruction - image).abs().mean() + 1e-3 * posterior.kl().mean()).backward()
     without = [name for name, weight in vae.named_parameters() if not weight.grad.abs().sum() > 0]
     # A constant added to all keys of an attention cancels in its softmax: rounding decides.
     assert not [name for name in without if not name.endswith(".k.bias")]
-
-
-def test_default_is_the_full_size_of_the_paper():
-    with torch.device("meta"):
-        vae = VAE()
-    assert sum(weight.numel() for weight in vae.parameters()) == 59_660_649
-    assert (vae.latent_channels, *vae.latent_size((64, 1024))) == (8, 16, 128)
 
 
 @pytest.mark.parametrize(

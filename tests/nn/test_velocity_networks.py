@@ -1,14 +1,17 @@
-"""What holds for every velocity network, SiT and UNet."""
+"""SiT and UNet: what holds for every velocity network, and what is their own."""
 
 from __future__ import annotations
 
 import copy
+import math
 
 import pytest
 import torch
 from torch import nn
 
 from r3dpa.nn import SiT, UNet
+from r3dpa.nn.sit import sincos_position_embedding
+from r3dpa.nn.velocity_network import time_frequencies
 
 COMMON = {"in_channels": 3, "feature_dim": 5, "projector_dim": 12}
 SIZES = {
@@ -31,10 +34,14 @@ SIZES = {
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
 
 
+def fresh(kind, **options):
+    return kind(**COMMON | SIZES[kind] | options)
+
+
 def build(kind, seed=0, **options):
     """Small network without zero layers, which would hide most of it."""
     torch.manual_seed(seed)
-    network = kind(**{**COMMON, **SIZES[kind], **options})
+    network = fresh(kind, **options)
     for parameter in network.parameters():
         if not parameter.any():
             nn.init.normal_(parameter, std=0.2)
@@ -186,10 +193,168 @@ def test_halved_weights_and_autocast_stay_close(network):
     assert (alone.velocity[0] - mixed.velocity[0]).norm() < 0.05 * velocity[0].norm()
 
 
+@pytest.mark.parametrize("kind", [SiT, UNet])
+def test_a_fresh_network_has_velocity_zero(kind):
+    network = fresh(kind)
+    assert not network.velocity(*inputs(network)).any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (SiT, {"input_size": (4, 7)}, r"4 x 7 do not divide into patches of 2"),
+        (SiT, {"num_heads": 3}, r"16 is not a multiple of num_heads 3"),
+        (SiT, {"alignment_depth": 4}, r"1\.\.3, got 4"),
+        (SiT, {"alignment_depth": 0}, r"1\.\.3, got 0"),
+        (SiT, {"hidden_size": 6}, r"divisible by 4, got 6"),
+        (UNet, {"input_size": (5, 16)}, "5 x 16 cannot be halved 1 times"),
+        (UNet, {"channels": 40}, "40 is not a multiple of head_channels 16"),
+        (UNet, {"channels": 48}, "multiple of 32"),
+        (UNet, {"attention_resolutions": [4]}, r"among \[1, 2\], got \[4\]"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(kind, options, message):
+    with pytest.raises(ValueError, match=message):
+        fresh(kind, **options)
+
+
 @pytest.mark.numerics
-def test_1000_times_have_1000_rows_under_autocast():
-    """Of the UNet; the embedding of SiT has a test of its own."""
+@pytest.mark.parametrize("half_weights", [False, True])
+def test_1000_times_have_1000_embeddings_in_half_precision(half_weights):
+    embedder = build(SiT).t_embedder
+    if half_weights:
+        embedder = embedder.bfloat16()
+    times = torch.linspace(0, 1, 1000)
     with torch.autocast("cpu", torch.bfloat16):
-        rows = build(UNet).modulations(torch.linspace(0, 1, 1000))
-    assert rows.dtype == torch.float32
-    assert len(rows.unique(dim=0)) == 1000
+        embeddings = embedder(times)
+    assert embeddings.dtype == torch.float32
+    assert len(embeddings.unique(dim=0)) == 1000
+    wide = embedder.double()
+    differences = torch.diff(embeddings.double(), dim=0) * 999
+    middles = (times[1:] + times[:-1]).double() / 2
+    derivative = torch.func.jvp(wide, (middles,), (torch.ones_like(middles),))[1]
+    error = (differences - derivative).norm(dim=1) / derivative.norm(dim=1)
+    assert error.max() < 0.01
+    assert len(times.bfloat16().unique()) < 600  # the times themselves would coincide
+    if not half_weights:
+        with torch.autocast("cpu", torch.bfloat16):
+            rows = build(UNet).modulations(times)
+        assert rows.dtype == torch.float32
+        assert len(rows.unique(dim=0)) == 1000
+
+
+def test_fresh_blocks_of_sit_do_nothing():
+    sit = fresh(SiT)
+    latents, time = inputs(sit)
+    tokens = sit.x_embedder(latents) + sit.pos_embed
+    assert torch.equal(sit.project_features(latents, time), sit.projector(tokens))
+    bound = math.sqrt(6 / (16 + 3 * 16))  # Xavier for the 16 -> 48 layer
+    weight = sit.blocks[0].attn.qkv.weight
+    assert 0.9 * bound < weight.abs().max() <= bound
+    assert sit.blocks[0].attn.qkv.bias.abs().max() == 0
+    assert 0.015 < sit.t_embedder.mlp[0].weight.std() < 0.025
+
+
+def test_position_embedding_encodes_the_column_then_the_row():
+    code = sincos_position_embedding(8, (2, 3))[0].view(2, 3, 8)
+    assert torch.equal(code[0, :, :4], code[1, :, :4])
+    assert torch.equal(code[:, 0, 4:], code[:, 2, 4:])
+    # Frequencies 1 and 10000^(-1/2) = 0.01; sines before cosines.
+    expected = [math.sin(2), math.sin(0.02), math.cos(2), math.cos(0.02)]
+    torch.testing.assert_close(code[1, 2, :4], torch.tensor(expected))
+    expected = [math.sin(1), math.sin(0.01), math.cos(1), math.cos(0.01)]
+    torch.testing.assert_close(code[1, 2, 4:], torch.tensor(expected))
+
+
+def test_time_frequencies_have_cosines_before_sines():
+    features = time_frequencies(torch.tensor([0.0, 0.5], dtype=torch.float64), 4)
+    expected = [[1, 1, 0, 0], [math.cos(0.5), math.cos(0.005), math.sin(0.5), math.sin(0.005)]]
+    torch.testing.assert_close(features, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_position_embedding_is_a_buffer_unless_it_is_to_be_learned():
+    fixed, learned = fresh(SiT), fresh(SiT, learn_pos_embed=True)
+    assert "pos_embed" not in dict(fixed.named_parameters())
+    assert learned.get_parameter("pos_embed").requires_grad
+    assert set(fixed.state_dict()) == set(learned.state_dict())
+    learned.load_state_dict(fixed.state_dict())
+
+
+def test_the_row_for_no_class_is_the_last_one():
+    sit = build(SiT, num_classes=2, class_dropout=True)
+    latents, time = inputs(sit)
+    assert sit.y_embedder.embedding_table.weight.shape == (3, 16)
+    no_class = sit.velocity(latents, time, torch.tensor([2, 2]))
+    assert not torch.equal(no_class, sit.velocity(latents, time, torch.tensor([0, 1])))
+
+
+@pytest.mark.numerics
+def test_token_norm_of_constant_tokens_is_finite():
+    sit = build(SiT)
+    nn.init.zeros_(sit.x_embedder.proj.weight)
+    nn.init.zeros_(sit.x_embedder.proj.bias)
+    sit.pos_embed.zero_()
+    latents, time = inputs(sit)
+    latents.requires_grad_()
+    output = sit(latents, time)
+    output.velocity.sum().backward()
+    assert output.velocity.isfinite().all()
+    assert latents.grad.isfinite().all()
+    tokens = torch.zeros(8, 16)
+    assert (tokens / tokens.std(dim=1, keepdim=True)).isnan().all()  # without eps
+
+
+def test_half_weights_leave_float32_islands():
+    """Closer to float32 than half of everything, which rounds the token stream in every block."""
+    sit, half, all_half = (build(SiT, depth=8) for _ in range(3))
+    half.halve_()
+    narrow = {name for name, p in half.named_parameters() if p.dtype == torch.bfloat16}
+    assert {name.split(".")[2] for name in narrow} == {"attn", "mlp"}
+    latents, time = inputs(sit, batch=16)
+    expected = sit.velocity(latents, time)
+    error = (half.velocity(latents, time) - expected).square().mean().sqrt()
+    naive = all_half.bfloat16().velocity(latents.bfloat16(), time).float()
+    assert 0 < error < 0.02 * expected.std()
+    assert error < 0.7 * (naive - expected).square().mean().sqrt()
+
+
+def test_columns_wrap_around_but_for_the_position_bias():
+    """Rotated by one cell of the middle block, everything turns along; a bias breaks that."""
+    unet = build(UNet)
+    latents, time = inputs(unet)
+    rotated = latents.roll(2, dims=-1)
+
+    def turned():
+        velocity, features = unet(rotated, time)
+        grid = features.unflatten(1, unet.grid_size)
+        return velocity.roll(-2, dims=-1), grid.roll(-1, dims=2).flatten(1, 2)
+
+    expected = unet(latents, time)
+    assert (turned()[0] - expected.velocity).abs().max() > 0.01
+    nn.init.zeros_(unet.ape.bias)
+    expected = unet(latents, time)
+    for found, value in zip(turned(), expected, strict=True):
+        torch.testing.assert_close(found, value, atol=1e-5, rtol=1e-5)
+
+
+def test_attention_at_chosen_resolutions():
+    """LiDM's names: the residual block is layer 0, attention layer 1, a step up the last one."""
+    unet = build(UNet, channel_multipliers=(1, 2, 1), attention_resolutions=[2])
+    kinds = [
+        [type(layer).__name__.strip("_") for layer in block]
+        for block in (*unet.input_blocks[1:], unet.middle_block, *unet.output_blocks)
+    ]
+    res, attention = "TimedResBlock", "HeadsAttention"
+    down = [[res], ["HalfSize"], [res, attention], ["HalfSize"], [res]]
+    up = [
+        [res],
+        [res, "DoubleSize"],
+        [res, attention],
+        [res, attention, "DoubleSize"],
+        [res],
+        [res],
+    ]
+    assert kinds == [*down, [res, attention, res], *up]
+    assert unet.velocity(*inputs(unet)).isfinite().all()
+    every = fresh(UNet, attention_resolutions=[2, 1])
+    assert every.state_dict().keys() == fresh(UNet).state_dict().keys()
