@@ -121,14 +121,7 @@ class TestView:
         missing[:, 24:40] = False  # 90 degrees ahead
         self.check(cloud(-24.5, 2.5, azimuths_deg=(-50, 50)), missing)
 
-
-def test_error_counts_pixels_with_returns_in_both():
-    first = torch.tensor([[10.0, -1.0, 5.0, 7.0]])
-    second = torch.tensor([[12.0, 4.0, -1.0, 6.0]])
-    assert range_error_m(first, second) == 1.5
-    assert range_error_m(first, second, torch.tensor([[True, True, True, False]])) == 2
-    assert math.isnan(range_error_m(first, -torch.ones(1, 4)))
-
+    @pytest.mark.data
     def test_real_scans_pass_and_half_their_beams_do_not(self, real_scans_dir):
         """Of the 64 lasers, stored one after the other, every second one is left out."""
         projection = SphericalProjection(LidarSensor())
@@ -141,3 +134,11 @@ def test_error_counts_pixels_with_returns_in_both():
         half = points[laser % 2 == 0]
         with pytest.raises(ValueError, match="fewer beams than the checkpoint"):
             check_view(half, range_image(half, projection)[0], projection)
+
+
+def test_error_counts_pixels_with_returns_in_both():
+    first = torch.tensor([[10.0, -1.0, 5.0, 7.0]])
+    second = torch.tensor([[12.0, 4.0, -1.0, 6.0]])
+    assert range_error_m(first, second) == 1.5
+    assert range_error_m(first, second, torch.tensor([[True, True, True, False]])) == 2
+    assert math.isnan(range_error_m(first, -torch.ones(1, 4)))

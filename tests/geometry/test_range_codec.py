@@ -38,11 +38,7 @@ def test_empty_pixels_stay_empty(codec):
     assert image.min() >= -1
     assert codec.valid_mask(image).tolist() == [False, False, True]
     assert codec.decode(image, LidarSensor())[:2].tolist() == [EMPTY_RANGE_M] * 2
-
-
-@pytest.mark.parametrize("codec", CODECS, ids=str)
-def test_threshold_is_one_grey_level(codec):
-    below, above = codec.encode(torch.tensor([1 / 255 - 3e-4, 1 / 255 + 3e-4]))
+    below, above = codec.encode(torch.tensor([1 / 255 - 3e-4, 1 / 255 + 3e-4]))  # one grey level
     assert below < codec.threshold < above
 
 
@@ -66,15 +62,12 @@ def test_wild_decoder_outputs_hold_no_return(codec):
     assert (codec.decode(image, LidarSensor()) == EMPTY_RANGE_M).all()
 
 
-def test_half_precision_images_decode_in_float32():
-    image = torch.tensor([0.25], dtype=torch.bfloat16)
-    assert RangeCodec().decode(image, LidarSensor()).tolist() == [35.0]
-
-
-def test_gradient_reaches_the_image():
-    image = torch.zeros(3, requires_grad=True)
-    RangeCodec().decode(image, LidarSensor()).sum().backward()
-    assert image.grad.tolist() == [28.0] * 3
+def test_half_precision_images_decode_in_float32_with_a_gradient():
+    image = torch.tensor([0.25], dtype=torch.bfloat16, requires_grad=True)
+    range_m = RangeCodec().decode(image, LidarSensor())
+    assert range_m.tolist() == [35.0]
+    range_m.sum().backward()
+    assert image.grad.tolist() == [28.0]
 
 
 def test_wrong_settings_are_refused():

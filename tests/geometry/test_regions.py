@@ -51,11 +51,8 @@ def test_azimuths_count_to_the_left_and_across_the_seam(azimuths, columns):
     assert selected(mask, 0) == [1, 2]
     assert selected(mask, 1) == columns
     assert mask.sum() == 2 * len(columns)
-
-
-def test_box_of_angles_takes_the_inclinations_of_the_rings():
-    assert selected(angle_box(RINGS, -20, 20, -2, 3), 0) == [1, 2]
-    assert selected(angle_box(RINGS, -20, 20, -30, -5), 0) == [3]
+    assert selected(angle_box(RINGS, *azimuths, -2, 3), 0) == [1, 2]
+    assert selected(angle_box(RINGS, *azimuths, -30, -5), 0) == [3]
 
 
 def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
@@ -97,6 +94,8 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
             lambda: sensor_pair(COARSE, SphericalProjection(LidarSensor(4, 36, 60, 25))),
             "selects all",
         ),
+        # Every token has a pixel of every second beam.
+        (lambda: token_mask(dropped_beams(FINE, 16), (8, 16)), "selects all of 128"),
         (lambda: check_mask(torch.zeros(2, 3, dtype=torch.bool), "mask a.png"), "mask a.png: sel"),
     ],
 )
@@ -145,7 +144,7 @@ def marched(projection, centre, size, yaw_deg, step=0.01):
 
 
 @pytest.mark.parametrize("projection", [DENSE, DENSE_RINGS], ids=["spherical", "rings"])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_box_is_what_marching_along_the_rays_finds(projection, seed):
     draw = torch.Generator().manual_seed(seed)
     centre = (torch.rand(3, generator=draw, dtype=torch.float64) - 0.5) * torch.tensor([16, 16, 3])
@@ -214,11 +213,6 @@ def test_tokens_with_any_or_all_pixels():
         token_mask(pixels, (3, 4))
     with pytest.raises(ValueError, match="'most'"):
         token_mask(pixels, (2, 4), rule="most")
-
-
-def test_every_second_beam_leaves_no_token_untouched():
-    with pytest.raises(ValueError, match="selects all of 512"):
-        token_mask(dropped_beams(SphericalProjection(LidarSensor()), 32), (8, 64))
 
 
 def test_mask_of_tokens_covers_their_patches():

@@ -27,7 +27,3 @@ def test_limits_in_radians():
 def test_impossible_sensors_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         LidarSensor(**wrong)
-
-
-def test_equal_sensors_are_one_key():
-    assert len({LidarSensor(), LidarSensor(beams=64), LidarSensor(beams=32)}) == 2

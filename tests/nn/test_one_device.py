@@ -65,14 +65,14 @@ def test_velocity_networks(make):
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_vae(legacy):
-    vae = on_device(
-        lambda: VAE(1, 4, 32, (1, 2), ((1, 2),), 1, attention_levels=(1,), legacy_upsample=legacy)
-    )
+def test_vae_and_discriminator(legacy):
+    vae = on_device(lambda: VAE(1, 4, 32, (1, 2), ((1, 2),), 1, (1,), legacy))
     posterior = vae.encode(values(2, 1, 8, 32))
     latents = posterior.sample(values(*posterior.mean.shape))
     backward(vae.decode(latents), posterior.kl())
     backward(vae.halve_decoder_().decode(latents))
+    discriminator = on_device(lambda: PatchDiscriminator(channels=8)).train(legacy)
+    backward(discriminator(values(2, 1, 32, 64)))
 
 
 def test_image_networks():
@@ -80,12 +80,6 @@ def test_image_networks():
     backward(vae.decode(vae.encode(values(1, 3, 16, 16)).mean))
     teacher = on_device(lambda: DINOv2(dim=32, depth=1, num_heads=2, grid_size=4))
     backward(teacher(values(2, 3, 20, 20), (2, 3)))
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_discriminator(training):
-    network = on_device(lambda: PatchDiscriminator(channels=8)).train(training)
-    backward(network(values(2, 1, 32, 64)))
 
 
 @pytest.mark.parametrize("official", [False, True])

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import ScaLR, ScanGrid, WaffleIron, collate_scans, prepare_scan
-from r3dpa.nn.backbones.waffleiron import SpatialMixing
 
 GRID = ScanGrid(
     minimum_m=(-8.0, -8.0, -2.0), maximum_m=(8.0, 8.0, 2.0), cell_m=1.0, num_neighbors=4
@@ -79,13 +78,6 @@ def test_cells_of_unequal_edges():
         ScanGrid(cell_m=(1.0, 0.0, 1.0))
 
 
-def test_neighbours_agree_with_all_distances():
-    scan = prepare(cloud(300))
-    xyz = scan.features[:, X:RADIUS].double()
-    distances = torch.cdist(xyz, xyz).fill_diagonal_(torch.inf)
-    assert torch.equal(scan.neighbors, distances.topk(4, largest=False).indices)
-
-
 def test_single_points_and_empty_scans(network):
     point = torch.tensor([[1.0, 2.0, 0.5, 0.3]])
     one = prepare(point)
@@ -123,27 +115,6 @@ def test_refused_input(network):
         WaffleIron(width=8, depth=0)
     with pytest.raises(ValueError, match=r"cells \(16, 16, 4\), but grid has \(256, 256, 32\)"):
         ScaLR(network)
-
-
-def test_spatial_mixing_agrees_with_matrices(network):
-    """Means and copies as products with the N x cells matrix that the network does without."""
-    scans = [prepare(cloud(150, seed)) for seed in (0, 1)]
-    batch = collate_scans(scans)
-    starts = [0, len(scans[0].features), len(batch.features)]
-    tokens = torch.randn(len(batch.features), 12, generator=torch.Generator().manual_seed(2))
-    for plane, (rows, columns) in enumerate([(16, 16), (16, 4), (16, 4)]):
-        layer: SpatialMixing = network.spatial[plane]
-        actual = layer(tokens, network._planes(batch)[plane])
-        for i, scan in enumerate(scans):
-            own = tokens[starts[i] : starts[i + 1]]
-            member = torch.nn.functional.one_hot(scan.cells[plane], rows * columns).float()
-            assert member.sum(dim=0).max() > 1
-            means = torch.linalg.pinv(member) @ layer.norm(own)
-            image = layer.convs(means.T.reshape(1, 12, rows, columns))
-            expected = own + layer.scale * (member @ image.reshape(12, -1).T)
-            torch.testing.assert_close(
-                actual[starts[i] : starts[i + 1]], expected, atol=2e-5, rtol=1e-5
-            )
 
 
 @torch.no_grad()
