@@ -6,7 +6,6 @@ without the seconds of the imports. Signals, limits and full disks are those of 
 
 from __future__ import annotations
 
-import csv
 import functools
 import json
 import multiprocessing
@@ -26,11 +25,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from PIL import Image
 from safetensors.torch import load_file
 
 from r3dpa.data.feature_grids import GridSettings
-from r3dpa.data.scans import read_ply, read_scan
+from r3dpa.data.scans import read_npz, read_ply, read_scan
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
@@ -189,63 +187,38 @@ def assert_whole(folder: Path) -> int:
 
 def rows_of(journal: Path) -> dict[str, bytes]:
     """Row of each scan that a journal names; a resumed run makes another shard."""
-    values = json.loads((journal.parent / "settings.json").read_text())
-    size = GridSettings(**values).store("").row.itemsize
+    settings = json.loads((journal.parent / "settings.json").read_text())
+    size = GridSettings(**settings).store("").row_bytes
     data = journal.with_suffix(".rows").read_bytes()
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    whole = journal.read_bytes().rpartition(b"\n")[0].splitlines() if journal.exists() else []
+    lines = [json.loads(line) for line in whole]
+    assert [line["row"] for line in lines] == list(range(len(lines)))
+    assert len(data) >= len(lines) * size
     return {line["scan"]: data[line["row"] * size : (line["row"] + 1) * size] for line in lines}
-
-
-def _check_rows(path: Path) -> None:
-    journal, settings = path.with_suffix(".jsonl"), path.parent / "settings.json"
-    values = json.loads(settings.read_text())
-    row = GridSettings(**values).store("").row.itemsize
-    whole = (journal.read_bytes() if journal.exists() else b"").rpartition(b"\n")[0].splitlines()
-    assert [json.loads(line)["row"] for line in whole] == list(range(len(whole)))
-    assert path.stat().st_size >= len(whole) * row
-
-
-def _check_beside_scan(path: Path) -> None:
-    num_points = len(read_scan(path.parents[1] / "data" / f"{path.stem}.bin"))
-    assert path.stat().st_size == num_points * {".label": 4, ".origin": 1}[path.suffix]
-
-
-def _check_table(path: Path) -> None:
-    rows = list(csv.reader(path.read_text().splitlines(keepends=True)))
-    assert {len(row) for row in rows} == {len(rows[0])}
-
-
-def _check_yaml(path: Path) -> None:
-    assert isinstance(yaml.safe_load(path.read_text()), dict)
-
-
-def _check_npz(path: Path) -> None:
-    with np.load(path) as archive:
-        assert all(np.isfinite(archive[name]).all() for name in archive.files)
 
 
 def _check_beside(path: Path) -> None:
     """A label may be there before the points of its scan; then it is no scan yet."""
-    if (path.parents[1] / "data" / f"{path.stem}.bin").exists():
-        _check_beside_scan(path)
+    scan = path.parents[1] / "data" / f"{path.stem}.bin"
+    if scan.exists():
+        size = {".label": 4, ".origin": 1}[path.suffix]
+        assert path.stat().st_size == len(read_scan(scan)) * size
 
 
 _CHECKS: dict[str, Callable[[Path], object]] = {
     ".bin": read_scan,
     ".ckpt": lambda path: torch.load(path, weights_only=True, map_location="cpu"),
-    ".csv": _check_table,
     ".json": lambda path: json.loads(path.read_text()),
-    ".jsonl": lambda path: _check_rows(path.with_suffix(".rows")),
+    ".jsonl": rows_of,
     ".label": _check_beside,
     ".npy": np.load,
-    ".npz": _check_npz,
+    ".npz": read_npz,
     ".origin": _check_beside,
     ".ply": read_ply,
-    ".png": lambda path: Image.open(path).verify(),
-    ".rows": _check_rows,
+    ".rows": lambda path: rows_of(path.with_suffix(".jsonl")),
     ".safetensors": load_file,
     ".txt": lambda path: path.read_text(),
-    ".yaml": _check_yaml,
+    ".yaml": lambda path: yaml.safe_load(path.read_text()),
 }
 
 

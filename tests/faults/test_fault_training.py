@@ -50,7 +50,7 @@ def goes_on(ended, scans_folder, undisturbed):
     return run
 
 
-class TestSigterm:
+class TestStopped:
     def test_between_two_batches_of_a_step(self, scans_folder, tmp_path, ended, goes_on):
         """In the first of the two batches of step 3: it waits for the second."""
         words = fit_words(scans_folder, tmp_path / "run")
@@ -71,6 +71,7 @@ class TestSigterm:
         assert "Traceback" not in seen
         assert step_of(last(tmp_path / "run")) == 2
 
+    @pytest.mark.slow
     def test_a_second_ctrl_c_ends_at_once(self, scans_folder, tmp_path, ended):
         words = fit_words(scans_folder, tmp_path / "run")
         twice = At(STEP, Signal(signal.SIGINT), call=3), At(STEP, Signal(signal.SIGINT), call=3)
@@ -78,6 +79,7 @@ class TestSigterm:
         assert status == 1, seen  # that of Lightning
         assert "stopped by" not in seen
 
+    @pytest.mark.slow
     def test_while_a_checkpoint_is_written(self, scans_folder, tmp_path, ended, goes_on):
         words = fit_words(scans_folder, tmp_path / "run")
         status, seen = ended(words, At("torch.save", Signal(signal.SIGTERM)))
@@ -103,9 +105,9 @@ class TestSigterm:
         assert_same_training(tmp_path / "run", calm)
 
 
-@pytest.mark.slow  # `make test-faults`
+@pytest.mark.slow
 class TestKilled:
-    @pytest.mark.parametrize("call", [pytest.param(1, marks=pytest.mark.slow), 6])
+    @pytest.mark.parametrize("call", [1, 6])
     def test_between_checkpoints(self, call, scans_folder, tmp_path, ended, goes_on):
         """Before the first one, too: ``last`` then means from the start."""
         words = fit_words(scans_folder, tmp_path / "run")
@@ -115,12 +117,8 @@ class TestKilled:
         assert last(tmp_path / "run").exists() == (call > 1)
         goes_on(tmp_path / "run")
 
-    @pytest.mark.parametrize(
-        "save", [*(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2)), 4]
-    )
-    def test_with_half_a_checkpoint_written(
-        self, save, scans_folder, tmp_path, ended, goes_on, fault
-    ):
+    @pytest.mark.parametrize("save", [1, 4])
+    def test_with_half_a_checkpoint_written(self, save, scans_folder, tmp_path, ended, goes_on):
         """Each saving writes two files, ``step=...`` and ``last``."""
         words = fit_words(scans_folder, tmp_path / "run")
         status, seen = ended(words, At("torch.save", Limit(100_000), call=save))
@@ -142,11 +140,9 @@ class TestKilled:
         goes_on(tmp_path / "run")
 
 
-@pytest.mark.slow  # `make test-faults`
+@pytest.mark.slow
 class TestDisk:
-    def test_full_while_a_checkpoint_is_written(
-        self, scans_folder, small_disk, ended, goes_on, fault
-    ):
+    def test_full_while_a_checkpoint_is_written(self, scans_folder, small_disk, ended, goes_on):
         """The disk of the run, which is not that of temporary files."""
         disk = small_disk(64_000_000)
         run_dir = disk / "run"
@@ -168,41 +164,33 @@ class TestDisk:
         assert f"Read-only file system: '{disk / 'run'}'" in seen
 
 
-class TestTwo:
-    def test_the_second_is_refused(self, scans_folder, tmp_path, start, ended, undisturbed):
-        run_dir = tmp_path / "run"
-        first = start(fit_words(scans_folder, run_dir), At(STEP, Pause(tmp_path), call=2))
-        first.wait_for((tmp_path / "reached").exists)
-        for more in ([], ["--ckpt_path", "last"]):
-            status, seen = ended(fit_words(scans_folder, run_dir, *more))
-            assert status == 1
-            assert f"another process ({first.pid} on " in seen
-            assert f"runs r3dpa fit in {run_dir}: wait for it" in seen
-        (tmp_path / "go").touch()
-        assert first.end()[0] == 0
-        assert_same_training(run_dir, undisturbed)
-        status, seen = ended(fit_words(scans_folder, run_dir))
-        assert "holds an earlier run: resume it with --ckpt_path last" in seen
+@pytest.mark.slow
+def test_a_second_run_is_refused(scans_folder, tmp_path, start, ended, undisturbed):
+    run_dir = tmp_path / "run"
+    first = start(fit_words(scans_folder, run_dir), At(STEP, Pause(tmp_path), call=2))
+    first.wait_for((tmp_path / "reached").exists)
+    status, seen = ended(fit_words(scans_folder, run_dir, "--ckpt_path", "last"))
+    assert status == 1
+    assert f"another process ({first.pid} on " in seen
+    assert f"runs r3dpa fit in {run_dir}: wait for it" in seen
+    (tmp_path / "go").touch()
+    assert first.end()[0] == 0
+    assert_same_training(run_dir, undisturbed)
 
 
-@pytest.mark.slow  # `make test-faults`
-class TestScan:
-    @pytest.mark.parametrize(
-        ("kept", "says"),
-        [(None, "No such file"), pytest.param(100, "not a multiple", marks=pytest.mark.slow)],
+@pytest.mark.slow
+@pytest.mark.parametrize(("kept", "says"), [(None, "No such file"), (100, "not a multiple")])
+def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ended, goes_on):
+    """All of them are, in the step after a checkpoint; then they are back."""
+    saved = tmp_path / "saved"
+    shutil.copytree(own_scans, saved)
+    words = fit_words(own_scans, tmp_path / "run")
+    status, seen = ended(
+        words, *(At(STEP, Change(path, kept), call=5) for path in own_scans.iterdir())
     )
-    def test_lost_between_index_and_read(
-        self, kept, says, own_scans, tmp_path, ended, goes_on, fault
-    ):
-        """All of them are, in the step after a checkpoint; then they are back."""
-        saved = tmp_path / "saved"
-        shutil.copytree(own_scans, saved)
-        words = fit_words(own_scans, tmp_path / "run")
-        faults = [At(STEP, Change(path, kept), call=5) for path in own_scans.iterdir()]
-        status, seen = ended(words, *faults)
-        assert status == 1
-        assert f"{own_scans}/0" in seen.splitlines()[-1]
-        assert says in seen.splitlines()[-1]
-        assert_whole(tmp_path / "run")
-        shutil.copytree(saved, own_scans, dirs_exist_ok=True)
-        goes_on(tmp_path / "run", scans=own_scans)
+    assert status == 1
+    assert f"{own_scans}/0" in seen.splitlines()[-1]
+    assert says in seen.splitlines()[-1]
+    assert_whole(tmp_path / "run")
+    shutil.copytree(saved, own_scans, dirs_exist_ok=True)
+    goes_on(tmp_path / "run", scans=own_scans)

@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import pytest
 import torch
+from velocities import gaussian_velocity, growth, standard_noise, still
 
-from r3dpa.bench.mixture import GaussianMixture, toy_mixture
+from r3dpa.bench.mixture import toy_mixture
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
@@ -29,10 +30,6 @@ INSIDE = torch.tensor([0.95, 0.9, 0.75, 0.7, 0.45, 0.2, 0.1, 0.05]).double()
 DATA_PREDICTION = ("dpmpp_2m", "unipc")
 
 
-def still(x, time):
-    return torch.zeros_like(x)
-
-
 def steady(x, time):
     return torch.ones_like(x)
 
@@ -41,25 +38,9 @@ def parabola(x, time):
     return 3 * time.square()[:, None].expand_as(x)
 
 
-def growth(x, time):
-    """Linear ODE whose solution is x(1) exp(-(1 - t)) going backwards."""
-    return x
-
-
 def wave(x, time):
     """Velocity without any structure of a path; its solution is C exp(sin(2 t))."""
     return 2 * torch.cos(2 * time)[:, None] * x
-
-
-def gaussian_velocity(spread, interpolant=Interpolant()):  # noqa: B008 -- frozen
-    """Exact velocity of data N(0, spread^2)."""
-
-    def velocity(x, time):
-        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
-        slope = alpha * d_alpha * spread**2 + sigma * d_sigma
-        return slope / (alpha.square() * spread**2 + sigma.square()) * x
-
-    return velocity
 
 
 def data_velocity(data, interpolant):
@@ -73,24 +54,16 @@ def data_velocity(data, interpolant):
     return velocity
 
 
-def standard_noise(*shape, seed=0, dtype=torch.float64):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def test_euler_of_a_parabola_is_the_left_sum():
+def test_euler_and_heun_of_a_parabola():
+    """The left sum, and the trapezoidal sum but for the last step."""
     steps, start = 8, torch.full((2, 1), 5.0).double()
-    expected = 5 - (steps + 1) * (2 * steps + 1) / (2 * steps**2)
+    left = (steps + 1) * (2 * steps + 1) / (2 * steps**2)
     result = euler(parabola, start, ode_times(steps))
-    torch.testing.assert_close(result, torch.full((2, 1), expected).double())
-
-
-def test_heun_of_a_parabola_is_the_trapezoidal_sum_but_for_the_last_step():
-    steps, start = 8, torch.full((2, 1), 5.0).double()
+    torch.testing.assert_close(result, start - left)
     width = 1 / steps
     trapezoids = (1 - width**3) + (steps - 1) * width**3 / 2
-    expected = 5 - trapezoids - width * 3 * width**2
     result = heun(parabola, start, ode_times(steps))
-    torch.testing.assert_close(result, torch.full((2, 1), expected).double())
+    torch.testing.assert_close(result, start - trapezoids - width * 3 * width**2)
 
 
 def test_solvers_keep_no_graph():
@@ -121,9 +94,8 @@ ORDERS = {"euler": 1, "heun": 2, "midpoint": 2, "ab2": 2, "ab3": 3, "dpmpp_2m": 
 
 
 @pytest.mark.parametrize(("solver", "order"), ORDERS.items())
-@pytest.mark.parametrize("shift", [1.0, 2.0])
-@pytest.mark.parametrize("ends", [(0.9, 0.1), (0.1, 0.9)])
-def test_halving_the_step_divides_the_error_by_two_to_the_order(solver, order, shift, ends):
+@pytest.mark.parametrize(("ends", "shift"), [((0.9, 0.1), 2.0), ((0.1, 0.9), 1.0)])
+def test_halving_the_step_divides_the_error_by_two_to_the_order(solver, order, ends, shift):
     start = torch.tensor([[2.0]]).double()
     exact = 2 * math.exp(math.sin(2 * ends[1]) - math.sin(2 * ends[0]))
 
@@ -134,33 +106,25 @@ def test_halving_the_step_divides_the_error_by_two_to_the_order(solver, order, s
 
 
 @pytest.mark.parametrize(("solver", "order"), (ORDERS | {"unipc": 2}).items())
-@pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0)])
-@pytest.mark.parametrize("path", ["linear", "cosine"])
+@pytest.mark.parametrize(
+    ("ends", "path"),
+    [((1.0, 0.0), "linear"), ((1.0, 0.0), "cosine"), ((0.0, 1.0), "cosine")],
+)
 def test_order_from_end_to_end(solver, order, ends, path):
     """From noise to data and back, where the log-SNR is infinite: the slope over three doublings.
 
     DPM-Solver++ loses a logarithm there. The midpoint rule gains an order on this ODE.
     """
-    start, interpolant = torch.ones(1, 1).double(), Interpolant(path)
-    spread = 0.5
+    start, spread = torch.ones(1, 1).double(), 0.5
     exact = spread if ends[1] == 0 else 1 / spread
-    solve = ode_solver(solver, interpolant)
+    solve, velocity = ode_solver(solver, Interpolant(path)), gaussian_velocity(spread, path)
 
     def error(steps):
-        velocity = gaussian_velocity(spread, interpolant)
         return abs(solve(velocity, start, ode_times(steps, *ends)).item() - exact)
 
     slope = math.log2(error(80) / error(640)) / 3
     assert slope > order - (0.4 if solver == "dpmpp_2m" else 0.25)
     assert error(640) < (5e-3 if order == 1 else 2e-4)
-
-
-@pytest.mark.parametrize("solver", sorted(set(ODE_SOLVERS) - set(DATA_PREDICTION)))
-@pytest.mark.parametrize("times", [UNEVEN, UNEVEN.flip(0)])
-def test_constant_velocity_is_exact(solver, times):
-    start = standard_noise(3, 2)
-    result = ODE_SOLVERS[solver](steady, start, times)
-    torch.testing.assert_close(result, start + (times[-1] - times[0]))
 
 
 @pytest.mark.parametrize(("solver", "degree"), [(ab2, 1), (ab3, 2)])
@@ -346,14 +310,6 @@ def test_unknown_solvers_and_counts_are_refused(call, message):
         call()
 
 
-@pytest.mark.parametrize("solver", [*ODE_SOLVERS.values(), dopri5])
-def test_times_that_turn_round_are_refused(solver):
-    if solver is dopri5:
-        pytest.importorskip("torchdiffeq")
-    with pytest.raises(ValueError, match="all increase or all decrease"):
-        solver(growth, torch.ones(1, 1), torch.tensor([1.0, 0.5, 0.5, 0.0]))
-
-
 @pytest.mark.parametrize("solver", ODE_SOLVERS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
 def test_state_keeps_its_dtype_and_times_are_at_least_float32(solver, dtype):
@@ -378,18 +334,6 @@ def test_samples_do_not_depend_on_their_batch(solver):
         assert torch.equal(alone[0], together[index])
 
 
-@pytest.mark.parametrize("solver", ODE_SOLVERS)
-def test_ode_carries_noise_to_gaussian_data_and_back(solver):
-    mixture = GaussianMixture(torch.full((1, 7), 2.0).double(), 0.5, torch.ones(1))
-    noise, times = standard_noise(5, 7), ode_times(400, shift=1.5)
-    solve = ODE_SOLVERS[solver]
-    data = solve(mixture.velocity, noise, times)
-    torch.testing.assert_close(data, 2 + 0.5 * noise, atol=6e-3, rtol=6e-3)
-    torch.testing.assert_close(
-        solve(mixture.velocity, data, times.flip(0)), noise, atol=0.03, rtol=0
-    )
-
-
 @pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0), (0.8, 0.3)])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
 def test_dopri5_reaches_its_tolerance_within_the_interval(ends, dtype):
@@ -406,6 +350,8 @@ def test_dopri5_reaches_its_tolerance_within_the_interval(ends, dtype):
     tolerance = 0.02 if dtype == torch.bfloat16 else 1e-5
     torch.testing.assert_close(result.double(), exact, rtol=tolerance, atol=0)
     assert result.dtype == dtype
+    with pytest.raises(ValueError, match="all increase or all decrease"):
+        dopri5(velocity, x, torch.tensor([1.0, 0.5, 0.5, 0.0]))
     rounding = 1e-7  # of times in float32
     assert {kind for kind, _ in seen} == {dtype}
     assert min(min(time) for _, time in seen) >= min(ends) - rounding
@@ -420,8 +366,8 @@ def test_dopri5_says_what_to_install(monkeypatch):
 
 def test_shifted_ab2_needs_an_eighth_of_eulers_evaluations():
     """AB2 at 16 on the grid of shift 2 is at least as close as Euler at 128, on the toy mixture."""
-    velocity, noise = toy_mixture().velocity, standard_noise(64, 64, seed=1)
-    converged, halved = (heun(velocity, noise, ode_times(steps)) for steps in (1000, 500))
+    velocity, noise = toy_mixture().velocity, standard_noise(32, 64, seed=1)
+    converged, halved = (heun(velocity, noise, ode_times(steps)) for steps in (600, 300))
 
     def error(solution):
         return (solution - converged).square().mean().sqrt().item()
