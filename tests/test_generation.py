@@ -69,9 +69,8 @@ def test_a_scene_does_not_depend_on_its_batch(sampler):
     torch.testing.assert_close(shuffled.latents, whole.latents[[5, 2]], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("sampler", [ODE, SDE], ids=["ode", "sde"])
-def test_other_indices_and_seeds_give_other_scenes(sampler):
-    scenes = generator(sampler)
+def test_other_indices_and_seeds_give_other_scenes():
+    scenes = generator(SDE)
     first, second = scenes.generate([0, 1], seed=0), scenes.generate([0, 1], seed=1)
     every = torch.cat([first.latents, second.latents])
     distance = torch.cdist(every.flatten(1), every.flatten(1)) / every[0].numel() ** 0.5
@@ -117,9 +116,7 @@ def test_network_evaluations(solver, steps, evaluations):
     calls = []
     velocity_at = scenes.sit.velocity_at
     scenes.sit.velocity_at = lambda *inputs: calls.append(1) or velocity_at(*inputs)
-    for _ in range(2):
-        calls.clear()
-        assert scenes.generate(range(2)).nfe == len(calls) == evaluations
+    assert scenes.generate(range(2)).nfe == len(calls) == evaluations
 
 
 def test_an_adaptive_solver_asks_at_times_of_its_own():
@@ -164,6 +161,8 @@ def test_tables_of_modulations_give_the_scenes_of_the_plain_network(sampler):
     half = generator(sampler, "bf16").generate(range(4), seed=2)
     error = (half.latents - expected).abs().max()
     assert 1e-5 < error < 0.08
+    assert half.latents.dtype == half.range_m.dtype == torch.float32
+    assert ((found.range_m > 0) == (half.range_m > 0)).float().mean() > 0.95
 
 
 def test_another_sampler_gets_another_table():
@@ -178,19 +177,7 @@ def test_another_sampler_gets_another_table():
     assert torch.equal(scenes.generate([0]).latents, fresh.latents)
 
 
-def test_a_table_is_computed_once():
-    scenes = generator(ODE)
-    asked = []
-    modulations = scenes.sit.modulations
-    scenes.sit.modulations = lambda time: asked.append(time.tolist()) or modulations(time)
-    for _ in range(2):
-        scenes.generate([0])
-    third = 1 / 3
-    assert asked == [pytest.approx([1, 2 * third, 2 * third, third, third])]
-
-
-@pytest.mark.parametrize("sampler", [ODE, SDE], ids=["ode", "sde"])
-@pytest.mark.parametrize("decode_batch_size", [None, 2])
+@pytest.mark.parametrize(("sampler", "decode_batch_size"), [(ODE, None), (SDE, 2)])
 def test_a_batch_that_is_filled_up_holds_the_same_scenes(sampler, decode_batch_size):
     """Bitwise: the networks see the same shape, and what fills it does not matter."""
     options = {"batch_size": 5, "decode_batch_size": decode_batch_size}
@@ -204,9 +191,6 @@ def test_a_batch_that_is_filled_up_holds_the_same_scenes(sampler, decode_batch_s
     assert torch.equal(part.latents, whole.latents[:3])
     assert torch.equal(part.range_m, whole.range_m[:3])
     assert shapes == {("sit", 5), ("vae", decode_batch_size or 5)}
-    plain = generator(sampler).generate(range(5), seed=1)
-    torch.testing.assert_close(plain.latents, whole.latents, atol=1e-5, rtol=0)
-    torch.testing.assert_close(plain.range_m, whole.range_m, atol=1e-3, rtol=0)
     with pytest.raises(ValueError, match=r"batch_size is 5, but 6 scenes"):
         scenes.generate(range(6))
 
@@ -236,7 +220,6 @@ def test_autoguidance_is_the_written_out_formula():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_compiled_networks_draw_the_same_scenes():
     """Fused kernels round in another order; no shape is met twice, so nothing recompiles."""
     options = {"batch_size": 3, "decode_batch_size": 2, "compile": True}
@@ -255,14 +238,17 @@ def test_options_that_do_not_fit_are_refused():
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, compile=True)
     with pytest.raises(ValueError, match="decode_batch_size must be at least 1, got 0"):
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, decode_batch_size=0)
+    vae, sit, _ = tiny_networks()
+    with pytest.raises(ValueError, match=r"never fitted.*joint or flow_matching"):
+        SceneGenerator(vae, sit, LatentNorm(4), GEOMETRY)
 
 
-@pytest.mark.parametrize("quality", ["draft", "good", "best"])
-def test_every_quality_is_a_sampler_and_better_ones_take_longer(quality):
-    sampler = SamplerConfig.of_quality(quality)
-    line = SamplerConfig.quality_line(quality)
-    assert f"quality {quality}: {sampler.solver}, {sampler.steps} steps, shift" in line
-    steps = [SamplerConfig.of_quality(name).steps for name in ("draft", "good", "best")]
+def test_every_quality_is_a_sampler_and_better_ones_take_longer():
+    samplers = {name: SamplerConfig.of_quality(name) for name in ("draft", "good", "best")}
+    for name, sampler in samplers.items():
+        line = SamplerConfig.quality_line(name)
+        assert f"quality {name}: {sampler.solver}, {sampler.steps} steps, shift" in line
+    steps = [sampler.steps for sampler in samplers.values()]
     assert steps == sorted(set(steps))
 
 
@@ -301,12 +287,6 @@ def test_the_sde_follows_the_path_of_the_sampler():
     )
 
 
-def test_unfitted_statistics_are_refused():
-    vae, sit, _ = tiny_networks()
-    with pytest.raises(ValueError, match=r"never fitted.*joint or flow_matching"):
-        SceneGenerator(vae, sit, LatentNorm(4), GEOMETRY)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -325,17 +305,6 @@ def test_unfitted_statistics_are_refused():
 def test_samplers_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         SamplerConfig(**options)
-
-
-def test_bf16_is_close_to_fp32():
-    """bf16 keeps 8 bits: 0.4 % per operation. State, latents and ranges stay float32."""
-    full, half = (generator(ODE, precision).generate(range(2)) for precision in ("fp32", "bf16"))
-    assert half.latents.dtype == half.range_m.dtype == torch.float32
-    assert not torch.equal(half.latents, full.latents)
-    torch.testing.assert_close(half.latents, full.latents, atol=0.05, rtol=0.02)
-    both = (full.range_m > 0) & (half.range_m > 0)
-    assert ((full.range_m > 0) == (half.range_m > 0)).float().mean() > 0.95
-    assert (full.range_m - half.range_m)[both].abs().mean() < 0.5
 
 
 @pytest.mark.parametrize("encoding", ["linear", "log2"])
@@ -392,10 +361,11 @@ def test_preparing_says_what_the_first_scene_would(monkeypatch):
             generator(SamplerConfig("dopri5")).prepare()
     scenes, asked = generator(ODE), []
     modulations = scenes.sit.modulations
-    scenes.sit.modulations = lambda time: asked.append(time) or modulations(time)
+    scenes.sit.modulations = lambda time: asked.append(time.tolist()) or modulations(time)
     scenes.prepare()
     scenes.generate([0])
-    assert len(asked) == 1
+    third = 1 / 3
+    assert asked == [pytest.approx([1, 2 * third, 2 * third, third, third])]
 
 
 @pytest.fixture(scope="module")
@@ -432,12 +402,9 @@ def test_a_checkpoint_is_sampled_with_the_weights_asked_for(checkpoint, weights)
     assert torch.equal(found.range_m, expected.range_m)
     assert torch.equal(found.points(1), points_of(expected.range_m[1], GEOMETRY.projection))
     assert len(found) == 2
-
-
-def test_a_checkpoint_is_sampled_in_good_quality_by_default(checkpoint):
-    scenes = SceneGenerator.from_checkpoint(str(checkpoint))
-    assert scenes.sampler == SamplerConfig.of_quality("good")
-    assert scenes.interpolant.path == "cosine"
+    default = SceneGenerator.from_checkpoint(str(checkpoint))
+    assert default.sampler == SamplerConfig.of_quality("good")
+    assert default.interpolant.path == "cosine"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 from tiny_networks import tiny_checkpoint, tiny_networks
 
 from r3dpa.editing import EditSettings, SceneEditor
-from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
+from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
 from r3dpa.geometry.regions import angle_box, dropped_beams, sector_weights, token_mask
 
@@ -40,33 +40,31 @@ FEATURE = torch.eye(8)[0]
 
 class TestInpaint:
     def test_outside_the_mask_the_scan_stays_bit_by_bit(self, editor, scan):
+        """And the tokens outside keep their latents."""
         result = editor.inpaint(scan, MASK, range(2), feature=FEATURE)
         assert result.range_m.shape == (2, 16, 64)
         for made in result.range_m:
             assert made[~MASK].equal(scan[~MASK])
             assert not made[MASK].equal(scan[MASK])
-
-    def test_tokens_outside_keep_the_latents_of_the_scan(self, editor, scan):
-        result = editor.inpaint(scan, MASK, [0])
-        latents = editor.encode(scan[None])
+        latents = editor.encode(scan[None])[0]
         kept = ~token_mask(MASK, (2, 8)).view(2, 8)
         kept = kept.repeat_interleave(2, 0).repeat_interleave(2, 1)
-        assert result.latents[0][:, kept].equal(latents[0][:, kept])
-        assert not result.latents[0][:, ~kept].equal(latents[0][:, ~kept])
+        assert result.latents[0][:, kept].equal(latents[:, kept])
+        assert not result.latents[0][:, ~kept].equal(latents[:, ~kept])
 
     def test_guidance_raises_the_cosine_and_none_is_none(self, generator, scan):
         cosines = {}
         for strength in (0.0, 0.8):
             own = SceneEditor(generator, EditSettings(steps=6, strength=strength))
-            cosines[strength] = own.inpaint(scan, MASK, range(3), feature=FEATURE)
+            cosines[strength] = own.inpaint(scan, MASK, range(2), feature=FEATURE)
         assert (cosines[0.8].cosine > cosines[0.0].cosine).all()
-        plain = SceneEditor(generator, SETTINGS).inpaint(scan, MASK, range(3))
+        plain = SceneEditor(generator, SETTINGS).inpaint(scan, MASK, range(2))
         assert plain.latents.equal(cosines[0.0].latents)
         assert plain.cosine is None
 
     def test_the_weights_get_no_gradients(self, generator, scan):
         generator.sit.requires_grad_(True)
-        SceneEditor(generator, SETTINGS).inpaint(scan, MASK, [0], feature=FEATURE)
+        SceneEditor(generator, EditSettings(steps=2)).inpaint(scan, MASK, [0], feature=FEATURE)
         weights = [*generator.sit.parameters(), *generator.vae.parameters()]
         assert all(weight.grad is None and not weight.requires_grad for weight in weights)
 
@@ -84,7 +82,7 @@ class TestInpaint:
     def test_the_round_trip_shrinks_with_the_steps(self, generator, scan):
         few, many = (
             SceneEditor(generator, EditSettings(steps=n)).inpaint(scan, MASK, [0]).round_trip_m
-            for n in (2, 16)
+            for n in (2, 12)
         )
         assert many < few / 4
 
@@ -100,15 +98,16 @@ def test_a_scene_does_not_depend_on_its_batch(generator, scan):
     Completions are fitted step by step, which would enlarge it: they are made one by one.
     """
     missing = dropped_beams(GEOMETRY.projection, 8)
-    together = SceneEditor(generator, SETTINGS, batch_size=3)
-    alone = SceneEditor(generator, SETTINGS, batch_size=1)
+    few = EditSettings(steps=2)
+    together = SceneEditor(generator, few, batch_size=2)
+    alone = SceneEditor(generator, few, batch_size=1)
     for edit, rounding in (
         (lambda by, indices: by.inpaint(scan, MASK, indices, 5, feature=FEATURE), 1e-4),
         (lambda by, indices: by.complete(scan, missing, indices, 5), 0),
         (lambda by, indices: by.vary(scan, indices, 5), 1e-4),
     ):
-        several, single = edit(together, [0, 1, 2]), edit(alone, [2])
-        torch.testing.assert_close(several.latents[2:], single.latents, atol=rounding, rtol=0)
+        several, single = edit(together, [0, 2]), edit(alone, [2])
+        torch.testing.assert_close(several.latents[1:], single.latents, atol=rounding, rtol=0)
         assert not several.latents[0].allclose(several.latents[1], atol=1e-1)
 
 
@@ -118,11 +117,11 @@ class TestMix:
         sources = [torch.eye(8)[k].expand(16, 8).clone() for k in range(2)]
         weights = sector_weights([(0, 0), (180, 1)], (2, 8))
         own = SceneEditor(generator, EditSettings(steps=6, strength=0.8))
-        result = own.mix(sources, weights, range(4))
+        result = own.mix(sources, weights, range(2))
         plain = SceneEditor(generator, EditSettings(steps=6, strength=0.0))
-        assert (result.cosine > plain.mix(sources, weights, range(4)).cosine).all()
+        assert (result.cosine > plain.mix(sources, weights, range(2)).cosine).all()
         with torch.no_grad():
-            features = generator.sit.project_features(result.latents, torch.zeros(4))
+            features = generator.sit.project_features(result.latents, torch.zeros(2))
         cosine = features / features.norm(dim=-1, keepdim=True)
         toward = cosine[..., 0] - cosine[..., 1]
         left = weights[0].bool()
@@ -137,12 +136,13 @@ class TestMix:
 
 
 class TestComplete:
-    def test_known_pixels_stay_and_what_the_scan_holds_elsewhere_is_not_used(self, editor, scan):
+    def test_known_pixels_stay_and_what_the_scan_holds_elsewhere_is_not_used(self, generator, scan):
+        editor = SceneEditor(generator, EditSettings(steps=2))
         missing = dropped_beams(GEOMETRY.projection, 8)
-        result = editor.complete(scan, missing, range(2))
-        assert all(made[~missing].equal(scan[~missing]) for made in result.range_m)
+        result = editor.complete(scan, missing, [0])
+        assert result.range_m[0][~missing].equal(scan[~missing])
         other = torch.where(missing, 30.0, scan)
-        assert editor.complete(other, missing, range(2)).range_m.equal(result.range_m)
+        assert editor.complete(other, missing, [0]).range_m.equal(result.range_m)
 
     def test_latents_are_fitted_to_what_is_known(self, editor, scan):
         codec = GEOMETRY.codec
@@ -165,7 +165,7 @@ class TestVaryAndInterpolate:
     def test_less_noise_leaves_more_of_the_scan(self, editor, scan):
         latents = editor.encode(scan[None])
         far = [
-            (editor.vary(scan, range(4), start=start).latents - latents).norm().item()
+            (editor.vary(scan, range(2), start=start).latents - latents).norm().item()
             for start in (0.1, 0.5, 1.0)
         ]
         assert far[0] < far[1] < far[2]
@@ -185,9 +185,12 @@ class TestVaryAndInterpolate:
         far = (result.latents - ends[:1]).flatten(1).norm(dim=1)
         assert (far.diff() > 0).all()
 
-    def test_a_single_frame_is_refused(self, editor, scan):
+    def test_a_single_frame_and_starts_outside_are_refused(self, editor, scan):
         with pytest.raises(ValueError, match="at least 2"):
             editor.interpolate(scan, scan, 1)
+        for start in (0.0, 1.5):
+            with pytest.raises(ValueError, match=r"start must be a time above 0"):
+                editor.vary(scan, [0], start=start)
 
 
 @pytest.mark.parametrize(
@@ -203,17 +206,6 @@ class TestVaryAndInterpolate:
 def test_settings_that_cannot_work_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         EditSettings(**given)
-
-
-@pytest.mark.parametrize("start", [0.0, 1.5])
-def test_starts_outside_are_refused(editor, scan, start):
-    with pytest.raises(ValueError, match=r"start must be a time above 0"):
-        editor.vary(scan, [0], start=start)
-
-
-def test_noise_is_that_of_the_generator(editor):
-    drawn = next(editor._draws([4], 7))
-    assert drawn[0].equal(torch.randn(4, 4, 16, generator=scene_random(7, 4)))
 
 
 def test_a_checkpoint_is_edited_with_its_averaged_weights(tmp_path, scan):

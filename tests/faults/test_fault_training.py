@@ -179,7 +179,7 @@ def test_a_second_run_is_refused(scans_folder, tmp_path, start, ended, undisturb
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kept", "says"), [(None, "No such file"), (100, "not a multiple")])
+@pytest.mark.parametrize(("kept", "says"), [(None, "No such file"), (90, "not a multiple")])
 def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ended, goes_on):
     """All of them are, in the step after a checkpoint; then they are back."""
     saved = tmp_path / "saved"
