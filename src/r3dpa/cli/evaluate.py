@@ -195,7 +195,7 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     Args:
         scans: Folder of ``.bin`` scans (A); one drive per folder.
         reference: Folder of real scans (B), of two or more drives; a single one is halved.
-        out: JSON file for the table and the curves behind it.
+        out: JSON file for the table.
     """
     from r3dpa.data.scans import find_scans
     from r3dpa.io import atomic_path

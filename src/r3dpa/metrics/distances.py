@@ -1,7 +1,7 @@
 """Distances of two sets of scenes that need no network, as torchmetrics metrics.
 
 Every metric is updated with real and with generated scenes, synchronises under DDP, and gives its
-numbers by ``compute()`` or, with bootstrap intervals, by ``results()``.
+numbers by ``compute()`` under their names in tables, or by ``results()`` with bootstrap intervals.
 Letters: B scenes, H x W range image, G groups of a bootstrap, n scenes that are kept.
 """
 
@@ -60,6 +60,21 @@ class SceneMetric(Metric):
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distances as rows of a table, with intervals; of this process alone."""
         raise NotImplementedError
+
+    def compute(self) -> dict[str, float]:
+        """Values of :meth:`results` by name, of the scenes of all processes.
+
+        Raises:
+            ValueError: If there are too few scenes.
+        """
+        if not self.count("generated") or not self.has_reference:
+            raise ValueError("update with real and with generated scenes: one side has none yet")
+        values = {}
+        for row in self.results(Resampling(num_resamples=0)):
+            if row.value is None:
+                raise ValueError(f"{row.name}: {row.note}")
+            values[row.name] = row.value
+        return values
 
     @property
     def has_reference(self) -> bool:
@@ -141,13 +156,6 @@ class SceneMetric(Metric):
         setattr(self, f"{side}_order", [order.index_select(0, kept)])
         setattr(self, f"{side}_values", [values.index_select(0, kept)])
 
-    def _need_both(self) -> None:
-        for side in SIDES:
-            if not self.count(side):
-                raise ValueError(
-                    f"no {side} scenes given yet; call update(..., real=...) with them"
-                )
-
     def _row(
         self,
         name: str,
@@ -208,7 +216,7 @@ class _Histograms(SceneMetric):
 
 
 class BEVHistogramDistance(_Histograms):
-    """JSD, TV and their relatives of how many clouds occupy each cell seen from above.
+    """JSD and TV of how many clouds occupy each cell seen from above.
 
     Args:
         grid: Cells; default: those of the published numbers.
@@ -228,27 +236,19 @@ class BEVHistogramDistance(_Histograms):
         for group, occupied in zip(groups, cells, strict=True):
             bins[group, occupied.to(bins.device)] += 1
 
-    def compute(self) -> dict[str, float]:
-        """Fields of :class:`HistogramDistance`; the published "JSD" is ``jsd_distance``."""
-        self._need_both()
-        return histogram_distance(self.real_bins, self.generated_bins.sum(dim=0))._asdict()
-
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """JSD and TV."""
         occupied = (self.real_bins > 0) | (self.generated_bins > 0).any(dim=0)
         real, groups = self.real_bins[occupied].double(), self.generated_bins[:, occupied].float()
 
-        def jsd(counted: Tensor) -> float:
-            return histogram_distance(real, counted).jsd_distance
+        def distance(name: str, field: str, note: str = "") -> MetricResult:
+            def of(counted: Tensor) -> float:
+                return getattr(histogram_distance(real, counted), field)
 
-        def total_variation(counted: Tensor) -> float:
-            return histogram_distance(real, counted).total_variation
+            return self._resampled_row(name, of, resampling, groups, note=note)
 
         half = "half of what the official code calls TV"
-        return [
-            self._resampled_row("JSD", jsd, resampling, groups),
-            self._resampled_row("TV", total_variation, resampling, groups, note=half),
-        ]
+        return [distance("JSD", "jsd_distance"), distance("TV", "total_variation", half)]
 
 
 class RangeHistogramDistance(_Histograms):
@@ -270,11 +270,6 @@ class RangeHistogramDistance(_Histograms):
         index = index + width * groups[:, None].to(index.device)
         returns = (range_m > 0).flatten()
         bins.view(-1).index_add_(0, index.flatten().to(bins.device), returns.to(bins))
-
-    def compute(self) -> dict[str, float]:
-        """``w1_m``."""
-        self._need_both()
-        return {"w1_m": self._distance(self.generated_bins.sum(dim=0))}
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """W1."""
@@ -326,21 +321,11 @@ class MinimumMatchingDistance(SceneMetric):
 
     def matching(self) -> Matching:
         """Nearest generated scene of each real one."""
-        if not self.reference_cells:
-            self._need_both()
         grid = self.protocol.grid
         real, made = (
             [grid.cells(cloud) for cloud in self.clouds(self.kept(side)[1])] for side in SIDES
         )
         return minimum_matching(self.reference_cells or real, made, grid)
-
-    def compute(self) -> dict[str, float]:
-        """The published number, and the 3D distance."""
-        matching = self.matching()
-        return {
-            "mmd_squared_normalised": matching.mmd_squared_normalised,
-            "chamfer_m2": self._chamfer(matching).mean().item(),
-        }
 
     def results(
         self, resampling: Resampling, matching: Matching | None = None

@@ -29,7 +29,6 @@ from r3dpa.metrics.functional import (
     frechet_distance,
     merge_packed,
     polynomial_mmd,
-    precision_recall,
     shared_balls,
 )
 from r3dpa.metrics.results import MetricResult
@@ -97,57 +96,45 @@ class FeatureMetric(SceneMetric):
         """Features ``(n, F)`` of the kept scenes."""
         return self.kept(side)[1].double()
 
-    def _rows(self) -> tuple[Tensor, Tensor]:
-        self._need_both()
-        return self.rows("real"), self.rows("generated")
+    def _both(self) -> tuple[Tensor, Tensor, tuple[int, int]]:
+        """Features of the kept real and generated scenes, and their numbers, generated first."""
+        real, generated = self.rows("real"), self.rows("generated")
+        return real, generated, (len(generated), len(real))
 
 
 class FrechetDistance(FeatureMetric):
     """Fréchet distance between real and generated features: FRID, FLD, FSVD, FPVD.
 
-    Args:
-        args: Of :class:`FeatureMetric`, ``num_features`` first.
-        allow_few_samples: Accept fewer than F + 1 samples, with a singular covariance: the
-            distance then mostly depends on how many there are.
-        options: Of :class:`FeatureMetric`.
-
     Attributes:
         reference: Mean ``(F,)`` and covariance ``(F, F)`` in place of real features, as in the
             official statistics file.
 
-    Raises:
-        ValueError: By ``compute``, if there are fewer than F + 1 samples.
-
     Example:
-        >>> metric = FrechetDistance(num_features=2)
+        >>> metric = FrechetDistance(num_features=2, label="FD")
         >>> square = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
         >>> metric.update(square, real=True)
         >>> metric.update(square + 3, real=False)
-        >>> round(metric.compute().item(), 6)
+        >>> round(metric.compute()["FD"], 6)
         18.0
     """
 
-    def __init__(self, *args: Any, allow_few_samples: bool = False, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.allow_few_samples = allow_few_samples
-        self.reference: tuple[Tensor, Tensor] | None = None
+    reference: tuple[Tensor, Tensor] | None = None
 
     @property
     def has_reference(self) -> bool:
         """Whether real features or their moments are known."""
         return self.reference is not None or super().has_reference
 
-    def compute(self) -> Tensor:
-        """Distance ``()`` float64 of everything seen so far, by all processes."""
+    def compute(self) -> dict[str, float]:
+        """The distance; a ``ValueError`` for fewer than F + 1 samples, unlike in ``results``."""
         for side in SIDES:
-            count, needed = self.moments(side).count, self.num_features + 1
-            needed = 2 if self.allow_few_samples else needed
+            count, needed = self.count(side), self.num_features + 1
             if count < needed and (side == "generated" or self.reference is None):
                 raise ValueError(
-                    f"{side}: {int(count)} samples for {self.num_features} features, at least "
-                    f"{needed} are needed; give more, or allow_few_samples=True for a smoke test"
+                    f"{side}: {count} samples for {self.num_features} features, at least {needed} "
+                    "are needed"
                 )
-        return self._distance(self.moments("generated"))
+        return super().compute()
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distance, with a bootstrap interval over the generated scenes that are kept."""
@@ -171,15 +158,9 @@ class FrechetDistance(FeatureMetric):
 class FrechetInfinity(FeatureMetric):
     """Fréchet distance extrapolated to infinitely many samples, see :func:`fd_infinity`."""
 
-    def compute(self) -> dict[str, float]:
-        """``fd_infinity`` and the standard error of the line."""
-        found = fd_infinity(*self._rows(), torch.Generator().manual_seed(0))
-        return {"fd_infinity": found.value, "standard_error": found.standard_error}
-
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The extrapolated distance with the error of the line."""
-        real, generated = self._rows()
-        counts = (len(generated), len(real))
+        real, generated, counts = self._both()
         name, needed = f"{self.label} inf", 4 * (self.num_features + 1)
         if min(counts) < needed:
             return [self._row(name, None, counts, note=f"needs {needed} scenes of both kinds")]
@@ -194,25 +175,17 @@ class PolynomialMMD(FeatureMetric):
     Subsets have at most 1000 scenes and half of the smaller set.
     """
 
-    def compute(self) -> dict[str, float]:
-        """``kid_mean`` and ``kid_std`` over the subsets."""
-        mean, std = self._kid(torch.Generator().manual_seed(0))
-        return {"kid_mean": mean, "kid_std": std}
-
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The mean with the spread of the subsets, wider than a 95 % interval."""
-        counts, name = (len(self.rows("generated")), len(self.rows("real"))), f"{self.label} KID"
+        real, generated, counts = self._both()
+        name = f"{self.label} KID"
         if min(counts) < 4:
             return [self._row(name, None, counts, note="needs 4 scenes of both kinds")]
-        mean, std = self._kid(resampling.generator())
+        size = min(_KID_SUBSET_SIZE, min(counts) // 2)  # subsets as large as a set would all be one
+        generator = resampling.generator()
+        mean, std = polynomial_mmd(real, generated, generator, _KID_SUBSETS, size)
         ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
         return [self._row(name, mean, counts, interval=ends)]
-
-    def _kid(self, generator: torch.Generator) -> tuple[float, float]:
-        real, generated = self._rows()
-        # Subsets as large as a set would all be one.
-        size = min(_KID_SUBSET_SIZE, min(len(real), len(generated)) // 2)
-        return polynomial_mmd(real, generated, generator, _KID_SUBSETS, size)
 
 
 class PrecisionRecall(FeatureMetric):
@@ -222,14 +195,9 @@ class PrecisionRecall(FeatureMetric):
     recall and coverage), not the balls.
     """
 
-    def compute(self) -> dict[str, float]:
-        """``precision``, ``recall``, ``density`` and ``coverage``."""
-        return precision_recall(*self._rows(), _NEIGHBORS)
-
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The four shares."""
-        real, generated = self._rows()
-        counts = (len(generated), len(real))
+        real, generated, counts = self._both()
         if min(counts) <= _NEIGHBORS:
             note = f"needs {_NEIGHBORS + 1} scenes of both kinds"
             return [

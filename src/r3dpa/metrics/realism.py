@@ -51,23 +51,14 @@ _NEEDS = {
 
 
 class Measure(NamedTuple):
-    """One quantity of a set of scans.
-
-    Args:
-        name: Printed name.
-        unit: Unit of the distance and of the summary.
-        lacks: Why the set cannot give the measure; empty where it can.
-        distance: Of the values of two sets; NaN where they cannot be compared.
-        values: Number, curve or histogram that is compared.
-        summary: One number for the set; NaN where there is none.
-    """
+    """One quantity of a set of scans."""
 
     name: str
-    unit: str
-    lacks: str
-    distance: Callable[[Any, Any], float]
-    values: Any
-    summary: float = math.nan
+    unit: str  # of the distance and of the summary
+    lacks: str  # why the set cannot give the measure; empty where it can
+    distance: Callable[[Any, Any], float]  # of the values of two sets; NaN where unknown
+    values: Any  # number, curve or histogram that is compared
+    summary: float = math.nan  # one number for the set; NaN where there is none
 
 
 def measures(s: ScanStatistics) -> dict[str, Measure]:
@@ -250,8 +241,6 @@ class RealismTable:
 
     rows: tuple[RealismRow, ...]
     notes: tuple[str, ...]
-    statistics_a: ScanStatistics
-    statistics_b: ScanStatistics
 
     @property
     def misses(self) -> tuple[RealismRow, ...]:
@@ -269,14 +258,13 @@ class RealismTable:
         return "\n".join([table, "", verdict, *missing, *unknown, *self.notes])
 
     def to_dict(self) -> dict[str, Any]:
-        """Rows, notes and the curves and histograms behind them, for JSON (null where unknown)."""
+        """Rows and notes for JSON, null where a number is unknown."""
         rows = [row._asdict() | {"within_3x": row.within} for row in self.rows]
-        return {
-            "rows": [{key: _json(value) for key, value in row.items()} for row in rows],
-            "notes": list(self.notes),
-            "a": _described(self.statistics_a),
-            "b": _described(self.statistics_b),
-        }
+        for row in rows:
+            row |= {
+                k: None for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)
+            }
+        return {"rows": rows, "notes": list(self.notes)}
 
 
 def realism_table(
@@ -323,7 +311,7 @@ def realism_table(
             RealismRow(name, own.unit, *values, distance, floor, largest, pooled, ratio, reason)
         )
     described = (_counted("A", scans, a), _counted("B", reference, b))
-    return RealismTable(tuple(rows), (*described, *notes), a, b)
+    return RealismTable(tuple(rows), (*described, *notes))
 
 
 def _cells(row: RealismRow) -> tuple[str, ...]:
@@ -353,21 +341,3 @@ def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatis
     }
     left_out = [f"{count} {what}" for what, count in parts.items() if count]
     return f"{total}; left out where needed: {', '.join(left_out)}" if left_out else total
-
-
-def _described(statistics: ScanStatistics) -> dict[str, Any]:
-    values = {name: np.asarray(found.values) for name, found in measures(statistics).items()}
-    return {
-        "scans": statistics.num_scans,
-        "scans_in_ring_order": statistics.num_ring_scans,
-        "scans_with_all_rings": statistics.num_beam_scans,
-        "shots_per_turn": _json(_ratio(statistics.shots, statistics.num_beam_scans)),
-        "curves": {name: _json(value) for name, value in values.items() if value.ndim == 1},
-    }
-
-
-def _json(value: Any) -> Any:
-    """Numbers and arrays for JSON, None for those that are not finite; texts as they are."""
-    if value is None or isinstance(value, str):
-        return value
-    return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
