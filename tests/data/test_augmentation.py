@@ -8,7 +8,8 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
-from r3dpa.data import Augmentation, LidarDataModule, View, find_scans, read_scan
+from r3dpa.data import Augmentation, LidarDataModule, find_scans, read_scan
+from r3dpa.data.augmentation import View
 from r3dpa.geometry import (
     LidarSensor,
     RingProjection,

@@ -7,13 +7,13 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from r3dpa.data import (
     KITTI360DataModule,
     LidarDataModule,
-    PointDataset,
     SimulatedDataModule,
     StoreError,
     check,
     pooled_grids,
     write_bin,
 )
+from r3dpa.data.datasets import PointDataset
 from r3dpa.data.feature_grids import plan
 from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor

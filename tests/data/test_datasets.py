@@ -6,18 +6,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from r3dpa import geometry
-from r3dpa.data import (
-    Augmentation,
-    CachedTensors,
-    FeatureGrids,
-    LidarDataModule,
-    LidarDataset,
-    TensorCache,
-    View,
-    find_scans,
-)
+from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset, find_scans
+from r3dpa.data.augmentation import View
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
+from r3dpa.data.store import CachedTensors, TensorCache
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
 
 

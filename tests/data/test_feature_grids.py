@@ -10,15 +10,14 @@ import torch
 
 from r3dpa.data import (
     FeatureGrids,
-    GridSettings,
-    PointDataset,
     StoreError,
     find_scans,
     pooled_grids,
     read_scan,
     write_feature_grids,
 )
-from r3dpa.data.feature_grids import any_settings, plan
+from r3dpa.data.datasets import PointDataset
+from r3dpa.data.feature_grids import GridSettings, any_settings, plan
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 

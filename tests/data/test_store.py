@@ -13,7 +13,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from r3dpa.data import CachedTensors, Store, StoreError, TensorCache, store
+from r3dpa.data import StoreError, store
+from r3dpa.data.store import CachedTensors, Store, TensorCache
 
 SHAPE = (8, 4)
 

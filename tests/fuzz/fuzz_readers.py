@@ -29,7 +29,8 @@ import yaml
 from PIL import Image
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
-from r3dpa.data import FeatureGrids, GridSettings, Scan, read_samples
+from r3dpa.data import FeatureGrids, Scan, read_samples
+from r3dpa.data.feature_grids import GridSettings
 from r3dpa.data.images import read_mask
 from r3dpa.data.objects import ObjectClass, ObjectLibrary, read_labels
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply

@@ -11,8 +11,9 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from r3dpa.data import Store, read_samples
+from r3dpa.data import read_samples
 from r3dpa.data.scans import read_npz
+from r3dpa.data.store import Store
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
 from r3dpa.metrics.reference import ReferenceStatistics

@@ -4,27 +4,14 @@ The data modules need Lightning, which takes seconds to import: they are loaded 
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from r3dpa.data.augmentation import Augmentation, View
-from r3dpa.data.datasets import (
-    LatentBatch,
-    LidarBatch,
-    LidarDataset,
-    PointDataset,
-    PointSample,
-)
-from r3dpa.data.feature_grids import (
-    Extractor,
-    FeatureGrids,
-    GridSettings,
-    pooled_grids,
-    write_feature_grids,
-)
+from r3dpa.data.augmentation import Augmentation
+from r3dpa.data.datasets import LidarBatch, LidarDataset, PointSample
+from r3dpa.data.feature_grids import Extractor, FeatureGrids, pooled_grids, write_feature_grids
 from r3dpa.data.images import DeadLeaves, ImageFolder, TarImages
-from r3dpa.data.samples import SampleError, Samples, read_samples
+from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import (
-    KITTI360_DRIVES,
     Scan,
     ScanError,
     check,
@@ -38,16 +25,7 @@ from r3dpa.data.scans import (
     write_npz,
     write_ply,
 )
-from r3dpa.data.store import CachedTensors, Store, StoreError, TensorCache
-
-if TYPE_CHECKING:
-    from r3dpa.data.datamodules import (
-        KITTI360DataModule,
-        LidarDataModule,
-        PointDataModule,
-        SimulatedDataModule,
-    )
-    from r3dpa.data.image_datamodule import ImageDataModule
+from r3dpa.data.store import StoreError
 
 _ON_FIRST_USE = {
     "ImageDataModule": "image_datamodule",
@@ -58,33 +36,23 @@ _ON_FIRST_USE = {
 }
 
 __all__ = [
-    "KITTI360_DRIVES",
     "Augmentation",
-    "CachedTensors",
     "DeadLeaves",
     "Extractor",
     "FeatureGrids",
-    "GridSettings",
     "ImageDataModule",
     "ImageFolder",
     "KITTI360DataModule",
-    "LatentBatch",
     "LidarBatch",
     "LidarDataModule",
     "LidarDataset",
     "PointDataModule",
-    "PointDataset",
     "PointSample",
-    "SampleError",
-    "Samples",
     "Scan",
     "ScanError",
     "SimulatedDataModule",
-    "Store",
     "StoreError",
     "TarImages",
-    "TensorCache",
-    "View",
     "check",
     "find_scans",
     "kitti360_scans",

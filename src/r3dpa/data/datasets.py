@@ -101,14 +101,14 @@ class PointSample(NamedTuple):
     prepared: Any
 
 
-class PointDataset(Dataset[PointSample]):
+class PointDataset(Dataset[Any]):
     """Points of each scan, prepared for a network by the loader processes.
 
     ``ScanError`` for a scan without a point within the range limits of ``sensor``.
     """
 
     def __init__(
-        self, scans: Sequence[Scan], sensor: LidarSensor, prepare: Callable[[Tensor], Any]
+        self, scans: Sequence[Scan], sensor: LidarSensor, prepare: Callable[..., Any]
     ) -> None:
         self.scans, self.sensor, self.prepare = list(scans), sensor, prepare
 
@@ -122,7 +122,7 @@ class PointDataset(Dataset[PointSample]):
         return PointSample(scan, key, points, self.prepare(points))
 
 
-class DrawnPoints(Dataset[Any]):
+class DrawnPoints(PointDataset):
     """Random preparation of points, ``prepare(points, generator)``.
 
     An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
@@ -135,10 +135,8 @@ class DrawnPoints(Dataset[Any]):
         prepare: Callable[[Tensor, np.random.Generator], Any],
         seed: int,
     ) -> None:
-        self.scans, self.sensor, self.prepare, self.seed = list(scans), sensor, prepare, seed
-
-    def __len__(self) -> int:
-        return len(self.scans)
+        super().__init__(scans, sensor, prepare)
+        self.seed = seed
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)

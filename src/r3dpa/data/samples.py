@@ -29,7 +29,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -47,7 +47,6 @@ from r3dpa.data.scans import (
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
-T = TypeVar("T")
 Arrays = Iterator[tuple[str, np.ndarray]]  # name within the file and cloud (P, ...) or (C, H, W)
 READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
@@ -76,48 +75,43 @@ class Sample(NamedTuple):
 class Samples:
     """Samples that are read while they are iterated over, see :func:`read_samples`.
 
-    ``num_read`` counts the usable ones of the last iteration, ``bad`` holds messages of the others.
+    ``bad`` holds the messages of the samples that the last iteration left out.
     """
 
     files: list[tuple[str, Path]]
     sensor: LidarSensor
     corner: bool
     skip_bad: bool
-    num_read: int = field(default=0, init=False)
     bad: list[str] = field(default_factory=list, init=False)
 
     def __iter__(self) -> Iterator[Sample]:
-        self.num_read, self.bad = 0, []
+        self.bad, num_read = [], 0
         for prefix, file in self.files:
             arrays = _arrays_of(file)
-            # An error of `next` ends the file, one of `_sample` only costs that sample.
-            while entry := self._attempt(next, arrays, None):
-                part, array = entry
-                name = "/".join(filter(None, (prefix, part))) or file.stem
-                where = f"{file}, sample {part}" if part else str(file)
-                sample = self._attempt(_sample, name, where, array, self.sensor, self.corner)
-                if sample is not None:
-                    self.num_read += 1
+            while True:
+                try:
+                    part, array = next(arrays)  # an error here ends the file
+                    name = "/".join(filter(None, (prefix, part))) or file.stem
+                    where = f"{file}, sample {part}" if part else str(file)
+                    sample = _sample(name, where, array, self.sensor, self.corner)
+                except StopIteration:
+                    break
+                except (ScanError, OSError) as error:
+                    if not self.skip_bad:
+                        raise SampleError(error) from error
+                    self.bad.append(str(error))
+                else:
+                    num_read += 1
                     yield sample
-        if not self.num_read:
+        if not num_read:
             first = f"all are bad; the first: {self.bad[0]}" if self.bad else "the files are empty"
             raise SampleError(f"{self.files[0][1]}: no sample can be used; {first}")
         if self.bad:
             warnings.warn(
-                f"{len(self.bad)} bad samples left out beside {self.num_read} good ones. "
+                f"{len(self.bad)} bad samples left out beside {num_read} good ones. "
                 f"The first: {self.bad[0]}",
                 stacklevel=2,
             )
-
-    def _attempt(self, function: Callable[..., T], *args: Any) -> T | None:
-        """Result of a call, or None after a bad sample that may be skipped."""
-        try:
-            return function(*args)
-        except (ScanError, OSError) as error:
-            if not self.skip_bad:
-                raise SampleError(error) from error
-            self.bad.append(str(error))
-            return None
 
 
 def read_samples(
