@@ -182,7 +182,7 @@ def test_another_protocol_is_recorded(data, samples, tmp_path):
     words = ["--data", data, "--out", published, "--spaces", "fgeo", "--protocol", "published"]
     main(["reference", *map(str, words), "--device", "cpu"])
     words = ["--samples", samples, "--allow_few", "--reference", published, "--out", tmp_path / "o"]
-    evaluate(*words, "--protocol", "published")
+    evaluate(*words)
     stored = Evaluation.load(tmp_path / "o" / "evaluation.json")
     assert stored.about["protocol"]["unprojection"] == "corner"
 
@@ -225,7 +225,6 @@ def test_official_weights_are_given_by_space(data, samples, tmp_path):
         ),
         (["--reference", "none.safetensors"], "none.safetensors holds no reference statistics"),
         (["--samples", "nowhere"], "nowhere: there is no such file or folder"),
-        (["--protocol", "published"], "of the protocol default, not published: compute another"),
     ],
 )
 def test_wrong_options_are_named(reference_file, samples, words, message):

@@ -26,7 +26,6 @@ NUM = 30
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
 GEOMETRIC = {"class_path": "r3dpa.nn.backbones.GeometricFeatures", "init_args": {"dim": 16}}
 QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
-OWN_DISKS = ("--trainer.num_nodes=2", "--data.init_args.prepare_data_per_node=true")
 ROW = 2 * 8 * 16 * 2  # bytes of a 2 x 8 grid, 16 float16 a cell
 
 
@@ -151,9 +150,11 @@ class TestForms:
         (["--data", "{scans}", "--extractor", "scalr"], "scalr needs ckpt"),
         (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
         (["--data", "{yaml}", "--grid_sizes", "[[3, 8]]"], "grid.*3"),
-        (["--data", "{yaml}", "--batch_size", "0"], "batch_size must be at least 1, got 0"),
+        (
+            ["--data", "{yaml}", "--data.init_args.batch_size", "0"],
+            "batch_size must be at least 1, got 0",
+        ),
         (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
-        (["--data", "{yaml}", *OWN_DISKS], "prepare_data_per_node is for disks of the nodes' own"),
     ],
 )
 def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):
@@ -171,7 +172,7 @@ def test_two_processes_write_what_one_does(data, expected):
     out = data.parent / "two"
     command = [Path(sys.executable).with_name("r3dpa"), "features", "--data", data, "--out", out]
     command += ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
-    command += ["--data.init_args.num_workers=1", "--batch_size=1"]
+    command += ["--data.init_args.num_workers=1", "--data.init_args.batch_size=1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     journals = [path.read_text().splitlines() for path in sorted(out.rglob("*.jsonl"))]

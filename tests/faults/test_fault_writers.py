@@ -57,8 +57,9 @@ def jobs(scans_folder, tmp_path_factory):
     lasers.write_text("lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]")
     data = {"class_path": "r3dpa.data.LidarDataModule"}
     data["init_args"] = {"scans": str(scans_folder), "sensor": SENSOR, "grid_size": [2, 8]}
+    data["init_args"]["batch_size"] = 1
     (folder / "data.yaml").write_text(json.dumps({"data": data}))
-    extractor = ["--extractor", "geometric", "--batch_size", 1, "--trainer.accelerator", "cpu"]
+    extractor = ["--extractor", "geometric", "--trainer.accelerator", "cpu"]
     sampler = ["--steps", 2, "--pictures", 0, "--device", "cpu", "--formats", "bin,ply,npz"]
     ckpt = tiny_checkpoint(folder / "tiny.safetensors", GEOMETRY)
     return {

@@ -30,7 +30,6 @@ def reference(
     limit: int | None = None,
     protocol: Literal["default", "published"] = "default",
     device: str = "auto",
-    every: int = 2000,
 ) -> str:
     """Write the statistics of real scans that r3dpa evaluate compares samples with.
 
@@ -47,7 +46,6 @@ def reference(
         protocol: ``published`` prepares scans as the published numbers do: points on the corners
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        every: Scans after which the unfinished file is saved; it also is on an interrupt.
     """
     import torch
 
@@ -77,7 +75,7 @@ def reference(
         for scan in scans[start:]:
             yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
 
-    statistics = complete_reference(job, scans_from, found, out, every)
+    statistics = complete_reference(job, scans_from, found, out)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
@@ -87,7 +85,6 @@ def evaluate(
     reference: Path,
     spaces: list[str] | None = None,
     ckpt: dict[str, Path] | None = None,
-    protocol: Literal["default", "published"] | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,
     label: str | None = None,
@@ -107,7 +104,6 @@ def evaluate(
         spaces: Feature spaces; default: those of the reference that need no file or have one in
             ``ckpt``.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
-        protocol: Refuse a reference of another protocol than this.
         skip_bad: Leave out samples that cannot be used, and list them.
         allow_few: Accept fewer samples than features: only to try it.
         label: Name of the generator in tables; default: that of ``samples``.
@@ -126,7 +122,7 @@ def evaluate(
     check_folder(out)
     made_with = _made_with(samples)  # refuses damaged metadata before the work starts
     statistics = metrics.load_reference(reference, split)
-    found = metrics.reference_spaces(statistics, spaces, ckpt, protocol, device)
+    found = metrics.reference_spaces(statistics, spaces, ckpt, None, device)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad

@@ -10,12 +10,11 @@ from inspect import signature
 from pathlib import Path
 from typing import Any, cast
 
-from jsonargparse import Namespace
 from lightning import Trainer
 
 from r3dpa.cli.stages import StageParser, ignore_harmless_warnings
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.feature_grids import Extractor, features_lock, plan
+from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
 from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
@@ -47,27 +46,21 @@ def features(words: Sequence[str]) -> None:
     trainer = Trainer(**objects.trainer, logger=False, enable_checkpointing=False)
     if trainer.precision not in _PRECISIONS:
         raise ValueError(
-            f"trainer.precision must be one of {', '.join(_PRECISIONS)}, got {trainer.precision}."
+            f"trainer.precision must be one of {', '.join(_PRECISIONS)}, got {trainer.precision}"
         )
     data: LidarDataModule = objects.data
     if data.extractor is None or data.features_dir is None:
         raise ValueError(
-            "there is no extractor: give --extractor, one of "
-            f"{', '.join(SOURCES)}, or one in the data configuration (data.init_args.extractor)."
+            f"there is no extractor: give --extractor, one of {', '.join(SOURCES)}, or one in the "
+            "data configuration (data.init_args.extractor)"
         )
-    if trainer.num_nodes > 1 and data.prepare_data_per_node:
-        raise ValueError(
-            "data.init_args.prepare_data_per_node is for disks of the nodes' own, but "
-            "trainer.num_nodes > 1 writes one store for all: leave one of them out."
-        )
-    _extract(data, trainer, config)
+    _extract(data, trainer, config.grid_sizes or [data.grid_size])
 
 
-def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None:
+def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int]]) -> None:
     # The data module finds its scans, or simulates them; it must not extract grids itself.
-    module, data.extractor = data.extractor, None
-    extractor, folder = cast(Extractor, module), cast(Path, data.features_dir)
-    sizes = config.grid_sizes if config.grid_sizes is not None else [data.grid_size]
+    extractor, data.extractor = cast(Any, data.extractor), None
+    folder = cast(Path, data.features_dir)
     projection: Projection | None = None
     scans: list[Scan] = []
     with ExitStack() as job:
@@ -89,8 +82,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, config: Namespace) -> None
                 f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}"
             )
         extraction = FeatureExtraction(extractor, projection, sizes, folder)
-        batch_size = data.batch_size if config.batch_size is None else config.batch_size
-        missing = MissingScans(scans, extractor, data.sensor, batch_size, data.num_workers)
+        missing = MissingScans(scans, extractor, data.sensor, data.batch_size, data.num_workers)
         started = time.monotonic()
         try:
             trainer.predict(extraction, missing, return_predictions=False)
@@ -121,8 +113,7 @@ def read_data(source: Path) -> LidarDataModule:
     """
     parser = _data_parser()
     config = parser.parse_args(_with_data_class(["--data", str(source)]))
-    settings = config.data.init_args
-    settings.extractor = settings.features_dir = None
+    config.data.init_args.extractor = config.data.init_args.features_dir = None
     module: LidarDataModule = parser.instantiate(config).data
     if source.is_file():
         module.prepare_data()
@@ -138,17 +129,18 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
         if name != "--data":
             found.append(word)
             continue
-        source = Path(value if equals else next(rest, ""))
+        value = value if equals else next(rest, "")
+        source = Path(value)
         if (source / "data_3d_raw").is_dir():
-            found += ["--data=r3dpa.data.KITTI360DataModule", f"--data.init_args.root={source}"]
+            found += ["--data=r3dpa.data.KITTI360DataModule", f"--data.init_args.root={value}"]
         elif source.is_dir():
-            found += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={source}"]
+            found += ["--data=r3dpa.data.LidarDataModule", f"--data.init_args.scans={value}"]
         elif source.suffix in (".yaml", ".yml"):
-            found += ["--config", str(source)]
+            found += ["--config", value]
         elif len(source.parts) > 1:
-            raise ValueError(f"--data {source}: is no folder of scans and no data YAML")
+            raise ValueError(f"--data {value}: is no folder of scans and no data YAML")
         else:
-            found += ["--data", str(source)]
+            found += ["--data", value]
     return found
 
 
@@ -167,16 +159,13 @@ def _parser() -> StageParser:
         "run. Several devices and nodes share the work.",
     )
     sources = f"one of {', '.join(SOURCES)}; default: that of the data, or scalr if --ckpt is given"
+    parser.add_argument("--extractor", type=str | None, help=sources)
+    parser.add_argument("--ckpt", type=Path | None, help="weights of the extractor")
     sizes = "such as '[[8, 64], [16, 128]]', all from one pass; default: grid_size of the data"
-    options: dict[str, tuple[Any, str]] = {
-        "extractor": (str | None, sources),
-        "ckpt": (Path | None, "weights of the extractor"),
-        "grid_sizes": (list[tuple[int, int]] | None, f"rows and columns of each grid, {sizes}"),
-        "batch_size": (int | None, "scans per pass; default: that of the data"),
-        "out": (Path | None, "folder of the grids, in place of features_dir of the data"),
-    }
-    for name, (kind, text) in options.items():
-        parser.add_argument(f"--{name}", type=kind, help=text)
+    sizes = f"rows and columns of each grid, {sizes}"
+    parser.add_argument("--grid_sizes", type=list[tuple[int, int]] | None, help=sizes)
+    out = "folder of the grids, in place of features_dir of the data"
+    parser.add_argument("--out", type=Path | None, help=out)
     skipped: Any = set(signature(Trainer).parameters) - _TRAINER_OPTIONS
     parser.add_class_arguments(
         Trainer, "trainer", fail_untyped=False, instantiate=False, sub_configs=True, skip=skipped
