@@ -66,18 +66,6 @@ def test_term_is_the_scaled_gradient_of_each_samples_own_energy():
     torch.testing.assert_close(build().term(x, time), term)
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_guided_sampling_ends_nearer_to_the_target(legacy):
-    def energy(scale):
-        guidance = build(scale=scale, legacy=legacy)
-        last = euler(guidance, latents(), ode_times(10))
-        probe = build()
-        probe(last, torch.zeros(3))
-        return probe.history[0].energy
-
-    assert (energy(10.0) < energy(0.0) - 0.05).all()
-
-
 def test_history_holds_energy_and_cosine_of_every_evaluation():
     x, time, guidance = latents(), times(), build()
     guided = guidance(x, time)
@@ -115,45 +103,6 @@ def test_an_empty_mask_means_no_guidance(legacy):
     assert naive.isnan()
 
 
-def test_an_empty_mask_of_one_sample_leaves_the_others_guided():
-    mask = masks()
-    mask[1] = False
-    term, full = build(mask=mask).term(latents(), times()), build().term(latents(), times())
-    assert term[1].abs().max() == 0
-    assert torch.equal(term[[0, 2]], full[[0, 2]])
-    for relative in (False, True):
-        guided = build(mask=mask, scale=0.5, relative=relative)(latents(), times())
-        plain = velocity(latents(), times())
-        assert torch.equal(guided[1], plain[1])
-        assert ((guided - plain)[[0, 2]].flatten(1).norm(dim=1) > 0.01).all()
-
-
-@pytest.mark.numerics
-@pytest.mark.parametrize("broken", [torch.inf, torch.nan])
-def test_a_gradient_that_is_not_finite_is_dropped_and_counted(broken):
-    calls = []
-
-    def features(x, time):
-        calls.append(None)
-        spoil = torch.zeros_like(x)
-        if len(calls) == 2:
-            spoil[1, 0, 0, 0] = broken
-        return tokens_of(x + spoil * x, time)
-
-    guidance, x = build(features=features), latents()
-    result = euler(guidance, x, ode_times(4))
-    assert result.isfinite().all()
-    assert guidance.num_dropped == 1
-    untouched = euler(build(), x, ode_times(4))
-    torch.testing.assert_close(result[[0, 2]], untouched[[0, 2]])
-    assert not torch.equal(result[1], untouched[1])
-
-    leaf = x.clone().requires_grad_()
-    calls[:] = [None]  # the next call is the second, which is spoiled
-    naive = torch.cosine_similarity(features(leaf, times()), target(), dim=-1).mean()
-    assert not torch.autograd.grad(naive, leaf)[0].isfinite().all()
-
-
 @pytest.mark.numerics
 def test_tokens_of_length_zero_have_a_finite_gradient():
     guidance = build(
@@ -171,55 +120,6 @@ def test_tokens_of_length_zero_have_a_finite_gradient():
     )
     (gradient,) = torch.autograd.grad(naive.sum(), leaf)
     assert gradient.abs().max() > 1e9
-
-
-@pytest.mark.numerics
-def test_energy_of_half_precision_features_is_computed_in_float32():
-    def half(x, time):
-        return 300 * tokens_of(x, time).half()
-
-    guidance = build(features=half)
-    term = guidance.term(latents(), times())
-    assert term.dtype == torch.float32
-    assert guidance.num_dropped == 0
-    torch.testing.assert_close(term, build().term(latents(), times()), atol=2e-3, rtol=0)
-    features = half(latents(), times())
-    assert features.square().sum(dim=-1).isinf().any()
-
-
-def test_scale_zero_is_unguided_in_the_legacy_sampler():
-    x, guidance = latents(), build(scale=0.0, legacy=True)
-    draws = torch.randn(3, *x.shape, generator=generator())
-    assert torch.equal(
-        heun(guidance, x, ode_times(4), corrector_velocity=guidance.corrector_velocity),
-        heun(velocity, x, ode_times(4)),
-    )
-    sde = euler_maruyama(
-        guidance.sde_velocity, x, sde_times(4), draws, change_drift=guidance.change_drift
-    )
-    assert torch.equal(sde, euler_maruyama(velocity, x, sde_times(4), draws))
-
-
-def test_every_evaluation_is_guided_but_those_the_legacy_sampler_leaves_out():
-    x, draws = latents(), torch.zeros(3, 3, 5, 2, 3)
-
-    def evaluations(solve, legacy):
-        guidance = build(legacy=legacy)
-        solve(guidance)
-        return len(guidance.history)
-
-    def solve_heun(guidance):
-        heun(guidance, x, ode_times(4), corrector_velocity=guidance.corrector_velocity)
-
-    def solve_sde(guidance):
-        euler_maruyama(
-            guidance.sde_velocity, x, sde_times(4), draws, change_drift=guidance.change_drift
-        )
-
-    assert evaluations(solve_heun, legacy=False) == 7
-    assert evaluations(solve_heun, legacy=True) == 4
-    assert evaluations(solve_sde, legacy=False) == 4
-    assert evaluations(solve_sde, legacy=True) == 3
 
 
 @pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])

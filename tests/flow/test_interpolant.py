@@ -59,14 +59,6 @@ def test_target_is_the_time_derivative_of_the_path(path):
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_denoise_undoes_interpolate_given_the_true_velocity(path):
-    data, noise, time = draws()
-    path = Interpolant(path)
-    x, velocity = path.interpolate(data, noise, time), path.target(data, noise, time)
-    torch.testing.assert_close(path.denoise(velocity, x, time), data)
-
-
-@pytest.mark.parametrize("path", PATHS)
 def test_score_of_gaussian_data_is_exact(path):
     x, _, time = draws(low=0.05)
     path = Interpolant(path)

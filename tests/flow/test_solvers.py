@@ -43,17 +43,6 @@ def wave(x, time):
     return 2 * torch.cos(2 * time)[:, None] * x
 
 
-def data_velocity(data, interpolant):
-    """Velocity of a path whose expected data are ``data(log snr)``, whatever x; inside (0, 1)."""
-
-    def velocity(x, time):
-        alpha, sigma, d_alpha, d_sigma = interpolant.coefficients(time[:, None])
-        expected = data((alpha / sigma).log())
-        return d_alpha * expected + d_sigma * (x - alpha * expected) / sigma
-
-    return velocity
-
-
 def test_euler_and_heun_of_a_parabola():
     """The left sum, and the trapezoidal sum but for the last step."""
     steps, start = 8, torch.full((2, 1), 5.0).double()
@@ -165,21 +154,6 @@ def test_adams_bashforth_on_a_uniform_grid_has_the_textbook_weights():
     assert weights(ab3, 5) == pytest.approx([0, 0, 5 / 12, -16 / 12, 23 / 12], abs=1e-12)
     # The second step of AB3 is one of AB2 and amends the first from Euler's to the trapezoidal.
     assert weights(ab3, 2) == pytest.approx([-1 / 2 - 1 / 2, 3 / 2 + 1 / 2])
-
-
-@pytest.mark.parametrize("solver", DATA_PREDICTION)
-@pytest.mark.parametrize("path", ["linear", "cosine"])
-@pytest.mark.parametrize("times", [UNEVEN, INSIDE, INSIDE.flip(0), UNEVEN[[0, -1]]])
-def test_data_prediction_is_exact_where_the_data_are_one_point(solver, path, times):
-    interpolant, point = Interpolant(path), 1.7
-    alpha, sigma, _, _ = interpolant.coefficients(times)
-    noise = standard_noise(4, 1)
-    result = ode_solver(solver, interpolant)(
-        data_velocity(lambda log_snr: point, interpolant),
-        alpha[0] * point + sigma[0] * noise,
-        times,
-    )
-    torch.testing.assert_close(result, alpha[-1] * point + sigma[-1] * noise)
 
 
 def published(velocity, x, times, interpolant, correct):

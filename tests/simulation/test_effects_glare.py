@@ -83,7 +83,7 @@ def test_chance_of_a_halo_is_gaussian_in_the_angle():
     angle = angles_to(sweep, candidates, sources)
     inner, outer = candidates[angle < 0.4999], candidates[angle < 0.5001]
     assert set(inner) <= set(beside) <= set(outer)
-    turns = 200
+    turns = 100
     count = halo_counts(sweep, turns, Blooming(spill=1.0))[beside]
     chance = np.exp(-((angles_to(sweep, beside, sources) / 0.2) ** 2))
     # Five standard errors of each count, and of their sum.
@@ -121,11 +121,8 @@ def test_halo_has_the_range_of_the_sheet_and_no_label():
 def test_halo_runs_across_the_end_of_the_turn():
     """The sheet begins just to the left of azimuth 0: its halo reaches the last shots."""
     sweep = swept(Scene((sheet(20, 0.46, 0.4),)), [RetroReflection()])
-    _, shot = np.divmod(RetroReflection().rays(sweep), SENSOR.shots)
-    assert shot.max() < SENSOR.shots // 2
-    _, beside = np.divmod(Blooming().rays(sweep), SENSOR.shots)
-    assert (beside >= SENSOR.shots - 2).any()
-    assert (beside < SENSOR.shots // 2).any()
+    assert (RetroReflection().rays(sweep) % SENSOR.shots).max() < SENSOR.shots // 2
+    assert (Blooming().rays(sweep) % SENSOR.shots).max() >= SENSOR.shots - 2
 
 
 def glared(scene):
@@ -147,28 +144,21 @@ def test_called_by_a_low_sun_in_a_clear_sky():
     """The highest beam of an HDL-64E rises by 1.96 degrees or little more, the glare 10 more."""
     highest = math.degrees(COARSE.lasers.inclination_rad[0])
     assert highest == pytest.approx(2, abs=1)
-    for elevation_deg, called in ((-1, False), (0.0, False), (1, True), (45, False)):
-        weather = replace(LOW, sun_elevation_deg=elevation_deg)
-        assert bool(SunGlare().called_by(Scene(weather=weather), COARSE)) is called
-    for elevation_deg, called in ((highest + 9.9, True), (highest + 10.1, False)):
+    for elevation_deg in (0.0, 45.0):
+        high = Scene(weather=replace(LOW, sun_elevation_deg=elevation_deg))
+        assert SunGlare().called_by(high, COARSE) is None
+    for elevation_deg, called in ((0.5, True), (highest + 9.9, True), (highest + 10.1, False)):
         weather = replace(LOW, sun_elevation_deg=elevation_deg)
         assert bool(SunGlare().called_by(Scene(weather=weather), COARSE)) is called
         assert bool(len(glared(Scene(weather=weather))[1])) is called
+    for covered in ("visibility_m", "rain_mm_h", "snow_mm_h"):
+        assert not len(glared(Scene(weather=replace(LOW, **{covered: 1.0})))[1])
+    assert SunGlare().called_by(Scene(weather=replace(LOW, clear_sky=False)), COARSE) is None
     # A sensor that leans towards the sun sees it higher.
     leaning = Scene(pose=Pose(roll_rad=0.1), weather=replace(LOW, sun_elevation_deg=highest + 14))
     assert SunGlare().called_by(leaning, COARSE)
     assert len(glared(leaning)[1])
     assert not len(glared(replace(leaning, pose=Pose(roll_rad=-0.1)))[1])
-
-
-@pytest.mark.parametrize(
-    "covered",
-    [{"clear_sky": False}, {"visibility_m": 200.0}, {"rain_mm_h": 1.0}, {"snow_mm_h": 1.0}],
-)
-def test_not_called_under_a_covered_sky(covered):
-    scene = Scene(weather=replace(LOW, **covered))
-    assert SunGlare().called_by(scene, COARSE) is None
-    assert len(glared(scene)[1]) == 0
 
 
 def test_threshold_near_the_sun():

@@ -96,20 +96,16 @@ def test_limits_of_power_and_range():
     assert kept[8:].all()
 
 
-def busy_scene():
-    """Edges, a pane, leaves, rain: every source of second echoes."""
-    street = Street(0, 3).scene(40)
-    return replace(street, weather=Weather(rain_mm_h=30.0), motion=EgoMotion(10.0, 0.1))
-
-
 def test_strongest_returns_are_the_first_of_dual_returns():
-    scene, key = busy_scene(), ("seed", 7)
+    """In a scene with edges, a pane, leaves and rain: every source of second echoes."""
+    street = Street(0, 3).scene(40)
+    scene = replace(street, weather=Weather(rain_mm_h=30.0), motion=EgoMotion(10.0, 0.1))
+    key = ("seed", 7)
     strongest = simulate_scan(scene, SENSOR, key)
     dual = simulate_scan(scene, replace(SENSOR, return_mode="dual"), key)
     first = dual.origins != Origin.SECOND_RETURN
-    np.testing.assert_array_equal(dual.points[first], strongest.points)
-    np.testing.assert_array_equal(dual.labels[first], strongest.labels)
-    np.testing.assert_array_equal(dual.origins[first], strongest.origins)
+    for column in ("points", "labels", "origins"):
+        np.testing.assert_array_equal(getattr(dual, column)[first], getattr(strongest, column))
     assert (~first).sum() > 100
     # Recording what is not reported changes nothing.
     recorded = simulate_scan(scene, SENSOR, key, {"dual_return": "on"})

@@ -14,7 +14,7 @@ from r3dpa.simulation.effects import (
     surface_power,
 )
 
-SENSOR = hdl64e()
+SENSOR = hdl64e(shots=1040)
 
 
 def power_of_wall(distance_m, tilt_deg=0.0, material=Material.PAINT):
@@ -72,7 +72,7 @@ def test_last_ground_return(smooth):
     floor = box((0, 0, -1), (200, 200, 1), semantic=Semantic.ROAD, reflectivity=0.1)
     farthest = 0.0
     # A pitch of the sensor sweeps its beams over the ground in steps far below their pitch.
-    for pitch in np.linspace(0, 0.006, 25):
+    for pitch in np.linspace(0, 0.006, 13):
         pose = Pose(pitch_rad=pitch)
         scene = (
             Scene((floor,), pose, ground_m=-3)
