@@ -17,8 +17,8 @@ import torch
 from scipy.stats import t as student
 
 from r3dpa import viz
-from r3dpa.ablation.plan import Plan, Row, Stage, Table
-from r3dpa.ablation.run import evaluation_of, settled, stage_folder, state_of
+from r3dpa.ablation.plan import Plan, Stage, Table
+from r3dpa.ablation.runs import mark_of, write
 from r3dpa.io import atomic_path, command, machine, versions
 from r3dpa.metrics.results import (
     Evaluation,
@@ -134,76 +134,81 @@ def write_table(
         The table for the terminal, and the evaluations by row and seed.
     """
     results: dict[str, dict[int, Evaluation]] = {row.key: {} for row in table.rows}
-    own, lost, num_seeds = [], [], len(plan.seeds)
+    means, lost, commits = [], [], dict[str, None]()
     for row in table.rows:
         for seed, chain in row.stages.items():
-            path = evaluation_of(out, chain[-1])
-            if f"test of {chain[-1].name}" not in failed and path.is_file():
-                results[row.key][seed] = Evaluation.load(path)
-            else:
+            path = chain[-1].evaluation(out)
+            if f"test of {chain[-1].name}" in failed or not path.is_file():
                 lost.append(f"{row.label}, seed {seed}: no result")
-        if found := list(results[row.key].values()):
-            few = "" if len(found) == num_seeds else f" ({len(found)} of {num_seeds} seeds)"
-            own.append(mean_of_seeds(row.label + few, found))
-    if not own:
+                continue
+            results[row.key][seed] = found = Evaluation.load(path)
+            by = [*(commit_of(out, stage) for stage in chain), found.about["commit"]]
+            commits |= dict.fromkeys(commit[:10] if commit else "unknown" for commit in by)
+        if num := len(results[row.key]):
+            few = "" if num == len(plan.seeds) else f" ({num} of {len(plan.seeds)} seeds)"
+            means.append(mean_of_seeds(row.label + few, list(results[row.key].values())))
+    if not means:
         for suffix in ("md", "tex", "csv", "json"):  # of another run, they would look like its own
             (out / f"{table.name}.{suffix}").unlink(missing_ok=True)
         return f"{table.name}: {table.caption}\n\nno row has a result", results
-    distances = [evaluation.only(_DISTANCES) for evaluation in own]
+    distances = [evaluation.only(_DISTANCES) for evaluation in means]
     shown = EvaluationTable((*_published(table), *distances))
     orders = order_results(
         table, results, [name for name in shown.columns if any(e.row(name) for e in distances)]
     )
-    seeds = ", ".join(map(str, plan.seeds))
     intervals = "those of the scenes: another training differs by more."
-    if num_seeds > 1:
+    if len(plan.seeds) > 1:
         intervals = (
             "Student's, of the mean over the seeds, which share scans and prior; those of orders "
             "are of the differences seed by seed."
         )
     head = (
-        f"{table.caption} Scale {plan.scale.name}: {plan.scale.about} Seeds {seeds}. Intervals are "
-        f"{intervals}"
+        f"{table.caption} Scale {plan.scale}: {plan.about} Seeds "
+        f"{', '.join(map(str, plan.seeds))}. Intervals are {intervals}"
     )
-    by: list[str | None] = []
-    for row in table.rows:
-        for seed, evaluation in results[row.key].items():
-            by += [*(commit_of(out, s) for s in row.stages[seed]), evaluation.about["commit"]]
-    commits = list(dict.fromkeys(commit[:10] if commit else "unknown" for commit in by))
     notes = [*_described(table, orders), *lost]
     if len(commits) > 1:
         notes.append(f"trained or tested by different commits: {', '.join(commits)}")
     listed = "\n".join(f"- {line}" for line in notes)
-    _save(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
-    _save(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
-    save_csv(own, out / f"{table.name}.csv")
-    trained = [stage for row in table.rows for chain in row.stages.values() for stage in chain]
+    write(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
+    write(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
+    save_csv(means, out / f"{table.name}.csv")
+    stages = [stage for row in table.rows for chain in row.stages.values() for stage in chain]
     stored = {
         "table": table.name,
         "caption": table.caption,
-        "scale": plan.scale.name,
-        "about": plan.scale.about,
+        "scale": plan.scale,
+        "about": plan.about,
         "command": command(),
         "machine": machine(),
         "versions": versions(torch),
-        "commits": commits,
-        "rows": [_stored_row(row, results[row.key]) for row in table.rows],
+        "commits": list(commits),
+        "rows": [
+            {
+                "key": row.key,
+                "label": row.label,
+                "published": row.published,
+                "stages": {seed: [s.name for s in chain] for seed, chain in row.stages.items()},
+                "values": _by_seed(results[row.key], "value"),
+                "intervals": _by_seed(results[row.key], "interval"),
+            }
+            for row in table.rows
+        ],
         "orders": [order._asdict() for order in orders],
-        "curves": {stage.name: _thinned(out, stage) for stage in trained},
+        "curves": {stage.name: _thinned(out, stage) for stage in stages},
         "failed": dict(failed),
     }
-    _save(out / f"{table.name}.json", json.dumps(stored, indent=1) + "\n")
+    write(out / f"{table.name}.json", json.dumps(stored, indent=1) + "\n")
     return "\n".join([f"{table.name}: {head}", "", str(shown), *notes]), results
 
 
-def _save(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+def _by_seed(found: Mapping[int, Evaluation], key: str) -> dict[int, dict[str, Any]]:
+    return {seed: {row.name: getattr(row, key) for row in e.rows} for seed, e in found.items()}
 
 
 def commit_of(out: Path, stage: Stage) -> str | None:
     """Commit of the code that trained a stage, if known."""
-    return state_of(stage_folder(out, stage) / "fit").get("commit")
+    return mark_of(stage.folder(out) / "fit").get("commit")
 
 
 def _described(table: Table, orders: Sequence[Order]) -> list[str]:
@@ -222,43 +227,6 @@ def _described(table: Table, orders: Sequence[Order]) -> list[str]:
     return [f"Paper: {claim}. Here: {'; '.join(found)}" for claim, found in lines.items()]
 
 
-def _stored_row(row: Row, found: Mapping[int, Evaluation]) -> dict[str, Any]:
-    return {
-        "key": row.key,
-        "label": row.label,
-        "published": row.published,
-        "stages": {seed: [stage.name for stage in chain] for seed, chain in row.stages.items()},
-        "values": {seed: {r.name: r.value for r in e.rows} for seed, e in found.items()},
-        "intervals": {seed: {r.name: r.interval for r in e.rows} for seed, e in found.items()},
-    }
-
-
-def curves_of(out: Path, stage: Stage) -> dict[str, dict[int, float]]:
-    """Logged values of a stage by quantity and step; a resumed run overwrites repeated steps."""
-    found: dict[str, dict[int, float]] = {}
-    paths = stage_folder(out, stage).glob("version_*/metrics.csv")
-    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
-        for name, (steps, values) in viz.read_metrics(path).items():
-            known = found.setdefault(name, {})
-            known.update(zip(map(int, steps), map(float, values), strict=True))
-    return {name: dict(sorted(values.items())) for name, values in found.items()}
-
-
-def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
-    """Steps and values of each loss of a stage: running means of up to 100 neighbouring parts."""
-    found = {}
-    for name, curve in curves_of(out, stage).items():
-        if name.startswith(("train/", "val/")):
-            size = math.ceil(len(curve) / _POINTS)
-            points = list(curve.items())
-            parts = [points[start : start + size] for start in range(0, len(points), size)]
-            found[name] = [
-                [fmean(step for step, _ in part) for part in parts],
-                [float(f"{fmean(value for _, value in part):.5g}") for part in parts],
-            ]
-    return found
-
-
 def _published(table: Table) -> list[Evaluation]:
     """The rows as the paper printed them; KITTI-360, other networks and other data than here."""
     source = f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}"
@@ -267,6 +235,30 @@ def _published(table: Table) -> list[Evaluation]:
         for row in table.rows
         if row.published
     ]
+
+
+def curves_of(out: Path, stage: Stage) -> dict[str, dict[int, float]]:
+    """Logged values of a stage by quantity and step; a resumed run overwrites repeated steps."""
+    found: dict[str, dict[int, float]] = {}
+    paths = stage.folder(out).glob("version_*/metrics.csv")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        for name, (steps, values) in viz.read_metrics(path).items():
+            known = found.setdefault(name, {})
+            known.update(zip(map(int, steps), map(float, values), strict=True))
+    return {name: dict(sorted(values.items())) for name, values in found.items()}
+
+
+def _thinned(out: Path, stage: Stage) -> dict[str, list[list[float]]]:
+    """Steps and values of each loss of a stage: means of up to 100 parts."""
+    found = {}
+    for name, curve in curves_of(out, stage).items():
+        if name.startswith(("train/", "val/")):
+            size = math.ceil(len(curve) / _POINTS)
+            points = list(curve.items())
+            parts = [points[start : start + size] for start in range(0, len(points), size)]
+            means = [[fmean(values) for values in zip(*part, strict=True)] for part in parts]
+            found[name] = [[step for step, _ in means], [float(f"{v:.5g}") for _, v in means]]
+    return found
 
 
 def log_rows(
@@ -282,33 +274,30 @@ def log_rows(
     for row in table.rows:
         for seed, evaluation in results[row.key].items():
             stages = row.stages[seed]
-            summary = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
-            summary = {name: value for name, value in summary.items() if value is not None}
-            content = json.dumps([[stage.name for stage in stages], plan.scale.scorer])
+            values = {r.name.replace(" ", "_"): r.value for r in evaluation.rows}
+            summary = {name: value for name, value in values.items() if value is not None}
+            content = json.dumps([[stage.name for stage in stages], summary])
             of_row = f"{table.name}-{row.key}-{seed}"
             run_id = f"{of_row}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
-            note, text = out / "wandb" / f"{run_id}.{mode}.json", json.dumps(summary)
-            if note.is_file() and note.read_text(encoding="utf-8") == text:
+            if any((out / "wandb").glob(f"*run-*-{run_id}")):
                 continue
-            for stale in note.parent.glob(f"offline-run-*-{of_row}-????????"):
+            for stale in (out / "wandb").glob(f"offline-run-*-{of_row}-????????"):
                 shutil.rmtree(stale)
             config = {
                 "table": table.name,
                 "row": row.key,
                 "label": row.label,
-                "scale": plan.scale.name,
+                "scale": plan.scale,
                 "seed": seed,
-                "stages": {stage.experiment: settled(stage, out) for stage in stages},
-                "runs": [stage.name for stage in stages],
+                "stages": {stage.name: stage.config for stage in stages},
                 "commits": [commit_of(out, stage) for stage in stages],
             }
             with wandb.init(
                 project="r3dpa",
-                group=f"{table.name} {plan.scale.name}",
+                group=f"{table.name} {plan.scale}",
                 job_type="row",
                 name=f"{row.label}, seed {seed}",
                 id=run_id,
-                resume="allow" if mode == "online" else None,
                 dir=out,
                 mode=mode,
                 config=config,
@@ -317,13 +306,9 @@ def log_rows(
                 for stage in stages:
                     prefix = stage.experiment
                     run.define_metric(f"{prefix}/*", step_metric=f"{prefix}/step")
-                    by_step: dict[int, dict[str, float]] = {}
-                    for name, values in curves_of(out, stage).items():
-                        for step, value in values.items():
-                            by_step.setdefault(step, {})[f"{prefix}/{name}"] = value
-                    for step, logged in sorted(by_step.items()):
-                        run.log({f"{prefix}/step": step} | logged)
-                for path in sorted(evaluation_of(out, stages[-1]).parent.rglob("*.png")):
+                    for name, curve in curves_of(out, stage).items():
+                        for step, value in curve.items():
+                            run.log({f"{prefix}/step": step, f"{prefix}/{name}": value})
+                for path in sorted(stages[-1].evaluation(out).parent.rglob("*.png")):
                     run.log({f"samples/{path.stem}": wandb.Image(str(path))})
                 run.summary.update(summary)
-            _save(note, text)

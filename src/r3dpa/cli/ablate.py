@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+import warnings
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
+
+import yaml
 
 from r3dpa.cli.options import check_folder
 
@@ -18,7 +24,6 @@ def ablate(
     seeds: tuple[int, ...] = (0,),
     out: Path | None = None,
     jobs: int = 1,
-    devices: int = 1,
     rgb_weights: Path | None = None,
     wandb: Literal["offline", "online", "off"] = "offline",
     budget_only: bool = False,
@@ -37,10 +42,9 @@ def ablate(
         seeds: Every row is trained and tested for each, such as ``0 1 2``.
         out: Folder for everything; default: ``runs/ablation/<scale>``.
         jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
-        devices: GPUs of each training, which share its batch.
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
         wandb: One run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
-            ``online``, which logs the stages while they train, too.
+            ``online``.
         budget_only: Print the cost, and start nothing.
     """
     from r3dpa import ablation
@@ -49,18 +53,18 @@ def ablate(
 
     if not tables.is_dir() and (conf_folder().parent / tables).is_dir():
         tables = conf_folder().parent / tables
-    found = ablation.read_scale(_scale_file(tables, scale))
-    folder = out or Path("runs/ablation") / found.name
+    scale_file = _scale_file(tables, scale)
+    folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
-    plan = ablation.make_plan(tables, found, seeds, rgb_weights)
+    plan = ablation.make_plan(tables, scale_file, seeds, _resolved, rgb_weights)
     if plan.missing_weights and not budget_only:
         listed = ", ".join(map(str, plan.missing_weights))
-        raise ValueError(f"scale {found.name} needs files that are not there: {listed}")
+        raise ValueError(f"scale {plan.scale} needs files that are not there: {listed}")
     _say(ablation.budget_of(plan))
     if budget_only:
         return
     with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
-        failed = ablation.run_plan(plan, folder, _say, jobs, devices, wandb == "online")
+        failed = ablation.run_plan(plan, folder, _say, jobs)
         for table in plan.tables:
             text, results = ablation.write_table(plan, table, folder, failed)
             _say(f"\n{text}")
@@ -83,6 +87,20 @@ def _scale_file(tables: Path, scale: str) -> Path:
     near = [folder / "scale" for folder in (tables, tables.resolve().parent)]
     place = next((folder for folder in near if folder.is_dir()), near[-1])
     return place / f"{scale}.yaml"
+
+
+def _resolved(command: str) -> dict[str, Any]:
+    """The whole configuration of an ``r3dpa fit`` command."""
+    from r3dpa.cli.stages import run
+
+    with redirect_stdout(StringIO()) as printed, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on words that are not those of the process
+        try:
+            run([*shlex.split(command), "--print_config"])
+        except SystemExit as ended:
+            if ended.code:
+                raise ValueError(f"the above is said of: r3dpa {command}") from None
+    return dict(yaml.safe_load(printed.getvalue()))
 
 
 def _say(text: Any) -> None:
