@@ -30,7 +30,7 @@ ELSEWHERE = {  # by the test that starts them
     "test_documented_commands": "launch/nodes",
     "part of experiments here": "net/discriminator net/discriminator_demo",
     "test_ablate": " ".join(
-        f"ablation/{p.parent.name}/{p.stem}" for p in CONF.glob("ablation/*/*")
+        p.relative_to(CONF).with_suffix("").as_posix() for p in CONF.glob("ablation/**/*.yaml")
     ),
 }
 EXPERIMENTS = ("vae_alignment", "joint", "flow_matching")

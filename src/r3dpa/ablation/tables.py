@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Stage, Table
 from r3dpa.ablation.runs import mark_of, write
-from r3dpa.io import atomic_path, command, machine, versions
+from r3dpa.io import command, machine, versions
 from r3dpa.metrics.results import (
     Evaluation,
     EvaluationTable,
