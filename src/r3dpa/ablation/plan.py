@@ -33,7 +33,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,7 +136,7 @@ class _Scale(NamedTuple):
     prior: Path | None
     resolve: Resolve
 
-    def stages(self, own: Mapping[str, str], seed: int, file: Path) -> list[Stage]:
+    def stages(self, own: dict[str, str], seed: int, file: Path) -> list[Stage]:
         """Stages of a row: its ``own`` commands, each after those that it needs."""
         checkpoints = {} if self.prior is None else {_PRIOR: str(self.prior)}
         stages: dict[str, Stage] = {}
