@@ -14,13 +14,13 @@ import threading
 from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import wandb
 import yaml
+from resolved_fits import resolved
 from scipy.stats import ttest_1samp
 
 from r3dpa.ablation import budget_of, make_plan, run_plan, write_table
@@ -41,12 +41,6 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:.*LeafSpec.*is deprecated",
     "ignore:Attribute '.*' is an instance of `nn.Module`",
 )
-
-
-@cache
-def resolved(command):
-    """Half a second each."""
-    return _resolved(command)
 
 
 def plan_of(scale, seeds=(0,), tables=TABLES, rgb_weights=None):

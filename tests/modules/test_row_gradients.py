@@ -10,16 +10,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from resolved_fits import resolved
 from tiny_stages import FEATURE_DIM, STAGES, group_of, stage_module, train
 from torch import nn
 
-from r3dpa.ablation import make_plan, read_scale
+from r3dpa.ablation import make_plan
 from r3dpa.modules import LossWeights
 from r3dpa.nn import UNet
 
 TABLES = Path(__file__).resolve().parents[2] / "conf" / "ablation"
-PLAN = make_plan(TABLES, read_scale(TABLES / "scale" / "paper.yaml"), (0,))
-ROWS = {(t.name, row.key): row.stages[0] for t in PLAN.tables for row in t.rows}
 
 VAE_ALONE = {"vae", "discriminator"}
 ALIGNED_VAE = VAE_ALONE | {"sit.projector", "sit.x_embedder"}
@@ -46,8 +45,15 @@ STARTS = {  # networks that the last stage takes from the stage before; from the
 }
 
 
-def on_scans(row):
-    return [stage for stage in ROWS[row] if stage.on_scans]
+@pytest.fixture(scope="module")
+def rows():
+    """Stages on scans of each row."""
+    plan = make_plan(TABLES, TABLES / "scale" / "paper.yaml", (0,), resolved)
+    return {
+        (table.name, row.key): [stage for stage in row.stages[0] if stage.on_scans]
+        for table in plan.tables
+        for row in table.rows
+    }
 
 
 def starts(stage):
@@ -73,26 +79,26 @@ def tiny_module(stage):
     return STAGES[name](ours.vae, unet, ours.discriminator, weights=weights)
 
 
-def test_every_row_is_expected():
-    assert set(EXPECTED) == set(STARTS) == set(ROWS)
+def test_every_row_is_expected(rows):
+    assert set(EXPECTED) == set(STARTS) == set(rows)
 
 
 @pytest.mark.parametrize("row", EXPECTED, ids="/".join)
-def test_what_a_row_starts_from(row):
-    *_, last = on_scans(row)
+def test_what_a_row_starts_from(row, rows):
+    *_, last = rows[row]
     networks, rgb = STARTS[row]
     assert last.config["model"]["init_args"].get("init_networks") == networks
     assert ("rgb_weights" in starts(last)) == rgb
-    assert ("init_from" in starts(last)) == (len(on_scans(row)) == 2)
+    assert ("init_from" in starts(last)) == (len(rows[row]) == 2)
     if EXPECTED[row][0][0] == ALIGNED_VAE:
-        assert starts(on_scans(row)[0]) == ["rgb_weights"]
+        assert starts(rows[row][0]) == ["rgb_weights"]
 
 
 @pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of", "ignore:Found .* eval mode")
 @pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated")
 @pytest.mark.parametrize("row", EXPECTED, ids="/".join)
-def test_who_learns_and_who_is_aligned(row):
-    for stage, (trained, aligned) in zip(on_scans(row), EXPECTED[row], strict=True):
+def test_who_learns_and_who_is_aligned(row, rows):
+    for stage, (trained, aligned) in zip(rows[row], EXPECTED[row], strict=True):
         module = tiny_module(stage)
         module.separates_losses = True
         before = {name: value.clone() for name, value in module.named_parameters()}
