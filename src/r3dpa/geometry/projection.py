@@ -57,8 +57,7 @@ class SphericalProjection(PixelRays):
         """Row and column ``(...)`` int64 of the range-image pixel of points ``(..., 3)``.
 
         Computed in float64: arcsin and float32 lose up to 4e-4 rad towards the zenith. A point that
-        is
-        not finite counts as the origin.
+        is not finite counts as the origin.
 
         Raises:
             ValueError: If the last axis of ``points`` is not of size 3.
@@ -71,17 +70,21 @@ class SphericalProjection(PixelRays):
         """
         inclination, azimuth = angles_of(points)
         sensor = self.sensor
-        pitch = (sensor.inclination_max_rad - sensor.inclination_min_rad) / sensor.beams
-        row = ((sensor.inclination_max_rad - inclination) / pitch).floor().long()
+        row = ((sensor.inclination_max_rad - inclination) / self._pitch).floor().long()
         column = column_of(azimuth, sensor.columns, self.legacy_seam)
         return row.clamp(0, sensor.beams - 1), column
 
     def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
         """Inclination ``(H,)`` and azimuth ``(W,)`` of the pixel centres or corners, radians."""
         sensor = self.sensor
-        pitch = (sensor.inclination_max_rad - sensor.inclination_min_rad) / sensor.beams
         rows = torch.arange(sensor.beams, dtype=torch.float64) + pixel_offset(corner)
-        return sensor.inclination_max_rad - pitch * rows, column_azimuths(sensor.columns, corner)
+        inclination = sensor.inclination_max_rad - self._pitch * rows
+        return inclination, column_azimuths(sensor.columns, corner)
+
+    @property
+    def _pitch(self) -> float:
+        """Angle between two rows, radians."""
+        return self.sensor.field_of_view_rad / self.sensor.beams
 
     def column_order(self) -> Tensor:
         """Columns ``(W,)`` int64 in the order in which the points of a row are listed."""

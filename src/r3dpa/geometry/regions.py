@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from einops import rearrange, repeat
@@ -127,20 +126,13 @@ def box3d(
     raise ValueError(_missed(projection, where))
 
 
-def dropped_beams(projection: Projection, kept: int | Sequence[int]) -> Tensor:
-    """Pixels ``(H, W)`` bool of the beams that a scan with fewer beams lacks.
-
-    ``kept`` is the number of beams that remain, evenly spread from the first row on, such as 32 of
-    64, or their rows.
+def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
+    """Pixels ``(H, W)`` bool of the beams that a scan with only the rows ``kept`` lacks.
 
     Raises:
-        ValueError: If the number does not divide H, a row does not exist, or none or all remain.
+        ValueError: If a row does not exist, or none or all remain.
     """
     beams = projection.sensor.beams
-    if isinstance(kept, int):
-        if kept < 1 or beams % kept:
-            raise ValueError(f"the number of beams that remain must divide {beams}, got {kept}")
-        kept = range(0, beams, beams // kept)
     if outside := [row for row in kept if not 0 <= row < beams]:
         raise ValueError(f"rows of beams must lie in 0..{beams - 1}, got {outside}")
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
@@ -186,38 +178,28 @@ def check_mask(mask: Tensor, what: str) -> Tensor:
     return mask
 
 
-def token_mask(
-    pixel_mask: Tensor,
-    grid_size: tuple[int, int],
-    rule: Literal["any", "all"] = "any",
-    dilation: int = 0,
-) -> Tensor:
-    """Tokens that a mask of pixels selects.
+def token_mask(pixel_mask: Tensor, grid_size: tuple[int, int], dilation: int = 0) -> Tensor:
+    """Tokens with a selected pixel.
 
     Args:
         pixel_mask: ``(H, W)`` bool.
         grid_size: Rows and columns (h, w) of the tokens, dividing H and W.
-        rule: Select a token if ``any`` pixel of its cell is selected, or only if ``all`` are.
         dilation: Steps of :func:`dilated` on the tokens afterwards.
 
     Returns:
         ``(N,)`` bool, row after row, as feature grids are.
 
     Raises:
-        ValueError: If the grid does not divide the mask, the rule is unknown, or no or every token
-            is selected.
+        ValueError: If the grid does not divide the mask, or no or every token is selected.
     """
     (height, width), (rows, columns) = pixel_mask.shape, grid_size
     if height % rows or width % columns:
         raise ValueError(
             f"a grid of {rows} x {columns} tokens does not divide a mask of {height} x {width}"
         )
-    if rule not in ("any", "all"):
-        raise ValueError(f"rule must be 'any' or 'all', got {rule!r}")
     cells = rearrange(pixel_mask, "(h p) (w q) -> h w (p q)", h=rows, w=columns)
-    tokens = cells.any(dim=-1) if rule == "any" else cells.all(dim=-1)
-    what = f"tokens with {rule} of their {height // rows} x {width // columns} pixels selected"
-    return check_mask(dilated(tokens, dilation).flatten(), what)
+    what = f"tokens with any of their {height // rows} x {width // columns} pixels selected"
+    return check_mask(dilated(cells.any(dim=-1), dilation).flatten(), what)
 
 
 def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, int]) -> Tensor:

@@ -157,7 +157,7 @@ class RingProjection(PixelRays):
         measured = mean_per_ring(inclination, ring, num_rings).cpu()
         beam = match_in_order(measured, known)
         out_of_place = (measured - known[beam]).abs().median()
-        if out_of_place > _OUT_OF_PLACE_SHARE * _field_of_view_rad(self.sensor):
+        if out_of_place > _OUT_OF_PLACE_SHARE * self.sensor.field_of_view_rad:
             found = f"rings lie {out_of_place.rad2deg():.1f} degrees from the beam of their place"
             raise _not_in_ring_order(found, self.sensor)
         return beam.to(ring.device)[ring]
@@ -193,7 +193,7 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
     mean = mean_per_ring(inclination, ring, num_rings)
     spread = mean_per_ring((inclination - mean[ring]).square(), ring, num_rings).sqrt().median()
     # Inclinations spread evenly over the field of view have a deviation of 0.29 times it.
-    if spread > _field_of_view_rad(sensor) / 6:
+    if spread > sensor.field_of_view_rad / 6:
         found = f"inclinations within one turn have a deviation of {spread.rad2deg():.1f} degrees"
         raise _not_in_ring_order(found, sensor)
     return ring, num_rings
@@ -228,10 +228,6 @@ def _is_return(points: Tensor, sensor: LidarSensor) -> Tensor:
     check_points(points)
     distance = range_of(points)
     return distance.isfinite() & (distance > sensor.range_min_m)
-
-
-def _field_of_view_rad(sensor: LidarSensor) -> float:
-    return sensor.inclination_max_rad - sensor.inclination_min_rad
 
 
 def _not_in_ring_order(found: str, sensor: LidarSensor) -> ValueError:

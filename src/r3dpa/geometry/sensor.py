@@ -83,6 +83,11 @@ class LidarSensor:
         """Lower border of the last row, radians."""
         return math.radians(self.inclination_min_deg)
 
+    @property
+    def field_of_view_rad(self) -> float:
+        """Height of the vertical field of view, radians."""
+        return self.inclination_max_rad - self.inclination_min_rad
+
 
 class PixelRays(ABC):
     """Rays of the pixels of a projection; its settings are hashable, so that rays are kept."""

@@ -211,7 +211,9 @@ class _Encoder(nn.Module):
         super().__init__()
         first, last = levels[0][1], levels[-1][1]
         self.conv_in = CircularConv2d(in_channels, first, (3, 3))
-        self.down = nn.ModuleList(_down_level(*level, num_blocks) for level in levels)
+        self.down = nn.ModuleList(
+            _Level(level, num_blocks, (3, 3), "downsample", Downsample) for level in levels
+        )
         self.mid = _Middle(last)
         self.norm_out = GroupNorm(last)
         self.conv_out = CircularConv2d(last, out_channels, (3, 3))
@@ -236,7 +238,11 @@ class _Decoder(nn.Module):
         first, last = levels[0][1], levels[-1][1]  # level 0 has the full resolution
         self.conv_in = CircularConv2d(in_channels, last, (3, 3))
         self.mid = _Middle(last)
-        self.up = nn.ModuleList(_up_level(*level, num_blocks, legacy) for level in levels)
+        upsample = partial(Upsample, legacy=legacy)
+        self.up = nn.ModuleList(
+            _Level(level, num_blocks, _up_kernel(level[3]), "upsample", upsample)
+            for level in levels
+        )
         self.norm_out = GroupNorm(first)
         self.conv_out = WideCircularConv2d(first, out_channels, (1, 4))
 
@@ -247,20 +253,24 @@ class _Decoder(nn.Module):
         return self.conv_out(F.silu(self.norm_out(hidden)))
 
 
+def _up_kernel(stride: Size | None) -> Size:
+    """Kernels extend over columns only, unless the rows are upsampled afterwards."""
+    return (1, 4) if stride is None or stride[0] == 1 else (3, 3)
+
+
 class _Level(nn.Module):
     """Residual blocks, each followed by attention if asked for, and a resampling layer."""
 
     def __init__(
         self,
-        in_channels: int,
-        out_channels: int,
-        attention: bool,
+        sizes: LevelSizes,
         num_blocks: int,
         kernel: Size,
         name: str,
-        resample: Callable[[int], nn.Module],
+        resampler: Callable[[int, Size], nn.Module],
     ) -> None:
         super().__init__()
+        in_channels, out_channels, attention, stride = sizes
         self.block = nn.ModuleList(
             ResBlock(out_channels if index else in_channels, out_channels, kernel)
             for index in range(num_blocks)
@@ -269,28 +279,12 @@ class _Level(nn.Module):
             AttentionBlock(out_channels) if attention else nn.Identity() for _ in self.block
         )
         self.name = name  # of the resampling layer in the official state dict
-        self.add_module(name, resample(out_channels))
+        self.add_module(name, nn.Identity() if stride is None else resampler(out_channels, stride))
 
     def forward(self, hidden: Tensor) -> Tensor:
         for block, attn in zip(self.block, self.attn, strict=True):
             hidden = attn(block(hidden))
         return getattr(self, self.name)(hidden)
-
-
-def _down_level(
-    inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int
-) -> _Level:
-    resample = nn.Identity if stride is None else partial(Downsample, stride=stride)
-    return _Level(inside, outside, attention, num_blocks, (3, 3), "downsample", resample)
-
-
-def _up_level(
-    inside: int, outside: int, attention: bool, stride: Size | None, num_blocks: int, legacy: bool
-) -> _Level:
-    """Level whose kernels extend over columns only, unless its rows are upsampled afterwards."""
-    kernel = (1, 4) if stride is None or stride[0] == 1 else (3, 3)
-    resample = nn.Identity if stride is None else partial(Upsample, stride=stride, legacy=legacy)
-    return _Level(inside, outside, attention, num_blocks, kernel, "upsample", resample)
 
 
 class _Middle(nn.Sequential):

@@ -130,17 +130,8 @@ class VelocityNetwork(nn.Module, ABC):
             latents: ``(B, C, h, w)`` noisy normalised latents.
             modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
 
-        Returns:
-            As :meth:`velocity`, up to the rounding of another batch size.
-
         Raises:
             ValueError: If a shape does not fit the network.
-
-        Example:
-            >>> sit = SiT(hidden_size=32, depth=2, num_heads=2, alignment_depth=1)
-            >>> table = sit.modulations(torch.linspace(1, 0, 9))
-            >>> sit.velocity_at(torch.randn(4, 8, 16, 128), table[3:4]).shape
-            torch.Size([4, 8, 16, 128])
         """
         self._check_latents(latents)
         if modulations.dim() != 2 or modulations.shape[1] != self.modulation_width:
@@ -266,19 +257,14 @@ class EMA(nn.Module):
     def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
         """Moves the averages one step towards the current weights."""
         for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
-            pairs: list[tuple[Tensor, Tensor]] = list(
-                zip(average.parameters(), network.parameters(), strict=True)
-            )
+            weights = [weight.float() for weight in network.parameters()]
+            if weights:
+                torch._foreach_lerp_([*average.parameters()], weights, 1.0 - self.decay)
             for target, source in zip(average.buffers(), network.buffers(), strict=True):
                 if self.decays_buffers and source.is_floating_point():
-                    pairs.append((target, source))
+                    target.lerp_(source.float(), 1.0 - self.decay)
                 else:
                     target.copy_(source)
-            if pairs:
-                targets, sources = zip(*pairs, strict=True)
-                torch._foreach_lerp_(
-                    targets, [source.float() for source in sources], 1.0 - self.decay
-                )
 
     @torch.no_grad()
     def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from r3dpa.io import UNPICKLING_ERRORS, first_line
+from r3dpa.nn.backbones.official import load_strictly, read_released
 from r3dpa.nn.layers import Mlp, SelfAttention
 
 _HEAD_WIDTH = 64  # of every released ViT
@@ -141,8 +141,7 @@ class DINOv2(nn.Module):
         trained: Whether the weights are those of a file.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, would run code, or does not fit, naming all keys.
+        ValueError: If the file is missing, damaged, would run code, or does not fit.
     """
 
     mean: Tensor
@@ -191,15 +190,11 @@ class DINOv2(nn.Module):
         return resized_positions(self.pos_embed, table_size, grid_size, "bicubic", antialias=True)
 
     def _load(self, path: Path) -> None:
-        if not path.is_file():
-            raise FileNotFoundError(f"no file {path}; give a released dinov2_vitb14_pretrain.pth")
+        released = "a released dinov2_vit?14_pretrain.pth, without registers"
         try:
             with torch.serialization.safe_globals([argparse.Namespace]):
-                state = torch.load(path, map_location="cpu", weights_only=True)
-            self.load_state_dict(state, strict=True)
-        except UNPICKLING_ERRORS as error:
+                load_strictly(self, read_released(path, released), str)
+        except ValueError as error:
             raise ValueError(
-                f"{path} holds no DINOv2 of width {self.dim} and {len(self.blocks)} blocks "
-                f"({first_line(error)}): give a released dinov2_vit?14_pretrain.pth, without "
-                "registers, with dim, depth and num_heads of its size"
+                f"{path} as DINOv2 of width {self.dim} and {len(self.blocks)} blocks: {error}"
             ) from error
