@@ -274,7 +274,7 @@ def test_unlike_evaluations_are_noted():
     b = evaluation("b", MetricResult("FRID", 2.0, num_samples=10_000), protocol={"name": "other"})
     assert EvaluationTable([a, b]).notes == [
         "not the same protocol: a, b",
-        "not the same number of scenes: a 500; b 10,000",
+        "not the same number of scenes: 500 of a; 10,000 of b",
     ]
     assert EvaluationTable([a, replace(a, label="b")]).notes == []
 

@@ -307,12 +307,13 @@ class EvaluationTable:
             for key in ("protocol", "reference", "backbones")
             if any(e.about[key] != own[0].about[key] for e in own[1:])
         ]
-        counts: dict[str, str] = {}
+        counts: dict[str, list[str]] = {}
         for e in self.evaluations:
             numbers = sorted({row.num_samples for row in e.rows if row.num_samples})
-            counts[e.name] = " or ".join(f"{number:,}" for number in numbers) or "unknown"
-        if len(set(counts.values())) > 1:
-            listed = "; ".join(f"{name} {numbers}" for name, numbers in counts.items())
+            text = " or ".join(f"{number:,}" for number in numbers) or "an unknown number"
+            counts.setdefault(text, []).append(e.name)
+        if len(counts) > 1:
+            listed = "; ".join(f"{text} of {', '.join(names)}" for text, names in counts.items())
             notes.append(f"not the same number of scenes: {listed}")
         for e in own:
             if e.bad_samples:
