@@ -6,15 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torchmetrics import MetricCollection
 
+from r3dpa.io import source_commit
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
 from r3dpa.metrics.feature_distances import (
-    FeatureMetric,
     metrics_of,
     scene_metrics,
     update_with,
@@ -35,7 +35,6 @@ from r3dpa.metrics.scene_features import (
 AnyReference = ReferenceStatistics | OfficialStatistics
 
 _GROUPS = 16  # of the bootstrap of histograms
-_BATCH = 8
 _UNBIASED = (" inf", " KID")  # distances whose mean does not depend on how many scenes there are
 _SHOWN_MATCHES = 3
 _SHARES = ("precision", "recall")
@@ -49,8 +48,7 @@ _ROWS = {
     "CD 3D": "matching",
 }
 _KINDS = {"": "frechet", "inf": "inf", "KID": "kid"}  # of a feature space; others are shares
-#: How a caller in Python sets an option that allows something.
-PYTHON_OPTION = "{}=True"
+_SKIP_BAD = ". --skip_bad leaves such scenes out, and lists them (`r3dpa test`: --scorer.skip_bad)"
 
 
 class TooFewScenesError(ValueError):
@@ -63,44 +61,11 @@ class Comparison:
 
     Args:
         evaluation: All numbers.
-        metrics: Of :func:`scene_metrics`, with the real and the generated scenes.
-        reference: Real scans.
-        matching: Of the real scans whose images or cells are kept to the generated scenes.
-        names: Of all generated scenes.
+        figures: Arguments of :func:`r3dpa.viz.evaluation.save_figures`; None without real scans.
     """
 
     evaluation: Evaluation
-    metrics: MetricCollection
-    reference: AnyReference
-    matching: Matching | None
-    names: list[str]
-
-    def figure_data(self) -> dict[str, Any] | None:
-        """Arguments of :func:`r3dpa.viz.evaluation.save_figures`; None without real scans."""
-        if isinstance(self.reference, OfficialStatistics) or self.matching is None:
-            return None
-        metrics: dict[str, Any] = metrics_of(self.metrics)
-        protocol, ranges = self.reference.protocol, metrics["ranges"]
-        cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
-        halves: list[Any] = [metrics_of(half)["ranges"] for half in self.reference.halves]
-        places, samples = metrics["matching"].kept("generated")
-        scans = metrics["matching"].kept("real")[1]
-        pairs = []
-        for index in self.matching.squared_normalised.argsort().tolist():
-            nearest = int(self.matching.nearest[index])
-            pair = f"{self.names[places[nearest]]} and {self.reference.kept_images[index]}"
-            title = f"{pair}: {self.matching.squared_normalised[index]:.3g}"
-            pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
-        return {
-            "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
-            "limits_m": ((-protocol.grid.half_m, protocol.grid.half_m),) * 2,
-            "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
-            "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
-            "halves": torch.stack([h.real_bins for h in halves if h.count("real")]).numpy(),
-            "best": pairs[:_SHOWN_MATCHES],
-            "worst": pairs[::-1][:_SHOWN_MATCHES],
-            "sensor": protocol.sensor,
-        }
+    figures: dict[str, Any] | None
 
 
 def evaluate(
@@ -111,11 +76,8 @@ def evaluate(
     label: str,
     source: str = "",
     made_with: Mapping[str, Any] | None = None,
-    commit: str | None = None,
     allow_few: bool = False,
     skip_bad: bool = False,
-    option: str = PYTHON_OPTION,
-    batch_size: int = _BATCH,
     resampling: Resampling | None = None,
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
@@ -140,12 +102,9 @@ def evaluate(
         source: Origin of the scenes.
         made_with: Provenance: ``solver``, ``steps``, ``seed``, ``precision``, ``feature_source``,
             and anything else that JSON can hold.
-        commit: Version of the code.
         allow_few: Accept fewer scenes than features.
         skip_bad: Leave out scenes that are empty, hold NaN or have another size; the result lists
             them as ``bad_samples`` of ``extra``.
-        option: How the caller sets ``allow_few`` and ``skip_bad``, for messages.
-        batch_size: Scenes per pass of a network.
         resampling: Seed, and cost of the intervals.
 
     Raises:
@@ -165,23 +124,17 @@ def evaluate(
         max_images=(None, protocol.num_mmd_samples),
     )
     bad: list[str] | None = [] if skip_bad else None
-    advice = f". {option.format('skip_bad')} leaves such scenes out, and lists them"
     stream, names = iter(scenes), []
-    counted = islice(usable_scenes(stream, protocol, bad, advice), protocol.num_samples)
-    for batch, features in with_features(counted, spaces, batch_size):
+    counted = islice(usable_scenes(stream, protocol, bad, _SKIP_BAD), protocol.num_samples)
+    for batch, features in with_features(counted, spaces):
         update_with(metrics, batch, features, real=False)
         names += [scene.name for scene in batch]
     more = next(stream, None) is not None
+    check_counts(len(names), reference, spaces, allow_few, bad or ())
 
-    counts = {"generated scenes": len(names)}
-    if isinstance(reference, ReferenceStatistics):
-        counts["real scans"] = reference.count()
-        reference.fill(metrics)
-    else:
-        reference.fill(metrics, spaces)
-    check_counts(counts, spaces, allow_few, option, bad or ())
-    by_name = metrics_of(metrics)
-    match = cast(MinimumMatchingDistance, by_name["matching"])
+    reference.fill(metrics, spaces)
+    by_name: dict[str, Any] = metrics_of(metrics)
+    match = by_name["matching"]
     known = match.matching() if match.has_reference else None
     rows: list[MetricResult] = []
     for metric in by_name.values():
@@ -189,22 +142,39 @@ def evaluate(
             rows += match.results(resampling, known)
         elif metric.has_reference:
             rows += metric.results(resampling)
-    about = _about(len(names), more, spaces, reference, made_with, commit, source)
-    extra = about["extra"]
+
+    extra = dict(made_with or {})
+    told = ("solver", "steps", "seed", "precision", "feature_source")
+    about = {key: extra.pop(key, None) for key in told}
+    if more:
+        extra["scenes"] = f"only the first {len(names)} were used, as many as the protocol counts"
+    elif len(names) < protocol.num_samples:
+        extra["scenes"] = f"{len(names)}, where the protocol asks for {protocol.num_samples}"
     floors: dict[str, MetricResult] = {}
-    if isinstance(reference, OfficialStatistics):
-        extra["left_out"] = reference.left_out
-    else:
+    if isinstance(reference, ReferenceStatistics):
         num_images = len(match.kept("generated")[0])
         floors = _floors(reference, spaces, len(names), num_images, resampling)
         extra["verdict"] = _verdict(rows, floors)
+    else:
+        extra["left_out"] = reference.left_out
     extra["bootstrap"] = dict(vars(resampling))
     if warning := _other_sensor(match):
         extra["warning"] = warning
     if bad:
         extra["bad_samples"] = bad
+    about |= {
+        "backbones": {space.label: dict(space.card) for space in spaces},
+        "protocol": protocol.to_dict(),
+        "reference": reference.describe(),
+        "commit": source_commit(),
+        "source": source,
+        "extra": extra,
+    }
     evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    return Comparison(evaluation, metrics, reference, known, names)
+    figures = None
+    if isinstance(reference, ReferenceStatistics) and known:
+        figures = _figures(by_name, reference, known, names)
+    return Comparison(evaluation, figures)
 
 
 def scene_distance(
@@ -254,10 +224,10 @@ def scene_distance(
 
 
 def check_counts(
-    counts: Mapping[str, int],
+    num_scenes: int,
+    reference: AnyReference,
     spaces: Sequence[SceneFeatures],
     allow_few: bool,
-    option: str = PYTHON_OPTION,
     bad: Sequence[str] = (),
 ) -> None:
     """Refuses fewer than two scenes and, unless allowed, fewer than features.
@@ -266,12 +236,14 @@ def check_counts(
         TooFewScenesError: If there are fewer than two generated scenes.
         ValueError: Naming the kinds and the spaces.
     """
-    num_samples = counts["generated scenes"]
-    if num_samples < 2:
+    if num_scenes < 2:
         left_out = f" {len(bad)} cannot be used, the first is {bad[0]}" if bad else ""
         raise TooFewScenesError(
-            f"{num_samples} generated scenes; a comparison needs at least 2.{left_out}"
+            f"{num_scenes} generated scenes; a comparison needs at least 2.{left_out}"
         )
+    counts = {"generated scenes": num_scenes}
+    if reference.names:
+        counts["real scans"] = len(reference.names)
     few = [
         f"{count} {what} for the {space.dim} features of {space.label}"
         for space in spaces
@@ -281,8 +253,8 @@ def check_counts(
     if few and not allow_few:
         raise ValueError(
             f"{'; '.join(few)}: the covariance would be singular, and the distance tell mostly how "
-            "few there are. Give more, choose a smaller space, or allow it with "
-            + option.format("allow_few")
+            "few there are. Give more, choose a smaller space, or allow it with --allow_few "
+            "(`r3dpa test`: --scorer.allow_few true)"
         )
 
 
@@ -331,34 +303,6 @@ def reference_spaces(
     return spaces
 
 
-def _about(
-    count: int,
-    more: bool,
-    spaces: Sequence[SceneFeatures],
-    reference: AnyReference,
-    made_with: Mapping[str, Any] | None,
-    commit: str | None,
-    source: str,
-) -> dict[str, Any]:
-    extra, protocol = dict(made_with or {}), reference.protocol
-    known = ("solver", "steps", "seed", "precision", "feature_source")
-    given = {key: extra.pop(key, None) for key in known}
-    if more:
-        extra["scenes"] = f"only the first {count} were used, as many as the protocol counts"
-    elif count < protocol.num_samples:
-        extra["scenes"] = f"{count}, where the protocol asks for {protocol.num_samples}"
-    return {
-        "backbones": {space.label: dict(space.card) for space in spaces},
-        "protocol": protocol.to_dict(),
-        "reference": reference.describe(),
-        **given,
-        "commit": commit,
-        "published": False,
-        "source": source,
-        "extra": extra,
-    }
-
-
 def _floors(
     reference: ReferenceStatistics,
     spaces: Sequence[SceneFeatures],
@@ -367,16 +311,16 @@ def _floors(
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
     """Rows of the first half of the reference as if it were generated, against the second."""
-    if min(reference.count(0), reference.count(1)) < 2:
+    if min(map(reference.count, (0, 1))) < 2:
         return {}
-    held: dict[str, Any] = metrics_of(reference.halves[0])
     names = [space.name for space in spaces]
     metrics = reference.metrics(names, max_images=(None, num_images))
-    reference.fill(metrics, 1)
-    own: dict[str, Any] = metrics_of(metrics)
+    held, other, own = ({**metrics_of(part)} for part in (*reference.halves, metrics))
+    for name, metric in own.items():
+        metric.adopt_real(other[name])
     places, images = held["matching"].kept("real")
-    of_first = [reference.names_of_half(0)[place] for place in places]
-    own["matching"].update(images, real=False, names=of_first)
+    of_first = reference.names_of_half(0)
+    own["matching"].update(images, real=False, names=[of_first[place] for place in places])
     if num_samples <= len(images):
         chosen = images[held["matching"].lowest("real", num_samples)]
         own["cells"].update(own["matching"].clouds(chosen), real=False)
@@ -386,7 +330,7 @@ def _floors(
             own[name].generated_bins[0] = held[name].real_bins
             own[name].generated_count = held[name].real_count.clone()
     for name in names:
-        rows = cast(FeatureMetric, held[f"{name}_frechet"]).rows("real")
+        rows = held[f"{name}_frechet"].rows("real")
         chosen = torch.randperm(len(rows), generator=resampling.generator())[:num_samples]
         own[f"{name}_frechet"].update(rows[chosen], real=False)
     without = replace(resampling, num_resamples=0)
@@ -447,3 +391,38 @@ def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> Metric
         text += f", rather {'high' if fewer else 'low'}: the value is of {row.num_samples} scenes"
     note = "; ".join(filter(None, [row.note, text]))
     return replace(row, floor=max(floor.value, 0.0), note=note)
+
+
+def _figures(
+    metrics: Mapping[str, Any],
+    reference: ReferenceStatistics,
+    matching: Matching,
+    names: Sequence[str],
+) -> dict[str, Any]:
+    """Data of the figures; ``matching`` is of the real scans that are kept."""
+    protocol, ranges, match = reference.protocol, metrics["ranges"], metrics["matching"]
+    halves: list[dict[str, Any]] = [{**metrics_of(half)} for half in reference.halves]
+    cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
+    (places, samples), (_, scans) = match.kept("generated"), match.kept("real")
+    of_scans = [
+        reference.names_of_half(index)[place]
+        for index, half in enumerate(halves)
+        for place in half["matching"].kept("real")[0]
+    ]
+    pairs = []
+    for index in matching.squared_normalised.argsort().tolist():
+        nearest = int(matching.nearest[index])
+        pair = f"{names[places[nearest]]} and {of_scans[index]}"
+        title = f"{pair}: {matching.squared_normalised[index]:.3g}"
+        pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
+    counted = [half["ranges"] for half in halves if half["ranges"].count("real")]
+    return {
+        "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
+        "limits_m": ((-protocol.grid.half_m, protocol.grid.half_m),) * 2,
+        "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
+        "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
+        "halves": torch.stack([half.real_bins for half in counted]).numpy(),
+        "best": pairs[:_SHOWN_MATCHES],
+        "worst": pairs[::-1][:_SHOWN_MATCHES],
+        "sensor": protocol.sensor,
+    }

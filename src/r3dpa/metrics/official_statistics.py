@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,8 +19,7 @@ from torch import Tensor
 from torchmetrics import MetricCollection
 
 from r3dpa.io import UNPICKLING_ERRORS
-from r3dpa.metrics.distances import BEVHistogramDistance, MinimumMatchingDistance
-from r3dpa.metrics.feature_distances import FrechetDistance, metrics_of
+from r3dpa.metrics.feature_distances import metrics_of
 from r3dpa.metrics.scene import PUBLISHED
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -29,17 +28,14 @@ OfficialSplit = Literal["val", "all"]
 _EVALUATORS = {"fld": "liploc", "fsvd": "minkowskinet", "fpvd": "spvcnn"}
 _FRID = {4: "rangevit_wo_i", 5: "rangevit_w_i"}  # by input channels
 _HISTOGRAM, _CLOUDS = "dataset_bev_hist", "valset_voxelized_bev"
-_MAGIC = b"\x93NUMPY"
-_SYMMETRY = 1e-5  # of the largest entry of a covariance
 
 
 def is_official(path: str | Path) -> bool:
     """Whether a file is in NumPy's format, which no file of ``r3dpa reference`` is."""
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         return False
-    with path.open("rb") as stream:
-        return stream.read(len(_MAGIC)) == _MAGIC
+    with Path(path).open("rb") as stream:
+        return stream.read(6) == b"\x93NUMPY"
 
 
 @dataclass(frozen=True)
@@ -61,6 +57,7 @@ class OfficialStatistics:
     clouds: Sequence[Tensor]
 
     protocol = PUBLISHED
+    names = halves = ()  # unknown
 
     @property
     def about(self) -> dict[str, Any]:
@@ -97,53 +94,57 @@ class OfficialStatistics:
         mean, covariance = self.moments[key]
         if len(mean) != space.dim:
             raise ValueError(
-                f"{where}.{key}.mu: has {len(mean)} numbers, but {space.name} has {space.dim} "
-                "features; give the weights that it was made with"
+                f"{where}.{key}: has {len(mean)} features, but {space.name} has {space.dim}; give "
+                "the weights that it was made with"
             )
         return mean, covariance
 
-    def check(self, spaces: Sequence[SceneFeatures]) -> None:
-        """Refuses spaces that the file lacks, and a file that has nothing to compare with."""
+    def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
+        """Refuses spaces that the file lacks."""
         for space in spaces:
             self.of_space(space)
-        if not spaces and self.cells is None and not self.clouds:
-            raise ValueError(f"{self.path}: nothing to compare; choose spaces that it holds")
 
     def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures]) -> None:
         """Sets the real side of the metrics that the file has something for."""
-        by_name = metrics_of(metrics)
+        by_name: dict[str, Any] = metrics_of(metrics)
         if self.cells is not None:
-            cast(BEVHistogramDistance, by_name["cells"]).real_bins = self.cells
-        matching = cast(MinimumMatchingDistance, by_name["matching"])
-        matching.reference_cells = list(self.clouds[: self.protocol.num_mmd_references])
+            by_name["cells"].real_bins = self.cells
+        by_name["matching"].reference_cells = list(self.clouds)
         for space in spaces:
-            frechet = cast(FrechetDistance, by_name[f"{space.name}_frechet"])
-            frechet.reference = self.of_space(space)
+            by_name[f"{space.name}_frechet"].reference = self.of_space(space)
 
     @classmethod
     def load(cls, path: str | Path, split: OfficialSplit | None = None) -> OfficialStatistics:
         """Reads the file without executing anything in it; ``val`` comes first without a split.
 
         Raises:
-            ValueError: If the file is missing, damaged or of something else, lacks the split, or a
-                field is wrong; names file and field.
+            ValueError: If the file is missing, damaged or of something else, or lacks the split.
         """
         path = Path(path)
-        content = _read(path)
-        chosen = split or next((name for name in get_args(OfficialSplit) if name in content), None)
-        part = content.get(chosen)
-        if chosen is None or not isinstance(part, dict):
+        try:
+            with path.open("rb") as stream:
+                version = np.lib.format.read_magic(stream)
+                getattr(np.lib.format, f"read_array_header_{version[0]}_0")(stream)
+                content = _ArraysOnly(stream).load().item()
+            chosen: OfficialSplit = split or ("val" if "val" in content else "all")
+            part = content[chosen]
+            moments = {
+                key: (_numbers(part[key]["mu"], 1), _numbers(part[key]["sigma"], 2))
+                for key in (*_FRID.values(), *_EVALUATORS.values())
+                if key in part
+            }
+            cells = None
+            if _HISTOGRAM in part:
+                cells = _numbers(part[_HISTOGRAM], 2).view(PUBLISHED.grid.shape).flatten()
+            parts = part[_CLOUDS]["points"] if _CLOUDS in part else []
+            clouds = [_cells(cloud) for cloud in parts[: PUBLISHED.num_mmd_references]]
+        except UNPICKLING_ERRORS as error:
             raise ValueError(
-                f"{path}: holds no split {chosen or 'val or all'}, its fields are "
-                f"{', '.join(map(str, content)) or 'none'}; give the official statistics file"
-            )
-        where = f"{path}, field {chosen}"
-        keys = [key for key in (*_FRID.values(), *_EVALUATORS.values()) if key in part]
-        moments = {key: _moments(part[key], f"{where}.{key}") for key in keys}
-        cells = _histogram(part, f"{where}.{_HISTOGRAM}") if _HISTOGRAM in part else None
-        clouds = _clouds(part[_CLOUDS], f"{where}.{_CLOUDS}") if _CLOUDS in part else []
+                f"{path}: is no official statistics file with the split {split or 'val or all'} "
+                f"({error!r}); give its data_statistics.npy"
+            ) from error
         if not moments and not clouds and cells is None:
-            raise ValueError(f"{where}: holds no statistics; give the official statistics file")
+            raise ValueError(f"{path}, field {chosen}: holds no statistics")
         return cls(path, chosen, moments, cells, clouds)
 
 
@@ -159,72 +160,18 @@ class _ArraysOnly(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
 
 
-def _read(path: Path) -> dict[Any, Any]:
-    try:
-        with path.open("rb") as stream:
-            version = np.lib.format.read_magic(stream)
-            head = getattr(np.lib.format, f"read_array_header_{version[0]}_0")(stream)
-            if head[0] != () or not head[2].hasobject:
-                raise ValueError(f"an array {head[0]} of {head[2]} instead of one dictionary")
-            content = _ArraysOnly(stream).load()
-        content = content.item() if isinstance(content, np.ndarray) else content
-        if not isinstance(content, dict):
-            raise ValueError(f"holds a {type(content).__name__} instead of a dictionary")
-    except UNPICKLING_ERRORS as error:
-        raise ValueError(
-            f"{path}: is no official statistics file ({error}); give its data_statistics.npy"
-        ) from error
-    return content
+def _numbers(values: np.ndarray, ndim: int) -> Tensor:
+    """Finite numbers as float64."""
+    if values.ndim != ndim or not np.isfinite(values).all():
+        raise ValueError(f"an array of shape {values.shape} instead of {ndim} axes of numbers")
+    return torch.from_numpy(values.astype(np.float64))
 
 
-def _array(parent: Any, key: str, where: str, ndim: int) -> np.ndarray:
-    """A finite array of float64 from a dictionary."""
-    value = parent.get(key) if isinstance(parent, dict) else None
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != ndim:
-        raise ValueError(f"{where}: needs an array of numbers with {ndim} axes; get the file again")
-    if not np.isfinite(value).all():
-        raise ValueError(f"{where}: holds NaN or infinite numbers; get the file again")
-    return value.astype(np.float64)
-
-
-def _moments(value: Any, where: str) -> tuple[Tensor, Tensor]:
-    mean = _array(value, "mu", f"{where}.mu", 1)
-    covariance = _array(value, "sigma", f"{where}.sigma", 2)
-    if covariance.shape != (len(mean), len(mean)):
-        raise ValueError(
-            f"{where}.sigma: has shape {covariance.shape}, but mu has {len(mean)} numbers"
-        )
-    largest = np.abs(covariance).max(initial=0.0)
-    if np.abs(covariance - covariance.T).max(initial=0.0) > _SYMMETRY * largest:
-        raise ValueError(f"{where}.sigma: is not symmetric, so no covariance; get the file again")
-    return torch.from_numpy(mean), torch.from_numpy(covariance)
-
-
-def _histogram(part: dict[str, Any], where: str) -> Tensor:
-    counts = _array(part, _HISTOGRAM, where, 2)
-    if counts.shape != PUBLISHED.grid.shape or (counts < 0).any() or not counts.any():
-        raise ValueError(
-            f"{where}: needs counts of scans in {PUBLISHED.grid.shape} cells, at least 0 and not "
-            f"all 0, got {counts.shape}"
-        )
-    return torch.from_numpy(counts).flatten()
-
-
-def _clouds(value: Any, where: str) -> list[Tensor]:
-    """Occupied cells of the scans that MMD may use."""
-    parts = value.get("points") if isinstance(value, dict) else None
-    if not isinstance(parts, list) or not parts:
-        raise ValueError(f"{where}.points: needs a list of clouds, got {type(parts).__name__}")
-    side, clouds = PUBLISHED.grid.shape[0], []
-    for index, part in enumerate(parts[: PUBLISHED.num_mmd_references]):
-        name = f"{where}.points[{index}]"
-        scaled = _array({name: part}, name, name, 2) * side
-        cells = np.rint(scaled)
-        inside = scaled.shape[1] == 2 and len(scaled) and (cells >= 0).all()
-        if not inside or (cells >= side).any() or np.abs(cells - scaled).max() > 0.01:
-            raise ValueError(
-                f"{name}: needs occupied cells (n, 2) divided by {side}, got {part.shape}"
-            )
-        index_of = torch.from_numpy(cells).long()
-        clouds.append((index_of[:, 0] * side + index_of[:, 1]).unique())
-    return clouds
+def _cells(points: np.ndarray) -> Tensor:
+    """Indices of occupied cells from their coordinates, which the file divides by the side."""
+    side = PUBLISHED.grid.shape[0]
+    scaled = _numbers(points, 2) * side
+    cells = scaled.round()
+    if ((cells < 0) | (cells >= side) | ((cells - scaled).abs() > 0.01)).any():
+        raise ValueError(f"occupied cells that are not multiples of 1 / {side}")
+    return (cells.long() @ torch.tensor([side, 1])).unique()

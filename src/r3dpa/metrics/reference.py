@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from glob import escape
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -31,7 +31,6 @@ from r3dpa.metrics.scene_features import SceneFeatures
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 2
 _EVERY = 2000  # scans between two saves of an unfinished reference
-_BATCH = 8
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +49,8 @@ class ReferenceStatistics:
         ValueError: If there are fewer than two scans, or a name occurs twice.
     """
 
+    left_out = ""
+
     def __init__(
         self,
         protocol: Protocol,
@@ -66,8 +67,7 @@ class ReferenceStatistics:
         self.protocol, self.spaces, self.about = protocol, spaces, about
         self.names, self._half_of = tuple(names), split_halves(names)
         self.num_done = 0
-        second = sum(self._half_of.values())
-        sizes = (len(names) - second, second)
+        sizes = [len(self.names_of_half(index)) for index in (0, 1)]
         rows, images = (
             _kept_of_halves(limit, sizes)
             for limit in (protocol.num_samples, protocol.num_mmd_references)
@@ -93,29 +93,19 @@ class ReferenceStatistics:
         cards = {name: (card["label"], card["dim"]) for name, card in chosen.items()}
         return scene_metrics(self.protocol, cards, **options)
 
-    def fill(self, metrics: MetricCollection, *halves: int) -> None:
-        """Sets the real side of metrics to the scans of both halves, or of one."""
-        parts = [metrics_of(self.halves[i]) for i in halves or (0, 1)]
+    def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures] = ()) -> None:
+        """Sets the real side of metrics to the scans of both halves."""
+        parts = [metrics_of(half) for half in self.halves]
         for name, metric in metrics_of(metrics).items():
             metric.adopt_real(*(part[name] for part in parts))
 
-    def count(self, *halves: int) -> int:
-        """Scans of both halves, or of one."""
-        parts = [metrics_of(self.halves[i])["cells"] for i in halves or (0, 1)]
-        return sum(part.count("real") for part in parts)
+    def count(self, half: int) -> int:
+        """Scans of a half that were added."""
+        return metrics_of(self.halves[half])["cells"].count("real")
 
     def names_of_half(self, index: int) -> list[str]:
         """Names of the scans of a half, in their order."""
         return [name for name in self.names if self._half_of[name] == index]
-
-    @property
-    def kept_images(self) -> list[str]:
-        """Names of the scans whose range images are kept, first half first."""
-        return [
-            self.names_of_half(index)[place]
-            for index, half in enumerate(self.halves)
-            for place in cast(Any, metrics_of(half)["matching"]).kept("real")[0]
-        ]
 
     @property
     def complete(self) -> bool:
@@ -123,20 +113,16 @@ class ReferenceStatistics:
         return self.num_done == len(self.names)
 
     def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
-        """A ``ValueError`` if scans are missing, or as :meth:`check_spaces`."""
+        """Refuses incomplete statistics, and spaces that they lack or that are not the same.
+
+        Raises:
+            ValueError: Naming the space and the fields that differ.
+        """
         if not self.complete:
             raise ValueError(
                 f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
                 "command to complete it"
             )
-        self.check_spaces(spaces)
-
-    def check_spaces(self, spaces: Sequence[SceneFeatures]) -> None:
-        """Refuses spaces that the statistics lack or that were made with something else.
-
-        Raises:
-            ValueError: Naming the space and the fields that differ.
-        """
         for space in spaces:
             if space.name not in self.spaces:
                 raise ValueError(
@@ -164,7 +150,6 @@ class ReferenceStatistics:
         spaces: Sequence[SceneFeatures],
         partial: Path | None = None,
         every: int = _EVERY,
-        batch_size: int = _BATCH,
     ) -> None:
         """Add the scans that are missing; interruptions change no bit of the result.
 
@@ -173,65 +158,58 @@ class ReferenceStatistics:
             spaces: Those that the statistics were prepared for.
             partial: File to save to every ``every`` scans and on a ``KeyboardInterrupt``.
             every: Rounded up to whole batches.
-            batch_size: Scans per pass of a network.
 
         Raises:
-            ValueError: If a scan is not the next one, there are too few, or one cannot be used;
-                the message names it.
+            ValueError: If a scan is not the next one or cannot be used; names it.
         """
-        self.check_spaces(spaces)
-        every = -(-every // batch_size) * batch_size
-        whole = True  # never saved in the middle of a batch
+        saved, whole = self.num_done, True  # never saved in the middle of a batch
         try:
-            batches = with_features(usable_scenes(scenes, self.protocol), spaces, batch_size)
-            for batch, features in batches:
+            for batch, features in with_features(usable_scenes(scenes, self.protocol), spaces):
                 whole = False
                 self._add(batch, features)
                 whole = True
-                if partial is not None and self.num_done % every == 0 and not self.complete:
+                if partial is not None and self.num_done - saved >= every:
                     self.save(partial)
+                    saved = self.num_done
         except KeyboardInterrupt:
             if whole and partial is not None and self.num_done:
                 self.save(partial)
             raise
-        if not self.complete:
-            raise ValueError(f"got {self.num_done} of {len(self.names)} scans; give all of them")
 
     def _add(self, batch: Sequence[EvaluationScene], features: dict[str, Tensor]) -> None:
         expected = self.names[self.num_done : self.num_done + len(batch)]
         if tuple(scene.name for scene in batch) != expected:
-            raise ValueError(
-                f"the scans from number {self.num_done} on are {[s.name for s in batch]}, but "
-                f"{list(expected)} were announced: give them in the order of their names"
-            )
+            raise ValueError(f"{batch[0].name}: not the next scan; give all, in announced order")
         for index, part in enumerate(self.halves):
             own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
             of_half = {name: values[own] for name, values in features.items()}
             update_with(part, [batch[i] for i in own], of_half, real=True)
         self.num_done += len(batch)
 
+    def _keeping(self, half: int) -> list[tuple[str, str, Any]]:
+        """Metrics of a half that keep single scans, with names of their tensors and places."""
+        metrics = metrics_of(self.halves[half])
+        found = [(f"{half}.features.{s}", "rows", metrics[f"{s}_frechet"]) for s in self.spaces]
+        return [*found, (f"{half}.images", "images", metrics["matching"])]
+
     def save(self, path: str | Path) -> None:
         """Writes everything to one ``.safetensors`` file, its card in the metadata."""
         tensors: dict[str, Tensor] = {}
         chosen = []
-        for index, part in enumerate(self.halves):
-            names = self.names_of_half(index)
-            metrics: dict[str, Any] = metrics_of(part)
-            places: dict[str, list[int]] = {"rows": [], "images": []}
+        for index, half in enumerate(self.halves):
+            names, places = self.names_of_half(index), {"rows": [], "images": []}
+            for key, kind, metric in self._keeping(index):
+                kept, tensors[key] = metric.kept("real")
+                places[kind] = [(names[place], place) for place in kept.tolist()]
+            chosen.append(places)
+            metrics: dict[str, Any] = metrics_of(half)
             for space in self.spaces:
-                metric = metrics[f"{space}_frechet"]
-                kept, rows = metric.kept("real")
-                places["rows"] = kept.tolist()
-                tensors[f"{index}.moments.{space}"] = metric.real_moments
-                tensors[f"{index}.features.{space}"] = rows
-            kept, images = metrics["matching"].kept("real")
-            places["images"], tensors[f"{index}.images"] = kept.tolist(), images
+                tensors[f"{index}.moments.{space}"] = metrics[f"{space}_frechet"].real_moments
             cells = metrics["cells"].real_bins
             occupied = cells.nonzero()[:, 0]
             tensors[f"{index}.cells"] = occupied.int()
             tensors[f"{index}.cell_counts"] = cells[occupied]
             tensors[f"{index}.ranges"] = metrics["ranges"].real_bins[None]
-            chosen.append({key: [(names[i], i) for i in of] for key, of in places.items()})
         card = {
             "version": _VERSION,
             "protocol": self.protocol.to_dict(),
@@ -243,11 +221,8 @@ class ReferenceStatistics:
             "chosen": chosen,
         }
         with atomic_path(path) as temporary:
-            save_file(
-                {name: tensor.contiguous() for name, tensor in tensors.items()},
-                temporary,
-                metadata={_ABOUT: json.dumps(card)},
-            )
+            contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
+            save_file(contiguous, temporary, metadata={_ABOUT: json.dumps(card)})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -273,81 +248,73 @@ class ReferenceStatistics:
         return reference
 
     def _load_half(self, tensors: dict[str, Tensor], index: int, card: dict[str, Any]) -> None:
-        def tensor(key: str, *shape: int) -> Tensor:
-            found = tensors.get(f"{index}.{key}")
-            if found is None or found.shape != shape:
+        def tensor(key: str, shape: Sequence[int]) -> Tensor:
+            found = tensors.get(key)
+            if found is None or found.shape != tuple(shape):
                 given = "is missing" if found is None else f"has shape {tuple(found.shape)}"
-                raise ValueError(f"tensor {index}.{key} {given}, expected {shape}")
+                raise ValueError(f"tensor {key} {given}, expected {tuple(shape)}")
             return found
 
         metrics: dict[str, Any] = metrics_of(self.halves[index])
-        chosen, sensor = card["chosen"][index], self.protocol.sensor
-        rows, images = chosen["rows"], chosen["images"]
         for metric in metrics.values():
             metric.real_count = torch.tensor(card["counts"][index])
-        for space, about in self.spaces.items():
-            metric, width = metrics[f"{space}_frechet"], about["dim"]
-            metric.real_moments = tensor(f"moments.{space}", 1 + width + width**2)
-            values = tensor(f"features.{space}", len(rows), width)
-            metric.load_kept("real", rows, values)
-        stack = tensor("images", len(images), sensor.beams, sensor.columns)
-        metrics["matching"].load_kept("real", images, stack)
-        occupied = len(tensors.get(f"{index}.cells", ()))
-        cells = tensor("cells", occupied).long()
-        metrics["cells"].real_bins[cells] = tensor("cell_counts", occupied)
-        bins = metrics["ranges"].real_bins
-        metrics["ranges"].real_bins = tensor("ranges", 1, len(bins))[0]
+        for space in self.spaces:
+            metric = metrics[f"{space}_frechet"]
+            metric.real_moments = tensor(f"{index}.moments.{space}", metric.real_moments.shape)
+        for key, kind, metric in self._keeping(index):
+            chosen, (_, width) = card["chosen"][index][kind], metric.kept("real")
+            metric.load_kept("real", chosen, tensor(key, (len(chosen), *width.shape[1:])))
+        cells, bins = tensors.get(f"{index}.cells", torch.zeros(0)), metrics["ranges"].real_bins
+        counts = tensor(f"{index}.cell_counts", cells.shape)
+        metrics["cells"].real_bins[cells.long()] = counts
+        metrics["ranges"].real_bins = tensor(f"{index}.ranges", (1, *bins.shape))[0]
 
 
-def complete_reference(
+def compute_reference(
     job: ReferenceStatistics,
     scans_from: Callable[[int], Iterable[EvaluationScene]],
     spaces: Sequence[SceneFeatures],
     out: Path,
-    every: int = _EVERY,
+    renew: bool = False,
 ) -> ReferenceStatistics:
-    """Statistics of scans as a file; resumes an interrupted call.
+    """Statistics of scans as a file; reads or resumes what an earlier call has left.
+
+    Args:
+        job: Empty statistics of the scans.
+        scans_from: Scans of the job from a number on.
+        spaces: Those that the statistics were prepared for.
+        out: File to write.
+        renew: Replace files of other jobs, such as those of other scans.
 
     Raises:
-        ValueError: If the unfinished file is of another job, another process computes ``out``, or
-            a scan cannot be used.
+        ValueError: If, without ``renew``, a file is of another job; if another process computes
+            ``out``, or a scan cannot be used.
     """
+    partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
-        partial = _partial(out)
         for path in out.parent.glob(f".{escape(partial.stem)}.*.partial.*"):
             path.unlink(missing_ok=True)  # of a killed call
-        statistics = resume_or_start(job, partial)
-        start, total = statistics.num_done, len(statistics.names)
-        scenes = tqdm(
-            scans_from(start), "reference", total, initial=start, unit="scan", disable=None
-        )
-        statistics.update(scenes, spaces, partial, every)
-        statistics.save(partial)
-        partial.replace(out)
+        statistics = job
+        for path in (partial, out):
+            try:
+                statistics = resume_or_start(statistics, path)
+            except ValueError as error:
+                if not renew:
+                    raise
+                _log.warning("made anew: %s", error)
+                path.unlink()
+        if not (statistics.complete and out.exists()):
+            start, total = statistics.num_done, len(statistics.names)
+            scans = scans_from(start)
+            scenes = tqdm(scans, "reference", total, initial=start, unit="scan", disable=None)
+            statistics.update(scenes, spaces, partial)
+            statistics.save(out)
+            partial.unlink(missing_ok=True)
         return statistics
 
 
-def cached_reference(
-    job: ReferenceStatistics,
-    scans_from: Callable[[int], Iterable[EvaluationScene]],
-    spaces: Sequence[SceneFeatures],
-    out: Path,
-) -> ReferenceStatistics:
-    """The same, but read from ``out`` if that file is of the same job, and else replacing it."""
-    for path in (out, _partial(out)):
-        try:
-            found = resume_or_start(job, path)
-        except ValueError as error:  # of other scans, spaces or settings, or damaged
-            _log.warning("made anew: %s", error)
-            path.unlink()
-        else:
-            if found.complete:
-                return found
-    return complete_reference(job, scans_from, spaces, out)
-
-
 def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
-    """Statistics that an interrupted job has saved, or the empty ones without a file.
+    """Statistics that an interrupted job has saved, or the given ones without a file.
 
     Raises:
         ValueError: If the file is of another job.
@@ -388,11 +355,7 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
     return {name: half for half, scans in enumerate(halves) for name in scans}
 
 
-def _kept_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
+def _kept_of_halves(limit: int, sizes: Sequence[int]) -> tuple[int, int]:
     """Limits of the halves: half the limit, and the scans that the other half lacks."""
     first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
     return first, min(sizes[1], limit - first)
-
-
-def _partial(out: Path) -> Path:
-    return out.with_name(f"{out.stem}.partial{out.suffix}")
