@@ -137,7 +137,7 @@ def test_the_reference_is_kept_while_it_fits(words, smoke_root, tmp_path, monkey
     [
         (
             ["--scorer.allow_few=false"],
-            "4 generated scenes for the 64 features of FGEO; 12.*with --scorer.allow_few true",
+            "4 generated scenes for the 64 features of FGEO; 12.*--scorer.allow_few true",
         ),
         (["--scorer.protocol=published"], "the reference is of the protocol default, not publi"),
         (["--scorer.spaces=[frid]"], r"frid needs its official weights.*--scorer\.ckpt\.frid"),
@@ -190,7 +190,9 @@ def test_an_empty_scene_is_counted_and_listed(reference, words, tmp_path, emptie
     assert note in printed
     assert stored.bad_samples[0] in printed
     assert note in (out / "table.md").read_text()
-    stop = "000002: no pixel of the range image.*--scorer.skip_bad true leaves such scenes out"
+    stop = (
+        "000002: no pixel of the range image.*--skip_bad leaves such scenes out.*--scorer.skip_bad"
+    )
     with pytest.raises(ValueError, match=stop):
         main(words(tmp_path, *given, "--scorer.skip_bad=false"))
 

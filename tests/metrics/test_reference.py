@@ -10,6 +10,7 @@ from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.feature_distances import metrics_of
 from r3dpa.metrics.reference import (
     ReferenceStatistics,
+    compute_reference,
     resume_or_start,
     split_halves,
 )
@@ -44,9 +45,9 @@ def empty(count=11, spaces=(TOY,), **changes):
     return ReferenceStatistics.prepare(spaces, replace(PROTOCOL, **changes), names, about)
 
 
-def filled():
-    reference = empty()
-    reference.update(scenes(), [TOY], batch_size=2)
+def filled(count=11):
+    reference = empty(count)
+    reference.update(scenes(count), [TOY])
     return reference
 
 
@@ -63,7 +64,9 @@ def test_moments_and_histograms_are_those_of_all_scans():
     moments = metrics["toy_frechet"].moments("real")
     assert moments.mean.numpy() == pytest.approx(features.mean(axis=0), rel=1e-9)
     assert moments.covariance().numpy() == pytest.approx(np.cov(features.T), rel=1e-9)
-    assert reference.count() == moments.count == metrics["matching"].count("real") == 11
+    assert (
+        moments.count == metrics["cells"].count("real") == metrics["matching"].count("real") == 11
+    )
     values = torch.cat([scene.range_m.flatten() for scene in scenes()])
     counts, _ = np.histogram(values.numpy(), bins=560, range=(0, 56))
     ranges = metrics["ranges"].real_bins
@@ -75,6 +78,11 @@ def test_moments_and_histograms_are_those_of_all_scans():
     assert torch.equal(metrics["cells"].real_bins.view(100, 100).long(), expected)
 
 
+def names_of_kept(reference, half):
+    places, _ = metrics_of(reference.halves[half])["matching"].kept("real")
+    return [reference.names_of_half(half)[place] for place in places]
+
+
 def test_kept_scans_are_few_and_the_halves_have_different_drives():
     reference = filled()
     drives = [{n.split("/")[0] for n in reference.names_of_half(half)} for half in (0, 1)]
@@ -84,9 +92,10 @@ def test_kept_scans_are_few_and_the_halves_have_different_drives():
         metrics = metrics_of(half)
         assert metrics["toy_frechet"].rows("real").shape == (4, 2)
         assert len(metrics["matching"].kept("real")[0]) == 2
+    kept = [name for half in (0, 1) for name in names_of_kept(reference, half)]
     images = {scene.name: scene.range_m for scene in scenes()}
-    _, kept = whole(reference)["matching"].kept("real")
-    for name, image in zip(reference.kept_images, kept, strict=True):
+    _, stored = whole(reference)["matching"].kept("real")
+    for name, image in zip(kept, stored, strict=True):
         assert torch.equal(image, images[name])
     assert whole(reference)["toy_kid"].rows("real").shape == (8, 2)
 
@@ -147,21 +156,48 @@ def test_a_reference_comes_back_from_its_file(tmp_path):
 
 def test_resumed_is_the_same_as_undisturbed(tmp_path):
     undisturbed, partial = tmp_path / "a.safetensors", tmp_path / "partial.safetensors"
-    filled().save(undisturbed)
+    filled(27).save(undisturbed)
 
-    def killed():
-        for index, scene in enumerate(scenes()):
-            if index == 9:
-                raise KeyboardInterrupt
+    def killed(error):
+        for index, scene in enumerate(scenes(27)):
+            if index == 23:  # in the third batch of 8
+                raise error
             yield scene
 
     with pytest.raises(KeyboardInterrupt):
-        empty().update(killed(), [TOY], partial, every=3, batch_size=2)  # every 4, whole batches
-    resumed = resume_or_start(empty(), partial)
-    assert resumed.num_done == 8
-    resumed.update(list(scenes())[8:], [TOY], partial, every=3, batch_size=2)
+        empty(27).update(killed(KeyboardInterrupt), [TOY], partial)
+    assert resume_or_start(empty(27), partial).num_done == 16
+    with pytest.raises(OSError, match="disk"):  # saved every 9 scans, in whole batches
+        empty(27).update(killed(OSError("disk")), [TOY], partial, every=9)
+    resumed = resume_or_start(empty(27), partial)
+    assert resumed.num_done == 16
+    resumed.update(list(scenes(27))[16:], [TOY], partial)
     resumed.save(partial)
     assert partial.read_bytes() == undisturbed.read_bytes()
+
+
+def test_a_file_is_read_resumed_or_renewed(tmp_path):
+    out, partial = tmp_path / "a.safetensors", tmp_path / "a.partial.safetensors"
+    started = []
+
+    def scans_from(start):
+        started.append(start)
+        return list(scenes(27))[start:]
+
+    half_done = empty(27)
+    half_done.update(list(scenes(27))[:16], [TOY])
+    half_done.save(partial)
+    compute_reference(empty(27), scans_from, [TOY], out)
+    filled(27).save(tmp_path / "b.safetensors")
+    assert out.read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    half_done.save(partial)  # as if killed before it was removed
+    assert compute_reference(empty(27), scans_from, [TOY], out).complete
+    assert started == [16]
+    with pytest.raises(ValueError, match="of another job: its names differ"):
+        compute_reference(empty(11), scans_from, [TOY], out)
+    compute_reference(empty(27, unprojection="corner"), scans_from, [TOY], out, renew=True)
+    assert started == [16, 0]
+    assert ReferenceStatistics.load(out).protocol.unprojection == "corner"
 
 
 def test_what_another_job_has_left_is_refused(tmp_path):
@@ -178,10 +214,8 @@ def test_what_another_job_has_left_is_refused(tmp_path):
 
 
 def test_scans_must_come_as_announced():
-    with pytest.raises(ValueError, match=r"number 0 on are .*drive1/001.* were announced"):
+    with pytest.raises(ValueError, match=r"drive1/001: not the next scan"):
         empty().update(list(scenes())[1:], [TOY])
-    with pytest.raises(ValueError, match="got 5 of 11 scans"):
-        empty().update(list(scenes(5)), [TOY], batch_size=1)
     with pytest.raises(ValueError, match="given twice: a/0"):
         ReferenceStatistics(PROTOCOL, {}, ["a/0", "a/0", "a/1"], {})
     with pytest.raises(ValueError, match="at least 2 scans"):
@@ -189,14 +223,14 @@ def test_scans_must_come_as_announced():
 
 
 def test_other_features_are_refused():
-    stored = empty()
-    stored.check_spaces([TOY])
     with pytest.raises(ValueError, match="holds 0 of 11 scans"):
-        stored.check([TOY])
+        empty().check([TOY])
+    stored = filled()
+    stored.check([TOY])
     with pytest.raises(ValueError, match="no features of fgeo, only of toy"):
-        stored.check_spaces([replace(TOY, name="fgeo")])
+        stored.check([replace(TOY, name="fgeo")])
     with pytest.raises(ValueError, match="toy is not that of the reference: weights x not abc"):
-        stored.check_spaces([replace(TOY, card={**CARD, "weights": "x"})])
+        stored.check([replace(TOY, card={**CARD, "weights": "x"})])
 
 
 def test_files_of_something_else_are_named(tmp_path):

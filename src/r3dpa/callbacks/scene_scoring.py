@@ -32,7 +32,7 @@ from r3dpa.metrics.evaluation import (
     load_reference,
     reference_spaces,
 )
-from r3dpa.metrics.reference import ReferenceStatistics, cached_reference
+from r3dpa.metrics.reference import ReferenceStatistics, compute_reference
 from r3dpa.metrics.results import Evaluation, report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
@@ -42,7 +42,6 @@ from r3dpa.viz.evaluation import save_figures
 __all__ = ["SceneScorer"]
 
 _SAMPLER = SamplerConfig()
-_OPTION = "--scorer.{} true"  # command-line option that makes SceneScorer allow something
 
 
 class SceneScorer(L.Callback):
@@ -110,10 +109,10 @@ class SceneScorer(L.Callback):
             rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
             return
         device = str(pl_module.device)
-        counts, statistics = {"generated scenes": self.num_scenes}, self._loaded()
+        statistics = self._loaded()
         scans: list[Scan] = []
         if statistics is not None:
-            spaces = reference_spaces(statistics, self.spaces, self.ckpt, self.protocol, device)
+            spaces = reference_spaces(statistics, self.spaces, self.ckpt, device, self.protocol)
         else:
             datamodule = getattr(trainer, "datamodule", None)
             if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
@@ -133,9 +132,7 @@ class SceneScorer(L.Callback):
             }
             scan_names = [scan.name for scan in scans]
             statistics = ReferenceStatistics.prepare(spaces, setting, scan_names, about)
-        if isinstance(statistics, ReferenceStatistics):
-            counts["real scans"] = len(statistics.names)
-        check_counts(counts, spaces, self.allow_few, _OPTION)
+        check_counts(self.num_scenes, statistics, spaces, self.allow_few)
         self._job = (statistics, spaces, scans)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -158,7 +155,7 @@ class SceneScorer(L.Callback):
                 for scan in scans[start:]:
                     yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
 
-            statistics = cached_reference(statistics, scans_from, spaces, path)
+            statistics = compute_reference(statistics, scans_from, spaces, path, renew=True)
         try:
             comparison = evaluate(
                 self._sampled(pl_module, folder, statistics),
@@ -167,10 +164,8 @@ class SceneScorer(L.Callback):
                 label=folder.absolute().parent.name,
                 source=str(trainer.ckpt_path),
                 made_with=made_with,
-                commit=source_commit(),
                 allow_few=True,  # checked before; scenes left out later are listed
                 skip_bad=self.skip_bad,
-                option=_OPTION,
             )
         except TooFewScenesError as error:  # the losses of the test are still to be printed
             trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
@@ -178,8 +173,8 @@ class SceneScorer(L.Callback):
         shutil.rmtree(_parts(folder))
         evaluation = comparison.evaluation
         save_reports(evaluation, statistics.about.get("split"), folder)
-        if figures := comparison.figure_data():
-            save_figures(folder, **figures)
+        if comparison.figures:
+            save_figures(folder, **comparison.figures)
         trainer.print(report(evaluation, statistics.about.get("split")))
         _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
 

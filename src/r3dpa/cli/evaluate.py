@@ -53,7 +53,7 @@ def reference(
     from r3dpa.data.scans import evenly, read_scan
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
-    from r3dpa.metrics.reference import ReferenceStatistics, complete_reference
+    from r3dpa.metrics.reference import ReferenceStatistics, compute_reference
     from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
@@ -75,7 +75,7 @@ def reference(
         for scan in scans[start:]:
             yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
 
-    statistics = complete_reference(job, scans_from, found, out)
+    statistics = compute_reference(job, scans_from, found, out)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
@@ -114,7 +114,6 @@ def evaluate(
     from tqdm import tqdm
 
     from r3dpa.data.samples import read_samples
-    from r3dpa.io import source_commit
     from r3dpa.metrics import evaluation as metrics
     from r3dpa.metrics.results import report, save_reports
     from r3dpa.viz.evaluation import save_figures
@@ -122,7 +121,7 @@ def evaluate(
     check_folder(out)
     made_with = _made_with(samples)  # refuses damaged metadata before the work starts
     statistics = metrics.load_reference(reference, split)
-    found = metrics.reference_spaces(statistics, spaces, ckpt, None, device)
+    found = metrics.reference_spaces(statistics, spaces, ckpt, device)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
@@ -134,18 +133,16 @@ def evaluate(
         label=label or samples.stem,
         source=str(samples),
         made_with=made_with,
-        commit=source_commit(),
         allow_few=allow_few,
         skip_bad=skip_bad,
-        option="--{}",
     )
     evaluation = comparison.evaluation
     if files.bad:  # the reader refused these, so that they never became scenes
         evaluation.about["extra"]["bad_samples"] = [*files.bad, *evaluation.bad_samples]
     if out is not None:
         save_reports(evaluation, statistics.about.get("split"), out)
-        if figures := comparison.figure_data():
-            save_figures(out, **figures)
+        if comparison.figures:
+            save_figures(out, **comparison.figures)
     return report(evaluation, statistics.about.get("split"))
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchmetrics import MetricCollection
 
 from r3dpa.io import source_commit
 from r3dpa.metrics.bootstrap import Resampling
@@ -133,7 +132,7 @@ def evaluate(
     check_counts(len(names), reference, spaces, allow_few, bad or ())
 
     reference.fill(metrics, spaces)
-    by_name: dict[str, Any] = metrics_of(metrics)
+    by_name = metrics_of(metrics)
     match = by_name["matching"]
     known = match.matching() if match.has_reference else None
     rows: list[MetricResult] = []
@@ -281,8 +280,8 @@ def reference_spaces(
     statistics: AnyReference,
     names: Sequence[str] | None,
     ckpt: Mapping[str, Any] | None,
-    protocol: str | None,
     device: str,
+    protocol: str | None = None,
 ) -> list[SceneFeatures]:
     """Feature spaces of a comparison; default: those of the reference that have what they need.
 
@@ -315,7 +314,7 @@ def _floors(
         return {}
     names = [space.name for space in spaces]
     metrics = reference.metrics(names, max_images=(None, num_images))
-    held, other, own = ({**metrics_of(part)} for part in (*reference.halves, metrics))
+    held, other, own = map(metrics_of, (*reference.halves, metrics))
     for name, metric in own.items():
         metric.adopt_real(other[name])
     places, images = held["matching"].kept("real")
@@ -401,7 +400,7 @@ def _figures(
 ) -> dict[str, Any]:
     """Data of the figures; ``matching`` is of the real scans that are kept."""
     protocol, ranges, match = reference.protocol, metrics["ranges"], metrics["matching"]
-    halves: list[dict[str, Any]] = [{**metrics_of(half)} for half in reference.halves]
+    halves = [metrics_of(half) for half in reference.halves]
     cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
     (places, samples), (_, scans) = match.kept("generated"), match.kept("real")
     of_scans = [

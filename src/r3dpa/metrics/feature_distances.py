@@ -248,7 +248,7 @@ def scene_metrics(
     return MetricCollection(dict(metrics), compute_groups=groups)
 
 
-def metrics_of(metrics: MetricCollection) -> dict[str, SceneMetric]:
+def metrics_of(metrics: MetricCollection) -> dict[str, Any]:
     """The metrics by name; those of a feature space share their states."""
     found: dict[str, Any] = dict(metrics.items(keep_base=True, copy_state=False))
     return {name: found[name] for group in metrics.compute_groups.values() for name in group}

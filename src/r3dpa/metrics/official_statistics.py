@@ -106,7 +106,7 @@ class OfficialStatistics:
 
     def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures]) -> None:
         """Sets the real side of the metrics that the file has something for."""
-        by_name: dict[str, Any] = metrics_of(metrics)
+        by_name = metrics_of(metrics)
         if self.cells is not None:
             by_name["cells"].real_bins = self.cells
         by_name["matching"].reference_cells = list(self.clouds)
@@ -128,11 +128,11 @@ class OfficialStatistics:
                 content = _ArraysOnly(stream).load().item()
             chosen: OfficialSplit = split or ("val" if "val" in content else "all")
             part = content[chosen]
-            moments = {
-                key: (_numbers(part[key]["mu"], 1), _numbers(part[key]["sigma"], 2))
-                for key in (*_FRID.values(), *_EVALUATORS.values())
-                if key in part
-            }
+            moments = {}
+            for key in (*_FRID.values(), *_EVALUATORS.values()):
+                if key in part:
+                    mean, covariance = _numbers(part[key]["mu"], 1), _numbers(part[key]["sigma"], 2)
+                    moments[key] = (mean, covariance.view(len(mean), len(mean)))
             cells = None
             if _HISTOGRAM in part:
                 cells = _numbers(part[_HISTOGRAM], 2).view(PUBLISHED.grid.shape).flatten()

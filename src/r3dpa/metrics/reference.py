@@ -197,12 +197,13 @@ class ReferenceStatistics:
         tensors: dict[str, Tensor] = {}
         chosen = []
         for index, half in enumerate(self.halves):
-            names, places = self.names_of_half(index), {"rows": [], "images": []}
+            names = self.names_of_half(index)
+            places: dict[str, list[tuple[str, int]]] = {"rows": [], "images": []}
             for key, kind, metric in self._keeping(index):
                 kept, tensors[key] = metric.kept("real")
                 places[kind] = [(names[place], place) for place in kept.tolist()]
             chosen.append(places)
-            metrics: dict[str, Any] = metrics_of(half)
+            metrics = metrics_of(half)
             for space in self.spaces:
                 tensors[f"{index}.moments.{space}"] = metrics[f"{space}_frechet"].real_moments
             cells = metrics["cells"].real_bins
@@ -255,7 +256,7 @@ class ReferenceStatistics:
                 raise ValueError(f"tensor {key} {given}, expected {tuple(shape)}")
             return found
 
-        metrics: dict[str, Any] = metrics_of(self.halves[index])
+        metrics = metrics_of(self.halves[index])
         for metric in metrics.values():
             metric.real_count = torch.tensor(card["counts"][index])
         for space in self.spaces:
@@ -292,7 +293,7 @@ def compute_reference(
     """
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
-        for path in out.parent.glob(f".{escape(partial.stem)}.*.partial.*"):
+        for path in out.parent.glob(f".{escape(out.stem)}.*.partial.*"):
             path.unlink(missing_ok=True)  # of a killed call
         statistics = job
         for path in (partial, out):
