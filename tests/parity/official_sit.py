@@ -1,6 +1,8 @@
-"""The SiT of a recorded case as our network and norm; used by the cases `sit`, `samplers`."""
+"""The SiT of a recorded case as our network and norm, and weights of recorded listings."""
 
 from __future__ import annotations
+
+import torch
 
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
@@ -8,6 +10,14 @@ from r3dpa.nn.sit import SiT
 
 def our_name(official: str) -> str:
     return official.replace("projectors.0.", "projector.")
+
+
+def weights_of(shapes, first=0):
+    """Tensors of the listed shapes, each of one value of its own and one element of memory."""
+    return {
+        key: torch.tensor(float(first + i)).expand(shape) if shape else torch.tensor(first + i)
+        for i, (key, shape) in enumerate(shapes.items())
+    }
 
 
 def sit_of(config, **options):

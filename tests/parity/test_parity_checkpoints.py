@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import pytest
 import torch
+from official_sit import weights_of
 
-from r3dpa.checkpoints import convert, from_official, read_checkpoint, to_official, transfer_rgb
+from r3dpa.checkpoints import (
+    NetworkState,
+    convert,
+    from_official,
+    read_checkpoint,
+    to_official,
+    transfer_rgb,
+)
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 
 PATH = Path("official.pt")
-
-
-def weights_of(shapes, first=0):
-    """Tensors of the listed shapes, each of one value of its own and one element of memory."""
-    return {
-        key: torch.tensor(float(first + i)).expand(shape) if shape else torch.tensor(first + i)
-        for i, (key, shape) in enumerate(shapes.items())
-    }
 
 
 def args_of(sit):
@@ -53,7 +54,18 @@ def through_our_networks(checkpoint):
     return type(checkpoint)(**{**vars(checkpoint), "networks": networks})
 
 
-def test_every_sit_state_dict(official_listing):
+def count(network):
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def assert_defaults(state, *names):
+    """The arguments are those of our class without any."""
+    defaults = NetworkState(state.class_path, {}, {}).arguments
+    for name in names:
+        assert state.arguments[name] == defaults[name], name
+
+
+def test_sit_state_dicts(official_listing):
     sits = official_listing("sit_state_dicts")
     for name, sit in sits.items():
         config, kitti = sit["config"], not isinstance(sit["config"]["input_size"], int)
@@ -73,10 +85,14 @@ def test_every_sit_state_dict(official_listing):
         assert built["alignment_depth"] == config["encoder_depth"], name
         assert built["class_dropout"] == (config["class_dropout_prob"] > 0), name
         assert [built["feature_dim"]] == config["z_dims"], name
-        parameters = sum(
-            value.numel() for key, value in checkpoint.network("sit").state_dict.items()
-        )
-        assert parameters == sit["param_count_total"], name
+        if sit["constructor"] == "SiT-B/2":
+            assert_defaults(checkpoint.network("sit"), "hidden_size", "depth", "num_heads")
+        with torch.device("meta"):
+            network = checkpoint.network("sit").new()
+        assert count(network) == sit["param_count_trainable"], name
+        total = count(network) + network.pos_embed.numel()
+        assert total == sit["param_count_total"], name
+        assert count(network.projector) == sit["param_count_projectors"], name
         back = to_official(through_our_networks(checkpoint))
         assert set(back) == set(official), name
         assert_same(back["model"], official["model"])
@@ -84,59 +100,62 @@ def test_every_sit_state_dict(official_listing):
         assert (back["steps"], back["args"]) == (12, args)
 
 
-def test_every_vae_state_dict(official_listing):
+def test_vae_state_dicts(official_listing):
     for name, vae in official_listing("vae_state_dicts").items():
-        official = {"model": {}, "vae": weights_of(vae["state_dict"])}
-        checkpoint = from_official({"vae": official["vae"]}, PATH)
+        official = weights_of(vae["state_dict"])
+        checkpoint = from_official({"vae": official}, PATH)
         with torch.device("meta"):
             network = checkpoint.network("vae").new()
         channels, *size = vae["latent_shape_for_64x1024"]
         assert network.latent_channels == channels, name
         assert list(network.latent_size((64, 1024))) == size, name
-        assert sum(p.numel() for p in network.parameters()) == vae["param_count_total"], name
+        for part in ("encoder", "decoder"):
+            assert count(getattr(network, part)) == vae[f"param_count_{part}"], name
+        assert count(network) == vae["param_count_total"], name
+        if name == "h2p4d8":
+            arguments = set(checkpoint.network("vae").arguments) - {"legacy_upsample"}
+            assert_defaults(checkpoint.network("vae"), *arguments)
         back = to_official(through_our_networks(checkpoint))
-        assert_same(back["vae"], official["vae"])
+        assert_same(back["vae"], official)
         assert vars(back["args"])["vae"] == name
 
 
 def test_discriminator_state_dict(official_listing):
-    official = weights_of(official_listing("discriminator_state_dict")["state_dict"])
+    listing = official_listing("discriminator_state_dict")
+    official = weights_of(listing["state_dict"])
     checkpoint = from_official(official, PATH)
+    state = checkpoint.network("discriminator")
+    assert_defaults(state, *state.arguments)
+    assert (
+        sum(v.numel() for k, v in official.items() if "running_" not in k and v.dim())
+        == (listing["param_count"])
+    )
     assert_same(to_official(through_our_networks(checkpoint))["discriminator"], official)
 
 
 def test_checkpoint_layout_through_our_file(official_listing, tmp_path):
     """A whole training checkpoint: official .pt -> our .safetensors -> official .pt."""
-    layout = official_listing("checkpoint_layout")
-    sits = official_listing("sit_state_dicts")
-    name, sit = next(
-        (name, sit)
-        for name, sit in sits.items()
-        if not isinstance(sit["config"]["input_size"], int)
-    )
-    vae = official_listing("vae_state_dicts")[name.rpartition("_")[2]]
-    discriminator = official_listing("discriminator_state_dict")
-    args = args_of(sit)
-    args.dataset_config = "configs/kitti.yaml"
+    sits, vaes = official_listing("sit_state_dicts"), official_listing("vae_state_dicts")
+    name = next(name for name, sit in sits.items() if isinstance(sit["config"]["input_size"], list))
+    discriminator = official_listing("discriminator_state_dict")["state_dict"]
     parts = {
-        "model": weights_of(sit["state_dict"]),
-        "ema": weights_of(sit["state_dict"], first=500),
-        "vae": weights_of(vae["state_dict"], first=1000),
-        "discriminator": weights_of(discriminator["state_dict"], first=2000),
-        "opt": {"state": {}},
-        "opt_vae": {"state": {}},
-        "opt_disc": {"state": {}},
-        "args": args,
-        "steps": 400_000,
+        "model": weights_of(sits[name]["state_dict"]),
+        "ema": weights_of(sits[name]["state_dict"], first=500),
+        "vae": weights_of(vaes[name.rpartition("_")[2]]["state_dict"], first=1000),
+        "discriminator": weights_of(discriminator, first=2000),
     }
-    official = {key: parts[key] for key in layout["train_repae_saved_keys"]}
-    torch.save(official, tmp_path / "0400000.pt")
+    args = args_of(sits[name])
+    args.dataset_config = "configs/kitti.yaml"
+    optimisers = {key: {"state": {}} for key in ("opt", "opt_vae", "opt_disc")}
+    whole = {**parts, **optimisers, "args": args, "steps": 400_000}
+    saved = official_listing("checkpoint_layout")["train_repae_saved_keys"]
+    torch.save({key: whole[key] for key in saved}, tmp_path / "0400000.pt")
     checkpoint = read_checkpoint(tmp_path / "0400000.pt")
-    assert set(checkpoint.left_out) == {"opt", "opt_vae", "opt_disc"}
+    assert set(checkpoint.left_out) == set(optimisers)
     back = to_official(checkpoint)
-    assert set(back) == set(official) - set(checkpoint.left_out)
-    for key in ("model", "ema", "vae", "discriminator"):
-        assert_same(back[key], official[key])
+    assert set(back) == set(saved) - set(optimisers)
+    for key, weights in parts.items():
+        assert_same(back[key], weights)
     assert (back["steps"], back["args"]) == (400_000, args)
 
 
@@ -185,53 +204,49 @@ def test_rgb_transfer_of_the_imagenet_variants(official_listing):
     rules = official_listing("checkpoint_layout")["rgb_transfer_in_tuning_stage"]
     kitti = next(s for n, s in sits.items() if "kitti" in n and s["constructor"] == "SiT-B/2")
     config = kitti["config"]
-    for name, rgb in sits.items():
-        if "imagenet" not in name or rgb["constructor"] != kitti["constructor"]:
-            continue
+    of_imagenet = {n: s for n, s in sits.items() if "imagenet" in n and "SiT-B/2" in n}
+    for (name, rgb), keep_projector in itertools.product(of_imagenet.items(), (False, True)):
         source = weights_of(rgb["state_dict"], first=1)
         checkpoint = from_official({"model": source, "args": args_of(rgb)}, PATH)
-        for keep_projector in (False, True):
-            with torch.device("meta"):
-                sit = SiT(
-                    input_size=tuple(config["input_size"]),
-                    in_channels=config["in_channels"],
-                    alignment_depth=config["encoder_depth"],
-                )
-            sit.to_empty(device="cpu")
-            sit = sit.bfloat16()
-            for parameter in (*sit.parameters(), *sit.buffers()):
-                parameter.data.zero_()
-            norm = LatentNorm(config["in_channels"])
-            report = transfer_rgb(checkpoint, sit, norm, keep_projector=keep_projector)
+        with torch.device("meta"):
+            sit = SiT(
+                input_size=tuple(config["input_size"]),
+                in_channels=config["in_channels"],
+                alignment_depth=config["encoder_depth"],
+            )
+        sit.to_empty(device="cpu").bfloat16()
+        for parameter in (*sit.parameters(), *sit.buffers()):
+            parameter.data.zero_()
+        norm = LatentNorm(config["in_channels"])
+        report = transfer_rgb(checkpoint, sit, norm, keep_projector=keep_projector)
 
-            fresh = [
-                *rules["dropped_if_in_channels_differ"],
-                rules["dropped_if_token_count_differs"][0],
-                *([] if keep_projector else rules["dropped_unless_train_vae_only"]),
-            ]
-            stems = tuple(key.removesuffix("*") for key in fresh)
-            kept = {key for key in source if not key.startswith(stems)}
-            own = {
-                key.replace("projector.", "projectors.0.", 1): value
-                for key, value in sit.state_dict().items()
-            }
-            for key, value in own.items():
-                if key in kept:
-                    assert value.flatten()[0] == source[key].flatten()[0].bfloat16(), (name, key)
-                else:
-                    assert not value.any(), (name, key)
-            assert torch.equal(norm.running_var, torch.ones(config["in_channels"]))
+        fresh = [
+            *rules["dropped_if_in_channels_differ"],
+            rules["dropped_if_token_count_differs"][0],
+        ]
+        fresh += [] if keep_projector else rules["dropped_unless_train_vae_only"]
+        stems = tuple(key.removesuffix("*") for key in fresh)
+        for key, value in sit.state_dict().items():
+            official = key.replace("projector.", "projectors.0.", 1)
+            if official in source and not official.startswith(stems):
+                expected = source[official].flatten()[0].bfloat16()
+                assert value.flatten()[0] == expected, (name, key)
+            else:
+                assert not value.any(), (name, key)
+        assert torch.equal(norm.running_var, torch.ones(config["in_channels"]))
 
-            fates = {row.group: row.result for row in report.rows}
-            assert fates["projector"] == ("kept" if keep_projector else "fresh")
-            assert fates["x_embedder"] == fates["final_layer.linear"] == "fresh"
-            assert fates["latent_norm"] == "fresh"
-            assert fates["pos_embed"] == "resized"  # computed for the grid here
-            cut = rgb["config"]["class_dropout_prob"] > 0
-            assert fates["y_embedder"] == ("truncated" if cut else "kept")
-            assert fates["blocks"] == fates["t_embedder"] == "kept"
-            assert fates["final_layer.adaLN_modulation"] == "kept"
-            assert sum(row.num_tensors for row in report.rows) == len(kitti["state_dict"])
+        results = {row.group: row.result for row in report.rows}
+        cut = rgb["config"]["class_dropout_prob"] > 0
+        expected = {
+            "x_embedder": "fresh",
+            "final_layer.linear": "fresh",
+            "latent_norm": "fresh",
+            "pos_embed": "resized",  # computed for the grid here
+            "projector": "kept" if keep_projector else "fresh",
+            "y_embedder": "truncated" if cut else "kept",
+        }
+        assert results == dict.fromkeys(results, "kept") | expected
+        assert sum(row.num_tensors for row in report.rows) == len(kitti["state_dict"])
 
 
 @pytest.mark.parametrize("change", ["missing", "unknown", "shape"])

@@ -117,10 +117,6 @@ def test_rangevit_released_sizes(official_listing, name):
     assert own + classifier == listing["param_count"]
     assert network.dim == listing["feature_dim"]
     assert [network.sensor.beams, network.sensor.columns] == config["original_image_size"]
-    weights = empty(shapes)
-    del weights["rangevit.encoder.norm.bias"]
-    with pytest.raises(ValueError, match=r"1 missing \['rangevit.encoder.norm.bias'\]"):
-        rangevit.load_official(network, weights)
 
 
 @pytest.fixture(scope="module")
@@ -180,5 +176,3 @@ def test_liploc_encoder_released_sizes(official_listing):
     liploc.load_official(network, weights)
     assert sum(value.numel() for value in network.parameters()) == listing["param_count"]
     assert network.dim == listing["feature_dim"]
-    with pytest.raises(ValueError, match=r"1 unexpected \['norm.bias'\]"):
-        liploc.load_official(network, weights | {"norm.bias": torch.empty(384)})

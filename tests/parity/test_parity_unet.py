@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from official_sit import our_name, weights_of
 
 from r3dpa.checkpoints import from_official, to_official
 from r3dpa.flow import Interpolant
@@ -16,10 +17,6 @@ from r3dpa.nn import LatentNorm, UNet
 
 PATH = Interpolant("linear")
 SIZES = {"UNet_lidm": {}, "UNet_small": {"channels": 160}}
-
-
-def our_name(official):
-    return official.replace("projectors.0.", "projector.")
 
 
 @pytest.fixture(scope="module")
@@ -107,50 +104,14 @@ def inference(case):
 GROUPS = [evaluation, training, alignment_only, inference]
 
 
-@pytest.mark.parametrize("group", GROUPS, ids=lambda group: f"unet-{group.__name__}")
-def test_unet_outputs(case, close, group):
-    for key, value in group(case).items():
-        close(value.detach(), case[key])
-
-
-def test_unet_every_recorded_output_is_compared(case):
-    assert set().union(*(group(case) for group in GROUPS)) == set(case.keys("out/"))
-
-
-def test_unet_train_statistics_are_those_of_torch(case, close):
-    _, norm = build(case)
-    reference = torch.nn.BatchNorm2d(
-        case.config["in_channels"], norm.eps, norm.momentum, affine=False
-    )
-    reference.load_state_dict(case.weights("w/bn."))
-    close(norm.update(case["in/x"]), reference(case["in/x"]))
-    for name in ("running_mean", "running_var"):
-        assert not torch.equal(norm.get_buffer(name), case[f"w/bn.{name}"])
-        close(norm.get_buffer(name), reference.get_buffer(name))
-
-
-@pytest.mark.parametrize("name", SIZES, ids=lambda name: f"unet-{name}")
-def test_unet_official_layouts_have_our_keys_and_shapes(official_listing, name):
-    official = official_listing("unet_state_dicts")[name]
-    with torch.device("meta"):
-        unet = UNet(**SIZES[name])
-    ours = {key: list(value.shape) for key, value in unet.state_dict().items()}
-    expected = {our_name(key): shape for key, shape in official["state_dict"].items()}
-    assert ours == {k: shape for k, shape in expected.items() if not k.startswith("bn.")}
-    assert sum(p.numel() for p in unet.parameters()) == official["param_count_total"]
-    projector = sum(p.numel() for p in unet.projector.parameters())
-    assert projector == official["param_count_projectors"]
+def test_unet_outputs(case, compare):
+    compare(case, {key: value for group in GROUPS for key, value in group(case).items()})
 
 
 @pytest.mark.parametrize("name", SIZES, ids=lambda name: f"unet-{name}")
 def test_unet_official_checkpoints_come_and_go_key_by_key(official_listing, name):
-    """Each tensor has one value of its own and one element of memory."""
     listing = official_listing("unet_state_dicts")
-    shapes = listing[name]["state_dict"]
-    weights = {
-        key: torch.tensor(float(i)).expand(shape) if shape else torch.tensor(i)
-        for i, (key, shape) in enumerate(shapes.items())
-    }
+    weights = weights_of(listing[name]["state_dict"])
     args = argparse.Namespace(model=name, vae="h2p4d8", dataset_config="configs/kitti.yaml")
     official = {"model": weights, "ema": weights, "steps": 5, "args": args}
     checkpoint = from_official(official, Path("official.pt"))
@@ -159,6 +120,9 @@ def test_unet_official_checkpoints_come_and_go_key_by_key(official_listing, name
         unet = state.new()
     assert isinstance(unet, UNet)
     assert {key: state.arguments[key] for key in SIZES[name]} == SIZES[name]
+    assert sum(p.numel() for p in unet.parameters()) == listing[name]["param_count_total"]
+    projector = sum(p.numel() for p in unet.projector.parameters())
+    assert projector == listing[name]["param_count_projectors"]
     assert list(unet.grid_size) == listing["_notes"]["grid_for_h2p4d8"]
     assert checkpoint.geometry["grid_size"] == list(unet.grid_size)
     unet.load_state_dict(state.state_dict, strict=True, assign=True)
@@ -192,11 +156,3 @@ def test_unet_attention_resolutions_are_inferred_from_an_official_file():
     latents, time = torch.randn(2, 3, 4, 16), torch.rand(2)
     features = unet.project_features(latents, time)
     assert torch.equal(state.build().project_features(latents, time), features)
-
-
-def test_unet_official_file_without_a_key_is_refused(official_listing):
-    shapes = dict(official_listing("unet_state_dicts")["UNet_small"]["state_dict"])
-    del shapes["middle_block.1.qkv.bias"]
-    weights = {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}
-    with pytest.raises(ValueError, match=r"middle_block\.1\.qkv\.bias"):
-        from_official({"model": weights}, Path("official.pt"))

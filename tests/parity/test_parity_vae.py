@@ -1,4 +1,4 @@
-"""The VAE against ``vae.npz`` and ``vae_state_dicts.json`` (official weights load as they are)."""
+"""The VAE against ``vae.npz`` (official weights load as they are)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ def case(load_case):
     return load_case("vae")
 
 
-def build(case, **options):
+@pytest.fixture
+def vae(case):
     config = case.config
     assert config["in_channels"] == config["out_ch"]
     vae = VAE(
@@ -25,15 +26,10 @@ def build(case, **options):
         strides=config["strides"],
         num_res_blocks=config["num_res_blocks"],
         attention_levels=config["attn_levels"],
-        **options,
+        legacy_upsample=True,
     )
     vae.load_state_dict(case.weights())
     return vae
-
-
-@pytest.fixture
-def vae(case):
-    return build(case, legacy_upsample=True)
 
 
 @torch.no_grad()
@@ -111,55 +107,5 @@ def strided_layers(case, vae):
 GROUPS = [encoding, decoding, rotation, gradients, clamp, strided_layers]
 
 
-@pytest.mark.parametrize("group", GROUPS, ids=lambda group: f"vae-{group.__name__}")
-def test_vae_outputs(case, vae, close, group):
-    for key, value in group(case, vae).items():
-        close(value, case[key])
-
-
-def test_vae_every_recorded_output_is_compared(case, vae):
-    compared = set().union(*(group(case, vae) for group in GROUPS))
-    assert compared == set(case.keys("out/"))
-
-
-def test_vae_default_upsampling_repairs_the_recorded_rotation_error(case):
-    vae = build(case)
-    error = rotation(case, vae)["out/dec_roll_max_err"]
-    assert error < 1e-5 * vae.decode(case["in/z"]).abs().max()
-    assert case["out/dec_roll_max_err"] > 1e3 * error
-
-
-LAYOUTS = {
-    "h2p4d8": {},
-    "h1p4d4": {
-        "latent_channels": 4,
-        "channel_multipliers": (1, 2, 4),
-        "strides": ((2, 2), (2, 2)),
-    },
-    "h16d4": {
-        "latent_channels": 4,
-        "channel_multipliers": (1, 1, 2, 2, 4),
-        "strides": ((1, 2),) * 4,
-        "attention_levels": (4,),
-    },
-    "h16p2d16": {
-        "latent_channels": 16,
-        "channel_multipliers": (1, 1, 2, 2, 2, 4),
-        "strides": (*((1, 2),) * 4, (2, 2)),
-        "attention_levels": (4,),
-    },
-}
-
-
-@pytest.mark.parametrize("name", LAYOUTS, ids=lambda name: f"vae-{name}")
-def test_vae_official_layouts_have_our_keys_and_shapes(official_listing, name):
-    official = official_listing("vae_state_dicts")[name]
-    with torch.device("meta"):
-        vae = VAE(**LAYOUTS[name])
-    ours = {key: list(value.shape) for key, value in vae.state_dict().items()}
-    assert ours == official["state_dict"]
-    for part, network in (("total", vae), ("encoder", vae.encoder), ("decoder", vae.decoder)):
-        count = sum(parameter.numel() for parameter in network.parameters())
-        assert count == official[f"param_count_{part}"]
-    latent_shape = [vae.latent_channels, *vae.latent_size((64, 1024))]
-    assert latent_shape == official["latent_shape_for_64x1024"]
+def test_vae_outputs(case, vae, compare):
+    compare(case, {key: value for group in GROUPS for key, value in group(case, vae).items()})
