@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_SMALLEST_SHARE = 4  # fd_infinity starts from a quarter of the samples
+_SMALLEST_SHARE, _NUM_SIZES = 4, 8  # fd_infinity starts from a quarter of the samples
 _BLOCK = 1024  # rows of a distance matrix held at once
 
 
@@ -152,9 +152,7 @@ class FDInfinity(NamedTuple):
     standard_error: float
 
 
-def fd_infinity(
-    real: Tensor, generated: Tensor, generator: torch.Generator, num_sizes: int = 8
-) -> FDInfinity:
+def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> FDInfinity:
     """Fréchet distance of ``(N, F)`` and ``(M, F)`` features, extrapolated to infinitely many.
 
     The distance of N samples is too large by about c / N. A line is fitted over 1/N to subsets of
@@ -169,13 +167,12 @@ def fd_infinity(
     width = real.shape[1]
     largest = min(len(real), len(generated))
     smallest = largest // _SMALLEST_SHARE
-    if smallest <= width or num_sizes < 3:
+    if smallest <= width:
         raise ValueError(
-            f"fd_infinity: {largest} samples of {width} features and {num_sizes} sizes; give at "
-            f"least {_SMALLEST_SHARE * (width + 1)} samples in both sets and 3 sizes, or use "
-            "polynomial_mmd, which has no bias"
+            f"fd_infinity: {largest} samples of {width} features; at least "
+            f"{_SMALLEST_SHARE * (width + 1)} are needed; polynomial_mmd has no bias with fewer"
         )
-    inverse = torch.linspace(1 / smallest, 1 / largest, num_sizes, dtype=torch.float64)
+    inverse = torch.linspace(1 / smallest, 1 / largest, _NUM_SIZES, dtype=torch.float64)
     sizes = [round(1 / value) for value in inverse.tolist()]
     distances = [
         frechet_distance_of(
@@ -187,8 +184,8 @@ def fd_infinity(
     spread = (over - over.mean()).square().sum()
     slope = ((over - over.mean()) * y).sum() / spread
     value = y.mean() - slope * over.mean()
-    noise = (y - value - slope * over).square().sum() / (num_sizes - 2)
-    error = (noise * (1 / num_sizes + over.mean().square() / spread)).sqrt()
+    noise = (y - value - slope * over).square().sum() / (_NUM_SIZES - 2)
+    error = (noise * (1 / _NUM_SIZES + over.mean().square() / spread)).sqrt()
     return FDInfinity(value.item(), error.item())
 
 
