@@ -20,8 +20,8 @@ from r3dpa.geometry import LidarSensor
 
 
 # 10 training scans and batches of 2: an epoch has 5 batches. Stops: within the first epoch, at its
-# end, within the second, and at the end of the second.
-@pytest.mark.parametrize(("workers", "stop"), [(2, 3), (0, 5), (0, 7), (2, 10)])
+# end, and within the second.
+@pytest.mark.parametrize(("workers", "stop"), [(2, 3), (0, 5), (0, 7)])
 def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop, fit):
     whole = fit(data(num_workers=workers), 12)
     saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
@@ -57,8 +57,8 @@ def test_resume_with_accumulation_and_validation_within_the_epoch(tmp_path, data
 
 
 def test_order_does_not_depend_on_workers_but_on_the_seed(tmp_path, data, fit):
-    orders = [fit(data(num_workers=w), 6).seen for w in (0, 1, 2)]
-    assert orders[0] == orders[1] == orders[2]
+    orders = [fit(data(num_workers=w), 6).seen for w in (0, 2)]
+    assert orders[0] == orders[1]
     assert fit(data(seed=1), 6).seen != orders[0]
 
 
@@ -67,12 +67,17 @@ def test_overfit_batches_takes_the_first_scans_again_and_again(tmp_path, data, f
     assert module.seen == [[0, 1], [2, 3], [0, 1], [2, 3]]
 
 
-def test_missing_grids_are_made_once_and_need_their_extractor(tmp_path, data, scaled_points):
+def test_missing_grids_are_made_once_and_need_their_extractor(
+    tmp_path, data, scaled_points, caplog
+):
     extractor = scaled_points()
     module = data(extractor=extractor)
     for _ in range(2):
-        module.prepare_data()
+        with caplog.at_level("INFO"):
+            module.prepare_data()
         module.setup("fit")
+    # 11 grids of 2 x 4 cells, 4 wide: 64 bytes each.
+    assert "feature grids: 11 to make, 7.04e-07 GB, 0 kept, in " in caplog.text
     assert extractor.calls == 11
     assert module.feature_dim == 4
     batch = next(iter(module.train_dataloader()))
@@ -115,14 +120,6 @@ def test_stored_grids_need_not_be_made_as_they_would_be_here(tmp_path, data, sca
     assert module.extractor.calls == 0
     read = module.all_set[3]["feature_grid"]
     assert torch.equal(read, grids[2, 4][3].half().float())
-
-
-def test_the_log_tells_the_disk_space(data, scaled_points, caplog):
-    """11 grids of 2 x 4 cells, 4 wide: 64 bytes each."""
-    with caplog.at_level("INFO"):
-        data(extractor=scaled_points()).prepare_data()
-    assert "feature grids: 11 to make, 7.04e-07 GB, 0 kept, in " in caplog.text
-    assert "feature grids: 11 made" in caplog.text
 
 
 def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):

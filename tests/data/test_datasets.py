@@ -35,14 +35,13 @@ def test_one_point_falls_into_its_pixel_with_its_range(tmp_path, projection):
     assert (sample["index"], sample["name"]) == (0, f"{tmp_path.name}/000000")
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_batches_with_grids(tmp_path, make_scans, projection, scaled_points, workers):
+def test_batches_with_grids(tmp_path, make_scans, projection, scaled_points):
     scans = find_scans(make_scans(tmp_path / "scans", 5))
     write_feature_grids(scans, scaled_points(), projection, [(2, 4)], tmp_path / "grids")
     grids = FeatureGrids(tmp_path / "grids", scans, projection, (2, 4))
     dataset = LidarDataset(scans, projection, RangeCodec("log2"), grids)
     single = [dataset[index] for index in range(5)]
-    batches = list(DataLoader(dataset, batch_size=3, num_workers=workers))
+    batches = list(DataLoader(dataset, batch_size=3, num_workers=2))
     for key in ("range_image", "valid_mask", "feature_grid"):
         joined = torch.cat([batch[key] for batch in batches])
         assert torch.equal(joined, torch.stack([sample[key] for sample in single]))
@@ -51,13 +50,12 @@ def test_batches_with_grids(tmp_path, make_scans, projection, scaled_points, wor
     assert batches[0]["feature_grid"].shape == (3, 8, 4)
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_bad_scan_is_named_from_any_process(tmp_path, make_scans, projection, workers):
+def test_bad_scan_is_named_from_a_loader_process(tmp_path, make_scans, projection):
     folder = make_scans(tmp_path / "scans", 3)
     (folder / "0000000001.bin").write_bytes(b"12345")
     dataset = LidarDataset(find_scans(folder), projection, RangeCodec())
     with pytest.raises(ScanError, match=r"0000000001\.bin: has 5 bytes") as caught:
-        list(DataLoader(dataset, num_workers=workers))
+        list(DataLoader(dataset, num_workers=1))
     assert "\n" not in str(caught.value)  # nor the traceback of a loader process
 
 

@@ -257,13 +257,6 @@ def test_a_damaged_journal_is_named(halves, change, reason):
     assert_holds(halves, items(0, 3))
 
 
-def test_lost_rows_are_noticed(halves):
-    fill(halves, (0, 3))
-    (halves.folder / "shard_00000.rows").unlink()
-    with pytest.raises(StoreError, match=r"damaged .*shard_00000\.rows"):
-        CachedTensors(halves, items(0, 3))
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_an_unwritable_folder_is_named(halves):
     fill(halves, (0, 1))
@@ -295,25 +288,6 @@ def test_readers_in_several_processes_while_another_one_writes(halves):
             assert torch.equal(read, tensor_of(item).half().float())
             add(writer, items(40 + number, 41 + number))
     assert_holds(halves, items(0, 80))
-
-
-def test_what_a_reader_sees_of_a_growing_store_is_right(halves):
-    def write():
-        with halves.writer() as writer:
-            for first in range(0, 200, 4):
-                add(writer, items(first, first + 4))
-
-    fill(halves, (0, 4))
-    child = multiprocessing.get_context("fork").Process(target=write)
-    child.start()
-    counts = []
-    while child.is_alive():
-        counts.append(len(halves.places()))
-        assert_holds(halves, items(0, counts[-1]))
-    child.join()
-    assert child.exitcode == 0
-    assert counts == sorted(counts)
-    assert_holds(halves, items(0, 200))
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])

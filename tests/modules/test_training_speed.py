@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 import torch
 from tiny_stages import QUIET, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from r3dpa.checkpoints import read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.data import Augmentation
 from r3dpa.modules import LossWeights, flow_matching
 from r3dpa.modules.steps import arrange_optimizer
 from r3dpa.nn import Posterior
@@ -44,6 +48,10 @@ class TestCachedLatents:
         assert len(read) == 3  # the steps of the first run
         assert list((tmp_path / "true" / "latents").glob("posterior_*/shard_00000.rows"))
         assert not (tmp_path / "false" / "latents").exists()
+        found = read_checkpoint(tmp_path / "true/checkpoints/last.ckpt")
+        assert found.augmentation == asdict(Augmentation(rotate=rotate))
+        ours = save_checkpoint(found, tmp_path / "ours.safetensors")
+        assert read_checkpoint(ours).augmentation == found.augmentation
         cached, plain = (load(tmp_path / name)["state_dict"] for name in ("true", "false"))
         assert cached.keys() == plain.keys()
         moved = 0.0
