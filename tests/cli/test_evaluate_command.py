@@ -16,6 +16,7 @@ from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
+from r3dpa.viz import evaluation as figures
 
 SENSOR = LidarSensor(beams=16, columns=64)
 PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
@@ -72,6 +73,12 @@ def samples(tmp_path):
     return folder
 
 
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Most of the time of a comparison; one test draws them."""
+    monkeypatch.setattr(figures, "save_figures", lambda *_, **__: None)
+
+
 def evaluate(*words):
     main(["evaluate", *map(str, words), "--device", "cpu"])
 
@@ -124,7 +131,7 @@ def test_the_split_and_the_limit_choose_scans(data, tmp_path):
     assert [name[0] for name in names["all"]] == ["a", "a", "b", "b"]
 
 
-def test_bad_samples_stop_or_are_listed(reference_file, samples, tmp_path, capsys):
+def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp_path, capsys):
     """The reader refuses the first, the scorer the second: all its points are beside the grid."""
     (samples / "004.bin").write_bytes(b"no points")
     write_bin(samples / "007.bin", torch.tensor([[0.0, 52.0, 0.0, 0.0]]))
@@ -177,7 +184,7 @@ def test_unusable_images_are_named(reference_file, tmp_path, content, message):
         evaluate("--samples", tmp_path / "img.npz", "--reference", reference_file)
 
 
-def test_another_protocol_is_recorded(data, samples, tmp_path):
+def test_another_protocol_is_recorded(data, no_figures, samples, tmp_path):
     published = tmp_path / "published.safetensors"
     words = ["--data", data, "--out", published, "--spaces", "fgeo", "--protocol", "published"]
     main(["reference", *map(str, words), "--device", "cpu"])
@@ -187,7 +194,7 @@ def test_another_protocol_is_recorded(data, samples, tmp_path):
     assert stored.about["protocol"]["unprojection"] == "corner"
 
 
-def test_official_weights_are_given_by_space(data, samples, tmp_path):
+def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path):
     torch.manual_seed(0)
     network, weights = MinkowskiNet((2,) * 9), tmp_path / "fsvd.ckpt"
     torch.save({official_name(k): v for k, v in network.state_dict().items()}, weights)

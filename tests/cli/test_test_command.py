@@ -40,6 +40,12 @@ def coarse_protocols():
         yield
 
 
+@pytest.fixture(autouse=True)
+def no_figures(monkeypatch):
+    """Most of the time of a test; those of the fixture ``scored`` are drawn."""
+    monkeypatch.setattr(scene_scoring, "save_figures", lambda *_, **__: None)
+
+
 @pytest.fixture(scope="module")
 def words(smoke_args, joint_checkpoint):
     """``words(run_dir, *more)``: arguments of ``r3dpa``."""
