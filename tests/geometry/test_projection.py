@@ -126,46 +126,28 @@ def test_scans_of_no_or_one_point(shape):
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: f"{sensor.beams}x{sensor.columns}")
-@pytest.mark.parametrize("corner", [False, True])
-def test_rays_are_unit_vectors_through_their_pixels(sensor, corner):
+def test_rays_are_unit_vectors_and_corners_lie_half_a_pixel_aside(sensor):
     projection = SphericalProjection(sensor)
-    rays = projection.ray_directions(corner, torch.float64)
-    assert rays.shape == (sensor.beams, sensor.columns, 3)
-    torch.testing.assert_close(rays.norm(dim=-1), torch.ones_like(rays[..., 0]))
-    if corner:  # a corner lies on a border; half a pixel further is the centre
-        inclination, azimuth = projection.ray_angles(corner=True)
-        centre_inclination, centre_azimuth = projection.ray_angles()
-        pitch = math.radians(sensor.inclination_max_deg - sensor.inclination_min_deg)
-        half_row = torch.full_like(inclination, pitch / sensor.beams / 2)
-        torch.testing.assert_close(inclination - centre_inclination, half_row)
-        half_column = torch.full_like(azimuth, math.pi / sensor.columns)
-        torch.testing.assert_close(azimuth - centre_azimuth, half_column)
-    else:
-        row, column = projection.pixel_of(rays)
-        expected = torch.meshgrid(
-            torch.arange(sensor.beams), torch.arange(sensor.columns), indexing="ij"
+    for corner in (False, True):
+        rays = projection.ray_directions(corner, torch.float64)
+        assert rays.shape == (sensor.beams, sensor.columns, 3)
+        torch.testing.assert_close(rays.norm(dim=-1), torch.ones_like(rays[..., 0]))
+    inclination, azimuth = (
+        at_corner - at_centre
+        for at_corner, at_centre in zip(
+            projection.ray_angles(corner=True), projection.ray_angles(), strict=True
         )
-        assert torch.equal(row, expected[0])
-        assert torch.equal(column, expected[1])
-
-
-def test_image_survives_a_round_trip():
-    projection = SphericalProjection(LidarSensor())
-    range_m, _ = range_image(random_points(20000), projection)
-    cloud = points_of(range_m, projection)
-    assert cloud.shape == ((range_m > 0).sum(), 3)
-    torch.testing.assert_close(cloud.norm(dim=-1), range_m[range_m > 0])
-    again, _ = range_image(cloud, projection)
-    torch.testing.assert_close(again, range_m)
-    # Empty pixels unproject to the origin, which is dropped like any other near point.
-    points = unproject(range_m, projection)
-    assert (points[range_m == EMPTY_RANGE_M] == 0).all()
-    again, _ = range_image(points.flatten(0, 1), projection)
-    torch.testing.assert_close(again, range_m)
+    )
+    half_row = sensor.field_of_view_rad / sensor.beams / 2
+    torch.testing.assert_close(inclination, torch.full_like(inclination, half_row))
+    half_column = math.pi / sensor.columns
+    torch.testing.assert_close(azimuth, torch.full_like(azimuth, half_column))
 
 
 def test_unproject_batches_and_gradients():
     projection = SphericalProjection(SMALL)
+    empty = unproject(torch.full((8, 16), EMPTY_RANGE_M), projection)
+    assert not empty.any()  # the origin, which is dropped like any other near point
     range_m = (10 * torch.rand(2, 3, 8, 16) + 2).requires_grad_()
     points = unproject(range_m, projection)
     assert points.shape == (2, 3, 8, 16, 3)
@@ -343,19 +325,6 @@ def test_mean_angle_of_a_round_trip():
 
     assert mean_residual_deg(corner=True) == pytest.approx((0.219, 0.176), abs=0.01)
     assert mean_residual_deg(corner=False) == pytest.approx((0.0, 0.0), abs=0.01)
-
-
-@pytest.mark.numerics
-def test_pooling_many_points_in_one_cell():
-    """A running float32 sum stops growing properly long before 2^24 equal terms."""
-    count, value = 200_000, 0.1
-    points = torch.tensor([[10.0, 0.0, 0.0]]).expand(count, 3)
-    values = torch.full((count, 1), value)
-    naive = torch.zeros(1).index_add(0, torch.zeros(count, dtype=torch.int64), values[:, 0])
-    assert (naive / count - value).abs() > 1e-5
-    means, counts = pool_cells(points, values, SphericalProjection(SMALL), (1, 1))
-    assert counts.tolist() == [count]
-    torch.testing.assert_close(means, torch.full((1, 1), value), atol=2e-7, rtol=0)
 
 
 @pytest.mark.numerics

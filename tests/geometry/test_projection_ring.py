@@ -106,20 +106,6 @@ def test_fit_is_the_median_of_all_scans():
         RingProjection.fit([], SENSOR)
 
 
-def test_round_trip():
-    points, _ = scan_of()
-    range_m, _ = range_image(points, RING)
-    cloud = points_of(range_m, RING)
-    row, column = RING.pixel_of(points)
-    rays = RING.ray_directions()[row, column]
-    cosine = (rays * torch.nn.functional.normalize(points, dim=-1)).sum(dim=-1)
-    # Half a column of 4 degrees aside, and 5 sd of the inclination noise.
-    assert cosine.clamp(max=1).arccos().rad2deg().max() < 2.0 + 0.3
-    torch.testing.assert_close(cloud.norm(dim=-1), range_m[:, RING.column_order()].flatten())
-    inclination = torch.atan2(cloud[:, 2], cloud[:, :2].norm(dim=-1)).rad2deg().reshape(8, 90)
-    torch.testing.assert_close(inclination, torch.tensor(INCLINATIONS).unsqueeze(1).expand(8, 90))
-
-
 @pytest.mark.parametrize("empty_rows", [[], [0], [0, 1, 2, 5]])
 def test_points_of_an_image_are_read_back_as_that_image(empty_rows):
     range_m, _ = range_image(scan_of()[0], RING)
@@ -127,6 +113,14 @@ def test_points_of_an_image_are_read_back_as_that_image(empty_rows):
     range_m[3, 10:40] = EMPTY_RANGE_M
     read_back, _ = range_image(points_of(range_m, RING), RING)
     torch.testing.assert_close(read_back, range_m, atol=1e-4, rtol=0)
+
+
+def test_rays_look_along_the_rings_and_a_corner_moves_columns_only():
+    inclination, azimuth = RING.ray_angles()
+    assert inclination.rad2deg().tolist() == pytest.approx(INCLINATIONS)
+    corner_inclination, corner_azimuth = RING.ray_angles(corner=True)
+    assert torch.equal(inclination, corner_inclination)
+    assert (corner_azimuth - azimuth).tolist() == pytest.approx([math.pi / 90] * 90)
 
 
 def test_batches_and_padding():

@@ -106,24 +106,6 @@ def test_coarser_voxels_are_the_floor_of_the_coordinates():
         assert level.stride == stride
 
 
-def test_one_voxel_sees_itself_alone():
-    voxels, _ = Voxels.from_coordinates(torch.tensor([[5, -3, 0, 7]]))
-    layer, features = SparseConv(4, 2, 3), torch.randn(1, 4)
-    torch.testing.assert_close(layer(features, voxels.neighbors), features @ layer.kernel[13])
-    # (5, -3, 0) lies in the voxel (4, -4, 0) of stride 2, one step up in x and in y: offset 6.
-    down = SparseConv(4, 2, 2)
-    assert voxels.coarser.coordinates.tolist() == [[4, -4, 0, 7]]
-    torch.testing.assert_close(down(features, voxels.to_coarser), features @ down.kernel[6])
-
-
-def test_no_voxel():
-    voxels, rows = Voxels.from_coordinates(torch.zeros(0, 4, dtype=torch.int64))
-    assert len(voxels) == len(rows) == len(voxels.coarser) == 0
-    features = torch.zeros(0, 4)
-    assert SparseConv(4, 2, 3)(features, voxels.neighbors).shape == (0, 2)
-    assert SparseConv(4, 2, 2)(features, voxels.to_coarser).shape == (0, 2)
-
-
 @pytest.mark.parametrize("half", ["weights", "autocast"])
 def test_half_precision_sums_in_float32(half):
     """27 equal products: a running sum in bfloat16 would stop growing by as much."""

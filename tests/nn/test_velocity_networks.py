@@ -304,18 +304,14 @@ def test_token_norm_of_constant_tokens_is_finite():
     assert (tokens / tokens.std(dim=1, keepdim=True)).isnan().all()  # without eps
 
 
-def test_half_weights_leave_float32_islands():
-    """Closer to float32 than half of everything, which rounds the token stream in every block."""
+def test_half_weights_leave_the_token_stream_in_float32():
+    """Closer to float32 than half of everything, which rounds the tokens in every block."""
     sit, half, all_half = (build(SiT, depth=8) for _ in range(3))
-    half.halve_()
-    narrow = {name for name, p in half.named_parameters() if p.dtype == torch.bfloat16}
-    assert {name.split(".")[2] for name in narrow} == {"attn", "mlp"}
     latents, time = inputs(sit, batch=16)
     expected = sit.velocity(latents, time)
-    error = (half.velocity(latents, time) - expected).square().mean().sqrt()
+    error = (half.halve_().velocity(latents, time) - expected).norm()
     naive = all_half.bfloat16().velocity(latents.bfloat16(), time).float()
-    assert 0 < error < 0.02 * expected.std()
-    assert error < 0.7 * (naive - expected).square().mean().sqrt()
+    assert 0 < error < 0.7 * (naive - expected).norm()
 
 
 def test_columns_wrap_around_but_for_the_position_bias():

@@ -117,20 +117,6 @@ def test_refused_input(network):
         ScaLR(network)
 
 
-@torch.no_grad()
-def test_order_of_points_does_not_matter(network):
-    points = cloud(300)
-    extractor = ScaLR(network, GRID)
-    features = extractor(points)
-    # No two points share a voxel, otherwise the order decides which of them is kept.
-    assert (prepare(points).kept.numel()) == (points[:, :3].abs() < torch.tensor([8, 8, 2])).all(
-        dim=1
-    ).sum()
-    order = torch.randperm(300, generator=torch.Generator().manual_seed(3))
-    torch.testing.assert_close(extractor(points[order]), features[order], atol=1e-5, rtol=1e-5)
-    assert features.std(dim=0).max() > 0.1  # and points differ
-
-
 def test_gradients_reach_every_parameter_and_statistics_follow_real_points(network):
     network.train()
     batch = collate_scans([prepare(cloud(100, 0)), prepare(cloud(30, 1))])
