@@ -191,6 +191,9 @@ def test_an_infinite_gradient_is_dropped_for_one_sample_and_step(dtype):
     result = euler(guidance, noise(dtype=dtype), ode_times(6))
     assert result.isfinite().all()
     assert guidance.num_dropped == 1
+    plain = guidance_of(2.0, lambda x, time: outward_tokens(x.to(dtype), time).to(dtype))
+    untouched = euler(plain, noise(dtype=dtype), ode_times(6))
+    torch.testing.assert_close(result[[0, 2, 3]], untouched[[0, 2, 3]])
     leaf = noise().requires_grad_()
     calls[:] = [None, None]
     cosine = torch.cosine_similarity(tokens(leaf, None), OUTWARD.to(dtype), dim=-1)

@@ -17,17 +17,12 @@ PYTHON = sys.executable
 
 @dataclass(frozen=True)
 class Node:
-    """A place to start processes in: rank, IPv4 address and its interface, network namespace."""
+    """A place to start processes in: rank, IPv4 address, and the prefix of its commands."""
 
     rank: int
     address: str
-    interface: str
-    namespace: str | None = None
-
-    @property
-    def prefix(self) -> list[str]:
-        """Words in front of a command that shall run here."""
-        return [] if self.namespace is None else ["ip", "netns", "exec", self.namespace]
+    prefix: tuple[str, ...] = ()
+    interface: str = "lo"
 
     def start(self, words: Sequence[object], log: Path, **environment: str) -> subprocess.Popen:
         """Starts a command here; its output goes to a file."""
@@ -48,8 +43,7 @@ class Node:
 
     def pull_the_cable(self) -> None:
         """Packets from and to this node are lost from now on, and nobody is told."""
-        assert self.namespace is not None
-        _ip("-n", self.namespace, "link", "set", self.interface, "down")
+        _ip("-n", self.prefix[-1], "link", "set", self.interface, "down")
 
 
 @contextmanager
@@ -60,7 +54,10 @@ def two_nodes() -> Iterator[list[Node]]:
     PermissionError: this process may not make them.
     """
     names = [f"r3dpa-{os.getpid()}-{rank}" for rank in (0, 1)]
-    nodes = [Node(rank, f"10.77.0.{rank + 1}", "veth0", name) for rank, name in enumerate(names)]
+    nodes = [
+        Node(rank, f"10.77.0.{rank + 1}", ("ip", "netns", "exec", name), "veth0")
+        for rank, name in enumerate(names)
+    ]
     made: list[str] = []
     try:
         try:

