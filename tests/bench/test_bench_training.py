@@ -58,7 +58,6 @@ def test_every_step_of_every_stage_is_run(figures):
         assert 2**27 < stage["peak_host_bytes"] < 2**33
         assert stage["peak_gpu_bytes"] is None
         assert stage["images_per_second"] == pytest.approx(2 / stage["step_seconds"][1])
-        assert stage["loader_images_per_second"] > 0
 
 
 def test_what_each_stage_trains_is_counted(figures):
@@ -94,7 +93,7 @@ def test_the_table_quotes_the_file(figures):
         assert cells[1] == f"{stage['num_parameters']['VAE']:.2f}"
         assert cells[6] == f"{stage['step_seconds'][0]:.3g}"
         assert cells[8] == f"{stage['peak_host_bytes'] / 2**30:.2f}"
-        assert cells[13] == f"{stage['flop'] / 1e9:.4g}"
+        assert cells[12] == f"{stage['flop'] / 1e9:.4g}"
     assert f"torch {torch.__version__}" in table
     assert content["settings"]["batch_size"] == 2
     assert content["machine"]["cpu"]

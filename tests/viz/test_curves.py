@@ -91,14 +91,3 @@ def test_pareto_picture_has_its_front_labels_and_sentences():
     faces = [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"]
     assert faces.count("white") == 2  # in fp32
     assert text in found.subfigs[1].texts[0].get_text()
-
-
-def test_errors_and_slopes_against_evaluations():
-    found = viz.discretisation_figure({"toy": POINTS}, {"toy": 0.001})
-    (axes,) = found.axes
-    lines = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
-    assert lines["euler"] == [[4, 0.5], [8, 0.25]]
-    assert lines["order 1"][1][1] == pytest.approx(lines["order 1"][0][1] / 2)
-    assert lines["order 2"][1][1] == pytest.approx(lines["order 2"][0][1] / 4)
-    (unsure,) = axes.patches
-    assert unsure.get_height() == pytest.approx(0.01)

@@ -1,4 +1,4 @@
-"""Times, work and memory: interleaved timing with an A/A check, FLOP, peak rate, peak memory."""
+"""Times, work and memory: interleaved timing with an A/A check, FLOP, peak memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,26 +18,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 _RESAMPLES = 2000
 _CPU = torch.device("cpu")
-
-
-class Spent(NamedTuple):
-    """Seconds of one run of a case: until its result was there, and until all was done with it.
-
-    ``core`` is the processor time of all threads within ``device``; None on a GPU.
-    """
-
-    device: float
-    end_to_end: float
-    core: float | None = None
-
-    def over(self, number: int) -> Spent:
-        """Seconds of one of several samples."""
-        core = None if self.core is None else self.core / number
-        return Spent(self.device / number, self.end_to_end / number, core)
-
-    def judged(self, threads: int) -> float:
-        """Processor time of a single thread, which other work hardly changes; else ``device``."""
-        return self.core if threads == 1 and self.core else self.device
 
 
 @dataclass(frozen=True)
@@ -67,8 +46,7 @@ class Ratio:
 class Comparison:
     """Seconds of cases measured together, by round, and the first of them over itself (A/A)."""
 
-    device: dict[str, list[float]]
-    end_to_end: dict[str, list[float]]
+    seconds: dict[str, list[float]]
     repeat: Ratio
 
     @property
@@ -83,64 +61,52 @@ class Comparison:
 
     def over_first(self, name: str) -> Ratio:
         """Time of a case over that of the first."""
-        return Ratio.of(self.device[name], next(iter(self.device.values())))
+        return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
 
 
 def compare(
-    cases: Mapping[str, Callable[[], Spent]],
+    cases: Mapping[str, Callable[[], float]],
     rounds: int,
-    keep: Callable[[int, Callable[[], list[Spent]]], list[Spent]] = lambda number, run: run(),
+    keep: Callable[[int, Callable[[], list[float]]], list[float]] = lambda number, run: run(),
 ) -> Comparison:
     """Runs each case once a round, the first one twice, after a warm-up round.
 
-    Every second round runs backwards, so that drifts of the machine affect all cases alike. With a
-    single thread processor time counts, which other processes hardly change.
+    Every second round runs backwards, so that drifts of the machine affect all cases alike.
 
     Args:
-        cases: Functions that return what they took, see :func:`timed`.
+        cases: Functions that return the seconds that they took, see :func:`timed`.
         rounds: At least 1.
         keep: Returns the measurements of a round by number from ``run``, or from an earlier run.
     """
     every = [*cases, next(iter(cases))]
 
-    def run(number: int) -> list[Spent]:
+    def run(number: int) -> list[float]:
         order = range(len(every))
         found = {i: cases[every[i]]() for i in (reversed(order) if number % 2 else order)}
         return [found[place] for place in order]
 
     run(0)
     taken = [keep(number, partial(run, number)) for number in range(1, rounds + 1)]
-    threads = torch.get_num_threads()
-    device = [[each[i].judged(threads) for each in taken] for i in range(len(every))]
-    end_to_end = [[each[i].end_to_end for each in taken] for i in range(len(every))]
-    return Comparison(
-        dict(zip(cases, device, strict=False)),
-        dict(zip(cases, end_to_end, strict=False)),
-        Ratio.of(device[-1], device[0]),
-    )
+    *seconds, again = (list(column) for column in zip(*taken, strict=True))
+    return Comparison(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
 
 
-def timed(function: Callable[[], object], device: torch.device = _CPU) -> Callable[[], Spent]:
-    """The function as a case of :func:`compare`; on a GPU until the device has finished."""
+def timed(function: Callable[[], object], device: torch.device = _CPU) -> Callable[[], float]:
+    """The function as a case of :func:`compare`; on a GPU until the device has finished.
 
-    def run() -> Spent:
+    With a single CPU thread processor time counts, which other processes hardly change.
+    """
+
+    def run() -> float:
+        one_core = device.type == "cpu" and torch.get_num_threads() == 1
+        clock = time.process_time if one_core else time.perf_counter
         synchronise(device)
-        start, core = time.perf_counter(), time.process_time()
+        start = clock()
         function()
         synchronise(device)
-        wall, core = time.perf_counter() - start, time.process_time() - core
-        return Spent(wall, wall, core if device.type == "cpu" else None)
+        return clock() - start
 
     return run
-
-
-def peak_of(device: torch.device, precision: str) -> float:
-    """Rate of a large matrix product in bf16 or fp32: FLOP per second, 2 for each multiply-add."""
-    size = 8192 if device.type == "cuda" else 1024
-    dtype = torch.bfloat16 if precision == "bf16" else torch.float32
-    factor, threads = torch.randn(size, size, device=device).to(dtype), torch.get_num_threads()
-    product = timed(lambda: factor @ factor, device)
-    return 2 * size**3 / min(product().judged(threads) for _ in range(7))
 
 
 def flop_of(function: Callable[[], object]) -> int:

@@ -1,31 +1,74 @@
 """Problems for samplers: a mixture with an exact velocity, and the networks of a checkpoint.
 
-Letters: N scenes or samples, D dimensions.
+Letters: N scenes or samples, D dimensions, B batch, K Gaussians.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from functools import cached_property, partial
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from r3dpa.bench.measure import Spent, flop_of, peak_bytes, synchronise, timed
-from r3dpa.bench.mixture import GaussianMixture
+from r3dpa.bench.measure import flop_of, timed
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.data import write_bin
 from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, heun
 from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
-from r3dpa.geometry import points_of
 
+Precision = Literal["fp32", "bf16"]
 _SEED = 0
+
+
+@dataclass(frozen=True)
+class GaussianMixture:
+    """Data distribution ``sum_k weight_k N(mean_k, std^2 I)`` and its velocity on the linear path.
+
+    ``means`` are ``(K, D)``, ``std`` is that of every Gaussian in every direction, and the
+    ``weights`` ``(K,)`` need not sum to 1.
+    """
+
+    means: Tensor
+    std: float
+    weights: Tensor
+
+    def velocity(self, x: Tensor, time: Tensor) -> Tensor:
+        """Exact velocity ``E[noise - data | x_t = x]`` on the path ``(1 - t) data + t noise``.
+
+        Given the Gaussian k, ``x_t`` is Gaussian about ``(1 - t) mean_k`` with variance
+        ``V = (1 - t)^2 std^2 + t^2``, so that with ``m = sum_k p(k | x) mean_k``::
+
+            v = -m + (t - (1 - t) std^2) / V (x - (1 - t) m)
+
+        ``|x|^2`` is common to all ``log p(k | x)`` and left out: nothing large cancels. Finite for
+        all t in [0, 1]: ``-x`` at t = 0 and ``x`` minus the mean of the data at t = 1. Samples are
+        ``(B, D)``, times ``(B,)``; computed in float64, returned in the dtype of ``x``.
+        """
+        state, t = x.double(), time.double()[:, None]
+        means, weights = self.means.to(state), self.weights.to(state)
+        variance = (1 - t).square() * self.std**2 + t.square()
+        nearness = (1 - t) * (state @ means.T) - (1 - t).square() * means.square().sum(1) / 2
+        mean = torch.softmax(weights.log() + nearness / variance, dim=1) @ means
+        slope = (t - (1 - t) * self.std**2) / variance
+        return (slope * (state - (1 - t) * mean) - mean).to(x.dtype)
+
+
+def toy_mixture(seed: int = 0) -> GaussianMixture:
+    """128 equally likely Gaussians in 64 dimensions, float64, standard deviation 0.2.
+
+    The means are standard Gaussian in a random plane of 4 dimensions, as data lie near few
+    dimensions of their space. There they crowd: late on its way a path still has to decide between
+    neighbours, which is what makes solvers err (apart from each other, means in all 64 dimensions
+    would be decided between at once near the noise).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.randn(128, 4, generator=generator, dtype=torch.float64)
+    plane = torch.randn(4, 64, generator=generator, dtype=torch.float64) / 2
+    return GaussianMixture(places @ plane, std=0.2, weights=torch.full((128,), 1 / 128).double())
 
 
 @dataclass(frozen=True)
@@ -35,13 +78,11 @@ class Setting:
     Args:
         sampler: ODE solver, steps and shift.
         precision: Of the networks.
-        compiled: Whether they are compiled.
         batch: Scenes computed together.
     """
 
     sampler: SamplerConfig
-    precision: Literal["fp32", "bf16"] = "fp32"
-    compiled: bool = False
+    precision: Precision = "fp32"
     batch: int = 1
 
     @property
@@ -57,8 +98,8 @@ class Setting:
 
     @property
     def plain(self) -> Setting:
-        """The same solver in fp32, not compiled."""
-        return replace(self, precision="fp32", compiled=False)
+        """The same solver in fp32."""
+        return replace(self, precision="fp32")
 
 
 class Solved(NamedTuple):
@@ -94,19 +135,15 @@ class MixtureProblem:
         """The same samples by Heun's method."""
         return self.solve(Setting(SamplerConfig("heun", steps)), indices)
 
-    def case(self, setting: Setting, folder: Path) -> Callable[[], Spent]:
-        """A batch as a case to be timed, times per sample; nothing is written."""
+    def case(self, setting: Setting) -> Callable[[], float]:
+        """A batch as a case to be timed, times per sample."""
         run = timed(lambda: self.solve(setting, range(self._timed_batch)))
-        return lambda: run().over(self._timed_batch)
+        return lambda: run() / self._timed_batch
 
     def flop(self) -> tuple[float, float]:
         """FLOP of a sample: of each evaluation, and of everything else."""
         x = self.mixture.means[:1]
         return flop_of(lambda: self.mixture.velocity(x, torch.ones(1))), 0.0
-
-    def memory(self, setting: Setting) -> int | None:
-        """Not measured."""
-        return None
 
 
 class ModelProblem:
@@ -121,26 +158,26 @@ class ModelProblem:
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
         self.batch, self._path = batch, checkpoint.interpolant
         self._plain = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device=device)
-        self._made = {Setting(SamplerConfig()): self._plain}
         self.device = self._plain.device
 
     def _generator(self, setting: Setting) -> SceneGenerator:
-        """Generator of its own that shares networks, and what was compiled, with others."""
-        batch = setting.batch if setting.compiled else 1
-        kind, plain = replace(setting, sampler=SamplerConfig(), batch=batch), self._plain
-        if kind not in self._made:
-            self._made[kind] = SceneGenerator(
-                plain.vae,
-                plain.sit,
-                plain.latent_norm,
-                plain.geometry,
-                setting.sampler,
-                self._path,
-                setting.precision,
-                batch_size=batch if setting.compiled else None,
-                compile=setting.compiled,
-            )
-        return self._made[kind].with_sampler(setting.sampler)
+        """Generator of its own that shares the plain networks with others."""
+        if setting.precision == "fp32":
+            return self._plain.with_sampler(setting.sampler)
+        return self._rounded.with_sampler(setting.sampler)
+
+    @cached_property
+    def _rounded(self) -> SceneGenerator:
+        plain = self._plain
+        return SceneGenerator(
+            plain.vae,
+            plain.sit,
+            plain.latent_norm,
+            plain.geometry,
+            SamplerConfig(),
+            self._path,
+            "bf16",
+        )
 
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Scenes of these indices as the generator draws them."""
@@ -166,24 +203,11 @@ class ModelProblem:
         range_m = geometry.codec.decode(image[:, 0].float(), geometry.projection.sensor)
         return Solved(found.cpu(), range_m.cpu())
 
-    def case(self, setting: Setting, folder: Path) -> Callable[[], Spent]:
-        """A batch of scenes: sampling and decoder; then copying, points and ``.bin`` files."""
-        generator, scenes = self._generator(setting), list[Tensor]()
-        indices = range(setting.batch)
-        sampling = timed(
-            lambda: scenes.append(generator.generate(indices, _SEED).range_m), self.device
-        )
-
-        def run() -> Spent:
-            scenes.clear()
-            start = time.perf_counter()
-            spent = sampling()
-            for index, range_m in enumerate(scenes[0].cpu()):
-                points = points_of(range_m, generator.geometry.projection)
-                write_bin(folder / f"{index:06d}.bin", points)
-            return spent._replace(end_to_end=time.perf_counter() - start).over(setting.batch)
-
-        return run
+    def case(self, setting: Setting) -> Callable[[], float]:
+        """Sampling and decoding a batch as a case to be timed, times per scene."""
+        generator, indices = self._generator(setting), range(setting.batch)
+        run = timed(lambda: generator.generate(indices, _SEED), self.device)
+        return lambda: run() / setting.batch
 
     def flop(self) -> tuple[float, float]:
         """Counted with one and with two Euler steps of one scene."""
@@ -194,16 +218,6 @@ class ModelProblem:
             counts.append(flop_of(partial(generator.generate, [0], _SEED)))
         each = float(counts[1] - counts[0])
         return each, counts[0] - each
-
-    def memory(self, setting: Setting) -> int | None:
-        """Peak memory of one batch on a GPU, bytes; None on a CPU."""
-        if self.device.type != "cuda":
-            return None
-        generator = self._generator(setting)
-        torch.cuda.reset_peak_memory_stats(self.device)
-        generator.generate(range(setting.batch), _SEED)
-        synchronise(self.device)
-        return peak_bytes(self.device)
 
 
 Problem = MixtureProblem | ModelProblem

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.bench.measure import Comparison, Spent, compare, peak_of
-from r3dpa.bench.mixture import toy_mixture
-from r3dpa.bench.problems import MixtureProblem, ModelProblem, Problem, Setting, Solved
-from r3dpa.bench.report import EVALUATIONS, Finding, write_report
-from r3dpa.bench.rows import Errors, Row
+from r3dpa.bench.measure import Comparison, compare
+from r3dpa.bench.problems import (
+    MixtureProblem,
+    ModelProblem,
+    Precision,
+    Problem,
+    Setting,
+    Solved,
+    toy_mixture,
+)
+from r3dpa.bench.report import Errors, Finding, Row, write_report
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.solvers import steps_for
 from r3dpa.generation import SamplerConfig, Solver
@@ -31,6 +36,7 @@ _SOLVERS: tuple[tuple[Solver, float], ...] = (
     *(("euler", 1.0), ("heun", 1.0), ("midpoint", 1.0), ("ab2", 1.0), ("ab2", 1.75), ("ab2", 2.0)),
     *(("ab3", 1.0), ("ab3", 1.5), ("ab3", 2.5), ("dpmpp_2m", 1.75), ("unipc", 1.0)),
 )
+_EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
 _PRECISION_STEPS = 32
 _BATCH = {"cuda": 64, "cpu": 4}
 Advance = Callable[[int], object]  # of a progress bar, by evaluations
@@ -60,8 +66,8 @@ class Effort:
             )
 
 
-_TOY = Effort(1024, 1000, EVALUATIONS, 20, 256)
-_TOY_QUICK = Effort(256, 1000, EVALUATIONS[:-2], 3, 256)
+_TOY = Effort(1024, 1000, _EVALUATIONS, 20, 256)
+_TOY_QUICK = Effort(256, 1000, _EVALUATIONS[:-2], 3, 256)
 
 
 class Work:
@@ -102,9 +108,9 @@ def sampling(
 ) -> str:
     """Measures what accuracy costs in time, for an exact velocity and for a trained model.
 
-    The folder gets ``sampling.json``, ``summary.md``, ``pareto.png`` (error against seconds),
-    ``discretisation.png`` (error against NFE), and from a model ``quality.json``, as ``r3dpa sample
-    --quality`` reads it. An interrupted run of a model goes on with the same call.
+    The folder gets ``sampling.json``, ``summary.md``, ``pareto.png`` (error against seconds), and
+    from a model ``quality.json``, as ``r3dpa sample --quality`` reads it. An interrupted run of a
+    model goes on with the same call.
 
     Args:
         out: Folder to write.
@@ -122,16 +128,16 @@ def sampling(
     """
     device = usable_device(device)
     kind = device.partition(":")[0]
-    usual = Effort(256, 1000, EVALUATIONS, 20, _BATCH[kind])
+    usual = Effort(256, 1000, _EVALUATIONS, 20, _BATCH[kind])
     if quick:
-        usual = Effort(8, 200, EVALUATIONS[1:-3], 3, _BATCH[kind])
+        usual = Effort(8, 200, _EVALUATIONS[1:-3], 3, _BATCH[kind])
     toy = _TOY_QUICK if quick else _TOY
     chosen = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
     about, work = {}, Work()
     problems: dict[str, Callable[[], Finding]] = {
-        # Without a network neither precision nor compilation applies.
+        # Without a network precision does not apply.
         "mixture": lambda: run_problem(
-            MixtureProblem(toy_mixture(), toy.samples, toy.batch), settings_of(toy, "cpu", ()), toy
+            MixtureProblem(toy_mixture(), toy.samples, toy.batch), settings_of(toy), toy
         )
     }
     if ckpt is not None:
@@ -140,7 +146,7 @@ def sampling(
         model = ModelProblem(checkpoint, device, chosen.batch)
         written = ckpt.stat().st_mtime_ns
         work = Work(out / "work", [about, written, str(chosen), device, quick])
-        ways = settings_of(chosen, kind, (False,) if quick else (False, True))
+        ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
         problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
@@ -155,29 +161,21 @@ def sampling(
     return text
 
 
-def settings_of(effort: Effort, device: str, compiled: Sequence[bool]) -> list[Setting]:
-    """All ways to sample: on a GPU in bf16 and compiled where wanted, on a CPU in fp32 as written.
+def settings_of(effort: Effort, precisions: Sequence[Precision] = ()) -> list[Setting]:
+    """All ways to sample, in the first of the precisions.
 
-    AB2 with 32 steps also runs in each precision, with and without compilation as ``compiled``
-    says, and with single scenes; not at all if that is empty.
+    AB2 with 32 steps also runs in each precision, and with single scenes.
     """
-    usual = Setting(SamplerConfig("euler", 1), batch=effort.batch)
-    if device == "cuda" and True in compiled:
-        usual = replace(usual, precision="bf16", compiled=True)
-    ways = []
-    for solver, shift in _SOLVERS:
-        for count in dict.fromkeys(steps_for(solver, nfe) for nfe in effort.evaluations):
-            ways.append(replace(usual, sampler=SamplerConfig(solver, count, shift=shift)))
-    if compiled:
-        usual = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
-        precisions: tuple[Literal["fp32", "bf16"], ...] = ("fp32", "bf16")
-        kinds = [(p, c, effort.batch) for p in precisions for c in compiled]
-        kinds.append((usual.precision, usual.compiled, 1))
-        for precision, is_compiled, batch in kinds:
-            way = replace(usual, precision=precision, compiled=is_compiled, batch=batch)
-            if way not in ways:
-                ways.append(way)
-    return ways
+    usual = Setting(SamplerConfig("euler", 1), [*precisions, "fp32"][0], effort.batch)
+    ways = [
+        replace(usual, sampler=SamplerConfig(solver, steps, shift=shift))
+        for solver, shift in _SOLVERS
+        for steps in dict.fromkeys(steps_for(solver, nfe) for nfe in effort.evaluations)
+    ]
+    fixed = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
+    ways += [replace(fixed, precision=precision) for precision in precisions]
+    ways += [replace(fixed, batch=1)] * bool(precisions)
+    return list(dict.fromkeys(ways))
 
 
 def run_problem(
@@ -194,23 +192,12 @@ def run_problem(
         errors = errors_of(problem, ways, exact, work, bar.update)
         labels = _labels(ways, effort.batch)
         measured = _timed(problem, dict(zip(labels, ways, strict=True)), effort, work, bar.update)
-    flop = problem.flop()
-    peaks = {way.precision: peak_of(problem.device, way.precision) for way in ways}
+    each, rest = problem.flop()
     rows = [
-        Row(
-            label,
-            way,
-            error,
-            measured.device[label],
-            measured.end_to_end[label],
-            way.nfe * flop[0] + flop[1],
-            peaks[way.precision],
-            self_error,
-            problem.memory(way),
-        )
+        Row(label, way, error, measured.seconds[label], way.nfe * each + rest, self_error)
         for label, way, error in zip(labels, ways, errors, strict=True)
     ]
-    return Finding(rows, steps, num, self_error, measured, max(peaks.values()), flop)
+    return Finding(rows, steps, num, self_error, measured, (each, rest))
 
 
 def _solved(
@@ -251,9 +238,8 @@ def errors_of(
     found: dict[int, Errors] = {}
 
     def solve(way: Setting) -> Solved:
-        size = way.batch if way.compiled else problem.batch
-        num = len(exact.latents)
-        return _solved(num, size, partial(problem.solve, way), way.nfe, advance)
+        solve_way = partial(problem.solve, way)
+        return _solved(len(exact.latents), problem.batch, solve_way, way.nfe, advance)
 
     for sampler in dict.fromkeys(way.sampler for way in ways):
         companion: list[Solved] = []
@@ -264,7 +250,6 @@ def errors_of(
             solved = companion[0] if way == way.plain else solve(way)
             return (
                 _squared(solved.latents, exact.latents).tolist(),
-                _rmse(companion[0].latents, exact.latents),
                 _rmse(solved.latents, companion[0].latents),
                 *_range_errors(solved.range_m, exact.range_m),
             )
@@ -299,30 +284,22 @@ def _timed(
 ) -> Comparison:
     """Times of all ways; complete rounds are kept."""
 
-    def case(way: Setting, run: Callable[[], Spent]) -> Spent:
-        spent = run()
+    def case(way: Setting, run: Callable[[], float]) -> float:
+        seconds = run()
         advance(way.nfe * way.batch)
-        return spent
+        return seconds
 
-    def keep(number: int, run: Callable[[], list[Spent]]) -> list[Spent]:
-        found = work.piece(f"round_{number}", lambda: [tuple(spent) for spent in run()])
-        return [Spent(*spent) for spent in found]
-
-    with tempfile.TemporaryDirectory(prefix="r3dpa_bench_") as folder:
-        cases = {
-            label: partial(case, way, problem.case(way, Path(folder)))
-            for label, way in ways.items()
-        }
-        return compare(cases, effort.rounds, keep)
+    cases = {label: partial(case, way, problem.case(way)) for label, way in ways.items()}
+    return compare(cases, effort.rounds, lambda number, run: work.piece(f"round_{number}", run))
 
 
 def _labels(ways: Sequence[Setting], batch: int) -> list[str]:
-    """Name and NFE; precision, compilation and batch only where several rows share them."""
+    """Name and NFE; precision and batch only where several rows share them."""
     labels: list[str] = []
     for way in ways:
         label = f"{way.name} {way.nfe}"
         if label in labels:
-            label += f" {way.precision}{' compiled' if way.compiled else ''}"
+            label += f" {way.precision}"
             label += f" batch {way.batch}" if way.batch != batch else ""
         labels.append(label)
     return labels

@@ -36,7 +36,6 @@ from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
 
 STAGES = ("vae_alignment", "joint", "flow_matching")
-_LOADER_EPOCHS = 4  # of one batch; the first one does not count
 
 
 @dataclass(frozen=True)
@@ -79,25 +78,26 @@ class StageCost:
     peak_gpu_bytes: int | None
     flop: int
     images_per_second: float
-    loader_images_per_second: float
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> dict[str, str]:
         """Cells of the table."""
         first, *others = self.step_seconds
-        usual, gpu = median(others or [first]), self.peak_gpu_bytes
-        return {
-            "stage": self.stage,
-            **{f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()},
-            "first s": f"{first:.3g}",
-            "next s": f"{median(others):.3g}" if others else "-",
-            "host GiB": f"{self.peak_host_bytes / 2**30:.2f}",
-            "GPU GiB": "-" if gpu is None else f"{gpu / 2**30:.2f}",
-            "loss": f"{self.loss:.4g}",
-            "images/s": f"{self.images_per_second:.3g}",
-            "loader images/s": f"{self.loader_images_per_second:.3g}",
-            "GFLOP/step": f"{self.flop / 1e9:.4g}",
-            "GFLOP/s": f"{self.flop / usual / 1e9:.4g}",
-        }
+        gpu = self.peak_gpu_bytes
+        counts = {f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()}
+        return (
+            {"stage": self.stage}
+            | counts
+            | {
+                "first s": f"{first:.3g}",
+                "next s": f"{median(others):.3g}" if others else "-",
+                "host GiB": f"{self.peak_host_bytes / 2**30:.2f}",
+                "GPU GiB": "-" if gpu is None else f"{gpu / 2**30:.2f}",
+                "loss": f"{self.loss:.4g}",
+                "images/s": f"{self.images_per_second:.3g}",
+                "GFLOP/step": f"{self.flop / 1e9:.4g}",
+                "GFLOP/s": f"{self.flop / median(others or [first]) / 1e9:.4g}",
+            }
+        )
 
 
 def training(
@@ -197,7 +197,6 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
         default_root_dir=folder,
     )
     trainer.fit(module, datamodule=_data(module, folder, stage, settings.batch_size))
-    usual = median(meter.seconds[1:] or meter.seconds)
     return StageCost(
         stage,
         _num_parameters(module),
@@ -206,8 +205,7 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
         meter.peak_host_bytes,
         meter.peak_gpu_bytes,
         meter.flop,
-        settings.batch_size / usual,
-        _loader_rate(trainer),
+        settings.batch_size / median(meter.seconds[1:] or meter.seconds),
     )
 
 
@@ -287,16 +285,6 @@ class _StepMeter(L.Callback):
     def _now(trainer: L.Trainer) -> float:
         synchronise(trainer.strategy.root_device)
         return time.perf_counter()
-
-
-def _loader_rate(trainer: L.Trainer) -> float:
-    """Scans per second of one loader process."""
-    rates = []
-    for _ in range(_LOADER_EPOCHS):
-        start = time.perf_counter()
-        num_scans = sum(len(batch["name"]) for batch in cast(Any, trainer.train_dataloader))
-        rates.append(num_scans / (time.perf_counter() - start))
-    return median(rates[1:])
 
 
 def _num_parameters(module: GenerativeModule) -> dict[str, float]:

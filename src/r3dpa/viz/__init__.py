@@ -9,7 +9,6 @@ pictures of different scenes can be compared. Dark means that there is no return
 from r3dpa.viz.curves import (
     ParetoPoint,
     Series,
-    discretisation_figure,
     loss_curves,
     pareto_figure,
     read_metrics,
@@ -42,7 +41,6 @@ __all__ = [
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",
-    "discretisation_figure",
     "edit_page",
     "edit_sheet",
     "encoded_picture",

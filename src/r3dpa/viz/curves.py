@@ -202,49 +202,6 @@ def pareto_figure(
     return figure
 
 
-def discretisation_figure(
-    panels: Mapping[str, Sequence[ParetoPoint]], references: Mapping[str, float]
-) -> Figure:
-    """Error of the solvers against network evaluations, with slopes of order 1 and 2.
-
-    Args:
-        panels: Points by title of the panel; their ``value`` is the error.
-        references: Error of the converged reference by title; errors below ten times of it cannot
-            be resolved.
-    """
-    figure = Figure(figsize=(6.6 * len(panels) + 0.4, 5.6), dpi=110, layout="constrained")
-    cells = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (title, points) in zip(cells, panels.items(), strict=True):
-        for solver, (colour, marker) in _styles(points).items():
-            own = sorted((p for p in points if p.solver == solver), key=lambda p: p.nfe)
-            counts, errors = [p.nfe for p in own], [p.value for p in own]
-            axes.plot(counts, errors, color=colour, marker=marker, ms=5, lw=1.2, label=solver)
-        _draw_orders(axes, points, 10 * references.get(title, 0.0))
-        axes.set_title(title, fontsize=11)
-        axes.legend(fontsize=7.5, frameon=False)
-    return figure
-
-
-def _draw_orders(axes: Axes, points: Sequence[ParetoPoint], unsure: float) -> None:
-    """Guides, the range that the reference cannot resolve, and the scales."""
-    counts = np.array(sorted({point.nfe for point in points}), dtype=float)
-    lowest, highest = (f(point.value for point in points) for f in (min, max))
-    for order, style in ((1, ":"), (2, "--")):
-        guide = 1.3 * highest * (counts / counts[0]) ** -order
-        axes.plot(counts, guide, color="#888888", linestyle=style, label=f"order {order}")
-    if unsure > 0:
-        label = "not converged: reference unsure"
-        axes.axhspan(1e-300, unsure, color="#cc3311", alpha=0.12, linewidth=0, label=label)
-    axes.set(xscale="log", yscale="log")
-    axes.set_ylim(min(lowest, max(unsure, lowest / 3)) / 1.6, 2.2 * highest)
-    axes.set_xlabel("network evaluations per sample (NFE)")
-    axes.set_ylabel("RMSE of the latents from the converged solution")
-    axes.xaxis.set_major_locator(LogLocator(2))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.grid(alpha=0.25, which="major")
-
-
 def _styles(points: Sequence[ParetoPoint]) -> dict[str, tuple[str, str]]:
     """Colour and marker of each solver, in order of appearance."""
     solvers = dict.fromkeys(point.solver for point in points)
