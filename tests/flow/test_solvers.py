@@ -8,7 +8,7 @@ import pytest
 import torch
 from velocities import gaussian_velocity, growth, standard_noise, still
 
-from r3dpa.bench.mixture import toy_mixture
+from r3dpa.bench.problems import toy_mixture
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,

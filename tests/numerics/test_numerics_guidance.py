@@ -7,7 +7,7 @@ import weakref
 import pytest
 import torch
 
-from r3dpa.bench.mixture import GaussianMixture
+from r3dpa.bench.problems import GaussianMixture
 from r3dpa.flow import (
     FeatureGuidance,
     FeatureTarget,

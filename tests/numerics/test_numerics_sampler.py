@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3dpa.bench.mixture import GaussianMixture
+from r3dpa.bench.problems import GaussianMixture
 from r3dpa.flow import (
     Interpolant,
     ab2,
