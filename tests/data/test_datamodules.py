@@ -88,18 +88,7 @@ def test_missing_grids_are_made_once_and_need_their_extractor(
     with pytest.raises(StoreError, match="No feature grid"):
         data(features_dir=str(tmp_path / "none")).setup("fit")
     data(features_dir=str(tmp_path / "none")).setup("predict")
-
-
-def test_grid_sizes_share_a_folder_and_its_source(tmp_path, data, scaled_points):
     assert data().feature_source is None
-    for size, cells in (((2, 4), 8), ((4, 8), 32)):
-        module = data(extractor=scaled_points(), grid_size=size)
-        assert module.feature_source == "scaled"
-        module.prepare_data()
-        module.setup("fit")
-        assert module.train_set[0]["feature_grid"].shape == (cells, 4)
-    folder = tmp_path / "scans/feature_grids/scaled"
-    assert {path.name for path in folder.iterdir()} == {"2x4", "4x8"}
     with pytest.raises(StoreError, match="No feature grids in"):
         _ = data(features_dir=str(tmp_path / "none")).feature_source
 
@@ -214,17 +203,6 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
     file = str(tmp_path / "scans/0000000000.bin")
     with pytest.raises(ValueError, match="features_dir is needed"):
         LidarDataModule(file, sensor=sensor, extractor=scaled_points())
-    module = LidarDataModule(
-        file,
-        sensor,
-        val_every=None,
-        extractor=scaled_points(),
-        features_dir=str(tmp_path / "g"),
-        grid_size=(2, 4),
-    )
-    module.prepare_data()
-    module.setup("fit")
-    assert module.train_set[0]["feature_grid"].shape == (8, 4)
 
 
 @pytest.mark.parametrize(
@@ -239,13 +217,6 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
 def test_bad_arguments(data, options, message):
     with pytest.raises(ValueError, match=message):
         data(**options)
-
-
-def test_a_batch_larger_than_the_data_is_refused(data):
-    module = data(batch_size=11)
-    module.setup("fit")
-    with pytest.raises(ValueError, match="10 training scans do not fill one batch of 11"):
-        module.train_dataloader()
 
 
 def test_simulated_data_are_made_once_and_feed_a_fit(tmp_path, scaled_points, fit):

@@ -209,14 +209,11 @@ def test_a_file_of_something_else_is_named(tmp_path, library):
     path = tmp_path / "objects.safetensors"
     library.save(path)
     content = path.read_bytes()
-    damaged = {"cut": content[:40], "empty": b"", "text": b"no library"}
-    for name, data in damaged.items():
+    for name, data in {"cut": content[:40], "empty": b"", "text": b"no library"}.items():
         path = tmp_path / f"{name}.safetensors"
         path.write_bytes(data)
         with pytest.raises(ValueError, match=rf"{name}\.safetensors holds no objects"):
             ObjectLibrary.load(path)
-    with pytest.raises(ValueError, match=r"absent\.safetensors holds no objects"):
-        ObjectLibrary.load(tmp_path / "absent.safetensors")
     for card in ({}, {"version": 2}, {"version": 1, "classes": [{"name": "car"}]}):
         metadata = {"r3dpa_objects": json.dumps(card)}
         save_file({"features": torch.ones(1, 2)}, path, metadata)

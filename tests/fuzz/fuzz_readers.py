@@ -54,14 +54,7 @@ class Hang(BaseException):
 
 
 class Reader(NamedTuple):
-    """A reader, and a valid file of its format.
-
-    Args:
-        file: The file that is mutated.
-        read: Reads it.
-        content: Bytes of a valid file.
-        wrap: Bytes of the file from mutated content, where it has a hash or is packed.
-    """
+    """A reader of a file, bytes of a valid one, and what packs mutated content again."""
 
     file: Path
     read: Callable[[], object]
@@ -347,20 +340,18 @@ def main() -> int:
         everything = readers(Path(folder))
         share = -(-options.inputs // len(everything))
         for name, reader in everything.items():
-            start, wrong, kinds = time.perf_counter(), 0, set()
+            start, wrong = time.perf_counter(), {}
             for data, reason in fuzz(name, reader, share, options.seed):
-                wrong += 1
-                kind = re.sub(r"\d+|'[^']*'|/\S+", "", reason)[:60]
-                if kind not in kinds and len(kinds) < 20:
-                    kinds.add(kind)
-                    options.keep.mkdir(exist_ok=True)
-                    safe = re.sub(r"\W+", "_", name)
-                    (options.keep / f"{safe}_{len(kinds)}").write_bytes(data)
-                    sys.stdout.write(f"  {name}: {reason}\n")
+                failures += 1
+                wrong.setdefault(re.sub(r"\d+|'[^']*'|/\S+", "", reason)[:60], (data, reason))
+            for number, (data, reason) in enumerate(wrong.values()):
+                options.keep.mkdir(exist_ok=True)
+                safe = re.sub(r"\W+", "_", name)
+                (options.keep / f"{safe}_{number}").write_bytes(data)
+                sys.stdout.write(f"  {name}: {reason}\n")
             seconds = time.perf_counter() - start
-            sys.stdout.write(f"{name:<26}{share:>8} inputs {wrong:>6} wrong {seconds:>8.1f} s\n")
+            sys.stdout.write(f"{name:<26}{share:>8} inputs {seconds:>8.1f} s\n")
             sys.stdout.flush()
-            failures += wrong
         sys.stdout.write(f"{share * len(everything)} inputs, {failures} taken wrongly\n")
     return int(failures > 0)
 
