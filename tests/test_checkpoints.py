@@ -72,7 +72,13 @@ def checkpoint():
         for name, (kind, args) in NETWORKS.items()
     }
     return Checkpoint(
-        Path("run.ckpt"), "joint", networks, step=30, geometry=GEOMETRY.to_dict(), commit="abc"
+        Path("run.ckpt"),
+        "joint",
+        networks,
+        step=30,
+        geometry=GEOMETRY.to_dict(),
+        feature_source="geometric",
+        commit="abc",
     )
 
 
@@ -124,19 +130,13 @@ class TestOurFiles:
         assert_same_networks(read, checkpoint)
         assert (read.stage, read.step) == ("joint", 30)
         assert ScanGeometry.from_dict(read.geometry) == GEOMETRY
+        assert read.feature_source == "geometric"
         assert {p.name for p in path.parent.iterdir()} == {"run.v1.safetensors", "run.v1.yaml"}
         sit = read.network("sit").build()
         latents, time = torch.randn(1, 4, 4, 8), torch.tensor([0.3])
         assert torch.equal(
             sit.velocity(latents, time), checkpoint.network("sit").build().velocity(latents, time)
         )
-
-    def test_an_earlier_file_without_feature_source(self, checkpoint, tmp_path):
-        known = replace(checkpoint, feature_source="geometric")
-        path = save_checkpoint(known, tmp_path / "a.safetensors")
-        assert read_checkpoint(path).feature_source == "geometric"
-        change_description(path, lambda about: about.pop("feature_source"))
-        assert read_checkpoint(path).feature_source is None
 
     def test_tensors_that_share_memory(self, checkpoint, tmp_path):
         shared = {**checkpoint.networks, "ema": checkpoint.network("sit")}
@@ -283,22 +283,19 @@ class TestLoadInto:
             load_into({"sit": deeper}, checkpoint, stage="joint")  # 20 keys: 10 per block
 
     @pytest.mark.parametrize(
-        ("name", "network", "message"),
+        ("name", "changes", "message"),
         [
-            ("sit", SiT(**{**SIT_ARGS, "num_heads": 4}), "num_heads: checkpoint 2, network 4"),
-            ("sit", SiT(**{**SIT_ARGS, "alignment_depth": 3}), "alignment_depth: checkpoint 2"),
-            ("sit", SiT(**{**SIT_ARGS, "input_size": (8, 4)}), r"input_size: checkpoint \(4, 8\)"),
-            (
-                "vae",
-                VAE(**{**VAE_ARGS, "legacy_upsample": False}),
-                "legacy_upsample: checkpoint True, network False",
-            ),
-            ("latent_norm", LatentNorm(4, eps=1e-5), "eps: checkpoint 0.0001, network 1e-05"),
+            ("sit", {"num_heads": 4}, "num_heads: checkpoint 2, network 4"),
+            ("sit", {"alignment_depth": 3}, "alignment_depth: checkpoint 2"),
+            ("sit", {"input_size": (8, 4)}, r"input_size: checkpoint \(4, 8\)"),
+            ("vae", {"legacy_upsample": False}, "legacy_upsample: checkpoint True, network False"),
+            ("latent_norm", {"eps": 1e-5}, "eps: checkpoint 0.0001, network 1e-05"),
         ],
     )
-    def test_settings_that_no_shape_shows(self, checkpoint, name, network, message):
+    def test_settings_that_no_shape_shows(self, checkpoint, name, changes, message):
+        kind, args = NETWORKS[name]
         with pytest.raises(ValueError, match=message):
-            load_into({name: network}, checkpoint, stage="joint")
+            load_into({name: kind(**args | changes)}, checkpoint, stage="joint")
 
 
 @pytest.fixture
@@ -320,18 +317,6 @@ class Exploit:
 
 
 class TestOfficial:
-    def test_a_namespace_is_read(self, checkpoint, official, tmp_path):
-        torch.save(official, tmp_path / "0000030.pt")
-        read = read_checkpoint(tmp_path / "0000030.pt", sit_args=OFFICIAL_SIT_ARGS)
-        assert (read.stage, read.step) == ("official", 30)
-        assert read.official_args == vars(official["args"])
-        for name in NETWORKS:
-            ours, theirs = checkpoint.network(name).state_dict, read.network(name).state_dict
-            assert set(ours) == set(theirs)
-            assert all(torch.equal(ours[key], theirs[key]) for key in ours), name
-        assert read.network("vae").arguments == checkpoint.network("vae").arguments
-        assert read.network("latent_norm").init_args["legacy_inverse"] is True
-
     def test_code_in_a_file_is_not_run(self, official, tmp_path):
         official["extra"] = Exploit(str(tmp_path / "marker"))
         torch.save(official, tmp_path / "a.pt")
@@ -360,12 +345,10 @@ class TestOfficial:
             with pytest.raises(ValueError, match=message):
                 read_checkpoint(path)
 
-    def test_what_the_file_cannot_tell_is_asked_for(self, official):
+    def test_files_that_lack_an_argument_or_a_layer(self, official):
         del official["args"]
         with pytest.raises(ValueError, match=r"\['alignment_depth', 'input_size', 'num_heads'\]"):
             from_official(official, Path("a.pt"))
-
-    def test_another_backbone(self, official):
         with pytest.raises(ValueError, match="UNet"):
             from_official({**official, "model": {"conv.weight": torch.zeros(1)}}, Path("a.pt"))
 
@@ -456,8 +439,7 @@ class TestConvert:
 
     def test_a_training_checkpoint_and_back_keeps_all_facts(self, checkpoint, tmp_path):
         """Sensor, encoding, path and arguments; the official code finds its own entries only."""
-        facts = {"feature_source": "geometric", "interpolant": "cosine"}
-        full = replace(checkpoint, **facts)
+        full = replace(checkpoint, interpolant="cosine")
         ours = save_checkpoint(full, tmp_path / "a.safetensors")
         convert(ours, tmp_path / "a.pt", "official")
         content = torch.load(tmp_path / "a.pt", weights_only=False)
@@ -479,6 +461,11 @@ class TestConvert:
         table = convert(tmp_path / "a.pt", out, sit_args=OFFICIAL_SIT_ARGS)
         assert all(name in table for name in NETWORKS)
         assert "not converted: opt (optimiser of the SiT" in table
+        read = read_checkpoint(out)
+        assert (read.stage, read.step) == ("official", 30)
+        assert read.official_args == vars(official["args"])
+        assert read.network("vae").arguments == checkpoint.network("vae").arguments
+        assert read.network("latent_norm").init_args["legacy_inverse"] is True
         with pytest.raises(ValueError, match="exists already"):
             convert(tmp_path / "a.pt", out, sit_args=OFFICIAL_SIT_ARGS)
         with pytest.raises(ValueError, match=r"a.pt exists already"):
@@ -535,7 +522,12 @@ class TestTransfer:
     @pytest.mark.parametrize(
         ("changes", "group", "expected"),
         [
-            ({"feature_dim": 5}, "projector", ("fresh", "requested, but its shapes differ")),
+            # a new head may look at another block
+            (
+                {"feature_dim": 5, "alignment_depth": 1},
+                "projector",
+                ("fresh", "requested, but its shapes differ"),
+            ),
             # as many tokens in another grid
             ({"input_size": (8, 4)}, "pos_embed", ("resized", "other token grid: computed for")),
         ],
@@ -613,8 +605,3 @@ class TestTransfer:
         source = Checkpoint(Path("unet.ckpt"), "flow_matching", networks)
         with pytest.raises(ValueError, match=r"unet\.ckpt holds a UNet, but .* of a SiT"):
             transfer_rgb(source, SiT(**SIT_ARGS), LatentNorm(4), keep_projector=False)
-
-    def test_a_fresh_projector_may_look_at_another_block(self):
-        source, sit = self.source(alignment_depth=1), SiT(**SIT_ARGS)
-        report = transfer_rgb(source, sit, LatentNorm(4), keep_projector=False)
-        assert self.results(report)["blocks"] == "kept"

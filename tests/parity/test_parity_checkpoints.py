@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from official_sit import weights_of
+from recorded_networks import weights_of
 
 from r3dpa.checkpoints import (
     NetworkState,

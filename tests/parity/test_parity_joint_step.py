@@ -7,55 +7,37 @@ import math
 import lightning as L
 import pytest
 import torch
-from official_sit import our_name, sit_of
+from recorded_networks import our_name, sit_of, vae_of
 from torch.utils.data import DataLoader
 
 from r3dpa import losses
-from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import JointAlignment, LossWeights, OptimizerConfig
 from r3dpa.modules.steps import PathDraws, batch_number
-from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator
+from r3dpa.nn import LatentNorm, PatchDiscriminator
+
+LOSSES = ("alignment_loss", "flow_matching_loss", "generator_loss", "discriminator_loss")
 
 
-class RecordedData(LidarDataModule):
+class RecordedData(L.LightningDataModule):
     """The recorded images and features in place of scans."""
 
     feature_source = "recorded"
 
-    def __init__(self, case, num_steps):
-        L.LightningDataModule.__init__(self)
-        sensor = LidarSensor(*case["in/step0/image"].shape[2:])
-        self.projection, self.codec = SphericalProjection(sensor), RangeCodec()
-        self.projection_kind = "spherical"
-        patch = case.config["sit"]["patch_size"]
-        self.grid_size = tuple(size // patch for size in case.config["sit"]["input_size"])
-        self.features_dir, self.extractor = "recorded", None
-        self.width = case["in/step0/features"].shape[-1]
+    def __init__(self, case):
+        super().__init__()
+        names = {"range_image": "image", "feature_grid": "features"}
         self.batches = [
-            {
-                "range_image": case[f"in/step{step}/image"],
-                "feature_grid": case[f"in/step{step}/features"],
-            }
-            for step in range(num_steps)
+            {ours: case[f"in/step{step}/{theirs}"] for ours, theirs in names.items()}
+            for step in range(case.config["steps"])
         ]
-
-    feature_dim = property(lambda self: self.width)
-    geometry = property(lambda self: ScanGeometry(self.projection, self.codec, self.grid_size))
-
-    def setup(self, stage=None):
-        pass
-
-    prepare_data = setup
+        sensor = LidarSensor(*self.batches[0]["range_image"].shape[2:])
+        sit = case.config["sit"]
+        grid_size = tuple(size // sit["patch_size"] for size in sit["input_size"])
+        self.geometry = ScanGeometry(SphericalProjection(sensor), RangeCodec(), grid_size)
 
     def train_dataloader(self):
         return DataLoader(self.batches, batch_size=None)
-
-    def val_dataloader(self):
-        return []
-
-    def state_dict(self):
-        return {}
 
 
 class Recording(JointAlignment):
@@ -105,9 +87,13 @@ def ours(official: str) -> str:
 
 
 def recorder(module, name, loss):
+    """The loss as it is, which also keeps its results and the means of its arguments."""
+
     def recording(*args, **kwargs):
         result = loss(*args, **kwargs)
-        module.steps[-1].setdefault(name, []).append(result.detach().clone())
+        step = module.steps[-1]
+        step.setdefault(name, []).append(result.detach().clone())
+        step[f"{name}_means"] = [value.detach().mean() for value in args]
         return result
 
     return recording
@@ -122,18 +108,9 @@ def recorded(load_case):
 def run(recorded):
     config = recorded.config
     vae_loss = config["loss_config"]["losses"]
-    sit, vae, disc = config["sit"], config["vae"], config["discriminator"]
+    sit, disc = config["sit"], config["discriminator"]
     module = Recording(
-        vae=VAE(
-            in_channels=vae["in_channels"],
-            latent_channels=vae["z_channels"],
-            channels=vae["ch"],
-            channel_multipliers=tuple(vae["ch_mult"]),
-            strides=tuple(tuple(stride) for stride in vae["strides"]),
-            num_res_blocks=vae["num_res_blocks"],
-            attention_levels=tuple(vae["attn_levels"]),
-            legacy_upsample=True,
-        ),
+        vae=vae_of(config["vae"]),
         sit=sit_of(sit, learn_pos_embed=True),
         discriminator=PatchDiscriminator(disc["input_nc"], disc["ndf"], disc["n_layers"]),
         weights=LossWeights(
@@ -159,22 +136,16 @@ def run(recorded):
         accelerator="cpu",
         max_steps=config["steps"],
         gradient_clip_val=config["max_grad_norm"],
+        limit_val_batches=0,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
     )
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("alignment_loss", "flow_matching_loss", "generator_loss"):
+        for name in LOSSES:
             patch.setattr(losses, name, recorder(module, name, getattr(losses, name)))
-        hinge = losses.discriminator_loss
-
-        def recorded_hinge(real, fake):
-            module.steps[-1]["logits"] = (real.mean().detach(), fake.mean().detach())
-            return hinge(real, fake)
-
-        patch.setattr(losses, "discriminator_loss", recorded_hinge)
-        trainer.fit(module, datamodule=RecordedData(recorded, config["steps"]))
+        trainer.fit(module, datamodule=RecordedData(recorded))
     assert len(module.steps) == config["steps"]
     return module.steps
 
@@ -196,8 +167,8 @@ def values(recorded, run):
             f"{out}/vae/gan_loss": ours_["generator_loss"][0],
             f"{out}/vae/align_proj_loss": ours_["alignment_loss"][0],
             f"{out}/disc/loss": parts["discriminator"],
-            f"{out}/disc/logits_real": ours_["logits"][0],
-            f"{out}/disc/logits_fake": ours_["logits"][1],
+            f"{out}/disc/logits_real": ours_["discriminator_loss_means"][0],
+            f"{out}/disc/logits_fake": ours_["discriminator_loss_means"][1],
             f"{out}/sit/denoising_loss": ours_["flow_matching_loss"][0],
             f"{out}/sit/proj_loss": ours_["alignment_loss"][1],
             f"{out}/sit/total": parts["denoising"] + parts["sit_alignment"],

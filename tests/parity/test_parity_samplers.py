@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from official_sit import build_sit
+from recorded_networks import build_sit
 
 from r3dpa.flow import (
     FeatureGuidance,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from official_sit import build_norm, build_sit, our_name
+from recorded_networks import build_norm, build_sit, our_name
 
 from r3dpa.flow import FeatureGuidance, FeatureTarget, Interpolant
 from r3dpa.losses import alignment_loss, flow_matching_loss

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from official_sit import our_name, weights_of
+from recorded_networks import our_name, weights_of
 
 from r3dpa.checkpoints import from_official, to_official
 from r3dpa.flow import Interpolant

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from recorded_networks import vae_of
 
 from r3dpa.nn.layers import Downsample, Upsample
-from r3dpa.nn.vae import VAE, Posterior
+from r3dpa.nn.vae import Posterior
 
 
 @pytest.fixture(scope="module")
@@ -16,18 +17,8 @@ def case(load_case):
 
 @pytest.fixture
 def vae(case):
-    config = case.config
-    assert config["in_channels"] == config["out_ch"]
-    vae = VAE(
-        in_channels=config["in_channels"],
-        latent_channels=config["z_channels"],
-        channels=config["ch"],
-        channel_multipliers=config["ch_mult"],
-        strides=config["strides"],
-        num_res_blocks=config["num_res_blocks"],
-        attention_levels=config["attn_levels"],
-        legacy_upsample=True,
-    )
+    assert case.config["in_channels"] == case.config["out_ch"]
+    vae = vae_of(case.config)
     vae.load_state_dict(case.weights())
     return vae
 

@@ -13,7 +13,6 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-import torch
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.viz import Category, PageScan, scan_page
@@ -83,11 +82,6 @@ class TestData:
         header, columns = unpacked(scan_page([PageScan("a", 10 * points)], "", {}, {}), 0)
         assert header["step_m"] == pytest.approx(1630 / 32767)
         assert columns["x"] == pytest.approx([1630, -1630, 1630], abs=header["step_m"] / 2)
-
-    def test_columns_are_there_only_where_known(self):
-        plain = PageScan("plain", torch.ones(3, 3))
-        assert pack_scan(plain)[0]["columns"] == ["x", "y", "z"]
-        assert pack_scan(example())[0]["columns"] == list(TYPES)
 
     def test_categories_are_those_that_occur_with_a_name_and_colour_each(self):
         page = page_data(scan_page([example()], "", SEMANTICS, ORIGINS | {9: Category("sun")}))
@@ -188,11 +182,9 @@ def projected(points, view, width, height):
 
 @needs_node
 class TestScript:
-    def test_scripts_are_valid(self, tmp_path):
-        for name in ("page_cloud.js", "page_viewer.js"):
-            path = tmp_path / name
-            path.write_text((files("r3dpa.viz") / name).read_text("utf-8"), "utf-8")
-            subprocess.run(["node", "--check", str(path)], check=True, timeout=60)
+    def test_the_viewer_is_a_valid_script(self):
+        path = files("r3dpa.viz") / "page_viewer.js"
+        subprocess.run(["node", "--check", str(path)], check=True, timeout=60)
 
     def test_unpacks_what_python_packed(self):
         scan = example(num_points=50)
@@ -234,17 +226,6 @@ class TestScript:
         pixel, depth = projected(points, view, *size)
         assert np.array(found)[:, :2] == pytest.approx(pixel, abs=1e-6)
         assert np.array(found)[:, 2] == pytest.approx(depth, abs=1e-9)
-
-    def test_seen_from_above_forward_is_up_and_left_is_left(self):
-        view = camera(target=[0, 0, 0], yaw=0, pitch=np.pi / 2, flat=True, distance=50)
-        ahead, left = run_node(
-            "const p = Cloud.projectionOf(given.view, 100, 100);"
-            "return [Cloud.project(p, 10, 0, 0), Cloud.project(p, 0, 10, 0)];",
-            view=view,
-        )
-        metre = 100 / 2 / np.tan(np.radians(25)) / 50
-        assert ahead[:2] == pytest.approx([50, 50 - 10 * metre])
-        assert left[:2] == pytest.approx([50 - 10 * metre, 50])
 
     def test_drawn_pixels_are_those_of_numpy_and_the_nearest_point_shows(self):
         points = np.random.default_rng(2).uniform(-12, 12, (4000, 3)).astype(np.float32)

@@ -23,7 +23,7 @@ from torch import Tensor
 from r3dpa import __version__
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import (
-    facts_of,
+    OURS,
     from_official,
     is_official,
     statistics_of,
@@ -109,20 +109,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
         for name, state in checkpoint.networks.items()
         for key, value in state.state_dict.items()
     }
-    about = {
-        "format": _FORMAT,
-        "stage": checkpoint.stage,
-        "step": checkpoint.step,
-        "version": __version__,
-        "commit": source_commit(),
-        "networks": {name: state.config for name, state in checkpoint.networks.items()},
-        "geometry": checkpoint.geometry,
-        "augmentation": checkpoint.augmentation,
-        "feature_source": checkpoint.feature_source,
-        "interpolant": checkpoint.interpolant,
-        "official_args": dict(checkpoint.official_args),
-        "left_out": dict(checkpoint.left_out),
-    }
+    about = {"format": _FORMAT, "step": checkpoint.step, **checkpoint.facts}
+    about |= {"version": __version__, "commit": source_commit()}
+    about["left_out"] = dict(checkpoint.left_out)
     with atomic_path(path) as weights_file, atomic_path(description) as description_file:
         save_file(weights, weights_file)
         about["sha256"] = _sha256(weights_file)
@@ -160,9 +149,8 @@ def convert(
         Files, networks and what was not converted, as text.
 
     Raises:
-        FileNotFoundError: If there is no such source.
-        ValueError: If it cannot be read, has no counterpart in the other layout, or the output
-            exists already.
+        ValueError: If the source has no counterpart in the other layout, or the output exists; and
+            as :func:`read_checkpoint`.
     """
     source, out = Path(source), Path(out)
     if to not in ("r3dpa", "official"):
@@ -190,7 +178,7 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
         raise ValueError(f"official checkpoints are called <name>.pt, got {out}")
     content = to_official(checkpoint)
     if {"model", "ema"} & set(content):
-        files: dict[Path, Any] = {out: content | facts_of(checkpoint)}
+        files: dict[Path, Any] = {out: content | {OURS: checkpoint.facts}}
     else:
         files = {out: content["vae"]} if "vae" in content else {}
         if "discriminator" in content:

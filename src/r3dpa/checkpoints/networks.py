@@ -73,11 +73,7 @@ class NetworkState:
 
     @classmethod
     def of(cls, network: nn.Module, init_args: Mapping[str, Any]) -> NetworkState:
-        """State of a network built by hand with the given arguments.
-
-        Raises:
-            ValueError: If the class is not allowed, or the arguments do not rebuild this network.
-        """
+        """State of a network built by hand; a ``ValueError`` if the arguments do not rebuild it."""
         return cls(path_of(type(network)), init_args, network.state_dict()).checked()
 
     @property
@@ -98,14 +94,10 @@ class NetworkState:
         return defaults | {key: _tuples(value) for key, value in self.init_args.items()}
 
     def new(self) -> nn.Module:
-        """The network freshly initialised, without the weights.
-
-        Raises:
-            ValueError: If the class is not allowed or does not accept the arguments.
-        """
-        kind = self.kind
+        """The network without the weights; a ``ValueError`` if the class refuses the arguments."""
+        kind, arguments = self.kind, {key: _tuples(value) for key, value in self.init_args.items()}
         try:
-            return kind(**{key: _tuples(value) for key, value in self.init_args.items()})
+            return kind(**arguments)
         except UNPICKLING_ERRORS as error:
             raise ValueError(
                 f"{self.class_path} does not accept the arguments "
@@ -173,6 +165,14 @@ class Checkpoint:
     commit: str | None = None  #: commit of r3dpa that wrote it
     official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options
     left_out: Mapping[str, str] = field(default_factory=dict)  #: unread entries, and the reason
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain values of all but the weights, the step and what was left out."""
+        about: dict[str, Any] = {key: getattr(self, key) for key in FACTS}
+        about["official_args"] = dict(self.official_args)
+        about["networks"] = {name: state.config for name, state in self.networks.items()}
+        return about
 
     def network(self, name: str) -> NetworkState:
         """The network called ``name``; raises a ``ValueError`` if the checkpoint has none."""

@@ -26,7 +26,7 @@ from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
 
-__all__ = ["facts_of", "from_official", "is_official", "statistics_of", "to_official"]
+__all__ = ["OURS", "from_official", "is_official", "statistics_of", "to_official"]
 
 StateDict = Mapping[str, Tensor]
 Options = Mapping[str, Any]
@@ -36,7 +36,7 @@ Strides = tuple[int, int] | None
 _SIT_NETWORKS = {"model": ("sit", "latent_norm"), "ema": ("ema", "ema_latent_norm")}
 _OPTIMISERS = {"opt": "SiT", "opt_vae": "VAE", "opt_disc": "discriminator"}
 _STATISTICS = {"latents_scale", "latents_bias"}
-_OURS = "r3dpa"
+OURS = "r3dpa"
 _DATASET_CONFIGS: dict[Encoding, str] = {"linear": "kitti.yaml", "log2": "kitti_logscale.yaml"}
 _SIT_SIZES = {384: ("S", 12, 6), 768: ("B", 12, 12), 1024: ("L", 24, 16), 1152: ("XL", 28, 16)}
 """Name, depth and number of heads by token width."""
@@ -82,14 +82,14 @@ def from_official(
         args: Options of the official training script, where ``content`` has no ``args``.
         sit_args: Arguments of SiT or UNet that override those of the file.
         encoding: Encoding of the range image; None takes that of the options. Without either the
-            geometry is unknown, unless the file holds :func:`facts_of`.
+            geometry is unknown, unless the file has an entry ``r3dpa``.
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
             or UNet can neither be read nor inferred.
     """
     given = sit_args or {}
-    if isinstance(content.get(_OURS), Mapping):
+    if isinstance(content.get(OURS), Mapping):
         return _from_ours(content, path, given)
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
@@ -128,8 +128,8 @@ def from_official(
 
 
 def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Checkpoint:
-    """Checkpoint from an official file with :func:`facts_of`."""
-    about = content[_OURS]
+    """Checkpoint from an official file with the entry that ours have."""
+    about = content[OURS]
     networks: dict[str, NetworkState] = {}
     for name, config in about["networks"].items():
         key = next((key for key, names in _SIT_NETWORKS.items() if name in names), name)
@@ -181,14 +181,6 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
         content["steps"] = checkpoint.step
     args = dict(checkpoint.official_args) or _args_of(checkpoint)
     return content | {"args": argparse.Namespace(**args)}
-
-
-def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Entry for an official training checkpoint: the facts that its layout has no place for."""
-    about: dict[str, Any] = {key: getattr(checkpoint, key) for key in FACTS}
-    about["official_args"] = dict(checkpoint.official_args)
-    about["networks"] = {name: state.config for name, state in checkpoint.networks.items()}
-    return {_OURS: about}
 
 
 def statistics_of(norm: StateDict) -> dict[str, Tensor]:

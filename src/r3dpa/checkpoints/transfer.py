@@ -217,7 +217,6 @@ def read_snapshot(
         allow: Warn of latents that differ instead of refusing them.
 
     Raises:
-        FileNotFoundError: If there is no such file.
         ValueError: If the file has no average or no fitted statistics, or another latent size, path
             or VAE, or statistics further apart than the tolerance.
     """

@@ -1,4 +1,4 @@
-"""The SiT of a recorded case as our network and norm, and weights of recorded listings."""
+"""Networks of recorded cases as ours, and weights of recorded listings."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
+from r3dpa.nn.vae import VAE
 
 
 def our_name(official: str) -> str:
@@ -51,3 +52,16 @@ def build_norm(case, **options):
     norm = LatentNorm(case.config["in_channels"], momentum=case.config["bn_momentum"], **options)
     norm.load_state_dict(case.weights("w/bn."))
     return norm
+
+
+def vae_of(config):
+    return VAE(
+        in_channels=config["in_channels"],
+        latent_channels=config["z_channels"],
+        channels=config["ch"],
+        channel_multipliers=config["ch_mult"],
+        strides=config["strides"],
+        num_res_blocks=config["num_res_blocks"],
+        attention_levels=config["attn_levels"],
+        legacy_upsample=True,
+    )
