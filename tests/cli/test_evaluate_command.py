@@ -224,7 +224,6 @@ def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path
         (["--spaces", "fgeo"], "10 generated scenes for the 64 features of FGEO.*allow_few"),
         (["--spaces", "fwid"], "the reference has no features of fwid, only of fgeo"),
         (["--spaces", "fid"], "there is no feature space 'fid'"),
-        (["--spaces", "fgeo,fgeo"], "spaces must be different names"),
         (["--ckpt.frid", "x.ckpt"], r"--ckpt\.frid: frid is not among the spaces \(fgeo\)"),
         (
             ["--spaces", "frid"],

@@ -239,7 +239,7 @@ def test_few_scenes_are_refused_or_marked(reference):
 
 
 BAD = [
-    (EvaluationScene("bad/1", torch.zeros(0, 3)), "bad/1: none of 0 points"),
+    (EvaluationScene("bad/1", torch.zeros(0, 3)), "bad/1: no pixel of the range image"),
     (EvaluationScene("bad/2", torch.full((1, 3), math.nan)), "bad/2: cloud holds 3 NaN"),
     (EvaluationScene("bad/3", None, torch.ones(8, 8)), r"bad/3: range image of shape \(8, 8\)"),
     (EvaluationScene("bad/4", torch.tensor([[0.0, 52.0, 0.0]])), "bad/4: none of 1 points has"),
@@ -285,7 +285,7 @@ def test_bad_scenes_do_not_use_up_what_the_protocol_counts():
 
 
 def test_bad_scenes_alone_are_an_error(reference):
-    with pytest.raises(TooFewScenesError, match=r"0 generated .* 7 cannot be used, .* bad/1: none"):
+    with pytest.raises(TooFewScenesError, match=r"0 generated .* 7 cannot .* bad/1: no pixel"):
         rows_of([bad for bad, _ in BAD], reference, skip_bad=True)
 
 

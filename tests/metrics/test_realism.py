@@ -8,15 +8,8 @@ import pytest
 from scipy import stats
 from scipy.spatial.distance import jensenshannon
 
-from r3dpa.metrics import (
-    ScanStatistics,
-    curve_rmse,
-    jensen_shannon,
-    measures,
-    realism_table,
-    scan_statistics,
-    wasserstein_1,
-)
+from r3dpa.metrics import ScanStatistics, measures, realism_table, scan_statistics
+from r3dpa.metrics.functional import curve_rmse, jensen_shannon, wasserstein_1
 
 
 def street(seed: int, lost: float = 0.02, wall_m: float = 25.0, gray: float = 0.3) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -84,14 +85,10 @@ def evaluate(
     Real and generated scenes are prepared alike by :func:`r3dpa.metrics.scene.through_sensor`, and
     the same scenes in the same order give the same numbers.
 
-    The floor of a distance is that between the halves of the reference: other drives if there are
-    several. It is computed with as many scenes as are evaluated, or as many as a half keeps; the
-    note of the row says so if these are fewer. For precision and its relatives the note has what
-    the halves reach.
-
-    Official statistics give the Fréchet distances and, if the file has what they need, JSD, TV and
-    MMD, without floors; ``left_out`` of ``extra`` lists the other rows. They do not name their
-    weights: the caller must know that those of ``spaces`` are the same.
+    The floor of a distance is that between the halves of the reference, with as many scenes as are
+    evaluated, or as many as a half keeps; the note of the row says so if these are fewer. For
+    precision and its relatives the note has what the halves reach. Official statistics give no
+    floors, and do not name their weights: those of ``spaces`` must be the same.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
@@ -109,8 +106,7 @@ def evaluate(
     Raises:
         TooFewScenesError: If there are fewer than two scenes.
         ValueError: If the reference is not complete or lacks a space, or there are, without
-            ``allow_few``, not more scenes than features; without ``skip_bad``, if a scene is empty,
-            holds NaN or has another size: it is named.
+            ``allow_few``, not more scenes than features; without ``skip_bad``, for a bad scene.
     """
     resampling = resampling or Resampling()
     reference.check(spaces)
@@ -229,20 +225,13 @@ def check_counts(
     allow_few: bool,
     bad: Sequence[str] = (),
 ) -> None:
-    """Refuses fewer than two scenes and, unless allowed, fewer than features.
-
-    Raises:
-        TooFewScenesError: If there are fewer than two generated scenes.
-        ValueError: Naming the kinds and the spaces.
-    """
+    """A ``TooFewScenesError`` below two scenes, a ``ValueError`` below the number of features."""
     if num_scenes < 2:
         left_out = f" {len(bad)} cannot be used, the first is {bad[0]}" if bad else ""
         raise TooFewScenesError(
             f"{num_scenes} generated scenes; a comparison needs at least 2.{left_out}"
         )
-    counts = {"generated scenes": num_scenes}
-    if reference.names:
-        counts["real scans"] = len(reference.names)
+    counts = {"generated scenes": num_scenes, "real scans": len(reference.names) or math.inf}
     few = [
         f"{count} {what} for the {space.dim} features of {space.label}"
         for space in spaces
@@ -258,12 +247,7 @@ def check_counts(
 
 
 def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
-    """Complete reference of either kind; ``split`` is of the official file alone.
-
-    Raises:
-        ValueError: If the file is missing, damaged, of something else or not complete, or has no
-            such split.
-    """
+    """Complete reference of either kind; ``split`` is of the official file alone."""
     if is_official(path):
         return OfficialStatistics.load(path, split)
     if split is not None:
@@ -283,12 +267,7 @@ def reference_spaces(
     device: str,
     protocol: str | None = None,
 ) -> list[SceneFeatures]:
-    """Feature spaces of a comparison; default: those of the reference that have what they need.
-
-    Raises:
-        ValueError: If the reference is of another protocol or lacks a space, or as
-            :func:`feature_spaces`.
-    """
+    """Feature spaces of a comparison; default: those of the reference that have what they need."""
     setting = statistics.protocol
     if protocol is not None and protocol != setting.name:
         raise ValueError(

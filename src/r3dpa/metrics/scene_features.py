@@ -16,7 +16,7 @@ Distances in the last two have no published numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,15 +96,14 @@ def scene_features(
         raise ValueError(f"there is no feature space {name!r}; there are {', '.join(SPACES)}")
     if name == "fgeo" and ckpt is not None:
         raise ValueError(f"fgeo has no weights: leave {ckpt} out")
-    if name not in FREE_SPACES and ckpt is None:
+    if name in FREE_SPACES:
+        return _of_points(name, None if ckpt is None else Path(ckpt), device)
+    if ckpt is None:
         raise ValueError(
             f"{name} needs its official weights: give --ckpt.{name} FILE (`r3dpa test`: "
             f"--scorer.ckpt.{name} FILE), the model.ckpt of the release; without a file there are "
             f"{' and '.join(FREE_SPACES)}"
         )
-    if name in ("fwid", "fgeo"):
-        return _of_points(name, None if ckpt is None else Path(ckpt), device)
-    assert ckpt is not None
     if name == "frid":
         return range_vit_space(RangeViT.from_checkpoint(ckpt, protocol.sensor).to(device))
     if name == "fld":
@@ -114,41 +113,34 @@ def scene_features(
 
 
 def feature_spaces(
-    names: Sequence[str], ckpt: Mapping[str, Any] | None, protocol: Protocol, device: str
+    names: Iterable[str], ckpt: Mapping[str, Any] | None, protocol: Protocol, device: str
 ) -> list[SceneFeatures]:
-    """Feature spaces by name.
-
-    Raises:
-        ValueError: If a name occurs twice, a file belongs to none of them, or as
-            :func:`scene_features`.
-    """
-    if len(set(names)) < len(names):
-        raise ValueError(f"spaces must be different names, got {', '.join(names)}")
-    unused = [name for name in ckpt or {} if name not in names]
-    if unused:
-        raise ValueError(
-            f"--ckpt.{unused[0]}: {unused[0]} is not among the spaces ({', '.join(names)}); add it "
-            f"to them, or leave its file out (`r3dpa test`: --scorer.ckpt.{unused[0]})"
-        )
+    """Feature spaces by name; a ``ValueError`` as :func:`scene_features`, or for an unused file."""
+    names, files = list(dict.fromkeys(names)), ckpt or {}
+    for name in files:
+        if name not in names:
+            raise ValueError(
+                f"--ckpt.{name}: {name} is not among the spaces ({', '.join(names)}); add it to "
+                f"them, or leave its file out (`r3dpa test`: --scorer.ckpt.{name})"
+            )
     device = usable_device(device)
-    return [scene_features(name, (ckpt or {}).get(name), protocol, device) for name in names]
+    return [scene_features(name, files.get(name), protocol, device) for name in names]
 
 
 def range_vit_space(network: RangeViT) -> SceneFeatures:
     """FRID's features; a network of 5 input channels needs scenes with intensity."""
-    needs_intensity = network.in_channels == 5
+    device = network.image_mean.device
 
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
-        intensity = None
-        if needs_intensity:
-            for scene in scenes:
-                if scene.intensity is None:
-                    raise ValueError(
-                        f"{scene.name}: has no intensity, which these weights of RangeViT read; "
-                        "give those of rangevit_wo_i"
-                    )
-            intensity = _stack(scenes, "intensity", network.image_mean.device)
-        return network(_stack(scenes, "range_m", network.image_mean.device), intensity)
+        if network.in_channels < 5:
+            return network(_stack(scenes, "range_m", device), None)
+        for scene in scenes:
+            if scene.intensity is None:
+                raise ValueError(
+                    f"{scene.name}: has no intensity, which these weights of RangeViT read; give "
+                    "those of rangevit_wo_i"
+                )
+        return network(_stack(scenes, "range_m", device), _stack(scenes, "intensity", device))
 
     card = _card(network, "decoder, means of bands of rows", "pixel corners, -1 where empty")
     card["in_channels"] = network.in_channels
@@ -180,11 +172,10 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
 
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
         device = network.head.weight.device
+        limits = {"range_min_m": sensor.range_min_m, "range_max_m": sensor.range_max_m}
         clouds = []
         for index, scene in enumerate(scenes):
-            assert scene.points is not None
-            limits = {"range_min_m": sensor.range_min_m, "range_max_m": sensor.range_max_m}
-            voxels, inputs = voxelize(scene.points, voxel_m, **limits)
+            voxels, inputs = voxelize(_points(scene), voxel_m, **limits)
             clouds.append((F.pad(voxels, (0, 1), value=index), inputs))
         coordinates, inputs = (torch.cat(parts).to(device) for parts in zip(*clouds, strict=True))
         features = network(coordinates, inputs)
@@ -197,20 +188,16 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
 
 def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
     """Means of the features of a point extractor, without their lift to a higher dimension."""
-    extractor: WaffleIronS | GeometricFeatures
+    extractor: Any = (WaffleIronS(ckpt) if name == "fwid" else GeometricFeatures()).to(device)
     if name == "fwid":
-        extractor = WaffleIronS(ckpt).to(device)
         dim, layer = extractor.network.width, "normalised tokens, mean over points"
     else:
-        extractor = GeometricFeatures().to(device)
         dim, layer = extractor.basis.shape[1], "kernel features, mean over points"
 
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
-        prepared: list[Any] = []
-        for scene in scenes:
-            assert scene.points is not None
-            prepared.append(extractor.prepare(F.pad(scene.points, (0, 1), value=_INTENSITY)))
-        return torch.stack([values.mean(dim=0) for values in extractor.point_features(prepared)])
+        clouds = [F.pad(_points(scene), (0, 1), value=_INTENSITY) for scene in scenes]
+        features = extractor.point_features([extractor.prepare(cloud) for cloud in clouds])
+        return torch.stack([values.mean(dim=0) for values in features])
 
     card = {
         "backbone": extractor.name,
@@ -233,3 +220,8 @@ def _card(network: nn.Module, layer: str, preprocessing: str) -> dict[str, Any]:
 
 def _stack(scenes: Sequence[EvaluationScene], field: str, device: torch.device) -> Tensor:
     return torch.stack([getattr(scene, field) for scene in scenes]).to(device)
+
+
+def _points(scene: EvaluationScene) -> Tensor:
+    assert scene.points is not None, "scenes of through_sensor have points"
+    return scene.points
