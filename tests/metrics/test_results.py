@@ -222,10 +222,9 @@ def test_text(table):
         "| c | 12.35 | - |",
         "| real vs. real (floor) | 1.00 to 1.50 | - |",
         "",
-        "- **best**, _second_, = tie for the next place: no further apart than the floor or the "
-        "intervals",
-        "- published: against KITTI-360 val, 1000 scans, not ranked",
+        "- **best**, _second_, = tie: no further apart than the floor or the intervals",
         "- [low, high]: 95 % interval of the value at this number of scenes",
+        "- published: against KITTI-360 val, 1000 scans, not ranked",
         "- c, FLD: no net",
     ]
 

@@ -7,6 +7,7 @@ stored, and 5.67 is printed below 10^-2.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -166,7 +167,7 @@ class Evaluation:
     @property
     def name(self) -> str:
         """Label in tables."""
-        return self.label + " (published)" * self.published
+        return " ".join(self.label.split()) + " (published)" * self.published
 
     @property
     def bad_samples(self) -> list[str]:
@@ -201,9 +202,7 @@ class Evaluation:
 
     def save(self, path: str | Path) -> None:
         """Writes the evaluation as JSON."""
-        with atomic_path(path) as temporary:
-            text = json.dumps(asdict(self), indent=2, ensure_ascii=False)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        save_text(path, json.dumps(asdict(self), indent=2, ensure_ascii=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -272,15 +271,15 @@ class EvaluationTable:
             heads.append(f"{result.name} ({kind})")
         lines = self._lines(cell)
         table = text_table(lines, ["", *heads], "l" + "r" * len(heads), "pipe")
+        marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
         interval = "[low, high]: 95 % interval of the value at this number of scenes"
-        below = [*self._legend("**best**, _second_"), interval, *self.notes]
+        below = [marks, interval, *self.notes]
         return "\n".join([table, "", *(f"- {text}" for text in below)]) + "\n"
 
     def latex(self) -> str:
         r"""The table as a ``tabular`` of the package booktabs: best bold, second underlined.
 
-        Intervals, which would make it too wide for a page, are left out; legend and notes are
-        comments.
+        Intervals, which would make it too wide for a page, are left out; notes are comments.
         """
 
         def cell(result: MetricResult, mark: Mark) -> str:
@@ -295,14 +294,16 @@ class EvaluationTable:
         table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
         for rule in ("toprule", "midrule", "bottomrule"):
             table = table.replace(r"\hline", f"\\{rule}", 1)
-        comments = [*self._legend("bold best, underlined second"), *self.notes]
-        return "\n".join([*(f"% {' '.join(text.split())}" for text in comments), table]) + "\n"
+        comments = [f"% {' '.join(note.split())}" for note in self.notes]
+        return "\n".join([*comments, table]) + "\n"
 
     @property
     def notes(self) -> list[str]:
         """Differences between the evaluations, samples left out, reasons of absent values."""
         own = [e for e in self.evaluations if not e.published]
-        notes = [
+        published = {e.about["reference"]: None for e in self.evaluations if e.published}
+        notes = [f"published: against {name}, not ranked" for name in published]
+        notes += [
             f"not the same {key}: {', '.join(e.label for e in own)}"
             for key in ("protocol", "reference", "backbones")
             if any(e.about[key] != own[0].about[key] for e in own[1:])
@@ -331,17 +332,9 @@ class EvaluationTable:
             marked = zip(column, self.marks(metric), strict=True)
             texts = [cell(result, mark) if result else "-" for result, mark in marked]
             cells.append([*texts, " to ".join(floors) or "-"])
-        names = [" ".join(e.name.split()).replace("|", "/") for e in self.evaluations]
+        names = [e.name.replace("|", "/") for e in self.evaluations]
         lines = [list(line) for line in zip([*names, _FLOOR], *cells, strict=True)]
         return lines if any(text != "-" for text in lines[-1][1:]) else lines[:-1]
-
-    def _legend(self, marks: str) -> list[str]:
-        """Meaning of the marks, and origin of the published numbers."""
-        marked = any(mark for metric in self.columns for mark in self.marks(metric))
-        tie = "= tie for the next place: no further apart than the floor or the intervals"
-        published = {e.about["reference"]: None for e in self.evaluations if e.published}
-        against = f"published: against {' and '.join(published)}, not ranked"
-        return [f"{marks}, {tie}"] * marked + [against] * bool(published)
 
 
 def report(evaluation: Evaluation, split: str | None) -> str:
@@ -357,22 +350,28 @@ def save_reports(evaluation: Evaluation, split: str | None, out: Path) -> None:
     evaluation.save(out / "evaluation.json")
     save_csv((evaluation,), out / "metrics.csv")
     table = _beside_published(evaluation, split)
-    for name, text in (("table.md", str(table)), ("table.tex", table.latex())):
-        with atomic_path(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    save_text(out / "table.md", str(table))
+    save_text(out / "table.tex", table.latex())
+
+
+def save_text(path: str | Path, text: str) -> None:
+    """Writes a text file at once."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
     """Writes every row of every evaluation as a line, with values as they were computed."""
     keys = [key.name for key in fields(MetricResult) if key.name not in ("name", "interval")]
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["label", "published", "metric", "low", "high", *keys])
-        for e in evaluations:
-            for row in e.rows:
-                low, high = row.interval or (None, None)
-                values = [getattr(row, key) for key in keys]
-                writer.writerow([e.label, e.published, row.name, low, high, *values])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["label", "published", "metric", "low", "high", *keys])
+    for e in evaluations:
+        for row in e.rows:
+            ends = row.interval or (None, None)
+            values = [getattr(row, key) for key in keys]
+            writer.writerow([e.label, e.published, row.name, *ends, *values])
+    save_text(path, text.getvalue())
 
 
 def _beside_published(evaluation: Evaluation, split: str | None) -> EvaluationTable:
