@@ -117,14 +117,11 @@ class TestFiles:
         edit(files, "vary", tmp_path / "again", *scan, "--overwrite")
         assert not (tmp_path / "again" / "mask.png").exists()
 
-    def test_mix_of_two_halves_is_that_of_a_layout(self, files, no_sheet, tmp_path):
+    def test_mix_of_two_scans(self, files, no_sheet, tmp_path):
         sides = ["--left", files / "a.bin", "--right", files / "b.bin", "--split", "30"]
-        edit(files, "mix", tmp_path / "sides", *sides)
-        layout = [30, files / "a.bin", 210, files / "b.bin"]
-        about = edit(files, "mix", tmp_path / "layout", "--layout", *layout)
-        made = [np.load(tmp_path / name / "range_m.npy") for name in ("sides", "layout")]
-        assert np.array_equal(*made)
+        about = edit(files, "mix", tmp_path / "sides", *sides)
         assert list(about["scans"]) == ["0: a", "1: b"]
+        assert np.load(tmp_path / "sides" / "range_m.npy").shape == (2, 16, 64)
         mask = np.asarray(Image.open(tmp_path / "sides" / "mask.png"))
         assert set(np.unique(mask)) == {0, 255}
 
@@ -188,9 +185,6 @@ REFUSED = [
     ("vary", "--scan two.npz", r"holds 2 scans \(x, y\)"),
     ("vary", "--scan scan.pcd", "scan.pcd: is no scan"),
     ("vary", "--scan gone.bin", "gone.bin"),
-    ("mix", "--left a.bin --right a.bin", "nothing to mix: .*a.bin"),
-    ("mix", "--left a.bin", "--left and --right, or a --layout"),
-    ("mix", "--layout 0 a.bin 90", "give pairs of azimuth and scan"),
     (
         "mix",
         "--ckpt None.safetensors --left a.bin --right b.bin",

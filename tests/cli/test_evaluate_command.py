@@ -144,7 +144,7 @@ def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp
     assert stored.row("JSD").num_samples == 8
     (first, second), printed = stored.bad_samples, capsys.readouterr().out
     assert re.search(r"004\.bin: has 9 bytes", first)
-    assert second.startswith("samples/007: none of 1 points has x in")
+    assert second.startswith("samples/007: none of 1 points has x and y within")
     assert first in printed
     assert second in printed
     note = "samples: samples that cannot be used and are left out: 2"
@@ -170,7 +170,7 @@ def images(height=16, width=64, second=10.0):
     [
         (
             images(second=-1),
-            r"img\.npz, sample .*1.*: has no pixel within the sensor's range.*--skip_bad",
+            r"img\.npz, sample .*1.*: has no point within the sensor's range.*--skip_bad",
         ),
         (images(second=np.nan), r"img\.npz, sample .*1.*: has NaN or infinite ranges.*--skip_bad"),
         (images(8, 8), r"img\.npz, .*: has an image of 8 x 8 pixels, but the sensor has 16 x 64"),

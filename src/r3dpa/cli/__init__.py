@@ -44,7 +44,7 @@ COMMANDS = {
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),
-    "edit mix": Command("edit:mix", "generate scenes that follow several scans by sector"),
+    "edit mix": Command("edit:mix", "generate scenes that follow one scan on each side"),
     "edit complete": Command("edit:complete", "fill a missing sector or dropped beams"),
     "edit vary": Command("edit:vary", "generate scenes similar to a scan"),
     "edit interpolate": Command("edit:interpolate", "generate the scenes between two scans"),

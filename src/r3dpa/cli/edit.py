@@ -79,11 +79,10 @@ def inpaint(
 
 def mix(
     *,
-    left: Path | None = None,
-    right: Path | None = None,
+    left: Path,
+    right: Path,
     split: float = 0.0,
     blend: float = 20.0,
-    layout: list[str] | None = None,
     features_ckpt: Path | None = None,
     strength: float = 0.5,
     window: tuple[float, float] = (0.0, 1.0),
@@ -100,7 +99,6 @@ def mix(
         right: Scan of the right half.
         split: Azimuth in degrees where the left half starts; it ends half a turn further.
         blend: Width of the seams in degrees.
-        layout: Start of each sector and its scan, not two scans: ``0 a.bin 120 b.bin 240 c.bin``.
         features_ckpt: Weights of the feature source, if it has none of its own.
         strength: Guidance in velocities, 0 to 1.
         window: First and last guided time; 0 data, 1 noise.
@@ -111,26 +109,11 @@ def mix(
     from r3dpa.cli.edit_session import EditSession, Parts
     from r3dpa.geometry.regions import mask_of_tokens, sector_weights
 
-    if (left is None) != (right is None) or (left is None) == (layout is None):
-        raise ValueError("give --left and --right, or a --layout of sectors and scans")
-    words = layout or [str(split), str(left), str(split + 180), str(right)]
-    try:
-        sectors = [
-            (float(azimuth), Path(path))
-            for azimuth, path in zip(words[::2], words[1::2], strict=True)
-        ]
-    except ValueError as error:
-        raise ValueError(
-            f"--layout {' '.join(words)}: give pairs of azimuth and scan, such as 0 a.bin 120 b.bin"
-        ) from error
-    paths = list(dict.fromkeys(path for _, path in sectors))
-    if len(paths) < 2:
-        raise ValueError(f"there is nothing to mix: give two scans or more, got {paths}")
     session = EditSession(EditOptions(**options), num, strength, window)
-    scans = {f"{number}: {path.stem}": session.read(path) for number, path in enumerate(paths)}
+    paths = enumerate((left, right))
+    scans = {f"{number}: {path.stem}": session.read(path) for number, path in paths}
     grids = session.feature_grids(scans.values(), features_ckpt)
-    numbered = [(azimuth, paths.index(path)) for azimuth, path in sectors]
-    weights = sector_weights(numbered, session.grid_size, blend)
+    weights = sector_weights([(split, 0), (split + 180, 1)], session.grid_size, blend)
     size = session.sensor.beams, session.sensor.columns
     numbers = mask_of_tokens(weights.argmax(dim=0), session.grid_size, size)
     run = partial(session.editor.mix, grids, weights, num, session.options.seed)

@@ -80,7 +80,7 @@ class StageCLI(LightningCLI):
 
     A run writes checkpoints, logs and pictures below ``run_dir``, where one process at a time
     trains. ``--ckpt_path last`` is its newest checkpoint, or none, so that one command starts and
-    resumes a job. A stage that needs a kind of data module names its class as ``data_class``.
+    resumes a job.
     """
 
     def __init__(self, args: list[str]) -> None:
@@ -141,17 +141,6 @@ class StageCLI(LightningCLI):
                 if any(isinstance(c, _RecordConfig) and c.started for c in callbacks):
                     error.during_training = True  # type: ignore[union-attr] # for cli.main
                 raise
-
-    def instantiate_classes(self) -> None:
-        """Builds stage, data module and trainer; checks that the first two belong together."""
-        super().instantiate_classes()
-        expected = getattr(self.model, "data_class", LightningDataModule)
-        if not isinstance(self.datamodule, expected):
-            stage, data = type(self.model).__name__, type(self.datamodule).__name__
-            raise ValueError(
-                f"data.class_path: {stage} needs a {expected.__module__}.{expected.__name__} or a "
-                f"subclass of it, got {data}; give another data.class_path or model.class_path"
-            )
 
     def before_fit(self) -> None:
         """Loads the stage before: what does not fit is said before hours of data preparation."""

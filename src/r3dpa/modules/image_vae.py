@@ -8,7 +8,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from r3dpa.data.image_datamodule import ImageBatch, ImageDataModule
+from r3dpa.data.image_datamodule import ImageBatch
 from r3dpa.losses import reconstruction_loss
 from r3dpa.modules import steps
 from r3dpa.modules.checks import check_trainer, image_datamodule
@@ -32,7 +32,6 @@ class ImageVAETraining(L.LightningModule):
     """
 
     stage = "image_vae"
-    data_class = ImageDataModule
 
     def __init__(
         self,

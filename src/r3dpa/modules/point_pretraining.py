@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.scans import evenly
 from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
 from r3dpa.nn.backbones.point_features import save_weights
@@ -44,7 +43,6 @@ class PointPretraining(LightningModule):
         num_bins: Quantiles of each descriptor.
     """
 
-    data_class = PointDataModule
     edges: Tensor
 
     def __init__(

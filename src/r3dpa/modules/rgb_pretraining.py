@@ -73,7 +73,6 @@ class RGBPretraining(L.LightningModule):
     """
 
     stage = "rgb_pretraining"
-    data_class = ImageDataModule
 
     def __init__(
         self,
