@@ -28,7 +28,7 @@ def draw(points, seed=0, **options):
 
 
 def test_surroundings_by_hand(points):
-    scan = prepare_scan(points.numpy(), GRID)
+    scan = prepare_scan(points, GRID)
     targets = Masking(GRID).describe(points, scan)
     assert targets.shape == (len(points), NUM_TARGETS)
     top = scan.features[:, 3].argmax()

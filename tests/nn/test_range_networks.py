@@ -1,8 +1,10 @@
+import math
+
 import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels
+from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
 from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
 from r3dpa.nn.backbones.vit import TransformerTrunk
 
@@ -45,6 +47,18 @@ def scans(count, seed=1):
     return torch.where(torch.rand(shape, generator=generator) < 0.25, -1.0, range_m)
 
 
+def test_points_lie_on_the_corners_of_their_pixels():
+    """Row 0 starts at 3 degrees, column 0 at the back, column W / 4 on the left."""
+    range_m = torch.full((1, 16, 64), 10.0)
+    distance, x, y, z = range_channels(range_m, SENSOR)[0]
+    up, flat = 10 * math.sin(math.radians(3)), 10 * math.cos(math.radians(3))
+    assert (distance == 10.0).all()
+    assert z[0].tolist() == pytest.approx([up] * 64, rel=1e-6)
+    assert (x[0, 0].item(), x[0, 32].item()) == pytest.approx((-flat, flat), rel=1e-6)
+    assert (y[0, 16].item(), y[0, 48].item()) == pytest.approx((flat, -flat), rel=1e-6)
+    assert z[8, 0].item() == pytest.approx(10 * math.sin(math.radians(3 - 28 / 2)), rel=1e-6)
+
+
 def test_pixels_out_of_range_have_no_point():
     """Both limits, 1 and 56 m, are out of range; what the pixel holds is left as it is."""
     values = [-1.0, 0.0, 0.5, 1.0, 1.001, 55.999, 56.0, 80.0]
@@ -73,6 +87,19 @@ def test_features_are_means_of_bands_channel_by_channel(monkeypatch):
     monkeypatch.setattr(network, "feature_map", lambda range_m, intensity: map_)
     assert network(scans(1)).tolist() == [[3.5, 11.5, 103.5, 111.5]]
     assert (network.dim, rangevit(band_rows=4).dim) == (5 * 2, 5 * 4)
+
+
+def test_patch_is_the_mean_over_one_pixel_more_than_its_size():
+    """Patches of 2 x 8 average 3 x 9 pixels, of which zeros beyond the border are part."""
+    network = rangevit(skip_channels=1, width=3)
+    network.embedding.weight.data.fill_(1.0)
+    network.embedding.bias.data.zero_()
+    patches = network.embed(torch.ones(1, 1, 16, 64))[0, 0]
+    assert patches.shape == (8, 8)
+    assert patches[1:, 1:].unique().tolist() == pytest.approx([1.0])
+    assert patches[0, 1:].unique().tolist() == pytest.approx([2 / 3])
+    assert patches[1:, 0].unique().tolist() == pytest.approx([5 / 9])
+    assert patches[0, 0].item() == pytest.approx(2 / 3 * 5 / 9)
 
 
 def test_scans_of_a_batch_do_not_see_each_other():
@@ -106,6 +133,34 @@ def test_bytes_wrap():
     levels = wrapped_grey_levels(range_m)
     assert levels.dtype == torch.uint8
     assert levels.tolist() == [251, 0, 0, 0, 1, 255, 0, 285 - 256, 0]
+
+
+def test_picture_is_antialiased_and_normalised():
+    """Halving: triangle of 4 pixels with weights 1 3 3 1, where bilinear alone takes 1 1."""
+    range_m = torch.zeros(2, 2, 16)
+    range_m[:, :, 7] = 50.0  # white, 255 levels
+    pictures = wrapped_picture(range_m, (2, 8))
+    assert pictures.shape == (2, 3, 2, 8)
+    for colour, (mean, std) in enumerate([(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)]):
+        row = pictures[1, colour, 0] * std + mean
+        assert row.tolist() == pytest.approx([0, 0, 0, 3 / 8, 1 / 8, 0, 0, 0], abs=1e-6)
+
+
+def test_feature_is_the_mean_of_the_patch_tokens_normalised():
+    """Without blocks a token is its patch plus its position; the class token has no part."""
+    network = LIPLoc(picture_side=4, patch_side=2, width=2, depth=0, num_heads=1)
+    network.embedding.weight.data.zero_()
+    network.embedding.bias.data.copy_(torch.tensor([1.0, 2.0]))
+    network.encoder.cls_token.data.fill_(1e3)
+    positions = torch.tensor([[1e3, -1e3], [4.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    network.encoder.pos_embed.data.copy_(positions[None])
+    network.norm.weight.data.copy_(torch.tensor([1.0, 10.0]))
+    # Mean (1 + 4 / 4, 2) has no variance: all of it is the bias of the norm.
+    network.norm.bias.data.copy_(torch.tensor([0.5, 0.25]))
+    assert network(torch.full((1, 3, 5), 10.0))[0].tolist() == [0.5, 0.25]
+    network.encoder.pos_embed.data[0, 2, 0] = 8.0  # mean (4, 2): normalised to 1, -1
+    feature = network(torch.full((1, 3, 5), 10.0))[0]
+    assert feature.tolist() == pytest.approx([1.5, -9.75], rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def cloud(num_points, seed=0):
 
 
 def prepare(points):
-    return prepare_scan(points.numpy(), GRID)
+    return prepare_scan(points, GRID)
 
 
 @pytest.fixture
@@ -115,6 +115,27 @@ def test_refused_input(network):
         WaffleIron(width=8, depth=0)
     with pytest.raises(ValueError, match=r"cells \(16, 16, 4\), but grid has \(256, 256, 32\)"):
         ScaLR(network)
+
+
+def test_spatial_mixing_agrees_with_matrices(network):
+    """Means and copies as products with the N x cells matrix that the network does without."""
+    scans = [prepare(cloud(150, seed)) for seed in (0, 1)]
+    batch = collate_scans(scans)
+    starts = [0, len(scans[0].features), len(batch.features)]
+    tokens = torch.randn(len(batch.features), 12, generator=torch.Generator().manual_seed(2))
+    for plane, (rows, columns) in enumerate([(16, 16), (16, 4), (16, 4)]):
+        layer = network.spatial[plane]
+        actual = layer(tokens, network._planes(batch)[plane])
+        for i, scan in enumerate(scans):
+            own = tokens[starts[i] : starts[i + 1]]
+            member = torch.nn.functional.one_hot(scan.cells[plane], rows * columns).float()
+            assert member.sum(dim=0).max() > 1
+            means = torch.linalg.pinv(member) @ layer.norm(own)
+            image = layer.convs(means.T.reshape(1, 12, rows, columns))
+            expected = own + layer.scale * (member @ image.reshape(12, -1).T)
+            torch.testing.assert_close(
+                actual[starts[i] : starts[i + 1]], expected, atol=2e-5, rtol=1e-5
+            )
 
 
 def test_gradients_reach_every_parameter_and_statistics_follow_real_points(network):

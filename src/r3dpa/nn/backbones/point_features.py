@@ -86,7 +86,7 @@ class TokenFeatures(nn.Module):
         network.head = nn.Identity()
         self.network = network.requires_grad_(False)
         self.grid = grid
-        self.prepare = partial(_prepare_points, grid=grid)
+        self.prepare = partial(prepare_scan, grid=grid)
         self.dim = network.width
         self.settings: dict[str, Any] = {"weights": sha256(network), "version": 1}
         self.eval()
@@ -313,7 +313,3 @@ def sha256(network: nn.Module) -> str:
         digest.update(key.encode())
         digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy())
     return digest.hexdigest()
-
-
-def _prepare_points(points: Tensor, grid: ScanGrid) -> PreparedScan:
-    return prepare_scan(points.detach().cpu().numpy(), grid)

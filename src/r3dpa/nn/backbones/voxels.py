@@ -117,7 +117,7 @@ class PointCloudBatch(NamedTuple):
         return type(self)(*(values.to(device, non_blocking=True) for values in self))
 
 
-def prepare_scan(points: np.ndarray, grid: ScanGrid | None = None) -> PreparedScan:
+def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> PreparedScan:
     """Thinned, cropped and indexed scan.
 
     Each voxel keeps its point of lowest index; voxels are counted from the lowest x, y, z of the
@@ -133,6 +133,8 @@ def prepare_scan(points: np.ndarray, grid: ScanGrid | None = None) -> PreparedSc
         grid: Settings. Default: those of ScaLR.
     """
     grid = grid or ScanGrid()
+    if isinstance(points, Tensor):
+        points = points.detach().cpu().numpy()
     points = np.asarray(points, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must be (P, 4) x, y, z, intensity, got {points.shape}.")
@@ -232,7 +234,7 @@ class Masking:
         points = points.clone()
         points[:, 0] = x * math.cos(angle) - y * math.sin(angle)
         points[:, 1] = x * math.sin(angle) + y * math.cos(angle)
-        scan = prepare_scan(points.numpy(), self.grid)
+        scan = prepare_scan(points, self.grid)
         kept = points[scan.kept]
         blocks = _block(kept)
         share = rng.uniform(0, self.max_hidden)
