@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from r3dpa.geometry import Projection, points_of
-from r3dpa.viz.figures import draw_panorama, range_bar
+from r3dpa.viz.figures import strip_sheet
 from r3dpa.viz.page import PALETTE, Category, PageScan, scan_page
 from r3dpa.viz.pictures import Array, Pixels, as_bytes, range_image_picture
 
@@ -57,23 +57,21 @@ def edit_sheet(
         part_names: Names of the parts by number; empty where no row has any.
         projection: Gives the limits of the colour scale.
     """
-    height_in = 1.2 * len(rows) + (0.9 if part_names else 0.6)
-    figure = Figure(figsize=(13.0, height_in), dpi=110, layout="constrained")
-    sensor = projection.sensor
-    colours = _part_colours(part_names)
-    cells = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    pictures = []
+    for row in rows:
+        picture = range_image_picture(row.range_m, projection.sensor)
+        tinted = picture if row.parts is None else _tinted(picture, row.parts, part_names)
+        pictures.append((row.name, tinted))
+    figure, cells = strip_sheet(pictures, projection.sensor, 0.3 if part_names else 0.0)
     for row, axes in zip(rows, cells, strict=True):
-        picture = range_image_picture(row.range_m, sensor)
-        if row.parts is not None:
-            picture = _tinted(picture, row.parts, part_names)
-        draw_panorama(axes, picture, row.name)
-        if row.outline is not None and (np.diff(row.outline, axis=0) != 0).mean() < _MOST_BORDERS:
-            for part in np.unique(row.outline)[1:]:
-                axes.contour(row.outline == part, [0.5], colors="white", linewidths=1.2)
+        outline = row.outline
+        if outline is not None and (np.diff(outline, axis=0) != 0).mean() < _MOST_BORDERS:
+            for part in np.unique(outline)[1:]:
+                axes.contour(outline == part, [0.5], colors="white", linewidths=1.2)
     _azimuth_ticks(cells[-1], projection)
-    range_bar(figure, sensor, ax=list(cells), pad=0.01, aspect=9 * len(rows))
     if part_names:
-        handles = [Patch(color=c, label=n) for n, c in zip(part_names, colours, strict=True)]
+        named = zip(part_names, _part_colours(part_names), strict=True)
+        handles = [Patch(color=colour, label=name) for name, colour in named]
         figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     return figure
 

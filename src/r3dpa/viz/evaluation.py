@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.viz.figures import draw_panorama, range_bar
+from r3dpa.viz.figures import strip_sheet
 from r3dpa.viz.pictures import BACKGROUND, Array, as_numpy, bright_part, range_image_picture, save
 
 Match = tuple[str, Array, Array]
@@ -142,17 +142,12 @@ def range_histogram(edges_m: Array, samples: Array, references: Array, halves: A
 
 def matches_figure(best: Sequence[Match], worst: Sequence[Match], sensor: LidarSensor) -> Figure:
     """The best and the worst matches, at least one: each sample above the nearest real scan."""
-    matches = [("best", *match) for match in best] + [("worst", *match) for match in worst]
-    figure = Figure(figsize=(13.0, 1.9 * len(matches) + 0.3), dpi=110, layout="constrained")
-    blocks = figure.subfigures(len(matches), 1, squeeze=False).ravel()
-    for block, (kind, title, *images) in zip(blocks, matches, strict=True):
-        cells = block.subplots(2, 1)
-        for axes, image, name in zip(cells, images, ("sample", "nearest"), strict=True):
-            draw_panorama(axes, range_image_picture(image, sensor))
-            axes.set_ylabel(name, fontsize=9)
-        cells[0].set_title(f"{kind}: {title}", loc="left", fontsize=10, parse_math=False)
-        range_bar(block, sensor, ax=list(cells), pad=0.01, aspect=12)
-    return figure
+    pictures = []
+    for kind, matches in (("best", best), ("worst", worst)):
+        for title, sample_m, reference_m in matches:
+            pictures.append((f"{kind}: {title}: sample", range_image_picture(sample_m, sensor)))
+            pictures.append(("nearest real scan", range_image_picture(reference_m, sensor)))
+    return strip_sheet(pictures, sensor)[0]
 
 
 def save_figures(

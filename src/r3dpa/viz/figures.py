@@ -81,7 +81,7 @@ def scenes_sheet(
     titles = ("range image", f"from above, {2 * extent_m:g} m wide", "from behind")
     for axes, title in zip(cells[0], titles, strict=True):
         axes.set_title(title, fontsize=11)
-    for left, bar in ((0.15, range_bar), (0.70, _height_bar)):
+    for left, bar in ((0.15, _range_bar), (0.70, _height_bar)):
         place = figure.add_axes((left, 0.45 / height_in, 0.22, 0.13 / height_in))
         bar(figure, projection.sensor, cax=place, orientation="horizontal")
     return figure
@@ -119,7 +119,7 @@ def reconstruction_figure(
     draw_panorama(upper, range_image_picture(before, sensor), "input")
     draw_panorama(middle, range_image_picture(after, sensor), "reconstruction")
     draw_panorama(lower, error, "absolute error")
-    range_bar(figure, sensor, ax=[upper, middle], pad=0.01)
+    _range_bar(figure, sensor, ax=[upper, middle], pad=0.01)
     mappable = ScalarMappable(error_scale, ERROR_MAP)
     figure.colorbar(mappable, ax=lower, label="error (m)", extend="max", pad=0.01)
     entries = [
@@ -133,16 +133,15 @@ def reconstruction_figure(
 
 def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
     """Range images of scans ``(P, 3+)`` by name, one below the other, with the range scale."""
-    size_in = (13.0, 1.2 * len(scans) + 0.6)
-    figure = Figure(figsize=size_in, dpi=110, layout="constrained")
-    rows = figure.subplots(len(scans), 1, squeeze=False).ravel()
-    for (name, points), axes in zip(scans.items(), rows, strict=True):
+    pictures, shares = [], []
+    for name, points in scans.items():
         xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
         range_m, _ = range_image(xyz, projection)
-        valid = float((range_m > 0).double().mean())
-        draw_panorama(axes, range_image_picture(range_m, projection.sensor), name)
-        axes.set_title(f"{valid:.0%} of the pixels have a return", loc="right", fontsize=9)
-    range_bar(figure, projection.sensor, ax=list(rows), pad=0.01, aspect=9 * len(scans))
+        pictures.append((name, range_image_picture(range_m, projection.sensor)))
+        shares.append(float((range_m > 0).double().mean()))
+    figure, cells = strip_sheet(pictures, projection.sensor)
+    for axes, share in zip(cells, shares, strict=True):
+        axes.set_title(f"{share:.0%} of the pixels have a return", loc="right", fontsize=9)
     return figure
 
 
@@ -165,6 +164,19 @@ def birds_eye_sheet(scans: Mapping[str, Array], extent_m: float = 50.0) -> Figur
     return figure
 
 
+def strip_sheet(
+    pictures: Sequence[tuple[str, Pixels]], sensor: LidarSensor, below_in: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """Pictures of range images under their names, with the range scale; inches left below."""
+    count = len(pictures)
+    figure = Figure(figsize=(13.0, 1.2 * count + 0.6 + below_in), dpi=110, layout="constrained")
+    cells = list(figure.subplots(count, 1, squeeze=False)[:, 0])
+    for (name, picture), axes in zip(pictures, cells, strict=True):
+        draw_panorama(axes, picture, name)
+    _range_bar(figure, sensor, ax=cells, pad=0.01, aspect=9 * count)
+    return figure, cells
+
+
 def draw_panorama(axes: Axes, picture: Pixels, title: str | None = None) -> None:
     """One turn of the sensor over the whole width, without ticks."""
     axes.imshow(picture, aspect="auto", interpolation="nearest")
@@ -185,7 +197,7 @@ def draw_birds_eye(
     axes.add_patch(Polygon(EGO_OUTLINE_M, facecolor="tab:red", edgecolor="white", lw=0.5))
 
 
-def range_bar(figure: Figure, sensor: LidarSensor, **place: object) -> None:
+def _range_bar(figure: Figure, sensor: LidarSensor, **place: object) -> None:
     """Colour bar of ranges; ``place`` as for :meth:`Figure.colorbar`."""
     mappable = ScalarMappable(range_scale(sensor), RANGE_MAP)
     ticks = range_ticks(sensor)
