@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder, TarImages
+from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder
 from r3dpa.data.image_datamodule import latent_statistics
 from r3dpa.data.images import ImageEntry, ImageError, center_crop, dead_leaves
 from r3dpa.data.store import CachedTensors, TensorCache
@@ -58,7 +58,7 @@ def shards(pictures, tmp_path):
 
 
 def test_folder_and_shards_hold_the_same_images(folder, shards, pictures):
-    for source in (ImageFolder(str(folder)), TarImages(str(shards))):
+    for source in (ImageFolder(str(folder)), ImageFolder(str(shards))):
         entries = source.entries()
         assert len(entries) == len(pictures)
         for entry in entries:
@@ -74,9 +74,10 @@ def test_damaged_files_are_named(folder, shards):
         source.read(entry, 8)
     (shards / "000.tar").write_bytes(b"\x1f\x8b" + bytes(600))
     with pytest.raises(ImageError, match=r"000\.tar is no uncompressed tar file"):
-        TarImages(str(shards)).entries()
-    with pytest.raises(ImageError, match="holds no image"):
         ImageFolder(str(shards)).entries()
+    for root in (shards / "none", shards.with_name("gone")):
+        with pytest.raises(ImageError, match="holds no image"):
+            ImageFolder(str(root)).entries()
 
 
 def test_a_damaged_chunk_of_a_png_names_the_file(tmp_path):
@@ -107,7 +108,7 @@ def test_a_shard_that_ends_too_soon_is_refused(damage, shards):
     path = shards / "000.tar"
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ImageError, match=r"000\.tar is .*damaged"):
-        TarImages(str(shards)).entries()
+        ImageFolder(str(shards)).entries()
 
 
 def test_links_are_followed_and_what_is_hidden_is_left_out(folder, tmp_path):
@@ -134,14 +135,14 @@ def test_hidden_shards_and_members_are_left_out(shards, pictures):
     (shards / "._000.tar").write_bytes(b"what macOS writes beside files")
     with tarfile.open(shards / "000.tar", "a") as file:
         file.addfile(tarfile.TarInfo("n01/._0.png"))
-    assert len(TarImages(str(shards)).entries()) == len(pictures)
+    assert len(ImageFolder(str(shards)).entries()) == len(pictures)
 
 
 def test_names_that_leave_the_folder_are_refused(tmp_path):
     with tarfile.open(tmp_path / "a.tar", "w") as file:
         file.addfile(tarfile.TarInfo("../../evil.png"), io.BytesIO())
     with pytest.raises(ImageError, match="leads out of its folder"):
-        TarImages(str(tmp_path)).entries()
+        ImageFolder(str(tmp_path)).entries()
 
 
 def test_the_crop_is_the_centre():
@@ -185,7 +186,7 @@ def test_fewer_images_than_processes_are_refused(folder):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_replaced_image_of_the_same_size_is_another_one(packed, folder, shards):
-    source = TarImages(str(shards)) if packed else ImageFolder(str(folder))
+    source = ImageFolder(str(shards if packed else folder))
     before = source.entries()[0]
     os.utime(before.path, ns=(0, before.path.stat().st_mtime_ns + 1))
     after = source.entries()[0]

@@ -106,21 +106,18 @@ class Augmentation:
 
         Judged by ``num_headings`` and ``mirror_invariant``, see :class:`r3dpa.data.Extractor`.
         """
-        if self.approximate_grids:
-            return
-        wrong = []
+        wrong = {}
         if self.rotate and (getattr(extractor, "num_headings", 0) or 1) % grid_columns:
-            wrong.append(("rotate", f"rotate with the scan by a {grid_columns}th of a turn"))
+            wrong["rotate"] = f"rotate with the scan by a {grid_columns}th of a turn"
         if self.flip and not getattr(extractor, "mirror_invariant", False):
-            wrong.append(("flip", "stay the same when the scan is mirrored"))
-        if wrong:
-            options = " and ".join(option for option, _ in wrong)
+            wrong["flip"] = "stay the same when the scan is mirrored"
+        if wrong and not self.approximate_grids:
+            options = " and ".join(wrong)
             name = "of an unknown extractor" if extractor is None else f"of {extractor.name!r}"
             raise ValueError(
                 f"augmentation.{options}: the features {name} are not known to "
-                f"{' or to '.join(what for _, what in wrong)}. Switch {options} off, use "
-                "GeometricFeatures, or train on the approximation with "
-                "augmentation.approximate_grids: true."
+                f"{' or to '.join(wrong.values())}. Switch {options} off, use GeometricFeatures, "
+                "or train on the approximation with augmentation.approximate_grids: true."
             )
 
     def check_latents(self, latent_columns: int, grid_columns: int) -> None:

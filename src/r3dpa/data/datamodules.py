@@ -134,10 +134,8 @@ class LidarDataModule(LoaderModule):
     @property
     def feature_source(self) -> str | None:
         """Name of the extractor of the feature grids; None where none are used."""
-        if self.extractor is not None:
-            return cast(Extractor, self.extractor).name
-        if self.features_dir is None:
-            return None
+        if self.extractor is not None or self.features_dir is None:
+            return getattr(self.extractor, "name", None)
         return str(any_settings(self.features_dir).extractor["name"])
 
     @property
@@ -186,13 +184,9 @@ class LidarDataModule(LoaderModule):
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
-            grids = FeatureGrids(
-                self.features_dir,
-                scans,
-                self.projection,
-                self.grid_size,
-                cast(Extractor | None, self.extractor),
-            )
+            extractor = cast(Extractor | None, self.extractor)
+            arguments = self.features_dir, scans, self.projection, self.grid_size, extractor
+            grids = FeatureGrids(*arguments)
         self.train_set, self.val_set, self.all_set = (
             LidarDataset(split, self.projection, self.codec, grids) for split in (train, val, scans)
         )
@@ -240,10 +234,8 @@ class LidarDataModule(LoaderModule):
         return self.loader(ready(self.all_set), train=False)
 
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
-        if features_dir is not None:
-            return Path(features_dir)
-        if self.extractor is None:
-            return None
+        if features_dir is not None or self.extractor is None:
+            return None if features_dir is None else Path(features_dir)
         scans = self.scans
         if not isinstance(scans, str) or has_magic(scans) or Path(scans).is_file():
             raise ValueError(
@@ -255,16 +247,12 @@ class LidarDataModule(LoaderModule):
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
         """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
-        projection: Projection
-        if self.projection_kind == "spherical":
-            projection = SphericalProjection(self.sensor)
-        elif self.ring_inclinations_deg is not None:
+        projection: Projection = SphericalProjection(self.sensor)
+        if self.projection_kind == "rings" and self.ring_inclinations_deg is not None:
             projection = RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
-        else:
-            points = (
-                torch.from_numpy(read_scan(scan.path, self.sensor)[:, :3])
-                for scan in (train or val)[:_SCANS_TO_FIT]
-            )
+        elif self.projection_kind == "rings":
+            files = [scan.path for scan in (train or val)[:_SCANS_TO_FIT]]
+            points = (torch.from_numpy(read_scan(file, self.sensor)[:, :3]) for file in files)
             projection = RingProjection.fit(points, self.sensor)
         return evenly(train, self.limit), evenly(val, self.limit), projection
 

@@ -93,55 +93,30 @@ class ImageSource(ABC):
 
 @dataclass(frozen=True)
 class ImageFolder(ImageSource):
-    """Images below a folder, at any depth: ImageNet's ``<split>/<class>/<image>.JPEG`` or others.
+    """Images below a folder, at any depth, as files or in ``.tar`` shards as of WebDataset.
+
+    The headers of uncompressed shards are read once; an image is then one read at a known offset.
 
     Args:
-        root: The folder; links are followed, hidden files (``.name``) left out.
+        root: The folder, such as one of ImageNet's with ``<class>/<image>.JPEG``, or one shard;
+            links are followed, hidden files and members (``.name``) left out.
     """
 
     root: str
 
     def entries(self) -> list[ImageEntry]:
-        """All images, by their path relative to the folder."""
+        """All images, by their path relative to the folder: ``<shard>/<member>`` in a shard."""
         root = Path(self.root)
-        if not root.is_dir():
-            raise ImageError(f"no folder {root}: give one that holds images.")
-        found = [
-            _entry(path, str(path.relative_to(root)))
-            for path in files_below(root)
-            if path.suffix.lower() in _SUFFIXES
-        ]
-        if not found:
-            raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}).")
-        return sorted(found, key=lambda entry: entry.name)
-
-
-@dataclass(frozen=True)
-class TarImages(ImageSource):
-    """Images of uncompressed tar files, as WebDataset writes them.
-
-    The headers of all shards are read once; an image is then one read at a known offset.
-
-    Args:
-        root: Folder of the ``.tar`` files, searched with its sub-folders, or one such file. Hidden
-            files and members (``.name``) are left out.
-    """
-
-    root: str
-
-    def entries(self) -> list[ImageEntry]:
-        """All images of all shards, as ``<shard>/<member>``."""
-        root = Path(self.root)
-        shards = [root] if root.is_file() else sorted(files_below(root))
         base = root.parent if root.is_file() else root
-        found = [
-            entry
-            for shard in shards
-            if shard.suffix.lower() == ".tar"
-            for entry in _members(shard, str(shard.relative_to(base).with_suffix("")))
-        ]
+        found: list[ImageEntry] = []
+        for path in [root] if root.is_file() else files_below(root):
+            name = path.relative_to(base)
+            if path.suffix.lower() in _SUFFIXES:
+                found.append(_entry(path, str(name)))
+            elif path.suffix.lower() == ".tar":
+                found += _members(path, str(name.with_suffix("")))
         if not found:
-            raise ImageError(f"no image ({', '.join(_SUFFIXES)}) in a .tar file of {root}.")
+            raise ImageError(f"{root} holds no image ({', '.join(_SUFFIXES)}), nor a .tar of them.")
         found.sort(key=lambda entry: entry.name)
         for before, entry in pairwise(found):
             if before.name == entry.name:
@@ -149,8 +124,7 @@ class TarImages(ImageSource):
         return found
 
 
-def _hidden(name: str) -> bool:
-    return any(part.startswith(".") and part != ".." for part in PurePath(name).parts)
+TarImages = ImageFolder  # name in older configurations
 
 
 def _entry(path: Path, name: str) -> ImageEntry:
@@ -168,8 +142,9 @@ def _members(shard: Path, prefix: str) -> list[ImageEntry]:
         # Not compressed, or nothing could be found fast.
         with shard.open("rb") as data, tarfile.open(fileobj=data, mode="r:") as file:
             for member in file:
-                suffix = PurePath(member.name).suffix.lower()
-                if not member.isfile() or suffix not in _SUFFIXES or _hidden(member.name):
+                path = PurePath(member.name)
+                hidden = any(part.startswith(".") and part != ".." for part in path.parts)
+                if not member.isfile() or path.suffix.lower() not in _SUFFIXES or hidden:
                     continue
                 name = f"{prefix}/{member.name.removeprefix('./')}"
                 if reason := refuse_name(name):

@@ -124,12 +124,10 @@ class ObjectLibrary:
     grid_size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        names = self.names
-        if self.features.shape[:-1] != (len(names),) or len(set(names)) < len(names):
-            raise ValueError(
-                f"needs features (C, D) of different classes, got {tuple(self.features.shape)} for "
-                f"{', '.join(names)}"
-            )
+        shape, names = tuple(self.features.shape), self.names
+        if shape[:-1] != (len(names),) or len(set(names)) < len(names):
+            given = f"{shape} for {', '.join(names)}"
+            raise ValueError(f"needs features (C, D) of different classes, got {given}")
         if not self.features.isfinite().all():
             raise ValueError("holds NaN or infinite features")
 
@@ -146,9 +144,8 @@ class ObjectLibrary:
     def feature(self, name: str) -> Tensor:
         """Mean feature ``(D,)`` of a class; ``ValueError`` lists the known ones."""
         if name not in self.names:
-            raise ValueError(
-                f"there is no {name!r} among the objects; there are {', '.join(self.names)}"
-            )
+            known = ", ".join(self.names)
+            raise ValueError(f"there is no {name!r} among the objects; there are {known}")
         return self.features[self.names.index(name)]
 
     def check_source(self, source: str | None, dim: int) -> None:
@@ -271,22 +268,21 @@ def object_library(
             f"the scans have no labelled point of {', '.join(missing)} within range; they show "
             f"{seen or 'no class at all'}. Give more scans or other classes"
         )
-    results = [_mean(name, found[name]) for name in wanted if name in found]
+    features, results = [], []
+    for name in (name for name in wanted if name in found):
+        sums = found[name]
+        mean = sums.features / sums.weight
+        cosine = (F.normalize(mean, dim=0) @ sums.directions / sums.weight).item()
+        counts = sums.num_scans, sums.num_cells, sums.num_points
+        features.append(mean.float())
+        results.append(ObjectClass(name, *counts, max(0.0, 1 - cosine)))
     return ObjectLibrary(
-        torch.stack([feature for feature, _ in results]),
-        tuple(entry for _, entry in results),
+        torch.stack(features),
+        tuple(results),
         json.loads(json.dumps({"name": extractor.name, "settings": extractor.settings})),
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
-
-
-def _mean(name: str, sums: _Part) -> tuple[Tensor, ObjectClass]:
-    """Feature ``(D,)`` and statistics of a class."""
-    mean = sums.features / sums.weight
-    cosine = (F.normalize(mean, dim=0) @ sums.directions / sums.weight).item()
-    counts = sums.num_scans, sums.num_cells, sums.num_points
-    return mean.float(), ObjectClass(name, *counts, max(0.0, 1 - cosine))
 
 
 def _wanted(classes: Sequence[str] | None) -> dict[str, int]:

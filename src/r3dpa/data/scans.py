@@ -430,10 +430,8 @@ def _compare_layout(
     official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
     for drive, expected in sorted((simulated or official).items()):
         folder, count = raw / drive, counts.get(drive, 0)
-        if not folder.is_dir():
-            missing.append(folder)
-        elif not count:
-            missing.append(folder / VELODYNE)
+        if not count:
+            missing.append(folder / VELODYNE if folder.is_dir() else folder)
         elif count < expected:
             reason = f"holds {count} of {expected} scans; simulate again to complete it"
             incomplete.append((folder, reason))
