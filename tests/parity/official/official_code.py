@@ -7,20 +7,17 @@ nobody else.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import logging
-import pickle
 import re
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,25 +27,6 @@ from torch import Tensor, nn
 COMMIT = "aa08e6d"
 """Commit of valeoai/R3DPA that is compared with."""
 
-# Files that are run or read, and the first 64 bits of their SHA-256 at that commit.
-_DIGESTS = {
-    "generate.py": "303118dd25702e2a",
-    "samplers.py": "caa3c87f2b5ec04c",
-    "utils.py": "c8c603055ce8f07c",
-    "dataset_kitti.py": "1a507d332e6cac2d",
-    "train_repae.py": "d1916ba529e1f46b",
-    "models/sit.py": "5376a0bc83265d7d",
-    "models/unet.py": "91a39b3323acecb4",
-    "models/basic.py": "5e37654173c3d671",
-    "models/attention.py": "9ab95c718796e3b4",
-    "models/autoencoder.py": "5f93cfce55f9e79a",
-    "models/model_lidm.py": "37e2859e7254b2d0",
-    "models/model_ldm.py": "060011798c22a962",
-    "loss/losses.py": "8bf6e93d58857da2",
-    "loss/discriminator.py": "a05f12c266eee99c",
-    "configs/kitti.yaml": "2d7fed48238b07d7",
-    "configs/l1_lpips_kl_gan.yaml": "85576d4b0bd59251",
-}
 _PACKAGES = ("generate", "train_repae", "samplers", "utils", "dataset_kitti", "models", "loss")
 
 
@@ -63,25 +41,28 @@ class Overlay:
         return getattr(self._base, name)
 
 
-@dataclass(frozen=True)
-class OfficialCode:
+class OfficialCode(NamedTuple):
     """Imported modules of a checkout."""
 
     repo: Path
-    modules: Mapping[str, Any]
-    stand_ins: Mapping[str, str]
+    modules: dict[str, Any]
 
     def __getitem__(self, name: str) -> Any:
         return self.modules[name]
 
 
 def load_official(repo: Path) -> OfficialCode:
-    """Imports the official code."""
-    _check_checkout(repo)
-    stand_ins = _stand_ins()
-    replaced: dict[str, ModuleType] = {}
-    for _, modules in stand_ins.values():
-        replaced |= modules
+    """Imports the official code of a checkout of the commit without local changes."""
+    git = ["git", "--no-optional-locks", "-C", str(repo)]
+    found = subprocess.run(
+        [*git, "describe", "--always", "--dirty"], capture_output=True, text=True
+    )
+    if found.stdout.strip() != COMMIT or not (repo / "generate.py").is_file():
+        raise ValueError(
+            f"{repo} is no unchanged checkout of commit {COMMIT} of valeoai/R3DPA: get it with "
+            f"`git clone https://github.com/valeoai/R3DPA && git checkout {COMMIT}`"
+        )
+    replaced = _stand_ins()
     with _importing_from(repo, replaced), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Deprecated names of torch are theirs to change.
         importlib.import_module("generate")
@@ -91,23 +72,7 @@ def load_official(repo: Path) -> OfficialCode:
             for name, module in sys.modules.items()
             if name.partition(".")[0] in _PACKAGES and name not in replaced
         }
-    return OfficialCode(repo, modules, {name: text for name, (text, _) in stand_ins.items()})
-
-
-def _check_checkout(repo: Path) -> None:
-    get = f"get it with `git clone https://github.com/valeoai/R3DPA && git checkout {COMMIT}`"
-    if not repo.is_dir():
-        raise ValueError(f"{repo} is no folder; give a checkout of valeoai/R3DPA: {get}")
-    for name, digest in _DIGESTS.items():
-        file = repo / name
-        if not file.is_file():
-            raise ValueError(f"{repo} is no checkout of valeoai/R3DPA, it has no {name}; {get}")
-        found = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        if found != digest:
-            raise ValueError(
-                f"{file} is not that of commit {COMMIT} of valeoai/R3DPA (SHA-256 begins with "
-                f"{found}, not {digest}); run `git checkout {COMMIT}` there, without local changes"
-            )
+    return OfficialCode(repo, modules)
 
 
 @contextmanager
@@ -132,68 +97,36 @@ def _importing_from(repo: Path, replaced: Mapping[str, ModuleType]) -> Iterator[
         sys.modules.update(before)
 
 
-def _stand_ins() -> dict[str, tuple[str, dict[str, ModuleType]]]:
-    """What is said and which modules there are for each package; only for absent ones."""
-    timm = _module("timm.models.vision_transformer", PatchEmbed=PatchEmbed, Attention=Attention)
-    timm.Mlp = Mlp  # type: ignore[attr-defined]
-    optional = {
-        "timm": (
-            "own patch embedding, attention and MLP with the numerics of timm 1.0.11",
-            {"timm": _module("timm"), "timm.models": _module("timm.models"), timm.__name__: timm},
-        ),
-        "omegaconf": (
-            "YAML as nested dictionaries",
-            {"omegaconf": _module("omegaconf", OmegaConf=_Configuration)},
-        ),
-        "dictdot": ("a dictionary with attributes", {"dictdot": _module("dictdot", dictdot=_Dot)}),
-        "joblib": ("dump by pickle", {"joblib": _module("joblib", dump=_dump)}),
-        "torchvision": (
-            "a name, never called",
-            {
-                "torchvision": _module("torchvision"),
-                "torchvision.utils": _module("torchvision.utils", make_grid=_never),
-            },
-        ),
+def _stand_ins() -> dict[str, ModuleType]:
+    """Modules in place of packages that are absent, or need several processes or weights."""
+    contents: dict[str, dict[str, Any]] = {
+        # With the numerics of timm 1.0.11.
+        "timm": {},
+        "timm.models": {},
+        "timm.models.vision_transformer": {
+            "PatchEmbed": PatchEmbed,
+            "Attention": Attention,
+            "Mlp": Mlp,
+        },
+        "omegaconf": {"OmegaConf": _Configuration},
+        "dictdot": {"dictdot": _Dot},
+        "torchvision": {},
+        "torchvision.utils": {"make_grid": _never},
+        "accelerate": {"Accelerator": _never},
+        "accelerate.logging": {"get_logger": logging.getLogger},
+        "accelerate.utils": {
+            "DistributedDataParallelKwargs": _never,
+            "ProjectConfiguration": dict,
+            "set_seed": _never,
+        },
+        "loss.perceptual_loss": {"PerceptualLoss": _NoPerceptualLoss},  # its weight is 0
+        "models.mocov3_vit": {},
+        "torch.utils.tensorboard": {"SummaryWriter": _never},
     }
-    # In every case: what would need several processes, files of weights, or a second logger.
-    always = {
-        "accelerate": (
-            "one process, full precision, no overhead; it times the steps",
-            {
-                "accelerate": _module("accelerate", Accelerator=_never),
-                "accelerate.logging": _module("accelerate.logging", get_logger=logging.getLogger),
-                "accelerate.utils": _module(
-                    "accelerate.utils",
-                    DistributedDataParallelKwargs=_never,
-                    ProjectConfiguration=dict,
-                    set_seed=_never,
-                ),
-            },
-        ),
-        "loss.perceptual_loss": (
-            "zero: its weight is 0, though the official step computes a VGG",
-            {
-                "loss.perceptual_loss": _module(
-                    "loss.perceptual_loss", PerceptualLoss=_NoPerceptualLoss
-                )
-            },
-        ),
-        "models.mocov3_vit": (
-            "a name, never called",
-            {"models.mocov3_vit": _module("models.mocov3_vit")},
-        ),
-        "tensorboard": (
-            "a name, never called",
-            {"torch.utils.tensorboard": _module("torch.utils.tensorboard", SummaryWriter=_never)},
-        ),
-    }
-    return {name: value for name, value in optional.items() if find_spec(name) is None} | always
-
-
-def _module(name: str, **content: Any) -> ModuleType:
-    module = ModuleType(name)
-    module.__dict__.update(content)
-    return module
+    modules = {name: ModuleType(name) for name in contents}
+    for name, content in contents.items():
+        vars(modules[name]).update(content)
+    return modules
 
 
 def _never(*args: Any, **kwargs: Any) -> Any:
@@ -342,11 +275,6 @@ def _dotted(value: Any) -> Any:
     if isinstance(value, dict):
         return _Dot({key: _dotted(entry) for key, entry in value.items()})
     return [_dotted(entry) for entry in value] if isinstance(value, list) else value
-
-
-def _dump(value: Any, path: str) -> None:
-    with Path(path).open("wb") as file:
-        pickle.dump(value, file, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 class _NoPerceptualLoss(nn.Module):

@@ -91,12 +91,6 @@ def official_vae(code: OfficialCode, checkpoint: Checkpoint) -> nn.Module:
 def save_for_official(code: OfficialCode, checkpoint: Checkpoint, folder: Path) -> None:
     """Writes the experiment folder that ``generate.py`` reads: ``args.json`` and one checkpoint."""
     sizes = checkpoint.network("sit").arguments
-    strides = checkpoint.network("vae").arguments["strides"]
-    if tuple(np.prod(strides, axis=0)) != _STRIDE or sizes["in_channels"] != 8:
-        raise ValueError(
-            f"the official scripts are run with the layout {_VAE} (stride 4 x 8, 8 channels), but "
-            f"{checkpoint.path} has strides {strides} and {sizes['in_channels']} channels"
-        )
     options = {
         "dataset_config": str(code.repo / "configs" / "kitti.yaml"),
         "vae": _VAE,
