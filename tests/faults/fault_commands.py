@@ -107,69 +107,37 @@ class At:
         setattr(holder, name, patched)
 
 
-@dataclass(frozen=True)
-class Signal:
-    """This process gets a signal."""
-
-    number: int
-
-    def __call__(self) -> None:
-        os.kill(os.getpid(), self.number)
-
-
 def kill_worker() -> None:
     """One of the processes that work for this one is killed."""
     os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
 
 
-@dataclass(frozen=True)
-class Limit:
+def limit_files(num_bytes: int) -> None:
     """The system kills this process in the midst of writing any longer file."""
-
-    num_bytes: int
-
-    def __call__(self) -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (self.num_bytes, resource.RLIM_INFINITY))
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, resource.RLIM_INFINITY))
 
 
-@dataclass(frozen=True)
-class Fill:
+def fill(disk: Path, left: int) -> None:
     """A disk has only so many bytes left."""
-
-    disk: Path
-    left: int
-
-    def __call__(self) -> None:
-        size = shutil.disk_usage(self.disk).free - self.left
-        with suppress(OSError):  # a thread of the command may take some of it first
-            (self.disk / "filler").write_bytes(bytes(max(size, 0)))
+    size = shutil.disk_usage(disk).free - left
+    with suppress(OSError):  # a thread of the command may take some of it first
+        (disk / "filler").write_bytes(bytes(max(size, 0)))
 
 
-@dataclass(frozen=True)
-class Change:
+def cut(path: Path, kept: int | None = None) -> None:
     """A file loses its end; or vanishes, where nothing of it is kept."""
-
-    path: Path
-    kept: int | None = None
-
-    def __call__(self) -> None:
-        if self.kept is None:
-            self.path.unlink()
-        else:
-            os.truncate(self.path, self.kept)
+    if kept is None:
+        path.unlink()
+    else:
+        os.truncate(path, kept)
 
 
-@dataclass(frozen=True)
-class Pause:
+def pause(folder: Path) -> None:
     """The command waits, having said so with one file, until there is another."""
-
-    folder: Path
-
-    def __call__(self) -> None:
-        (self.folder / "reached").touch()
-        while not (self.folder / "go").exists():
-            time.sleep(0.01)
+    (folder / "reached").touch()
+    while not (folder / "go").exists():
+        time.sleep(0.01)
 
 
 def assert_whole(folder: Path) -> int:

@@ -7,7 +7,7 @@ import errno
 import numpy as np
 import pytest
 import torch
-from fault_commands import Change, fit_words, last
+from fault_commands import cut, fit_words, last
 from safetensors.torch import save_file
 from torch import nn
 
@@ -61,7 +61,7 @@ def test_a_checkpoint_cut_short(reader, undisturbed, scans_folder, tmp_path):
 def test_a_scan_that_is_gone_since_the_index_was_made(own_scans, kept, says):
     scans = find_scans(own_scans)
     dataset = LidarDataset(scans, PROJECTION, RangeCodec())
-    Change(scans[3].path, kept)()
+    cut(scans[3].path, kept)
     with pytest.raises(ScanError, match=f"{scans[3].path}: .*{says}"):
         dataset[3]
 
@@ -76,7 +76,7 @@ def test_rows_of_a_store_that_are_cut(opened, kept, own_scans, tmp_path):
     if opened:
         grids.read(scans[7])
     (rows,) = tmp_path.rglob("*.rows")
-    Change(rows, kept)()
+    cut(rows, kept)
     if opened and kept is None:  # the system keeps what is open
         assert grids.read(scans[7]).isfinite().all()
         return

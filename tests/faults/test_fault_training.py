@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import shutil
 import signal
+from functools import partial
 
 import pytest
 import torch
 from fault_commands import (
     STEPS,
     At,
-    Change,
-    Fill,
-    Limit,
-    Pause,
-    Signal,
     assert_whole,
+    cut,
+    fill,
     fit_words,
     kill_worker,
     last,
+    limit_files,
+    pause,
 )
 
 STEP = "r3dpa.modules.VAEAlignment.training_step"
+TERMINATE, INTERRUPT = (
+    partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT)
+)
 
 
 def assert_same_training(run_dir, other):
@@ -54,7 +57,7 @@ class TestStopped:
     def test_between_two_batches_of_a_step(self, scans_folder, tmp_path, ended, goes_on):
         """In the first of the two batches of step 3: it waits for the second."""
         words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At(STEP, Signal(signal.SIGTERM), call=5))
+        status, seen = ended(words, At(STEP, TERMINATE, call=5))
         assert status == 143
         says = "stopped by SIGTERM after step 3: the same command goes on with --ckpt_path "
         assert f"{says}{last(tmp_path / 'run')}\n" in seen
@@ -65,7 +68,7 @@ class TestStopped:
 
     def test_ctrl_c_saves_too(self, scans_folder, tmp_path, ended):
         words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At(STEP, Signal(signal.SIGINT), call=3))
+        status, seen = ended(words, At(STEP, INTERRUPT, call=3))
         assert status == 130, seen
         assert "stopped by SIGINT after step 2: the same command goes on" in seen
         assert "Traceback" not in seen
@@ -74,7 +77,10 @@ class TestStopped:
     @pytest.mark.slow
     def test_a_second_ctrl_c_ends_at_once(self, scans_folder, tmp_path, ended):
         words = fit_words(scans_folder, tmp_path / "run")
-        twice = At(STEP, Signal(signal.SIGINT), call=3), At(STEP, Signal(signal.SIGINT), call=3)
+        twice = (
+            At(STEP, INTERRUPT, call=3),
+            At(STEP, INTERRUPT, call=3),
+        )
         status, seen = ended(words, *twice)
         assert status == 1, seen  # that of Lightning
         assert "stopped by" not in seen
@@ -82,7 +88,7 @@ class TestStopped:
     @pytest.mark.slow
     def test_while_a_checkpoint_is_written(self, scans_folder, tmp_path, ended, goes_on):
         words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At("torch.save", Signal(signal.SIGTERM)))
+        status, seen = ended(words, At("torch.save", TERMINATE))
         assert status == 143, seen
         assert "stopped by SIGTERM after step 2" in seen
         assert step_of(last(tmp_path / "run")) == 2
@@ -97,7 +103,7 @@ class TestStopped:
         assert ended(fit_words(scans_folder, calm, *more))[0] == 0
         words = fit_words(scans_folder, tmp_path / "run", *more)
         validation = "r3dpa.modules.VAEAlignment.validation_step"
-        status, seen = ended(words, At(validation, Signal(signal.SIGTERM), call=2))
+        status, seen = ended(words, At(validation, TERMINATE, call=2))
         assert status == 143, seen
         assert step_of(last(tmp_path / "run")) == 3
         status, seen = ended([*words, "--ckpt_path", "last"])
@@ -111,7 +117,7 @@ class TestKilled:
     def test_between_checkpoints(self, call, scans_folder, tmp_path, ended, goes_on):
         """Before the first one, too: ``last`` then means from the start."""
         words = fit_words(scans_folder, tmp_path / "run")
-        status, _ = ended(words, At(STEP, Signal(signal.SIGKILL), call=call))
+        status, _ = ended(words, At(STEP, partial(signal.raise_signal, signal.SIGKILL), call=call))
         assert status == -signal.SIGKILL
         assert_whole(tmp_path / "run")
         assert last(tmp_path / "run").exists() == (call > 1)
@@ -121,7 +127,7 @@ class TestKilled:
     def test_with_half_a_checkpoint_written(self, save, scans_folder, tmp_path, ended, goes_on):
         """Each saving writes two files, ``step=...`` and ``last``."""
         words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At("torch.save", Limit(100_000), call=save))
+        status, seen = ended(words, At("torch.save", partial(limit_files, 100_000), call=save))
         assert status == -signal.SIGXFSZ, seen
         (half,) = (tmp_path / "run").rglob(".*.partial.ckpt")
         assert half.stat().st_size == 100_000
@@ -146,7 +152,7 @@ class TestDisk:
         """The disk of the run, which is not that of temporary files."""
         disk = small_disk(64_000_000)
         run_dir = disk / "run"
-        full = At("torch.save", Fill(disk, 100_000), call=4)
+        full = At("torch.save", partial(fill, disk, 100_000), call=4)
         status, seen = ended(fit_words(scans_folder, run_dir), full)
         assert status == 1
         assert f"No space left on device: '{last(run_dir)}'" in seen
@@ -167,7 +173,7 @@ class TestDisk:
 @pytest.mark.slow
 def test_a_second_run_is_refused(scans_folder, tmp_path, start, ended, undisturbed):
     run_dir = tmp_path / "run"
-    first = start(fit_words(scans_folder, run_dir), At(STEP, Pause(tmp_path), call=2))
+    first = start(fit_words(scans_folder, run_dir), At(STEP, partial(pause, tmp_path), call=2))
     first.wait_for((tmp_path / "reached").exists)
     status, seen = ended(fit_words(scans_folder, run_dir, "--ckpt_path", "last"))
     assert status == 1
@@ -186,7 +192,7 @@ def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ende
     shutil.copytree(own_scans, saved)
     words = fit_words(own_scans, tmp_path / "run")
     status, seen = ended(
-        words, *(At(STEP, Change(path, kept), call=5) for path in own_scans.iterdir())
+        words, *(At(STEP, partial(cut, path, kept), call=5) for path in own_scans.iterdir())
     )
     assert status == 1
     assert f"{own_scans}/0" in seen.splitlines()[-1]

@@ -7,17 +7,17 @@ import os
 import re
 import signal
 from dataclasses import dataclass
+from functools import partial
 
 import pytest
 from fault_commands import (
     At,
     Command,
-    Fill,
-    Limit,
-    Pause,
-    Signal,
     assert_whole,
+    fill,
     kill_worker,
+    limit_files,
+    pause,
     rows_of,
 )
 from tiny_networks import tiny_checkpoint
@@ -146,7 +146,9 @@ NAMES = ("simulate", "features", "sample", "reference")
 @pytest.mark.parametrize("name", NAMES)
 def test_sigterm(name, jobs, ended, out_of, goes_on):
     out = out_of(name)
-    status, seen = ended(jobs[name].command(out), at(jobs[name], Signal(signal.SIGTERM)))
+    status, seen = ended(
+        jobs[name].command(out), at(jobs[name], partial(signal.raise_signal, signal.SIGTERM))
+    )
     assert status == 130
     assert seen.endswith(f"r3dpa {name}: stopped; the same command continues\n")
     assert "Traceback" not in seen
@@ -161,7 +163,11 @@ def test_killed_between_two_writes_or_in_the_midst_of_one(
     number, name, jobs, ended, out_of, goes_on
 ):
     out, job = out_of(name), jobs[name]
-    fault = at(job, Signal(number)) if number == signal.SIGKILL else Limit(job.num_bytes)
+    fault = (
+        at(job, partial(signal.raise_signal, number))
+        if number == signal.SIGKILL
+        else partial(limit_files, job.num_bytes)
+    )
     status, seen = ended(job.command(out), fault)
     assert status == -number, seen
     assert not out.is_file()
@@ -174,7 +180,7 @@ def test_killed_between_two_writes_or_in_the_midst_of_one(
 def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on):
     disk = small_disk(32_000_000)
     out, job = out_of(name, disk), jobs[name]
-    status, seen = ended(job.command(out), at(job, Fill(disk, 0)))
+    status, seen = ended(job.command(out), at(job, partial(fill, disk, 0)))
     assert status == 1
     assert "No space left on device" in seen
     assert str(out.with_suffix("")) in seen.splitlines()[-1]
@@ -203,7 +209,7 @@ def test_read_only(name, jobs, ended, out_of, small_disk, make_read_only):
 @pytest.mark.parametrize("name", ["sample", "reference"])  # the others wait
 def test_a_second_command_is_refused(name, jobs, start, ended, out_of, tmp_path, expected):
     out, job = out_of(name, tmp_path / "two"), jobs[name]
-    first = start(job.command(out), at(job, Pause(tmp_path)))
+    first = start(job.command(out), at(job, partial(pause, tmp_path)))
     first.wait_for((tmp_path / "reached").exists)
     status, seen = ended(job.command(out))
     assert status == 1

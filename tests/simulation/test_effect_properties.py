@@ -14,25 +14,10 @@ import pytest
 from random_scenes import random_case
 from sweeps import box, pole
 
-from r3dpa.simulation import (
-    EFFECTS,
-    EgoMotion,
-    Lasers,
-    Material,
-    Primitive,
-    Puddle,
-    Scene,
-    Semantic,
-    Shape,
-    Sweep,
-    Weather,
-    effect_name,
-    hdl64e,
-    scan,
-    simulate_scan,
-)
+from r3dpa.simulation import scan
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import (
+    EFFECTS,
     RAY_EFFECTS,
     Blooming,
     PolishedMetal,
@@ -41,7 +26,19 @@ from r3dpa.simulation.effects import (
     SunGlare,
     SurfaceTexture,
 )
-from r3dpa.simulation.sweep import Echoes
+from r3dpa.simulation.scan import effect_name, simulate_scan
+from r3dpa.simulation.scene import (
+    EgoMotion,
+    Material,
+    Primitive,
+    Puddle,
+    Scene,
+    Semantic,
+    Shape,
+    Weather,
+)
+from r3dpa.simulation.sensor import Lasers, hdl64e
+from r3dpa.simulation.sweep import Echoes, Sweep
 
 # No effect warns, whatever the scene.
 pytestmark = pytest.mark.filterwarnings("error")

@@ -7,17 +7,6 @@ import pytest
 import sweeps
 from sweeps import box, pole
 
-from r3dpa.simulation import (
-    EgoMotion,
-    Material,
-    Origin,
-    Pose,
-    Primitive,
-    Scene,
-    Semantic,
-    Shape,
-    hdl64e,
-)
 from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.effects import (
     DiffuseReflection,
@@ -28,7 +17,10 @@ from r3dpa.simulation.effects import (
     RollingShutter,
 )
 from r3dpa.simulation.raycast import cast
+from r3dpa.simulation.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
+from r3dpa.simulation.sensor import hdl64e
 from r3dpa.simulation.solids import EGO_BODY, NO_SURFACE
+from r3dpa.simulation.sweep import Origin
 
 SENSOR = hdl64e()
 LEVEL = 5  # a beam within 0.3 degrees of the horizon

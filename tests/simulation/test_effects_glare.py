@@ -9,19 +9,12 @@ import pytest
 import sweeps
 from sweeps import applied, box
 
-from r3dpa.simulation import (
-    Material,
-    Origin,
-    Pose,
-    Scene,
-    Semantic,
-    Sweep,
-    Weather,
-    hdl64e,
-    simulate_scan,
-)
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import Blooming, DiffuseReflection, RetroReflection, SunGlare
+from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.scene import Material, Pose, Scene, Semantic, Weather
+from r3dpa.simulation.sensor import hdl64e
+from r3dpa.simulation.sweep import Origin, Sweep
 
 SENSOR = hdl64e()
 COARSE = hdl64e(shots=720)

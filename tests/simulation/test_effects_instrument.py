@@ -7,18 +7,6 @@ import numpy as np
 import pytest
 from sweeps import applied, box, pole
 
-from r3dpa.simulation import (
-    EgoMotion,
-    Material,
-    Origin,
-    Scene,
-    Semantic,
-    Street,
-    Sweep,
-    Weather,
-    hdl64e,
-    simulate_scan,
-)
 from r3dpa.simulation.effects import (
     DetectionLimit,
     DualReturn,
@@ -26,6 +14,11 @@ from r3dpa.simulation.effects import (
     RangeNoise,
     SoftRaydrop,
 )
+from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.scene import EgoMotion, Material, Scene, Semantic, Weather
+from r3dpa.simulation.sensor import hdl64e
+from r3dpa.simulation.street import Street
+from r3dpa.simulation.sweep import Origin, Sweep
 
 NOISE = {"range_sigma_m": 0.015, "weak_range_sigma_m": 0.09, "range_step_m": 0.002}
 SENSOR = replace(hdl64e(), **NOISE)

@@ -7,21 +7,12 @@ import pytest
 import sweeps
 from sweeps import applied, box
 
-from r3dpa.simulation import (
-    EgoMotion,
-    Material,
-    Origin,
-    Pose,
-    Primitive,
-    Scene,
-    Semantic,
-    Shape,
-    Sweep,
-    hdl64e,
-    simulate_scan,
-)
 from r3dpa.simulation.effects import EgoOcclusion, FoliageOcclusion, MovingActors, RollingShutter
+from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.scene import EgoMotion, Material, Pose, Primitive, Scene, Semantic, Shape
+from r3dpa.simulation.sensor import hdl64e
 from r3dpa.simulation.solids import EGO_BODY
+from r3dpa.simulation.sweep import Origin, Sweep
 
 SENSOR = replace(hdl64e(), range_sigma_m=0.0, weak_range_sigma_m=0.0, range_step_m=0.0)
 PLAIN = {"laser_calibration": "off"}

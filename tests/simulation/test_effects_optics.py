@@ -5,16 +5,6 @@ import pytest
 import sweeps
 from sweeps import applied, box
 
-from r3dpa.simulation import (
-    Material,
-    Origin,
-    Pose,
-    Puddle,
-    Scene,
-    Semantic,
-    Weather,
-    hdl64e,
-)
 from r3dpa.simulation.effects import (
     DiffuseReflection,
     Glass,
@@ -23,6 +13,9 @@ from r3dpa.simulation.effects import (
     WetGround,
 )
 from r3dpa.simulation.effects.optics import fresnel_reflectance
+from r3dpa.simulation.scene import Material, Pose, Puddle, Scene, Semantic, Weather
+from r3dpa.simulation.sensor import hdl64e
+from r3dpa.simulation.sweep import Origin
 
 SENSOR = hdl64e(shots=720)
 

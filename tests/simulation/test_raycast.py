@@ -4,20 +4,11 @@ import numpy as np
 import pytest
 from sweeps import inside
 
-from r3dpa.simulation import (
-    EgoMotion,
-    Pose,
-    Primitive,
-    Scene,
-    Semantic,
-    Shape,
-    Weather,
-    hdl64e,
-    raycast,
-)
+from r3dpa.simulation import raycast
 from r3dpa.simulation.drive_files import velodyne_to_world
 from r3dpa.simulation.raycast import cast, cast_single, normals
-from r3dpa.simulation.sensor import Rays
+from r3dpa.simulation.scene import EgoMotion, Pose, Primitive, Scene, Semantic, Shape, Weather
+from r3dpa.simulation.sensor import Rays, hdl64e
 from r3dpa.simulation.solids import GROUND, NO_SURFACE, Windows, level, solids_of
 
 REACH_M = 120.0

@@ -12,23 +12,14 @@ import numpy as np
 import pytest
 
 from r3dpa.io import only_writer
-from r3dpa.simulation import (
-    TRAIN_DRIVES,
-    VAL_DRIVES,
-    Origin,
-    Pose,
-    Street,
-    Weather,
-    drive_files,
-    drive_name,
-    drives,
-    expected_scans,
-    hdl64e,
-    simulate,
-    simulate_scan,
-    split_scans,
-)
-from r3dpa.simulation.drive_files import velodyne_to_world
+from r3dpa.simulation import drive_files, drives
+from r3dpa.simulation.drive_files import drive_name, velodyne_to_world
+from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate, split_scans
+from r3dpa.simulation.scan import simulate_scan
+from r3dpa.simulation.scene import Pose, Weather
+from r3dpa.simulation.sensor import hdl64e
+from r3dpa.simulation.street import Street
+from r3dpa.simulation.sweep import Origin
 
 SMALL = {"sensor": hdl64e(32)}
 KINDS = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
