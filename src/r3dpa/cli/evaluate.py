@@ -195,30 +195,30 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from r3dpa.metrics import realism_table
 
     check_file(out)
-    ours, real = (
-        [(scan.drive, scan) for scan in find_scans(folder)] for folder in (scans, reference)
-    )
+    ours, real = find_scans(scans), find_scans(reference)
     notes = [f"A: {scans}", f"B: {reference}"]
+    drives = [scan.drive for scan in real]
     if len(real) == 1:
         notes.append("B is a single scan: there is no floor; give a reference of two drives")
-    elif len({drive for drive, _ in real}) == 1:
+    elif len(set(drives)) == 1:
         middle = len(real) // 2
-        halves = ["first half"] * middle + ["second half"] * (len(real) - middle)
-        real = [
-            (f"{drive}, {half}", scan) for (drive, scan), half in zip(real, halves, strict=True)
-        ]
+        drives = ["first half"] * middle + ["second half"] * (len(real) - middle)
         notes.append(
             "B is a single drive: the floor compares its first half with its second one, which are "
             "more alike than two drives; all ratios come out too high"
         )
-    table = realism_table(_by_drive(ours, "scans"), _by_drive(real, "reference"), notes)
+    table = realism_table(
+        _by_drive(ours, [scan.drive for scan in ours], "scans"),
+        _by_drive(real, drives, "reference"),
+        notes,
+    )
     if out is not None:
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table
 
 
-def _by_drive(scans: list[tuple[str, Scan]], name: str) -> dict[str, ScanStatistics]:
+def _by_drive(scans: list[Scan], drives: list[str], name: str) -> dict[str, ScanStatistics]:
     """Statistics of all scans of each drive together."""
     from tqdm import tqdm
 
@@ -226,7 +226,7 @@ def _by_drive(scans: list[tuple[str, Scan]], name: str) -> dict[str, ScanStatist
     from r3dpa.metrics import ScanStatistics, scan_statistics
 
     totals: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-    for drive, scan in tqdm(scans, unit="scan", desc=name, disable=None):
+    for scan, drive in zip(tqdm(scans, name, unit="scan", disable=None), drives, strict=True):
         points = read_scan(scan.path)
         try:
             totals[drive] += scan_statistics(points)
