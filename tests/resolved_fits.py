@@ -2,6 +2,6 @@
 
 from functools import cache
 
-from r3dpa.cli import ablate
+from r3dpa.cli import bench
 
-resolved = cache(ablate._resolved)
+resolved = cache(bench._resolved)

@@ -28,7 +28,7 @@ from r3dpa.ablation import runs as runner
 from r3dpa.ablation.plan import Plan, Row, Stage, Table
 from r3dpa.ablation.tables import mean_of_seeds, order_results
 from r3dpa.cli import main
-from r3dpa.cli.ablate import _resolved
+from r3dpa.cli.bench import _resolved
 from r3dpa.metrics.results import Evaluation, MetricResult
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -392,7 +392,7 @@ def files(tmp_path_factory):
 @pytest.fixture
 def command(files, tmp_path, monkeypatch):
     """Words that run it."""
-    monkeypatch.setattr("r3dpa.cli.ablate._resolved", resolved)
+    monkeypatch.setattr("r3dpa.cli.bench._resolved", resolved)
     words = ["ablate", str(files / "table_x"), "--scale", str(files / "smoke.yaml")]
     return [*words, "--out", str(tmp_path / "out"), "--wandb", "off"]
 

@@ -52,7 +52,7 @@ COMMANDS = {
     "convert": Command("runs:convert", "convert checkpoints from and to the official layout"),
     "report": Command("runs:report", "draw the loss curves of a run and list the losses"),
     "replay": Command("runs:replay", "repeat a skipped step to find the layer that failed"),
-    "ablate": Command("ablate:ablate", "train and compare the paper's ablations", resumable=True),
+    "ablate": Command("bench:ablate", "train and compare the paper's ablations", resumable=True),
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
 }

@@ -1,18 +1,24 @@
-"""``r3dpa bench``: speed and accuracy of sampling, cost of training steps."""
+"""``r3dpa bench`` and ``ablate``: cost of sampling and training, and the paper's ablations."""
 
 from __future__ import annotations
 
+import shlex
+import sys
+import warnings
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml
+
 from r3dpa.cli.options import check_file, check_folder
 
-__all__ = ["sampling", "training"]
+__all__ = ["ablate", "sampling", "training"]
 
 
 def training(
     *,
-    conf: Path | None = None,
     stages: tuple[str, ...] = ("vae_alignment", "joint", "flow_matching"),
     batch_size: int = 1,
     steps: int = 2,
@@ -24,8 +30,7 @@ def training(
     """Train each stage for a few steps at its real size; print time, memory, work and speed.
 
     Args:
-        conf: Folder of the configurations; default: those of the package.
-        stages: Experiments below ``<conf>/experiment``; one process each.
+        stages: Experiments below ``conf/experiment``; one process each.
         batch_size: Scans per step.
         steps: Optimiser steps; two are needed for the peak memory of a long run.
         precision: Precision as the Trainer names it.
@@ -33,13 +38,12 @@ def training(
         out: JSON file for the same figures.
         quick: The demo's networks.
     """
-    from r3dpa.bench.training import StepSettings
-    from r3dpa.bench.training import training as measure
+    from r3dpa.bench import training as bench
     from r3dpa.cli.stages import conf_folder
 
     check_file(out)
-    settings = StepSettings(batch_size, steps, precision, device, quick)
-    return measure(conf or conf_folder(), stages, settings, out)
+    settings = bench.StepSettings(batch_size, steps, precision, device, quick)
+    return bench.training(conf_folder(), stages, settings, out)
 
 
 def sampling(
@@ -82,3 +86,94 @@ def sampling(
         "batch": batch_size,
     }
     return measure(out, ckpt, quick, effort, device)
+
+
+def ablate(
+    tables: Path,
+    *,
+    scale: str = "demo",
+    seeds: tuple[int, ...] = (0,),
+    out: Path | None = None,
+    jobs: int = 1,
+    rgb_weights: Path | None = None,
+    wandb: Literal["offline", "online", "off"] = "offline",
+    budget_only: bool = False,
+) -> None:
+    """Train, test and compare the rows of the paper's ablations.
+
+    Prints the estimated cost, then trains each stage once, however many rows and tables share it,
+    and writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json``. The same command continues an
+    interrupted run. A row that fails does not stop the others; the exit status is then 1.
+
+    Args:
+        tables: Folder of a table, such as ``conf/ablation/table_3`` (also found in the package), or
+            of several: ``conf/ablation``.
+        scale: ``demo`` for CPU cores, ``small`` for half an hour of one GPU, ``paper``; or a YAML
+            file of that kind.
+        seeds: Every row is trained and tested for each, such as ``0 1 2``.
+        out: Folder for everything; default: ``runs/ablation/<scale>``.
+        jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
+        rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
+        wandb: One run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
+            ``online``.
+        budget_only: Print the cost, and start nothing.
+    """
+    from r3dpa import ablation
+    from r3dpa.cli.stages import conf_folder
+    from r3dpa.io import only_writer
+
+    if not tables.is_dir() and (conf_folder().parent / tables).is_dir():
+        tables = conf_folder().parent / tables
+    scale_file = _scale_file(tables, scale)
+    folder = out or Path("runs/ablation") / scale_file.stem
+    check_folder(folder)
+    plan = ablation.make_plan(tables, scale_file, seeds, _resolved, rgb_weights)
+    if plan.missing_weights and not budget_only:
+        listed = ", ".join(map(str, plan.missing_weights))
+        raise ValueError(f"scale {plan.scale} needs files that are not there: {listed}")
+    _say(ablation.budget_of(plan))
+    if budget_only:
+        return
+    with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
+        failed = ablation.run_plan(plan, folder, _say, jobs)
+        for table in plan.tables:
+            text, results = ablation.write_table(plan, table, folder, failed)
+            _say(f"\n{text}")
+            if wandb != "off":
+                ablation.log_rows(plan, table, results, folder, wandb)
+    for name, reason in failed.items():
+        _say(f"failed: {name}: {reason}")
+    files = [folder / f"{table.name}.md" for table in plan.tables]
+    _say(f"tables: {', '.join(str(file) for file in files if file.is_file()) or 'none'}")
+    if failed:
+        sys.exit(1)
+
+
+def _scale_file(tables: Path, scale: str) -> Path:
+    """The YAML file of a scale: itself, or by its name in the folder of the tables."""
+    if not tables.is_dir():
+        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
+    if Path(scale).suffix in (".yaml", ".yml"):
+        return Path(scale)
+    near = [folder / "scale" for folder in (tables, tables.resolve().parent)]
+    place = next((folder for folder in near if folder.is_dir()), near[-1])
+    return place / f"{scale}.yaml"
+
+
+def _resolved(command: str) -> dict[str, Any]:
+    """The whole configuration of an ``r3dpa fit`` command."""
+    from r3dpa.cli.stages import run
+
+    with redirect_stdout(StringIO()) as printed, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on words that are not those of the process
+        try:
+            run([*shlex.split(command), "--print_config"])
+        except SystemExit as ended:
+            if ended.code:
+                raise ValueError(f"the above is said of: r3dpa {command}") from None
+    return dict(yaml.safe_load(printed.getvalue()))
+
+
+def _say(text: Any) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()  # into a log file at once
