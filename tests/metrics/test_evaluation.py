@@ -88,17 +88,6 @@ def test_the_same_scenes_have_no_distance(reference):
         assert rows[f"TOY {name}"].value == 1.0
 
 
-def test_noise_makes_everything_worse():
-    """Fresh streets; then the same ones with 1 m, 4 m and 12 m of noise in each pixel."""
-    clean, noisy, broken, lost = (found(1, noise=noise) for noise in (0.0, 1.0, 4.0, 12.0))
-    for name in DISTANCES:
-        assert clean[name].value < noisy[name].value < broken[name].value, name
-    for name in SHARES:  # precision is the last to fall: balls around few scans are wide
-        assert clean[name].value > lost[name].value, name
-    for name in ("W1 range", "TOY", "CD 3D"):
-        assert clean[name].interval[1] < broken[name].interval[0], name
-
-
 def test_values_are_those_of_the_metrics_one_by_one(reference):
     """The same numbers from the functions that see all scenes at once."""
     rows = rows_of(scenes(1, 30, noise=1.0), reference)
@@ -163,7 +152,7 @@ def test_intervals_are_as_wide_as_fresh_sets_differ():
     """Half a 95 % interval is two standard deviations; both are estimates from few."""
     sets = [
         found(1, noise=1.0),
-        *(found(seed, noise=1.0, num_resamples=0) for seed in range(2, 12)),
+        *(found(seed, noise=1.0, num_resamples=0) for seed in range(2, 9)),
     ]
     for name in ("W1 range", "TOY", "JSD"):
         spread = torch.tensor([rows[name].value for rows in sets]).std().item()
@@ -197,30 +186,6 @@ def test_results_repeat_and_go_through_json(reference, tmp_path):
     assert Evaluation.load(tmp_path / "a.json") == runs[0]
 
 
-def test_only_as_many_scenes_as_the_protocol_counts():
-    reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
-    comparison = evaluate(scenes(1, 30), reference, [TOY], label="x", resampling=QUICK)
-    assert comparison.evaluation.row("JSD").num_samples == 20
-    assert comparison.evaluation.about["extra"]["scenes"].startswith("only the first 20 were used")
-
-
-def test_corners_and_centres_differ_by_half_a_pixel():
-    """The protocol changes points, so cells and 3D distances change; ranges do not."""
-    real = list(scenes())
-    kinds = {}
-    for kind in ("centre", "corner"):
-        protocol = replace(PROTOCOL, unprojection=kind, voxel_m=0.25)
-        kinds[kind] = evaluate(
-            scenes(1, noise=1.0), reference_of(real, protocol), [TOY], label=kind, resampling=QUICK
-        )
-    rows = {k: {r.name: r.value for r in c.evaluation.rows} for k, c in kinds.items()}
-    for name in ("JSD", "TV", "MMD"):
-        assert rows["centre"][name] != rows["corner"][name], name
-        assert rows["centre"][name] == pytest.approx(rows["corner"][name], rel=0.3), name
-    assert rows["centre"]["W1 range"] == rows["corner"]["W1 range"]
-    assert rows["centre"]["TOY"] == rows["corner"]["TOY"]
-
-
 def test_few_scenes_are_refused_or_marked(reference):
     with pytest.raises(
         ValueError, match=r"3 generated scenes for the 3 features of TOY.*allow_few"
@@ -249,10 +214,10 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("bad", "message"), BAD)
-def test_bad_scenes_are_named(reference, bad, message):
-    with pytest.raises(ValueError, match=rf"{message}.*\. --skip_bad leaves such scenes out"):
-        rows_of([*scenes(1, 5), bad], reference)
+def test_a_bad_scene_is_named_with_the_option_that_leaves_it_out(reference):
+    message = r"bad/4: none of 1 points has.*\. --skip_bad leaves such scenes out"
+    with pytest.raises(ValueError, match=message):
+        rows_of([*scenes(1, 5), BAD[3][0]], reference)
 
 
 def test_bad_scenes_are_left_out_and_listed(reference):
@@ -277,11 +242,12 @@ def test_bad_scenes_are_left_out_and_listed(reference):
     assert "cannot be used" not in str(clean) + str(EvaluationTable((clean,)))
 
 
-def test_bad_scenes_do_not_use_up_what_the_protocol_counts():
+def test_only_as_many_good_scenes_as_the_protocol_counts():
     reference = reference_of(list(scenes()), replace(PROTOCOL, num_samples=20))
     mixed = [*(bad for bad, _ in BAD), *scenes(1, 21)]
-    comparison = evaluate(mixed, reference, [TOY], label="x", resampling=QUICK, skip_bad=True)
-    assert comparison.evaluation.row("JSD").num_samples == 20
+    found = evaluate(mixed, reference, [TOY], label="x", resampling=QUICK, skip_bad=True).evaluation
+    assert found.row("JSD").num_samples == 20
+    assert found.about["extra"]["scenes"].startswith("only the first 20 were used")
 
 
 def test_bad_scenes_alone_are_an_error(reference):
@@ -365,6 +331,10 @@ def test_every_distance_worsens_with_each_corruption(reference, ladder, amounts,
         values = [rows[name].value for rows in steps]
         assert values == sorted(values), (name, values)
         assert values[0] < values[-1], name
+    for name in SHARES if ladder == "noise" else ():  # balls around few scans are wide
+        assert steps[0][name].value > steps[-1][name].value, name
+    for name in ("TOY", "CD 3D"):
+        assert steps[0][name].interval[1] < steps[-1][name].interval[0], name
 
 
 def test_one_metric_of_two_sets_is_that_of_an_evaluation(reference):

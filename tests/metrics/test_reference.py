@@ -124,11 +124,9 @@ def test_a_drive_that_outweighs_the_others_is_divided():
     ("sizes", "limit", "kept"),
     [
         ((50, 3, 1), 20, (10, 10)),
-        ((50, 3, 1), 7, (4, 3)),
         ((50, 3, 1), 100, (27, 27)),
         ((4, 2), 5, (3, 2)),  # halves of 4 and 2
         ((7, 4), 10, (6, 4)),  # the first makes up for what the second lacks
-        ((7, 4), 100, (7, 4)),
     ],
 )
 def test_as_many_scans_are_kept_as_the_protocol_asks_for(sizes, limit, kept):
@@ -235,15 +233,13 @@ def test_other_features_are_refused():
 
 def test_files_of_something_else_are_named(tmp_path):
     path = tmp_path / "a.safetensors"
-    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
-        ReferenceStatistics.load(path)
-    path.write_bytes(b"no tensors at all")
-    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
-        ReferenceStatistics.load(path)
     filled().save(path)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
-        ReferenceStatistics.load(path)
+    for content in (None, b"no tensors at all", path.read_bytes()[:-100]):
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"a\.safetensors holds no reference statistics"):
+            ReferenceStatistics.load(path)
 
 
 @pytest.mark.parametrize(
@@ -251,10 +247,8 @@ def test_files_of_something_else_are_named(tmp_path):
     [
         ("0.moments.toy", lambda x: x[:-1], r"has shape \(6,\), expected \(7,\)"),
         ("1.features.toy", lambda x: x[:, :1], r"has shape \(4, 1\), expected \(4, 2\)"),
-        ("0.features.toy", lambda x: x[1:], r"has shape \(3, 2\), expected \(4, 2\)"),
         ("1.images", lambda x: x[..., :32], r"has shape \(2, 16, 32\), expected \(2, 16, 64\)"),
         ("0.cell_counts", lambda x: x[1:], r"has shape \(\d+,\), expected \(\d+,\)"),
-        ("1.ranges", lambda x: x[:, 1:], r"has shape \(1, 559\), expected \(1, 560\)"),
         ("1.ranges", None, r"is missing, expected \(1, 560\)"),
     ],
 )
