@@ -161,7 +161,7 @@ def prdc_by_loops(real, generated, k):
     }
 
 
-@pytest.mark.parametrize("offset", [0.0, 1e5])
+@pytest.mark.parametrize("offset", [0.0, 1e7])
 def test_prdc_against_loops(monkeypatch, offset):
     monkeypatch.setattr("r3dpa.metrics.functional._BLOCK", 7)  # several blocks, the last one short
     real, generated = draw(30, 3) + offset, 1.2 * draw(24, 3, seed=1) + 0.5 + offset
@@ -194,6 +194,7 @@ def test_cells_of_a_grid():
     assert GRID.cells(points).tolist() == [0, 4 * 8 + 4, 7 * 8 + 3]
     assert len(GRID.kept(points)) == 4
     assert GRID.shape == (8, 8)
+    assert BEVGrid(4.0, 0.7).cells(cloud((-3.9, -3.9), (3.9, 3.9))).tolist() == [0, 10 * 12 + 10]
 
 
 def test_every_point_of_the_published_grid_has_a_cell():

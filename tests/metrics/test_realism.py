@@ -71,6 +71,11 @@ def test_identical_data_have_distance_0_everywhere(drives):
     assert all(row.distance == row.pooled == 0 for row in table.rows)
     # One drive of the reference: distances, but no floor.
     assert all(math.isnan(row.ratio) and "no floor" in row.reason for row in table.rows)
+    twice = {"first": drives["drive 0"], "second": drives["drive 0"]}  # a floor of 0
+    assert {row.ratio for row in realism_table(one, twice).rows} == {0}
+    other = realism_table({"other": drives["drive 1"]}, twice)
+    assert {row.ratio for row in other.rows} <= {0, math.inf}
+    assert len(other.misses) > len(NAMES) / 2
 
 
 def test_scans_like_the_reference_are_within_its_floor(drives):

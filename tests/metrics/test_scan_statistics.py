@@ -66,6 +66,14 @@ def test_a_whole_scan_has_no_dropout(whole):
     assert whole.num_returns == 64 * SHOTS
 
 
+def test_fewer_rings_are_no_beams():
+    range_m = road_and_wall()
+    range_m[::2] = 0
+    statistics = statistics_of(range_m)
+    assert (statistics.num_ring_scans, statistics.num_beam_scans) == (1, 0)
+    assert statistics.beam_returns.sum() == 0
+
+
 def test_a_tenth_dropped_at_random_keeps_nine_tenths():
     generator = np.random.default_rng(0)
     range_m = road_and_wall()
