@@ -182,22 +182,6 @@ def test_nodes(smoke_root, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", [*EXPERIMENTS, "joint_unet"])
-def test_demo_sizes(stage, start, smoke_root, tmp_path):
-    settings = SIMULATED | {
-        "data.init_args.root": smoke_root,
-        "data.init_args.extractor": WIDE,
-        "data.init_args.features_dir": smoke_root / "wide_grids",
-    }
-    if stage == "flow_matching":
-        settings |= start_flow(tmp_path, net("vae_demo"), (32, 256))
-    if stage == "joint_unet":
-        stage, settings["model.init_args.sit"] = "joint", CONF / "net/unet_demo.yaml"
-    configs = ("data/demo", f"experiment/{stage}", f"experiment/{stage}_demo")
-    start(("trainer", "trainer_demo", *configs), settings)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("stage", EXPERIMENTS)
 def test_experiments_at_their_own_size(stage, start, smoke_root, tmp_path):
     """With 64 x 1024 range images of the scans there are."""

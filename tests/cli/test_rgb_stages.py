@@ -175,18 +175,3 @@ def test_what_does_not_fit_is_said(settings, message, tmp_path, capsys):
     with pytest.raises((ValueError, SystemExit)) as stop:
         fit(tmp_path, RGB, LEAVES, VAE, TINY, steps(1), settings)
     assert re.search(message, str(stop.value) + capsys.readouterr().err)
-
-
-@pytest.mark.slow
-def test_shipped_demo_configs_start_as_they_are(tmp_path):
-    """At their own sizes, on few images."""
-    few = {
-        "data.init_args.source.init_args.num_images": 40,
-        "data.init_args.val_every": 2,
-        "data.init_args.num_workers": 0,
-    }
-    vae = fit(tmp_path / "vae", (*DEMO, "experiment/image_vae"), few, steps(1))
-    start = {"model.init_args.init_from": vae, "trainer.fast_dev_run": "true"}
-    fit(tmp_path / "rgb", RGB, few, start)
-    (rows,) = (tmp_path / "rgb").rglob("*.rows")
-    assert rows.stat().st_size == 16 * 4 * (8 * 16 * 16)  # a batch of the 20, in float32
