@@ -125,8 +125,7 @@ class TestView:
     def test_real_scans_pass_and_half_their_beams_do_not(self, real_scans_dir):
         """Of the 64 lasers, stored one after the other, every second one is left out."""
         projection = SphericalProjection(LidarSensor())
-        paths = sorted(real_scans_dir.rglob("*.bin"))
-        for path in paths:
+        for path in sorted(real_scans_dir.rglob("*.bin"))[::3]:
             points = torch.from_numpy(read_scan(path)[:, :3])
             check_view(points, range_image(points, projection)[0], projection)
         azimuth = torch.atan2(points[:, 1], points[:, 0]) % (2 * math.pi)

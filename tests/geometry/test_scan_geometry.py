@@ -32,6 +32,31 @@ def test_to_plain_values_and_back(projection):
     assert hash(restored.projection) == hash(projection)
 
 
+def test_limits_in_radians():
+    sensor = LidarSensor(inclination_max_deg=45.0, inclination_min_deg=-90.0)
+    assert sensor.inclination_max_rad == pytest.approx(math.pi / 4)
+    assert sensor.inclination_min_rad == pytest.approx(-math.pi / 2)
+    assert sensor.field_of_view_rad == pytest.approx(0.75 * math.pi)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"beams": 0}, "beams=0"),
+        ({"columns": -3}, "columns=-3"),
+        ({"inclination_max_deg": -25.0}, "inclination_max_deg=-25.0"),
+        ({"inclination_max_deg": 90.5}, "90.5"),
+        ({"inclination_min_deg": float("nan")}, "nan"),
+        ({"range_min_m": -0.1}, "range_min_m=-0.1"),
+        ({"range_min_m": 56.0}, "range_max_m=56.0"),
+        ({"range_max_m": math.inf}, "inf"),
+    ],
+)
+def test_impossible_sensors_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        LidarSensor(**wrong)
+
+
 def test_damaged_values_are_refused():
     whole = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8)).to_dict()
     for damaged in (
