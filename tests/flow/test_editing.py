@@ -133,30 +133,26 @@ class TestKept:
         with pytest.raises(ValueError, match="step 5 of the solver"):
             solve(growth, latents(), torch.tensor(longer).double())
 
-    @pytest.mark.parametrize("mask", [edit_mask().float(), edit_mask()[0], edit_mask()[..., :2]])
-    def test_masks_that_do_not_fit_are_refused(self, mask):
+    def test_masks_and_noise_that_do_not_fit_are_refused(self):
         way = invert(growth, latents(), ode_times(2), "euler")
-        with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
-            kept(way, mask)
-        with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
-            renoised(way, mask, latents())
-
-
-class TestRenoised:
-    def test_all_of_the_noise_at_time_1_and_a_part_before(self):
-        noise = latents().flip(0)
-        for start, path in ((1.0, "linear"), (0.25, "linear"), (0.25, "cosine")):
-            way = invert(growth, latents(), ode_times(3, start=start), "euler")
-            state = renoised(way, edit_mask(), noise, Interpolant(path))
-            quarter = torch.tensor(torch.pi / 8).double()
-            data, fresh = (1 - start, start) if path == "linear" else (quarter.cos(), quarter.sin())
-            inside = data * latents() + fresh * noise
-            torch.testing.assert_close(state, torch.where(edit_mask(), inside, way.states[0]))
-
-    def test_noise_of_another_shape_is_refused(self):
-        way = invert(growth, latents(), ode_times(2), "euler")
+        for mask in (edit_mask().float(), edit_mask()[0], edit_mask()[..., :2]):
+            with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
+                kept(way, mask)
+            with pytest.raises(ValueError, match=r"such as \(2, 1, 4, 6\); got torch"):
+                renoised(way, mask, latents())
         with pytest.raises(ValueError, match=r"shape \(2, 3, 4, 6\), got \(1, 3, 4, 6\)"):
             renoised(way, edit_mask(), latents()[:1])
+
+
+def test_all_of_the_noise_at_time_1_and_a_part_before():
+    noise = latents().flip(0)
+    for start, path in ((1.0, "linear"), (0.25, "linear"), (0.25, "cosine")):
+        way = invert(growth, latents(), ode_times(3, start=start), "euler")
+        state = renoised(way, edit_mask(), noise, Interpolant(path))
+        quarter = torch.tensor(torch.pi / 8).double()
+        data, fresh = (1 - start, start) if path == "linear" else (quarter.cos(), quarter.sin())
+        inside = data * latents() + fresh * noise
+        torch.testing.assert_close(state, torch.where(edit_mask(), inside, way.states[0]))
 
 
 class TestSphericalMean:

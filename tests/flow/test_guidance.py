@@ -150,6 +150,10 @@ def test_features_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"\(3, 6, 5\), but .* \(2, 6, 5\)"):
         build()(latents(2), times(2))
     aligned = aligned_velocity(velocity, tokens_of)
+    with pytest.raises(ValueError, match=r"weight of a target must be 0 or above, got -0\.5"):
+        FeatureTarget(target(), weight=-0.5)
+    with pytest.raises(ValueError, match="no term without a velocity"):
+        build(scale=0.5, relative=True).term(latents(), times())
     for goals in ([], [FeatureTarget(target()), FeatureTarget(target(2))]):
         with pytest.raises(ValueError, match="targets of one shape, got"):
             FeatureGuidance(velocity, aligned, goals, scale=1.0)
@@ -170,13 +174,6 @@ def test_features_that_do_not_fit_are_named():
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         build(**options)
-
-
-def test_weights_of_targets_out_of_range_are_refused():
-    with pytest.raises(ValueError, match=r"weight of a target must be 0 or above, got -0\.5"):
-        FeatureTarget(target(), weight=-0.5)
-    with pytest.raises(ValueError, match="no term without a velocity"):
-        build(scale=0.5, relative=True).term(latents(), times())
 
 
 def test_the_energy_of_several_targets_is_their_weighted_sum():

@@ -106,6 +106,8 @@ def test_unknown_path_and_wrong_times_are_refused():
     data, noise, time = draws()
     with pytest.raises(ValueError, match=r"\(5,\), got \(4,\)"):
         Interpolant().interpolate(data, noise, time[:4])
+    with pytest.raises(ValueError, match="got 'beta'"):
+        sample_time(2, "beta")
 
 
 def test_sampled_times_follow_their_distribution():
@@ -128,8 +130,3 @@ def test_sampled_times_repeat_with_the_generator(kind):
     assert torch.equal(first, sample_time(4, kind, generator=torch.Generator().manual_seed(3)))
     torch.manual_seed(3)
     assert torch.equal(first, sample_time(4, kind, device="cpu"))
-
-
-def test_unknown_distribution_of_times_is_refused():
-    with pytest.raises(ValueError, match="got 'beta'"):
-        sample_time(2, "beta")

@@ -138,24 +138,20 @@ def drawn(number, off=None):
     """Key and random numbers of each effect in a busy scene by its calls; and the scan."""
     log = {}
 
+    def recorded(kind):
+        def draw(self, rays):
+            numbers = getattr(Draws, kind)(self, slice(None))
+            self.calls.append(numbers.tobytes())
+            return numbers[rays]
+
+        return draw
+
     class Recorded(Draws):
         def __init__(self, num_rays, *key):
             super().__init__(num_rays, *key)
             self.calls = log.setdefault(key[-1], [key])
 
-        def _record(self, draw, rays):
-            numbers = draw(slice(None))
-            self.calls.append(numbers.tobytes())
-            return numbers[rays]
-
-        def uniform(self, rays):
-            return self._record(super().uniform, rays)
-
-        def normal(self, rays):
-            return self._record(super().normal, rays)
-
-        def exponential(self, rays):
-            return self._record(super().exponential, rays)
+        uniform, normal, exponential = map(recorded, ("uniform", "normal", "exponential"))
 
     with pytest.MonkeyPatch.context() as context:
         context.setattr(scan, "Draws", Recorded)
