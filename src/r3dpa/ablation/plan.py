@@ -16,9 +16,10 @@ A table is a folder with ``table.yaml`` and one YAML file per row::
 
 A scale defines data, networks and length::
 
-    words:                                   # abbreviations
-      vae_alignment: vae_alignment --preset demo --seed_everything {seed} --trainer.max_steps 400
-      flow_matching: flow_matching --preset demo --seed_everything {seed} --trainer.max_steps 400
+    words:                                   # abbreviations; one may use those before it
+      demo: --preset demo --seed_everything {seed} --trainer.max_steps 400
+      vae_alignment: vae_alignment {demo}
+      flow_matching: flow_matching {demo}
     commands:                                # run first where a row needs them
       prior: fit rgb_pretraining --preset demo
     reference: --spaces fwid,fgeo            # options of `r3dpa reference`
@@ -144,9 +145,8 @@ class _Scale(NamedTuple):
             if name in checkpoints:
                 continue
             place, text = f"{file}: commands.{name}", command
-            while abbreviated := self.words.keys() & set(_NAME.findall(text)):
-                for word in abbreviated:
-                    text = text.replace(f"{{{word}}}", self.words[word])
+            for word in reversed(self.words):  # one may use those before it
+                text = text.replace(f"{{{word}}}", self.words[word])
             used = {f"{{{n}}}": n for n in _NAME.findall(text) if n not in ("seed", "out")}
             if unknown := [n for n in used.values() if n not in checkpoints]:
                 known = ", ".join([*checkpoints, *self.words])
@@ -154,7 +154,7 @@ class _Scale(NamedTuple):
                     f"{place}: {{{unknown[0]}}} is nothing known before it; give one of {known}"
                 )
             words = shlex.split(text.replace("{seed}", str(seed)))
-            if words[:1] != ["fit"] or not "".join(words[1:2]).strip("-"):
+            if words[:1] != ["fit"] or not words[1:] or words[1].startswith("-"):
                 raise ValueError(f"{place}: {command!r} is no command `fit EXPERIMENT ...`")
             content = json.dumps(self.resolve(text.replace("{seed}", "0")))
             for mark, before in used.items():

@@ -22,7 +22,8 @@ from lightning.pytorch.cli import LightningArgumentParser
 from torch.utils.flop_counter import FlopCounterMode
 
 from r3dpa.ablation.plan import Plan
-from r3dpa.io import atomic_path, only_writer, source_commit
+from r3dpa.io import only_writer, source_commit
+from r3dpa.metrics.results import save_text
 from r3dpa.modules import GenerativeModule
 from r3dpa.modules.steps import PathDraws
 
@@ -61,10 +62,7 @@ class Job(NamedTuple):
 def mark_of(place: Path) -> dict[str, Any]:
     """Settings and commit of a job that has ended well; empty before."""
     path = place.with_suffix(".done")
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: is damaged ({error}); remove it to run its job again") from error
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
 
 
 def run_plan(plan: Plan, out: Path, say: Callable[[str], None], jobs: int = 1) -> dict[str, str]:
@@ -157,7 +155,7 @@ async def _run(job: Job, cores: int) -> str | None:
         lines = log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-_TAIL:]
         return "\n      ".join([f"{why}; {log_path} ends with", *lines])
     mark = {"content": job.content, "commit": source_commit()}
-    write(job.place.with_suffix(".done"), json.dumps(mark))
+    save_text(job.place.with_suffix(".done"), json.dumps(mark))
     return None
 
 
@@ -171,7 +169,7 @@ def _jobs(plan: Plan, out: Path) -> list[Job]:
     data, reference = out / "data.yaml", out / "reference.safetensors"
     on_scans = [_placed(stage.config["data"], out) for stage in plan.stages if stage.on_scans]
     sizes = sorted({tuple(block["init_args"]["grid_size"]) for block in on_scans})
-    write(data, yaml.safe_dump({"data": on_scans[0]}))
+    save_text(data, yaml.safe_dump({"data": on_scans[0]}))
     scans = json.dumps([on_scans[0], sizes], sort_keys=True)
     words = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]
     jobs = [Job("features", words, out / "features", scans)]
@@ -199,12 +197,6 @@ def _jobs(plan: Plan, out: Path) -> list[Job]:
 def _placed(content: Any, out: Path) -> Any:
     """Words or a configuration with the folder of the ablation for ``{out}``."""
     return json.loads(json.dumps(content).replace("{out}", json.dumps(str(out))[1:-1]))
-
-
-def write(path: Path, text: str) -> None:
-    """Writes a whole file or none."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def budget_of(plan: Plan) -> str:

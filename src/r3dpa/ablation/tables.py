@@ -18,13 +18,14 @@ from scipy.stats import t as student
 
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Stage, Table
-from r3dpa.ablation.runs import mark_of, write
+from r3dpa.ablation.runs import mark_of
 from r3dpa.io import command, machine, versions
 from r3dpa.metrics.results import (
     Evaluation,
     EvaluationTable,
     published_evaluation,
     save_csv,
+    save_text,
 )
 from r3dpa.metrics.scene_features import SPACES
 
@@ -170,8 +171,8 @@ def write_table(
     if len(commits) > 1:
         notes.append(f"trained or tested by different commits: {', '.join(commits)}")
     listed = "\n".join(f"- {line}" for line in notes)
-    write(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
-    write(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
+    save_text(out / f"{table.name}.md", f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
+    save_text(out / f"{table.name}.tex", f"% {' '.join(head.split())}\n{shown.latex()}")
     save_csv(means, out / f"{table.name}.csv")
     stages = [stage for row in table.rows for chain in row.stages.values() for stage in chain]
     stored = {
@@ -198,7 +199,7 @@ def write_table(
         "curves": {stage.name: _thinned(out, stage) for stage in stages},
         "failed": dict(failed),
     }
-    write(out / f"{table.name}.json", json.dumps(stored, indent=1) + "\n")
+    save_text(out / f"{table.name}.json", json.dumps(stored, indent=1) + "\n")
     return "\n".join([f"{table.name}: {head}", "", str(shown), *notes]), results
 
 

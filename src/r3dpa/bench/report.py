@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from r3dpa import viz
 from r3dpa.bench.measure import Comparison
 from r3dpa.bench.problems import Setting
-from r3dpa.io import atomic_path, one_line, text_table
+from r3dpa.io import one_line, text_table
+from r3dpa.metrics.results import save_text
 
 Floats = NDArray[np.float64]
 
@@ -228,7 +229,7 @@ class Finding(NamedTuple):
 def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any]) -> str:
     """Writes all files; returns the text of the summary."""
     content = facts | {"problems": {name: _record(part) for name, part in found.items()}}
-    _write(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    save_text(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     name = "model" if "model" in found else "mixture"
     viz.save(_picture(name, found[name]), out / "pareto.png")
     tail = ["no checkpoint was given: all figures are of the mixture, none of a model"]
@@ -236,7 +237,7 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
         levels = quality_levels(found[name].rows)
         where = f"{facts['machine']['gpu'] or facts['machine']['cpu']}, {one_line(facts['model'])}"
         table = {"levels": levels, "measured_on": where}
-        _write(out / "quality.json", json.dumps(table, indent=2, allow_nan=False) + "\n")
+        save_text(out / "quality.json", json.dumps(table, indent=2, allow_nan=False) + "\n")
         tail = [
             f"quality {level}: {choice['solver']}, {choice['steps']} steps, shift "
             f"{choice['shift']:g} (error {choice['error']:.3g}, {choice['seconds_share']:.0%} of "
@@ -250,14 +251,9 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
         lines += [f"## {_TITLES[key]}", "", "What each further second buys:", ""]
         lines += [*(f"- {sentence}" for sentence in steps), "", "```", _table(part), *_notes(part)]
         lines += ["```", ""]
-    _write(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
+    save_text(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
     files = sorted(path.name for path in out.iterdir() if path.is_file())
     return "\n".join([*lines[4:], *tail, f"files: {', '.join(files)}"])
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _record(found: Finding) -> dict[str, Any]:

@@ -29,7 +29,8 @@ from r3dpa.bench.measure import peak_bytes, synchronise
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import atomic_path, command, machine, one_line, text_table, usable_device, versions
+from r3dpa.io import command, machine, one_line, text_table, usable_device, versions
+from r3dpa.metrics.results import save_text
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
 from r3dpa.nn.backbones import GeometricFeatures
@@ -83,21 +84,16 @@ class StageCost:
         """Cells of the table."""
         first, *others = self.step_seconds
         gpu = self.peak_gpu_bytes
-        counts = {f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()}
-        return (
-            {"stage": self.stage}
-            | counts
-            | {
-                "first s": f"{first:.3g}",
-                "next s": f"{median(others):.3g}" if others else "-",
-                "host GiB": f"{self.peak_host_bytes / 2**30:.2f}",
-                "GPU GiB": "-" if gpu is None else f"{gpu / 2**30:.2f}",
-                "loss": f"{self.loss:.4g}",
-                "images/s": f"{self.images_per_second:.3g}",
-                "GFLOP/step": f"{self.flop / 1e9:.4g}",
-                "GFLOP/s": f"{self.flop / median(others or [first]) / 1e9:.4g}",
-            }
-        )
+        cells = {f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()}
+        cells["first s"] = f"{first:.3g}"
+        cells["next s"] = f"{median(others):.3g}" if others else "-"
+        cells["host GiB"] = f"{self.peak_host_bytes / 2**30:.2f}"
+        cells["GPU GiB"] = "-" if gpu is None else f"{gpu / 2**30:.2f}"
+        cells["loss"] = f"{self.loss:.4g}"
+        cells["images/s"] = f"{self.images_per_second:.3g}"
+        cells["GFLOP/step"] = f"{self.flop / 1e9:.4g}"
+        cells["GFLOP/s"] = f"{self.flop / median(others or [first]) / 1e9:.4g}"
+        return {"stage": self.stage} | cells
 
 
 def training(
@@ -136,8 +132,7 @@ def training(
     }
     if out is not None:
         content = about | {"stages": [asdict(cost) for cost in costs]}
-        with atomic_path(out) as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n")
+        save_text(out, json.dumps(content, indent=2) + "\n")
     rows = [cost.row() for cost in costs]
     table = text_table(([*row.values()] for row in rows), list(rows[0]))
     return "\n".join([table, *(f"{name}: {one_line(values)}" for name, values in about.items())])
