@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
 from r3dpa.data import FeatureGrids, LidarDataModule, kitti360_scans, read_scan, write_feature_grids
-from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, pool_cells, range_image
+from r3dpa.geometry import LidarSensor, SphericalProjection, pool_cells, range_image
 from r3dpa.nn.backbones import GeometricFeatures
 
 pytestmark = [pytest.mark.bench, pytest.mark.filterwarnings("ignore")]
@@ -55,20 +54,6 @@ def bench_epoch(benchmark, loaded, workers, one_thread):
     benchmark(lambda: sum(1 for _ in loader))
 
 
-def loop_over_cells(xyz, values):
-    """The feature grid as the official code makes it: a mask and a mean for each cell."""
-    rows, columns = PROJECTION.sensor.cell_size(GRID_SIZE)
-    row, column = PROJECTION.pixel_of(xyz)
-    cell = row // rows * GRID_SIZE[1] + column // columns
-    cell[~in_range(xyz, PROJECTION.sensor)] = -1
-    grid = values.new_zeros(GRID_SIZE[0] * GRID_SIZE[1], values.shape[1])
-    for index in range(len(grid)):
-        members = cell == index
-        if members.any():
-            grid[index] = values[members].mean(dim=0)
-    return grid
-
-
 @pytest.mark.benchmark(group="feature grid of one scan, 768 wide", min_rounds=3)
 class BenchGrid:
     @pytest.fixture
@@ -77,14 +62,10 @@ class BenchGrid:
 
     def bench_pool_cells(self, benchmark, points, values, alone):
         xyz = points[:, :3].contiguous()
-        grid, _ = benchmark(pool_cells, xyz, values, PROJECTION, GRID_SIZE)
-        torch.testing.assert_close(grid, loop_over_cells(xyz, values), atol=1e-5, rtol=1e-4)
+        benchmark(pool_cells, xyz, values, PROJECTION, GRID_SIZE)
 
     def bench_floor_one_sum_over_all_features(self, benchmark, values, alone):
         benchmark(values.sum)
-
-    def bench_loop_over_cells(self, benchmark, points, values, alone):
-        benchmark(loop_over_cells, points[:, :3].contiguous(), values)
 
 
 @pytest.mark.benchmark(group="read one feature grid")
@@ -94,13 +75,3 @@ class BenchStore:
         write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path)
         store = FeatureGrids(tmp_path, scans, PROJECTION, GRID_SIZE, extractor)
         benchmark(lambda: store.read(scans[0]))
-
-    def bench_one_npz_a_scan(self, benchmark, tmp_path, alone):
-        """As the official code keeps them."""
-        np.savez(tmp_path / "grid.npz", feats=np.random.default_rng(0).normal(size=(512, DIM)))
-
-        def read():
-            with np.load(tmp_path / "grid.npz") as content:
-                return torch.from_numpy(content["feats"].astype(np.float32))
-
-        benchmark(read)

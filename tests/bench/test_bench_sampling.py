@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -209,12 +208,6 @@ class TestErrors:
         both = (ours.range_m > 0) & (exact.range_m > 0)
         assert (ours.range_m - exact.range_m)[both].abs().max() < 0.01
 
-    def test_generators_of_one_network_keep_their_own_times(self, model):
-        few, many = (model._generator(Setting(SamplerConfig("euler", n))) for n in (2, 5))
-        first = few.generate([0]).latents
-        assert many.generate([0]).nfe == 5
-        assert torch.equal(few.generate([0]).latents, first)
-
     @pytest.mark.parametrize(
         ("wrong", "message"),
         [
@@ -262,19 +255,6 @@ class TestFiles:
                 assert line["flop"] == pytest.approx(work)
         assert any("bf16" in line["label"] for line in content["problems"]["model"]["rows"])
         assert any("batch 1" in line["label"] for line in content["problems"]["model"]["rows"])
-
-    def test_sentences_quote_the_rows(self, folder):
-        out, text = folder
-        content = json.loads((out / "sampling.json").read_text())
-        for problem in content["problems"].values():
-            rows = {line["label"]: line for line in problem["rows"]}
-            steps = zip(problem["front"], problem["front"][1:], strict=False)
-            for sentence, (cheap, dear) in zip(problem["sentences"], steps, strict=True):
-                assert sentence in text
-                found = re.search(r"falls from (\S+) to (\S+), (\S+) times less", sentence)
-                before, after = rows[cheap]["error"], rows[dear]["error"]
-                expected = [before, after, before / after]
-                assert [float(n) for n in found.groups()] == pytest.approx(expected, rel=0.006)
 
     def test_pictures_and_levels(self, folder):
         out, text = folder
