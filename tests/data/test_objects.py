@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -161,12 +160,9 @@ def test_library_comes_back_from_its_file(tmp_path, library):
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
-def test_an_unknown_object_lists_those_there_are(library):
+def test_other_objects_and_features_of_another_source_are_refused(library):
     with pytest.raises(ValueError, match="no 'tram' among the objects; there are road, car"):
         library.feature("tram")
-
-
-def test_features_of_another_source_are_refused(library):
     library.check_source("scaled", 4)
     for source, dim in (("scalr", 4), (None, 4), ("scaled", 768)):
         with pytest.raises(ValueError, match=f"of 'scaled' of width 4, .* of {source!r} of width"):
@@ -208,17 +204,11 @@ def test_parts_that_do_not_fit_are_refused(library):
 def test_a_file_of_something_else_is_named(tmp_path, library):
     path = tmp_path / "objects.safetensors"
     library.save(path)
-    content = path.read_bytes()
-    for name, data in {"cut": content[:40], "empty": b"", "text": b"no library"}.items():
-        path = tmp_path / f"{name}.safetensors"
+    for data in (path.read_bytes()[:40], b"no library"):
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=rf"{name}\.safetensors holds no objects"):
+        with pytest.raises(ValueError, match=r"objects\.safetensors holds no objects"):
             ObjectLibrary.load(path)
-    for card in ({}, {"version": 2}, {"version": 1, "classes": [{"name": "car"}]}):
-        metadata = {"r3dpa_objects": json.dumps(card)}
+    for metadata in (None, {"r3dpa_objects": "{}"}, {"r3dpa_objects": '{"version": 2}'}):
         save_file({"features": torch.ones(1, 2)}, path, metadata)
         with pytest.raises(ValueError, match="holds no objects"):
             ObjectLibrary.load(path)
-    save_file({"features": torch.ones(1, 2)}, path)  # without a card
-    with pytest.raises(ValueError, match="holds no objects"):
-        ObjectLibrary.load(path)

@@ -37,36 +37,33 @@ def test_good_names(name):
     assert refuse_name(name) is None
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_journal_of_a_store(name, tmp_path):
+def test_journal_of_a_store(tmp_path):
     (tmp_path / "shard_00000.rows").write_bytes(bytes(8))
-    line = json.dumps({"scan": name, "bytes": 16, "row": 0}) + "\n"
+    line = json.dumps({"scan": "../../x", "bytes": 16, "row": 0}) + "\n"
     (tmp_path / "shard_00000.jsonl").write_text(line)
     with pytest.raises(ValueError, match=r"shard_00000\.jsonl is damaged .*name of scan in line 1"):
         Store(tmp_path, "{}", (2,)).places()
 
 
-@pytest.mark.parametrize("name", ["../../x", "/etc/x", "a\\..\\x"])
-def test_members_of_archives(name, tmp_path):
+def test_members_of_archives(tmp_path):
     array = io.BytesIO()
     np.save(array, POINTS)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr(f"{name}.npy", array.getvalue())
+        archive.writestr("../../x.npy", array.getvalue())
     with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
         read_npz(tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"a\.npz, member .*\(its name"):
         list(read_samples(tmp_path / "a.npz", LidarSensor(4, 16)))
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_names_in_a_reference(name, tmp_path):
+def test_names_in_a_reference(tmp_path):
     path = tmp_path / "a.safetensors"
     protocol = PROTOCOLS["default"].with_sensor(LidarSensor(4, 16))
     ReferenceStatistics(protocol, {}, ["a/0", "b/0"], {}).save(path)
     with safe_open(path, framework="pt") as file:
         tensors, about = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
     card = json.loads(about["r3dpa_reference"])
-    card["names"][0] = name
+    card["names"][0] = "../../x"
     save_file(tensors, path, {"r3dpa_reference": json.dumps(card)})
     with pytest.raises(ValueError, match=r"a\.safetensors holds no .*name of a scan"):
         ReferenceStatistics.load(path)

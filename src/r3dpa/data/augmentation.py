@@ -2,12 +2,11 @@
 
 Mirroring left and right and rotating about the vertical axis by whole grid columns move whole
 pixels and cells: image and stored grid are reordered, nothing is projected or extracted again.
-Letters: H beams, W columns, h x w cells, D feature width, P points.
+Letters: H beams, W columns, h x w cells, D feature width.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,23 +35,12 @@ class View:
     mirrored: bool
     grid_columns: int
 
-    def points(self, points: Tensor) -> Tensor:
-        """Transformed points ``(P, 3 or more)``, computed in float64; other columns stay.
+    def image(self, image: Tensor) -> Tensor:
+        """Reordered image ``(..., W)``, W a multiple of w.
 
-        :meth:`image` equals projecting these, but for points at the border of two pixels: a pixel
+        Equals projecting the transformed points, but for those at the border of two pixels: a pixel
         holds its left border only, which mirroring makes the right one.
         """
-        angle = -2 * math.pi * self.columns / self.grid_columns
-        x, y = points[:, 0].double(), points[:, 1].double()
-        if self.mirrored:
-            y = -y
-        result = points.clone()
-        result[:, 0] = math.cos(angle) * x - math.sin(angle) * y
-        result[:, 1] = math.sin(angle) * x + math.cos(angle) * y
-        return result
-
-    def image(self, image: Tensor) -> Tensor:
-        """Reordered image ``(..., W)``, W a multiple of w; exact."""
         return self._reordered(image, -1, image.shape[-1] // self.grid_columns)
 
     def grid(self, grid: Tensor) -> Tensor:
