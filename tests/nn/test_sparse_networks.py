@@ -175,6 +175,8 @@ def test_pooling_by_hand():
     assert rings[0, 0].tolist() == [2, 20]
     assert rings[2, 1].tolist() == [7, 60]  # 7.25 <= 10 < 10.5
     assert rings.count_nonzero() == 4
+    alone = pool_voxels(features[:1], coordinates[:1], 1).view(16, 2)  # at the mean itself
+    assert alone[0].tolist() == [1, 10]
     beyond = torch.tensor([[1200, 0, 0, 0], [-1200, 0, 0, 0]])  # 60 m
     assert not pool_voxels(features[:2], beyond, 1).any()
     above = torch.tensor([[120, 0, 160, 0], [-120, 0, -160, 0]])  # 6 m aside, 10 m in space
