@@ -404,6 +404,15 @@ class TestOfficial:
         content = to_official(replace(checkpoint, geometry=official_sensor.to_dict()))
         assert content["args"].dataset_config == "configs/kitti.yaml"
 
+    @pytest.mark.parametrize(("depth", "model"), [(12, "SiT-S/2"), (3, None)])
+    def test_models_of_official_sizes_have_their_name(self, checkpoint, depth, model):
+        init_args = {**SIT_ARGS, "hidden_size": 384, "depth": depth}
+        networks = {
+            name: replace(checkpoint.network(name), init_args=init_args) for name in ("sit", "ema")
+        }
+        content = to_official(replace(checkpoint, networks={**checkpoint.networks, **networks}))
+        assert vars(content["args"]).get("model") == model
+
     def test_a_short_class_path_is_the_same_class(self, checkpoint):
         vae = replace(checkpoint.network("vae"), class_path="r3dpa.nn.VAE")
         assert "vae" in to_official(replace(checkpoint, networks={"vae": vae}))
