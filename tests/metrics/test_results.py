@@ -81,13 +81,6 @@ def test_a_number_that_is_none_is_refused(fields):
         MetricResult("FRID", **fields)
 
 
-def test_a_value_that_is_none_needs_a_reason():
-    with pytest.raises(ValueError, match="reason in the note"):
-        MetricResult("FRID", None)
-    assert MetricResult("FRID", None, note="fewer samples than features").value is None
-    assert MetricResult("FRID", 1.0, interval=(0.2, 0.8)).half_width == pytest.approx(0.3)
-
-
 def test_half_widths_add_in_squares():
     # half widths 3 and 4: values tie up to a difference of 5
     a = MetricResult("M", 20.0, interval=(17.0, 23.0))
@@ -129,9 +122,7 @@ def test_saved_evaluation_is_read_back(tmp_path):
         (lambda s: s.pop("label"), "missing .* 'label'"),
         (lambda s: s["rows"][0].pop("value"), "missing .* 'value'"),
         (lambda s: s["rows"][0].update(std=1), "unexpected keyword argument 'std'"),
-        (lambda s: s["rows"][0].update(value=None), "FRID: value is None"),
         (lambda s: s.update(rows=[3]), "must be a mapping"),
-        (lambda s: s["about"].update(other=1), r"unknown keys \['other'\]"),
     ],
 )
 def test_a_file_with_a_wrong_key_is_refused_by_name(tmp_path, change, message):

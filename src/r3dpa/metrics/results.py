@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -26,6 +26,7 @@ Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
 Mark = Literal["", "best", "second", "tie"]
 
+_PUBLISHED: Any = json.loads(files(__package__).joinpath("published.json").read_text("utf-8"))
 _SHOWN_BAD = 20  # samples left out that are printed
 _PAPER_ORDER = ("FRID", "FLD", "FSVD", "FPVD", "JSD", "MMD")
 _FLOOR = "real vs. real (floor)"
@@ -87,14 +88,11 @@ class MetricResult:
     note: str = ""
 
     def __post_init__(self) -> None:
-        low, high = self.interval or (0.0, 0.0)
-        known = [number for number in (self.value, self.floor) if number is not None]
-        if not all(map(math.isfinite, (*known, low, high))) or low > high:
+        numbers = [self.value or 0.0, self.floor or 0.0, *(self.interval or ())]
+        if not all(map(math.isfinite, numbers)) or numbers[2:] != sorted(numbers[2:]):
             raise ValueError(f"{self}: give finite numbers, the lower end of the interval first")
-        if self.value is None and not self.note:
-            raise ValueError(f"{self.name}: value is None; give the reason in the note")
-        if self.interval is not None:
-            object.__setattr__(self, "interval", (low, high))
+        if self.interval is not None:  # a list, in JSON
+            object.__setattr__(self, "interval", tuple(self.interval))
 
     @property
     def half_width(self) -> float:
@@ -142,7 +140,7 @@ class Evaluation:
         about: Provenance, with the keys of ``_ABOUT``; those left out get its defaults.
 
     Raises:
-        ValueError: If ``about`` has an unknown key, or holds what JSON cannot.
+        ValueError: If ``about`` holds what JSON cannot.
     """
 
     label: str
@@ -150,8 +148,6 @@ class Evaluation:
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if unknown := sorted(self.about.keys() - _ABOUT.keys()):
-            raise ValueError(f"about has the unknown keys {unknown}; put them in its extra")
         try:
             about = json.loads(json.dumps(_ABOUT | self.about, allow_nan=False))
         except (TypeError, ValueError) as error:
@@ -269,12 +265,11 @@ class EvaluationTable:
             scale = f"1e{result.scale}" * bool(result.scale)
             kind = ", ".join(filter(None, [scale, result.unit, result.direction]))
             heads.append(f"{result.name} ({kind})")
-        lines = self._lines(cell)
-        table = text_table(lines, ["", *heads], "l" + "r" * len(heads), "pipe")
+        table = text_table(self._lines(cell), ["", *heads], "l" + "r" * len(heads), "pipe")
         marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
         interval = "[low, high]: 95 % interval of the value at this number of scenes"
-        below = [marks, interval, *self.notes]
-        return "\n".join([table, "", *(f"- {text}" for text in below)]) + "\n"
+        below = [f"- {text}" for text in (marks, interval, *self.notes)]
+        return "\n".join([table, "", *below]) + "\n"
 
     def latex(self) -> str:
         r"""The table as a ``tabular`` of the package booktabs: best bold, second underlined.
@@ -294,8 +289,7 @@ class EvaluationTable:
         table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
         for rule in ("toprule", "midrule", "bottomrule"):
             table = table.replace(r"\hline", f"\\{rule}", 1)
-        comments = [f"% {' '.join(note.split())}" for note in self.notes]
-        return "\n".join([*comments, table]) + "\n"
+        return "\n".join([*(f"% {' '.join(note.split())}" for note in self.notes), table, ""])
 
     @property
     def notes(self) -> list[str]:
@@ -382,7 +376,6 @@ def _beside_published(evaluation: Evaluation, split: str | None) -> EvaluationTa
     return EvaluationTable((*(other for other in others if other.rows), own))
 
 
-@cache
 def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
     """Rows of the main table of the paper, without intervals and floors.
 
@@ -390,20 +383,19 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
-    table = _published_table()
-    counts = {"MMD": (table["num_mmd_samples"], table["num_mmd_references"])}
+    counts = {"MMD": (_PUBLISHED["num_mmd_samples"], _PUBLISHED["num_mmd_references"])}
     return tuple(
         published_evaluation(
             method["label"],
             method[split],
             f"KITTI-360, {split}",
-            f"{table['source']}, line {method['line']}",
+            f"{_PUBLISHED['source']}, line {method['line']}",
             dict.fromkeys(method[split], (method["num_samples"], None)) | counts,
             solver=method["solver"],
             steps=method["steps"],
             extra={"venue": method["venue"]},
         )
-        for method in table["methods"]
+        for method in _PUBLISHED["methods"]
     )
 
 
@@ -433,12 +425,7 @@ def published_evaluation(
 
 def published_scales() -> dict[str, int]:
     """Power of ten of the printed column of each metric of the paper."""
-    return dict(_published_table()["scales"])
-
-
-@cache
-def _published_table() -> Any:
-    return json.loads(files(__package__).joinpath("published.json").read_text(encoding="utf-8"))
+    return dict(_PUBLISHED["scales"])
 
 
 def _cells(row: MetricResult) -> tuple[str, ...]:
