@@ -89,16 +89,15 @@ def _find(args: list[str]) -> tuple[str, list[str]]:
 
 
 def _run(args: list[str]) -> None:
-    if not args or args[0] in ("-h", "--help"):
-        sys.stdout.write(f"{_help()}\n")
-        return
-    if args[0] == "--version":
+    if args == ["--version"]:
         from r3dpa import __version__
 
         sys.stdout.write(f"{__version__}\n")
         return
-    if args[0] in _GROUPS and (len(args) == 1 or args[1] in ("-h", "--help")):
-        sys.stdout.write(f"{_help(args[0])}\n")
+    group = args[0] if args and args[0] in _GROUPS else ""
+    rest = args[1:] if group else args
+    if not rest or rest[0] in ("-h", "--help"):
+        sys.stdout.write(f"{_help(group)}\n")
         return
     name, words = _find(args)
     prog = f"r3dpa {' '.join(args[: len(args) - len(words)])}"  # as it was typed
