@@ -53,10 +53,6 @@ class Origin(IntEnum):
     SECOND_RETURN = 11
 
 
-#: Origins whose points show no surface, so that they have no label.
-IN_THE_AIR = (Origin.FOG, Origin.RAIN, Origin.SNOW, Origin.SPRAY, Origin.BLOOMING, Origin.SUN)
-
-
 @dataclass(slots=True)
 class Echoes:
     """One echo of every shot; all arrays are ``(R,)``."""
@@ -261,7 +257,8 @@ class Sweep:
         """
         codes = [p.semantic | p.instance << 16 for p in self.scene.primitives]
         coded = self.of_surface(codes, Semantic.ROAD, np.uint32, surface, Semantic.EGO_VEHICLE)
-        coded[np.isin(origin, IN_THE_AIR)] = Semantic.UNLABELED
+        # Other echoes from the air have no surface; those of a halo keep that of their sheet.
+        coded[origin == Origin.BLOOMING] = Semantic.UNLABELED
         return coded
 
 
