@@ -523,6 +523,7 @@ def test_wandb_gets_the_newest_numbers_of_each_row(command, tmp_path, processes,
     for run, key, weight in zip(logged, ("1_a", "2_b"), (0.0, 0.5), strict=True):
         assert (run.group, run.job_type, run.mode) == ("table_x smoke", "row", "offline")
         assert run.name == f"row {key}, seed 0"
+        assert f"sit_alignment {weight}" in list(run.config["commands"].values())[-1]
         model = list(run.config["stages"].values())[-1]["model"]["init_args"]
         assert model["weights"]["sit_alignment"] == weight
         assert run.summary == {"JSD": 1.0}

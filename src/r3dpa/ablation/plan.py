@@ -56,7 +56,8 @@ class Stage(NamedTuple):
     """A training, shared by all rows in which it is the same.
 
     ``name``, also of its folder, is the experiment and a hash of the resolved ``config``, the files
-    of weights in it, the seed, and the stages ``before``. ``words`` are those after ``fit``.
+    of weights in it, the seed, and the stages ``before``. ``words`` are those after ``fit``, and
+    ``config`` what they amount to with seed 0.
     """
 
     name: str

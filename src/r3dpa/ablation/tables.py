@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -290,6 +291,7 @@ def log_rows(
                 "label": row.label,
                 "scale": plan.scale,
                 "seed": seed,
+                "commands": {s.name: shlex.join(["r3dpa", "fit", *s.words]) for s in stages},
                 "stages": {stage.name: stage.config for stage in stages},
                 "commits": [commit_of(out, stage) for stage in stages],
             }

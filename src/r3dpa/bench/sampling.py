@@ -54,15 +54,11 @@ class Effort:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        if self.samples < 2 or min(self.rounds, self.batch, *self.evaluations, 1) < 1:
+        least = min(self.samples - 1, self.rounds, self.batch, *self.evaluations, 1)
+        if least < 1 or not self.evaluations or self.reference_steps not in range(2, 10**6, 2):
             raise ValueError(
-                "scenes must be at least 2, rounds, batch_size and nfe at least 1, got "
-                f"{self.samples}, {self.rounds}, {self.batch} and {list(self.evaluations)}"
-            )
-        if self.reference_steps < 2 or self.reference_steps % 2 or not self.evaluations:
-            raise ValueError(
-                f"reference_steps must be even and at least 2, got {self.reference_steps}, and nfe "
-                f"must name some, got {list(self.evaluations)}"
+                "scenes must be at least 2, rounds, batch_size and nfe at least 1 with some nfe, "
+                f"and reference_steps even and at least 2, got {self}"
             )
 
 
