@@ -57,7 +57,7 @@ class OfficialStatistics:
     clouds: Sequence[Tensor]
 
     protocol = PUBLISHED
-    names = halves = ()  # unknown
+    names = ()  # unknown
 
     @property
     def about(self) -> dict[str, Any]:

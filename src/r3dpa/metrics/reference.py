@@ -49,8 +49,6 @@ class ReferenceStatistics:
         ValueError: If there are fewer than two scans, or a name occurs twice.
     """
 
-    left_out = ""
-
     def __init__(
         self,
         protocol: Protocol,

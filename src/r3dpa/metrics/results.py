@@ -137,10 +137,8 @@ class Evaluation:
     Args:
         label: Of the generator or the run.
         rows: One for each metric.
-        about: Provenance, with the keys of ``_ABOUT``; those left out get its defaults.
-
-    Raises:
-        ValueError: If ``about`` holds what JSON cannot.
+        about: Provenance, with the keys of ``_ABOUT`` and values that JSON can hold; those left out
+            get its defaults.
     """
 
     label: str
