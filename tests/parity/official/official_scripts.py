@@ -256,57 +256,29 @@ def _training_options(
 ) -> Namespace:
     """Those of the second stage as published, but without compiling and in full precision."""
     configs, sizes = code.repo / "configs", checkpoint.network("sit").arguments
-    seldom = 10**9
-    return Namespace(
+    options = code["train_repae"].parse_args(["--exp-name", "joint"])
+    vars(options).update(
         output_dir=str(folder),
-        exp_name="joint",
-        gradient_accumulation_steps=1,
         mixed_precision="no",
         allow_tf32=False,
         compile=False,
         seed=None,
-        # networks
         model=_MODEL,
         vae=_VAE,
         resolution=list(image.shape[-2:]),
         num_classes=sizes["num_classes"],
         encoder_depth=sizes["alignment_depth"],
         cfg_prob=0.0,
-        bn_momentum=0.1,
-        fused_attn=True,
         qk_norm=sizes["qk_norm"],
-        vae_ckpt=None,
-        disc_pretrained_ckpt=None,
-        resume_step=0,
-        resume_path=None,
-        tuning=False,
-        train_vae_only=False,
-        train_diffusion_only=False,
-        # data
-        data_dir="",
         dataset_config=str(configs / "kitti.yaml"),
         batch_size=len(image),
         num_workers=0,
-        # losses and optimisers
         loss_cfg_path=str(configs / "l1_lpips_kl_gan.yaml"),
-        path_type="linear",
-        prediction="v",
-        weighting="uniform",
-        proj_coeff=0.5,
-        vae_align_proj_coeff=1.5,
-        learning_rate=1e-4,
-        vae_learning_rate=1e-4,
-        disc_learning_rate=1e-4,
-        adam_beta1=0.9,
-        adam_beta2=0.999,
         adam_weight_decay=0.03,
-        adam_epsilon=1e-8,
-        max_grad_norm=1.0,
         epochs=steps,
         max_train_steps=steps,
-        sampling_steps=seldom,
-        checkpointing_steps=seldom,
     )
+    return options
 
 
 @contextmanager
