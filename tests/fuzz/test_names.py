@@ -87,3 +87,13 @@ def test_few_bytes_that_ask_for_much_memory(tmp_path, count):
         archive.writestr("a.npy", data)
     with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': is damaged"):
         read_npz(tmp_path / "a.npz")
+
+
+def test_a_directory_that_claims_more_than_the_archive_holds(tmp_path):
+    np.savez(tmp_path / "a.npz", a=POINTS)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    packed_size = data.index(b"PK\x01\x02") + 20
+    data[packed_size : packed_size + 4] = (2**31).to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': .*larger than the file"):
+        read_npz(tmp_path / "a.npz")
