@@ -20,15 +20,9 @@ def test_the_default_has_the_keys_and_size_of_vitb14():
     with torch.device("meta"):
         state = DINOv2().state_dict()
     assert (len(state), sum(value.numel() for value in state.values())) == (175, 86_580_480)
-    for key, shape in {
-        "pos_embed": (1, 1370, 768),
-        "mask_token": (1, 768),
-        "patch_embed.proj.weight": (768, 3, 14, 14),
-        "blocks.11.attn.qkv.bias": (2304,),
-        "blocks.0.ls1.gamma": (768,),
-        "blocks.3.mlp.fc1.weight": (3072, 768),
-    }.items():
-        assert tuple(state[key].shape) == shape
+    assert state["pos_embed"].shape == (1, 1370, 768)
+    assert state["patch_embed.proj.weight"].shape == (768, 3, 14, 14)
+    assert {"mask_token", "blocks.11.attn.qkv.bias", "blocks.0.ls1.gamma"} <= state.keys()
 
 
 @torch.no_grad()

@@ -37,16 +37,6 @@ def test_update_and_normalise_are_the_two_modes_of_batch_norm():
     assert all(torch.equal(ours.state_dict()[key], value) for key, value in before.items())
 
 
-def test_an_unfitted_norm_says_so():
-    norm = LatentNorm(3)
-    assert not norm.fitted
-    norm.update(raw_latents())
-    assert norm.fitted
-    loaded = LatentNorm(3)
-    loaded.load_state_dict(norm.state_dict())
-    assert loaded.fitted
-
-
 @pytest.mark.numerics
 @pytest.mark.parametrize("value", [torch.inf, -torch.inf, torch.nan])
 @pytest.mark.parametrize("replace", [False, True])

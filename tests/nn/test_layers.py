@@ -14,8 +14,6 @@ from r3dpa.nn.layers import (
     Upsample,
 )
 
-STRIDES = [(1, 2), (1, 4), (2, 1), (2, 2)]
-
 
 def picking(kernel_size, row, column):
     """Convolution of one channel that picks one tap of its kernel."""
@@ -26,25 +24,17 @@ def picking(kernel_size, row, column):
     return conv
 
 
-@pytest.mark.parametrize(
-    ("columns", "tap", "offset"), [(3, 0, -1), (3, 2, 1), (4, 0, -1), (4, 3, 2)]
-)
-def test_circular_conv_takes_columns_from_the_other_side(columns, tap, offset):
+def test_circular_conv_has_columns_of_the_other_side_and_zeros_above_and_below():
     image = torch.randn(2, 1, 3, 8)
-    torch.testing.assert_close(
-        picking((1, columns), 0, tap)(image), image.roll(-offset, -1), atol=0, rtol=0
-    )
+    for columns, tap, offset in ((3, 0, -1), (3, 2, 1), (4, 0, -1), (4, 3, 2)):
+        assert torch.equal(picking((1, columns), 0, tap)(image), image.roll(-offset, -1))
+    for tap, empty, offset in ((0, 0, 1), (2, -1, -1)):
+        expected = image.roll(offset, -2)
+        expected[:, :, empty] = 0
+        assert torch.equal(picking((3, 1), tap, 0)(image), expected)
 
 
-@pytest.mark.parametrize(("tap", "empty", "offset"), [(0, 0, 1), (2, -1, -1)])
-def test_circular_conv_sees_zeros_above_and_below(tap, empty, offset):
-    image = torch.randn(2, 1, 3, 8)
-    expected = image.roll(offset, -2)
-    expected[:, :, empty] = 0
-    assert torch.equal(picking((3, 1), tap, 0)(image), expected)
-
-
-@pytest.mark.parametrize("stride", STRIDES)
+@pytest.mark.parametrize("stride", [(1, 2), (1, 4), (2, 1), (2, 2)])
 def test_resampling_changes_the_size_and_commutes_with_rotation(stride):
     small, large = torch.randn(2, 4, 4, 8), torch.randn(2, 4, 4 * stride[0], 8 * stride[1])
     down, up = Downsample(4, stride), Upsample(4, stride)
@@ -75,15 +65,6 @@ def test_group_norm_of_half_precision_images_has_float32_statistics():
     assert actual.dtype == torch.float16
     naive_variance = image.half().square().flatten(2).mean(-1)
     assert naive_variance.isinf().any()
-
-
-def test_attention_equals_the_written_out_formula():
-    block, image = AttentionBlock(32), torch.randn(2, 32, 3, 4)
-    hidden = block.norm(image)
-    query, key, value = (layer(hidden).flatten(2) for layer in (block.q, block.k, block.v))
-    weights = (torch.einsum("bci,bcj->bij", query, key) / 32**0.5).softmax(-1)
-    mixed = torch.einsum("bij,bcj->bci", weights, value).view_as(image)
-    torch.testing.assert_close(block(image), image + block.proj_out(mixed), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.numerics

@@ -16,16 +16,15 @@ FLOAT32 = {"atol": 1e-5, "rtol": 0.0}
 def randomise(network):
     """Random norms and positions too, so that no layer is close to doing nothing."""
     generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for name, value in network.state_dict().items():
-            if value.is_floating_point() and not name.startswith("image_"):
-                values = torch.randn(value.shape, generator=generator)
-                if name.endswith("running_var"):
-                    value.copy_(0.5 + values.abs())
-                elif name.endswith("weight") and value.ndim == 1:
-                    value.copy_(1 + 0.3 * values)
-                else:
-                    value.copy_(values * (value[0].numel() ** -0.5 if value.ndim > 1 else 0.3))
+    for name, value in network.state_dict().items():
+        if value.is_floating_point() and not name.startswith("image_"):
+            values = torch.randn(value.shape, generator=generator)
+            if name.endswith("running_var"):
+                value.copy_(0.5 + values.abs())
+            elif name.endswith("weight") and value.ndim == 1:
+                value.copy_(1 + 0.3 * values)
+            else:
+                value.copy_(values * (value[0].numel() ** -0.5 if value.ndim > 1 else 0.3))
     return network
 
 
@@ -116,15 +115,13 @@ def test_scans_of_a_batch_do_not_see_each_other():
             torch.testing.assert_close(alone, together[index], **FLOAT32)
 
 
-def test_network_without_intensity_ignores_it():
+def test_intensity_counts_where_the_network_reads_it():
     range_m, intensity = scans(2), torch.rand(2, 16, 64)
-    network = rangevit()
-    assert torch.equal(network(range_m, intensity), network(range_m))
-    with_intensity = rangevit(in_channels=5)
-    change = with_intensity(range_m, intensity) - with_intensity(range_m, 1 - intensity)
+    network = rangevit(in_channels=5)
+    change = network(range_m, intensity) - network(range_m, 1 - intensity)
     assert change.abs().max() > 1e-3
     with pytest.raises(ValueError, match="reads the intensity"):
-        with_intensity(range_m)
+        network(range_m)
 
 
 def test_bytes_wrap():
@@ -163,36 +160,28 @@ def test_feature_is_the_mean_of_the_patch_tokens_normalised():
     assert feature.tolist() == pytest.approx([1.5, -9.75], rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"in_channels": 6}, "in_channels must be in 1..5, got 6"),
-        ({"patch_size": (3, 8)}, "even numbers"),
-        ({"trained_size": (16, 30)}, "do not divide"),
-        ({"band_rows": 5}, "bands of 5 rows"),
-        ({"num_heads": 5}, "num_heads must divide the width 24, got 5"),
-    ],
-)
-def test_rangevit_refuses_sizes(settings, message):
-    with pytest.raises(ValueError, match=message):
-        rangevit(**settings)
+def test_rangevit_refuses_sizes():
+    for name, value, message in (
+        ("in_channels", 6, "in_channels must be in 1..5, got 6"),
+        ("patch_size", (3, 8), "even numbers"),
+        ("trained_size", (16, 30), "do not divide"),
+        ("band_rows", 5, "bands of 5 rows"),
+        ("num_heads", 5, "num_heads must divide the width 24, got 5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            rangevit(**{name: value})
 
 
-def test_rangevit_refuses_images_of_another_size():
+def test_images_that_do_not_fit_are_refused():
     for shape in ((16, 64), (2, 16, 32), (2, 1, 16, 64)):
         with pytest.raises(ValueError, match=r"range image.* must be .* got shape"):
             rangevit()(torch.ones(shape))
     with pytest.raises(ValueError, match=r"intensity must have the shape .*\(1, 16, 64\)"):
         range_channels(scans(1), SENSOR, torch.ones(16, 64))
-
-
-def test_liploc_refuses_what_is_no_picture():
-    network = small_liploc()
-    with pytest.raises(ValueError, match=r"\(B, H, W\), got shape \(16, 64\)"):
-        network(torch.ones(16, 64))
-    with pytest.raises(ValueError, match=r"\(B, H, W\), got shape \(0, 16, 64\)"):
-        network(torch.ones(0, 16, 64))
+    for shape in ((16, 64), (0, 16, 64)):
+        with pytest.raises(ValueError, match=r"\(B, H, W\), got shape \((0, )?16, 64\)"):
+            small_liploc()(torch.ones(shape))
     with pytest.raises(ValueError, match="finite"):
-        network(torch.full((1, 16, 64), float("nan")))
+        small_liploc()(torch.full((1, 16, 64), float("nan")))
     with pytest.raises(ValueError, match="patches of 7"):
         LIPLoc(picture_side=32, patch_side=7)

@@ -58,17 +58,14 @@ def test_sit_sizes(size, patch):
     assert sit.grid_size == (16 // patch, 128 // patch)
 
 
-@pytest.mark.parametrize(
-    ("name", "total", "head", "grid_size"),
-    [
+def test_unet_configs():
+    for name, total, head, grid_size in (
         ("unet_lidm", 266_146_056, 7_869_184, (4, 32)),
         ("unet_small", 108_141_000, 7_082_752, (4, 32)),
         ("unet_demo", 3_164_488, 296_192, (4, 16)),
-    ],
-)
-def test_unet_config(name, total, head, grid_size):
-    unet = build(name)
-    assert (count(unet), count(unet.projector), unet.grid_size) == (total, head, grid_size)
+    ):
+        unet = build(name)
+        assert (count(unet), count(unet.projector), unet.grid_size) == (total, head, grid_size)
 
 
 @pytest.mark.parametrize("name", LATENTS)

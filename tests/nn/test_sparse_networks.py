@@ -132,17 +132,6 @@ def test_points_between_voxels():
     torch.testing.assert_close(result, torch.tensor([[12.5], [17.5], [15], [0]]))
 
 
-def test_gradients_between_points_and_voxels():
-    axis = torch.arange(-4, 5, 2)
-    lattice = torch.cartesian_prod(axis, axis, axis, torch.tensor([0]))
-    voxels = Voxels.from_coordinates(lattice)[0].coarser
-    points = Points(torch.rand(3, 3, dtype=torch.float64) * 7.9 - 4, torch.zeros(3).long())
-    features = torch.randn(len(voxels), 1, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda given: to_points(given, points, voxels), features)
-    at_points = torch.randn(3, 1, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda given: to_voxels(given, points, voxels), at_points)
-
-
 def test_voxelize():
     points = torch.tensor(
         [

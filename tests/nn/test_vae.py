@@ -4,7 +4,6 @@ import copy
 
 import pytest
 import torch
-from torch.distributions import Normal, kl_divergence
 
 from r3dpa.nn import PatchDiscriminator
 from r3dpa.nn.vae import VAE, Posterior
@@ -16,18 +15,6 @@ SMALL = {"latent_channels": 4, "channels": 32, "channel_multipliers": (1, 1, 2, 
 def vae():
     torch.manual_seed(0)
     return VAE(**SMALL, num_res_blocks=1, attention_levels=(2,))
-
-
-@pytest.mark.parametrize("columns", [1, 3, 7])
-@torch.no_grad()
-def test_rotating_the_scan_rotates_the_latents_and_back(vae, columns):
-    image, latents = torch.randn(1, 1, 16, 64), torch.randn(1, 4, 4, 8)
-    pixels = columns * vae.stride[1]
-    encoded, decoded = vae.encode(image).mean, vae.decode(latents)
-    encoder_error = vae.encode(image.roll(pixels, -1)).mean - encoded.roll(columns, -1)
-    decoder_error = vae.decode(latents.roll(columns, -1)) - decoded.roll(pixels, -1)
-    assert encoder_error.norm() < 1e-5 * encoded.norm()
-    assert decoder_error.norm() < 1e-5 * decoded.norm()
 
 
 def test_every_parameter_learns(vae):
@@ -60,15 +47,6 @@ def test_images_that_do_not_fit_are_refused(vae):
         vae.encode(torch.randn(2, 3, 8, 64))
     with pytest.raises(ValueError, match=r"multiple of \(4, 8\), got \(8, 60\)"):
         vae.encode(torch.randn(2, 1, 8, 60))
-
-
-def test_posterior_agrees_with_torch_distributions():
-    moments, latents = torch.randn(2, 6, 2, 4), torch.randn(2, 3, 2, 4)
-    posterior = Posterior(moments)
-    normal = Normal(moments[:, :3], (0.5 * moments[:, 3:]).exp())
-    expected = kl_divergence(normal, Normal(0.0, 1.0)).sum(dim=(1, 2, 3))
-    torch.testing.assert_close(posterior.kl(), expected)
-    torch.testing.assert_close(posterior.sample(latents), normal.mean + normal.stddev * latents)
 
 
 @pytest.mark.numerics
@@ -109,21 +87,17 @@ def test_half_decoder_leaves_float32_ends(vae):
         assert 0 < (image - expected).abs().max() < 0.05 * expected.abs().max()
 
 
-def test_each_logit_of_the_discriminator_belongs_to_one_patch():
+def test_logits_of_the_discriminator_are_those_of_patches():
+    """Of 34 x 34 pixels at the default depth."""
     for num_layers in (1, 2, 3):
         logits = PatchDiscriminator(1, 4, num_layers)(torch.randn(2, 1, 32, 64))
         assert logits.shape == (2, 1, 32 // 2**num_layers - 2, 64 // 2**num_layers - 2)
     with pytest.raises(ValueError, match="at least 1, got 0"):
         PatchDiscriminator(num_layers=0)
-
-
-def test_patch_of_the_default_depth_has_34_pixels():
-    network = PatchDiscriminator(channels=4).eval()
     image = torch.randn(1, 1, 64, 96, requires_grad=True)
-    network(image)[0, 0, 7, 11].backward()
-    rows, columns = image.grad[0, 0].nonzero(as_tuple=True)
-    assert rows.max() - rows.min() + 1 == 34
-    assert columns.max() - columns.min() + 1 == 34
+    PatchDiscriminator(channels=4).eval()(image)[0, 0, 7, 11].backward()
+    for places in image.grad[0, 0].nonzero(as_tuple=True):
+        assert places.max() - places.min() + 1 == 34
 
 
 def test_fresh_weights_follow_pix2pix():
