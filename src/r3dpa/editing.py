@@ -18,8 +18,8 @@ from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.editing import Trajectory, invert, kept, renoised, spherical_mean
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
-from r3dpa.flow.times import batch_time, ode_times
-from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices, scene_random
+from r3dpa.flow.times import batch_time, check_interval, ode_times
+from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices, scene_noise
 from r3dpa.geometry.gaps import filled, range_error_m, refined
 from r3dpa.geometry.regions import check_mask, mask_of_tokens, token_mask
 
@@ -61,11 +61,7 @@ class EditSettings:
         self.times(1.0)
         if not 0 <= self.strength <= 1:
             raise ValueError(f"strength must lie in 0..1, got {self.strength:g}; 0.5 is strong")
-        if not 0 <= self.window[0] < self.window[1] <= 1:
-            raise ValueError(
-                f"window must be two times 0 <= first < last <= 1 (0 data, 1 noise), got "
-                f"{self.window[0]:g} and {self.window[1]:g}"
-            )
+        check_interval(self.window, "window")
 
     def times(self, start: float) -> Tensor:
         """Times from ``start`` in (0, 1] to the data."""
@@ -291,9 +287,8 @@ class SceneEditor:
             return self._fitted(x, image, known)
 
         parts = []
-        for index in scene_indices(
-            indices
-        ):  # one by one: fitting enlarges the rounding of another batch size
+        # One by one: fitting enlarges the rounding of another batch size.
+        for index in scene_indices(indices):
             draws = self._draws([index], seed)
             parts.append(solve(next(draws), draws))
         made = torch.cat(parts)
@@ -387,7 +382,7 @@ class SceneEditor:
         return FeatureGuidance(
             self._sit.velocity,
             self._sit.aligned_pass,
-            [target],
+            target,
             scale=self.settings.strength,
             relative=True,
             interval=self.settings.window,
@@ -395,11 +390,7 @@ class SceneEditor:
 
     def _draws(self, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
         """Noise after noise ``(B, C, h, w)`` for scenes, drawn on the CPU."""
-        generators = [scene_random(seed, index) for index in indices]
-        shape = (self._sit.in_channels, *self._sit.input_size)
-        while True:
-            noise = torch.stack([torch.randn(shape, generator=g) for g in generators])
-            yield noise.to(self.generator.device)
+        return (x.to(self.generator.device) for x in scene_noise(self._sit, indices, seed))
 
     def _each(
         self,

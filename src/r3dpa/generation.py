@@ -17,8 +17,7 @@ from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
-from r3dpa.flow.solvers import Velocity, dopri5
-from r3dpa.flow.times import ode_times
+from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
@@ -32,6 +31,7 @@ __all__ = [
     "SceneVAE",
     "Solver",
     "scene_indices",
+    "scene_noise",
     "scene_random",
 ]
 
@@ -98,13 +98,12 @@ class SceneGenerator:
             float32.
         autoguidance: Weak model and strength; no guidance where None.
         batch_size: Pad smaller batches with zeros, so that the networks see a single shape.
-        decode_batch_size: Scenes decoded together. Default: the whole batch.
         compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a
             GPU batches of at most 8 scenes are replayed as CUDA graphs.
 
     Raises:
-        ValueError: If the latent statistics were never fitted, a batch size is below 1, or
-            ``compile`` comes without ``batch_size``.
+        ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1, or
+            ``compile`` comes without it.
     """
 
     def __init__(
@@ -119,7 +118,6 @@ class SceneGenerator:
         *,
         autoguidance: Autoguidance | None = None,
         batch_size: int | None = None,
-        decode_batch_size: int | None = None,
         compile: bool = False,
     ) -> None:
         if not latent_norm.fitted:
@@ -127,9 +125,8 @@ class SceneGenerator:
                 "the latent statistics were never fitted, so latents cannot be denormalised; "
                 "sample from a checkpoint of stage joint or flow_matching"
             )
-        for name, size in (("batch_size", batch_size), ("decode_batch_size", decode_batch_size)):
-            if size is not None and size < 1:
-                raise ValueError(f"{name} must be at least 1, got {size}")
+        if batch_size is not None and batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
         if compile and batch_size is None:
             raise ValueError("compiled networks have one shape: give SceneGenerator a batch_size")
         self.vae = vae.eval()
@@ -149,7 +146,6 @@ class SceneGenerator:
         self.interpolant = Interpolant(path)
         self.precision = precision
         self.batch_size = batch_size
-        self.decode_batch_size = decode_batch_size
         graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
         self._strong = _ScheduledNetwork(self.sit, compile, graphs)
         self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
@@ -169,7 +165,6 @@ class SceneGenerator:
         precision: Literal["fp32", "bf16"] = "fp32",
         autoguidance: Autoguidance | None = None,
         batch_size: int | None = None,
-        decode_batch_size: int | None = None,
         compile: bool = False,
     ) -> Self:
         """Rebuilds the networks of a checkpoint, on the path and geometry they were trained with.
@@ -182,7 +177,6 @@ class SceneGenerator:
             precision: As for the constructor, like all other arguments.
             autoguidance: Weak model, on the same device.
             batch_size: See the constructor.
-            decode_batch_size: See the constructor.
             compile: See the constructor.
 
         Raises:
@@ -218,7 +212,6 @@ class SceneGenerator:
             precision,
             autoguidance=autoguidance,
             batch_size=batch_size,
-            decode_batch_size=decode_batch_size,
             compile=compile,
         )
 
@@ -237,8 +230,19 @@ class SceneGenerator:
 
     @torch.inference_mode()
     def prepare(self) -> None:
-        """Does the set-up of the first scene; raises the errors of :meth:`SamplerConfig.solve`."""
-        self._schedule()
+        """Does the set-up of the first scene; raises the errors of :meth:`SamplerConfig.solve`.
+
+        Computes the modulations of all times of the solver: a run with velocities of 0 lists them.
+        """
+        if self._scheduled == self.sampler:
+            return
+        for network in self._networks:
+            network.times, network.table = [], None
+        noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
+        self._solve(noise, iter(lambda: noise, None))
+        for network in self._networks:
+            network.fill_table()
+        self._scheduled = self.sampler
 
     @torch.inference_mode()
     def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
@@ -255,19 +259,11 @@ class SceneGenerator:
         size = self.batch_size or len(indices)
         if len(indices) > size:
             raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
-        generators = [scene_random(seed, index) for index in indices]
-        shape = (self.sit.in_channels, *self.sit.input_size)
-
-        def draws() -> Iterator[Tensor]:
-            while True:
-                noise = torch.stack([torch.randn(shape, generator=g) for g in generators])
-                yield _filled(noise, size).to(self.device)
-
-        self._schedule()
+        self.prepare()
         for network in self._networks:
             network.calls = 0
-        noise = draws()
-        latents = self._solve(next(noise), noise)[: len(indices)]
+        draws = (_filled(x, size).to(self.device) for x in scene_noise(self.sit, indices, seed))
+        latents = self._solve(next(draws), draws)[: len(indices)]
         range_m = self.decode(latents)
         nfe = sum(network.calls for network in self._networks)
         return SceneBatch(range_m, latents, nfe, self.geometry.projection)
@@ -275,7 +271,7 @@ class SceneGenerator:
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents."""
-        size = self.decode_batch_size or self.batch_size or len(latents)
+        size = self.batch_size or len(latents)
         sensor = self.geometry.projection.sensor
         parts = []
         for part in self.latent_norm.denormalise(latents).split(size):
@@ -289,26 +285,6 @@ class SceneGenerator:
     @property
     def _networks(self) -> list[_ScheduledNetwork]:
         return [self._strong, *([] if self._weak is None else [self._weak])]
-
-    def _schedule(self) -> None:
-        """Computes the modulations of all times of the solver.
-
-        One run with velocities of 0 lists them in order; those of an adaptive solver are unknown.
-        """
-        if self._scheduled == self.sampler:
-            return
-        adaptive = self.sampler.solver == "dopri5"
-        if adaptive:  # its package may be missing
-            dopri5(lambda x, _: torch.zeros_like(x), torch.zeros(1), ode_times(1))
-        for network in self._networks:
-            network.times = None if adaptive else []
-            network.table = None
-        if not adaptive:
-            noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
-            self._solve(noise, iter(lambda: noise, None))
-            for network in self._networks:
-                network.fill_table()
-        self._scheduled = self.sampler
 
     def _solve(self, noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
         return self.sampler.solve(self._velocity, noise, draws, self.interpolant)
@@ -360,13 +336,9 @@ class SceneVAE:
     def encode(self, points: Tensor | np.ndarray) -> Tensor:
         """Posterior means ``(1, C, h, w)`` of one scan ``(P, 3)`` or ``(P, 4)`` in metres."""
         xyz = torch.as_tensor(points)[:, :3].float()
-        return self.encode_images(range_image(xyz, self.geometry.projection)[0][None])
-
-    @torch.no_grad()
-    def encode_images(self, range_m: Tensor) -> Tensor:
-        """Posterior means ``(B, C, h, w)`` of range images ``(B, H, W)``, -1 without a return."""
+        range_m = range_image(xyz, self.geometry.projection)[0]
         image = self.geometry.codec.encode(range_m.to(next(self.vae.parameters()).device))
-        return self.vae.encode(image[:, None]).mean
+        return self.vae.encode(image[None, None]).mean
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> SceneBatch:
@@ -391,20 +363,20 @@ def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
 
 
 class _ScheduledNetwork:
-    """A network as the velocity function of a solver whose times are known.
+    """A network as the velocity function of a solver.
 
     All samples of a call have the same time. A trial run records the times; afterwards the k-th
     call takes row k of their modulations, so that no value of a time is read back from a GPU.
 
     Attributes:
-        times: Those of the trial run, each ``(1,)``; None for an adaptive solver.
+        times: Those of the trial run, each ``(1,)``.
         table: ``(T, M)`` their modulations, after the trial run.
         calls: Evaluations since it was set to 0.
     """
 
     def __init__(self, sit: VelocityNetwork, compile: bool, graphs: bool) -> None:
         self.sit = sit
-        self.times: list[Tensor] | None = None
+        self.times: list[Tensor] = []
         self.table: Tensor | None = None
         self.calls = 0
         self._graphs = graphs
@@ -415,18 +387,15 @@ class _ScheduledNetwork:
 
     def fill_table(self) -> None:
         """Ends the trial run."""
-        if self.times:
+        if self.times:  # a weak model may be unused
             self.table = self.sit.modulations(torch.cat(self.times))
 
     def __call__(self, latents: Tensor, time: Tensor) -> Tensor:
         """Velocity ``(B, C, h, w)`` float32 at a time ``(B,)`` that all samples share."""
-        if self.table is None and self.times is not None:
+        if self.table is None:
             self.times.append(time[:1])
             return torch.zeros_like(latents)
-        if self.table is None:
-            row = self.sit.modulations(time[:1])
-        else:
-            row = self.table[self.calls : self.calls + 1]
+        row = self.table[self.calls : self.calls + 1]
         self.calls += 1
         velocity = (self._compiled or self.sit.velocity_at)(latents, row)
         return velocity.clone() if self._graphs else velocity  # a replay writes to one place
@@ -440,6 +409,14 @@ def _filled(values: Tensor, size: int) -> Tensor:
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     """Numbers of scenes; a number stands for that many from 0 on."""
     return range(indices) if isinstance(indices, int) else indices
+
+
+def scene_noise(sit: VelocityNetwork, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
+    """Noise after noise ``(B, C, h, w)`` for latents of scenes, each scene's own, on the CPU."""
+    generators = [scene_random(seed, index) for index in indices]
+    shape = (sit.in_channels, *sit.input_size)
+    while True:
+        yield torch.stack([torch.randn(shape, generator=g) for g in generators])
 
 
 def scene_random(seed: int, index: int) -> torch.Generator:

@@ -74,7 +74,7 @@ class BenchGuidance:
         target = FeatureTarget(torch.randn(1, 512, sit.feature_dim))
 
         def guided(aligned):
-            return FeatureGuidance(sit.velocity, aligned, [target], scale=0.5, relative=True)
+            return FeatureGuidance(sit.velocity, aligned, target, scale=0.5, relative=True)
 
         return {
             "plain": sit.velocity,

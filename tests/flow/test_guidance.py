@@ -43,7 +43,7 @@ def build(batch=3, mask=None, scale=2.0, features=tokens_of, **options):
     mask = masks(batch) if mask is None else mask
     aligned = aligned_velocity(velocity, features)
     goal = FeatureTarget(target(batch), mask)
-    return FeatureGuidance(velocity, aligned, [goal], scale=scale, **options)
+    return FeatureGuidance(velocity, aligned, goal, scale=scale, **options)
 
 
 def times(batch=3):
@@ -149,14 +149,8 @@ def test_features_that_do_not_fit_are_named():
         build(mask=masks(2))
     with pytest.raises(ValueError, match=r"\(3, 6, 5\), but .* \(2, 6, 5\)"):
         build()(latents(2), times(2))
-    aligned = aligned_velocity(velocity, tokens_of)
-    with pytest.raises(ValueError, match=r"weight of a target must be 0 or above, got -0\.5"):
-        FeatureTarget(target(), weight=-0.5)
     with pytest.raises(ValueError, match="no term without a velocity"):
         build(scale=0.5, relative=True).term(latents(), times())
-    for goals in ([], [FeatureTarget(target()), FeatureTarget(target(2))]):
-        with pytest.raises(ValueError, match="targets of one shape, got"):
-            FeatureGuidance(velocity, aligned, goals, scale=1.0)
 
 
 @pytest.mark.parametrize(
@@ -174,19 +168,6 @@ def test_features_that_do_not_fit_are_named():
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         build(**options)
-
-
-def test_the_energy_of_several_targets_is_their_weighted_sum():
-    x, time, mask = latents(), times(), masks()
-    aligned, other = aligned_velocity(velocity, tokens_of), target().flip(0)
-
-    def gradient(*goals):
-        return FeatureGuidance(velocity, aligned, goals, scale=1.0).term(x, time)
-
-    first, second = FeatureTarget(target(), mask), FeatureTarget(other, ~mask, weight=3.0)
-    parts = gradient(FeatureTarget(target(), mask)), gradient(FeatureTarget(other, ~mask))
-    torch.testing.assert_close(gradient(first, second), parts[0] + 3 * parts[1])
-    assert torch.equal(gradient(first, FeatureTarget(other, weight=0.0)), parts[0])
 
 
 def test_relative_strength_is_the_length_of_the_term_in_velocities_of_the_guided_tokens():
@@ -228,7 +209,7 @@ def test_cells_of_the_target_without_points_are_not_selected():
     def guided(mask, **options):
         aligned = aligned_velocity(velocity, tokens_of)
         guidance = FeatureGuidance(
-            velocity, aligned, [FeatureTarget(goal, mask)], scale=0.5, **options
+            velocity, aligned, FeatureTarget(goal, mask), scale=0.5, **options
         )
         return guidance(x, time)
 
@@ -270,8 +251,8 @@ def noise(batch=3):
 
 def guidance_of(sit, mask=None, batch=3, factor=1.0, **options):
     goal = torch.randn(8, 8, 5, generator=torch.Generator().manual_seed(3))[:batch]
-    targets = [FeatureTarget(factor * goal, mask)]
-    return FeatureGuidance(sit.velocity, sit.aligned_pass, targets, **options)
+    target = FeatureTarget(factor * goal, mask)
+    return FeatureGuidance(sit.velocity, sit.aligned_pass, target, **options)
 
 
 def solve(solver, velocity, x):

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from itertools import pairwise
 
 import pytest
@@ -15,7 +14,6 @@ from r3dpa.flow.solvers import (
     CountingVelocity,
     ab2,
     ab3,
-    dopri5,
     euler,
     evaluations,
     heun,
@@ -275,7 +273,7 @@ def test_network_evaluations_are_known_beforehand(solver, steps):
         (lambda: evaluations("rk4", 3), "euler, heun, .*, unipc, got 'rk4'"),
         (lambda: evaluations("ab2", 0), "at least one step, got 0"),
         (lambda: steps_for("midpoint", 1), "midpoint cannot make a step with 1 network"),
-        (lambda: steps_for("dopri5", 9), "got 'dopri5'"),
+        (lambda: steps_for("rk45", 9), "got 'rk45'"),
         (lambda: ode_solver("Euler"), "got 'Euler'"),
     ],
 )
@@ -306,36 +304,6 @@ def test_samples_do_not_depend_on_their_batch(solver):
     for index in range(len(x)):
         alone = ODE_SOLVERS[solver](velocity, x[index : index + 1], UNEVEN)
         assert torch.equal(alone[0], together[index])
-
-
-@pytest.mark.parametrize("ends", [(1.0, 0.0), (0.0, 1.0), (0.8, 0.3)])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
-def test_dopri5_reaches_its_tolerance_within_the_interval(ends, dtype):
-    pytest.importorskip("torchdiffeq")
-    seen = []
-
-    def velocity(x, time):
-        seen.append((x.dtype, time.tolist()))
-        return wave(x, time)
-
-    x, steps = torch.tensor([[2.0], [1.0]], dtype=dtype), ode_times(3, *ends)
-    result = dopri5(velocity, x, steps, rtol=1e-6, atol=1e-6)
-    exact = x.double() * math.exp(math.sin(2 * ends[1]) - math.sin(2 * ends[0]))
-    tolerance = 0.02 if dtype == torch.bfloat16 else 1e-5
-    torch.testing.assert_close(result.double(), exact, rtol=tolerance, atol=0)
-    assert result.dtype == dtype
-    with pytest.raises(ValueError, match="all increase or all decrease"):
-        dopri5(velocity, x, torch.tensor([1.0, 0.5, 0.5, 0.0]))
-    rounding = 1e-7  # of times in float32
-    assert {kind for kind, _ in seen} == {dtype}
-    assert min(min(time) for _, time in seen) >= min(ends) - rounding
-    assert max(max(time) for _, time in seen) <= max(ends) + rounding
-
-
-def test_dopri5_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torchdiffeq", None)
-    with pytest.raises(ImportError, match="pip install torchdiffeq"):
-        dopri5(growth, torch.ones(1, 1), ode_times(3))
 
 
 def test_shifted_ab2_needs_an_eighth_of_eulers_evaluations():

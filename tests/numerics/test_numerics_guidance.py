@@ -41,7 +41,7 @@ OUTWARD = torch.tensor([0.0, 1.0, 0.0])
 def guidance_of(scale, tokens=outward_tokens, batch=4, mask=None, length=1.0, **options):
     target = FeatureTarget(length * OUTWARD.expand(batch, 8, 3), mask)
     aligned = aligned_velocity(DATA.velocity, tokens)
-    return FeatureGuidance(DATA.velocity, aligned, [target], scale=scale, **options)
+    return FeatureGuidance(DATA.velocity, aligned, target, scale=scale, **options)
 
 
 def solve(kind, guidance, x):

@@ -40,7 +40,7 @@ def guidance_of(case, sit, count=None, mask="in/token_mask", config=None):
     return FeatureGuidance(
         velocity_of(case, sit),
         lambda x, t: sit.aligned_pass(x.float(), t.float(), case["in/y"][: len(x)]),
-        [FeatureTarget(case["in/zs"][:count], case[mask])],
+        FeatureTarget(case["in/zs"][:count], case[mask]),
         scale=(config or case.config)["v_feat_scale"],
         legacy=True,
     )

@@ -109,7 +109,7 @@ def feature_guidance(case):
         guidance = FeatureGuidance(
             lambda x, t: sit.velocity(x, t, labels),
             lambda x, t: sit.aligned_pass(x, t, labels),
-            [FeatureTarget(case["in/zs"], mask)],
+            FeatureTarget(case["in/zs"], mask),
             scale=case.config["v_feat_scale"],
             legacy=True,
         )

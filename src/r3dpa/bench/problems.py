@@ -18,7 +18,7 @@ from r3dpa.bench.measure import flop_of, timed
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, heun
 from r3dpa.flow.times import ode_times
-from r3dpa.generation import SamplerConfig, SceneGenerator, scene_random
+from r3dpa.generation import SamplerConfig, SceneGenerator, scene_noise
 
 Precision = Literal["fp32", "bf16"]
 _SEED = 0
@@ -189,9 +189,7 @@ class ModelProblem:
     def converged(self, steps: int, indices: range) -> Solved:
         """The same scenes by Heun's method: network in float32 without TF32, state in float64."""
         generator, sit = self._plain, self._plain.sit
-        shape = (sit.in_channels, *sit.input_size)
-        draws = [torch.randn(shape, generator=scene_random(_SEED, i)) for i in indices]
-        noise = torch.stack(draws).to(self.device)
+        noise = next(scene_noise(sit, indices, _SEED)).to(self.device)
 
         def velocity(x: Tensor, moment: Tensor) -> Tensor:
             return sit.velocity(x.float(), moment.float()).double()

@@ -15,7 +15,7 @@ def sample(
     num: int = 16,
     quality: Literal["draft", "good", "best"] | None = None,
     solver: Literal[
-        "euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "dopri5", "euler_maruyama"
+        "euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "euler_maruyama"
     ]
     | None = None,
     steps: int | None = None,

@@ -1,34 +1,16 @@
 """Flow matching without networks: paths, solvers, guidance and editing over velocity functions."""
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
-from r3dpa.flow.editing import (
-    Trajectory,
-    invert,
-    kept,
-    pnp_flow_feature,
-    renoised,
-    spherical_mean,
-)
-from r3dpa.flow.guidance import (
-    AlignedEvaluation,
-    AlignedVelocity,
-    FeatureGuidance,
-    FeatureTarget,
-    GuidanceRecord,
-    aligned_velocity,
-)
-from r3dpa.flow.interpolant import Interpolant, PathCoefficients, sample_time
-from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
-from r3dpa.flow.sde import DriftChange, euler_maruyama
+from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
+from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
+from r3dpa.flow.interpolant import Interpolant, sample_time
+from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
-    AfterStep,
     CountingVelocity,
-    OdeSolver,
     Velocity,
     ab2,
     ab3,
-    dopri5,
     dpm_solver_pp_2m,
     euler,
     evaluations,
@@ -42,27 +24,15 @@ from r3dpa.flow.times import ode_times, sde_times
 
 __all__ = [
     "ODE_SOLVERS",
-    "AfterStep",
-    "AlignedEvaluation",
-    "AlignedVelocity",
     "CountingVelocity",
-    "DriftChange",
     "FeatureGuidance",
     "FeatureTarget",
-    "GuidanceRecord",
     "Interpolant",
-    "OdeSolver",
-    "PathCoefficients",
-    "Quality",
-    "SamplerConfig",
-    "Solver",
-    "Trajectory",
     "Velocity",
     "ab2",
     "ab3",
     "aligned_velocity",
     "autoguided",
-    "dopri5",
     "dpm_solver_pp_2m",
     "euler",
     "euler_maruyama",

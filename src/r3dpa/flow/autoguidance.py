@@ -51,7 +51,7 @@ def autoguided(
             f"the scale of autoguidance must be a number of 1 or more, got {scale}; 1 is no "
             "guidance, and less would move towards the weak model"
         )
-    check_interval(interval, "autoguidance")
+    check_interval(interval, "the interval of autoguidance")
     if scale == 1:
         return velocity
     everywhere = first == 0 and last == 1

@@ -69,15 +69,13 @@ class FeatureTarget:
     Args:
         features: ``(B, N, F)``, any length per vector; a zero vector is a cell without points.
         token_mask: ``(B, N)`` bool, tokens to guide. Default: all.
-        weight: Share of this target in the energy.
 
     Raises:
-        ValueError: If a shape or dtype is wrong or the weight is below 0 or not finite.
+        ValueError: If a shape or dtype is wrong.
     """
 
     features: Tensor
     token_mask: Tensor | None = None
-    weight: float = 1.0
 
     def __post_init__(self) -> None:
         features, mask = self.features, self.token_mask
@@ -88,8 +86,6 @@ class FeatureTarget:
                 f"token_mask must be bool of shape {tuple(features.shape[:2])}, got "
                 f"{mask.dtype} of shape {tuple(mask.shape)}"
             )
-        if not 0 <= self.weight < math.inf:
-            raise ValueError(f"the weight of a target must be 0 or above, got {self.weight}")
 
     @classmethod
     def stitched(cls, sources: Sequence[Tensor], token_weights: Tensor) -> Self:
@@ -134,9 +130,9 @@ class FeatureGuidance:
     """Velocity plus a multiple of the gradient of the alignment energy of given features.
 
     The energy of a sample is minus the mean cosine between its projected features and a target
-    over the selected tokens, in float32 or wider; that of several targets their weighted sum.
-    Cells of a target without points are not selected. Solvers step backwards in time, so adding
-    the gradient g to the velocity v raises the similarity::
+    over the selected tokens, in float32 or wider. Cells of a target without points are not
+    selected. Solvers step backwards in time, so adding the gradient g to the velocity v raises the
+    similarity::
 
         v + scale g                     as published
         v + scale |v| sqrt(q) g / |g|   relative
@@ -167,7 +163,7 @@ class FeatureGuidance:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` without guidance.
         aligned: The same with projected features, see :class:`AlignedEvaluation`: the
             ``aligned_pass`` of a network, or :func:`aligned_velocity`.
-        targets: What to reach, of one shape; at least one.
+        target: What to reach.
         scale: Strength, 0 or above.
         relative: Measure the strength in velocities rather than in gradients.
         interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
@@ -183,16 +179,16 @@ class FeatureGuidance:
         history: One record per guided evaluation, on the device of the latents.
 
     Raises:
-        ValueError: If there is no target or they differ in shape, or an option is out of its
-            range: ``relative`` takes no scale above ``max_ratio`` and is not ``legacy``. When
-            called, if the projected features have another shape than the targets.
+        ValueError: If an option is out of its range: ``relative`` takes no scale above
+            ``max_ratio`` and is not ``legacy``. When called, if the projected features have another
+            shape than the target.
     """
 
     def __init__(
         self,
         velocity: Velocity,
         aligned: AlignedVelocity,
-        targets: Sequence[FeatureTarget],
+        target: FeatureTarget,
         *,
         scale: float,
         relative: bool = False,
@@ -200,14 +196,11 @@ class FeatureGuidance:
         max_ratio: float = 1.0,
         legacy: bool = False,
     ) -> None:
-        shapes = {tuple(target.features.shape) for target in targets}
-        if len(shapes) != 1:
-            raise ValueError(f"guidance needs targets of one shape, got {sorted(shapes)}")
         if not 0 <= scale < math.inf:
             raise ValueError(f"scale of the guidance must be 0 or above, got {scale}")
         if not max_ratio >= 0:
             raise ValueError(f"max_ratio of the guidance must be 0 or above, got {max_ratio}")
-        check_interval(interval, "guidance")
+        check_interval(interval, "the interval of guidance")
         if relative and (legacy or scale > max_ratio):
             raise ValueError(
                 f"relative guidance is not legacy, and its scale at most max_ratio ({max_ratio}), "
@@ -222,11 +215,14 @@ class FeatureGuidance:
         self._legacy = legacy
         self.history: list[GuidanceRecord] = []
         with torch.inference_mode(False):  # autograd cannot save tensors of inference mode
-            self._targets = [_prepared(target, legacy) for target in targets if target.weight]
-            device = targets[0].features.device
-            self._num_dropped = torch.zeros((), dtype=torch.long, device=device)
-            masks = [target.mask for target in self._targets]
-            selected = torch.stack(masks).any(dim=0) if masks else torch.zeros(1, 1, device=device)
+            features = _at_least_float32(target.features.detach().clone())
+            selected = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+            if target.token_mask is not None:
+                selected &= target.token_mask
+            if not legacy:
+                selected &= features.abs().amax(dim=-1) > 0
+            self._target, self._selected = _unit(features), selected
+            self._num_dropped = torch.zeros((), dtype=torch.long, device=features.device)
         self._spread = selected.double().mean(dim=1).sqrt()  # float64: see _limited
         self._idle = scale == 0 or max_ratio == 0 or not bool(selected.any())
 
@@ -302,18 +298,14 @@ class FeatureGuidance:
         return evaluation, energy.detach(), torch.where(per_sample(finite, x), gradient, 0.0)
 
     def _energy(self, features: Tensor) -> Tensor:
-        unit = _unit(_at_least_float32(features))
-        energy = unit.new_zeros(len(unit))
-        for target in self._targets:
-            if features.shape != target.unit.shape:
-                raise ValueError(
-                    f"guidance towards features of shape {tuple(target.unit.shape)}, but the "
-                    f"network projects to {tuple(features.shape)}"
-                )
-            cosine = torch.where(target.mask, (unit * target.unit).sum(dim=-1), 0.0).sum(dim=1)
-            counts = target.mask.sum() if self._legacy else target.mask.sum(dim=1)
-            energy = energy - target.weight * cosine / counts.clamp(min=1)
-        return energy
+        if features.shape != self._target.shape:
+            raise ValueError(
+                f"guidance towards features of shape {tuple(self._target.shape)}, but the "
+                f"network projects to {tuple(features.shape)}"
+            )
+        cosine = (_unit(_at_least_float32(features)) * self._target).sum(dim=-1)
+        counts = self._selected.sum() if self._legacy else self._selected.sum(dim=1)
+        return -torch.where(self._selected, cosine, 0.0).sum(dim=1) / counts.clamp(min=1)
 
     def _limited(self, gradient: Tensor, velocity: Tensor) -> Tensor:
         """Gradient of each sample, scaled to the length of its term."""
@@ -335,22 +327,6 @@ class FeatureGuidance:
     def _record(self, energy: Tensor, direction: Tensor, term: Tensor) -> None:
         cosine = torch.cosine_similarity(direction.flatten(1), term.flatten(1), dim=1)
         self.history.append(GuidanceRecord(energy, cosine))
-
-
-class _Prepared(NamedTuple):
-    unit: Tensor
-    mask: Tensor
-    weight: float
-
-
-def _prepared(target: FeatureTarget, count_empty_cells: bool) -> _Prepared:
-    features = _at_least_float32(target.features.detach().clone())
-    mask = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
-    if target.token_mask is not None:
-        mask &= target.token_mask
-    if not count_empty_cells:
-        mask &= features.abs().amax(dim=-1) > 0
-    return _Prepared(_unit(features), mask, target.weight)
 
 
 def _at_least_float32(values: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import euler_maruyama
-from r3dpa.flow.solvers import Velocity, dopri5, ode_solver
+from r3dpa.flow.solvers import ODE_SOLVERS, Velocity, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
 __all__ = ["Quality", "SamplerConfig", "Solver"]
@@ -26,20 +26,9 @@ Solver = Literal[
     "ab3",
     "dpmpp_2m",
     "unipc",
-    "dopri5",
     "euler_maruyama",
 ]
 Quality = Literal["draft", "good", "best"]
-
-_SDE: tuple[Solver, ...] = ("euler_maruyama",)
-#: Settings that only some solvers read.
-_READ_BY: dict[str, tuple[Solver, ...]] = {
-    "eta": _SDE,
-    "sde_last": _SDE,
-    "sde_last_time": _SDE,
-    "shift": tuple(s for s in get_args(Solver) if s not in ("euler_maruyama", "dopri5")),
-    "steps": tuple(s for s in get_args(Solver) if s != "dopri5"),
-}
 
 
 @dataclass(frozen=True)
@@ -47,12 +36,11 @@ class SamplerConfig:
     """How noise becomes latents.
 
     Args:
-        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``dopri5`` chooses its steps
-            itself.
-        steps: Solver steps; not of ``dopri5``.
+        solver: ``euler_maruyama`` solves the SDE, the others the ODE.
+        steps: Solver steps.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
-        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE and ``dopri5``.
+        shift: Finer steps near noise (above 1) or data (below 1); not of the SDE.
         eta: Strength of the noise of the SDE; 1 as published, 0 for none.
 
     Raises:
@@ -77,12 +65,12 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
-        for name, solvers in _READ_BY.items():
-            changed = getattr(self, name) != getattr(type(self), name)
-            if changed and self.solver not in solvers:
+        of_sde = ("eta", "sde_last", "sde_last_time")
+        for name in ("shift",) if self.solver == "euler_maruyama" else of_sde:
+            if getattr(self, name) != getattr(type(self), name):
+                readers = ", ".join(ODE_SOLVERS) if name == "shift" else "euler_maruyama"
                 raise ValueError(
-                    f"solver {self.solver} does not read {name}, which is for "
-                    f"{', '.join(solvers)}; drop one"
+                    f"solver {self.solver} does not read {name}, which is for {readers}; drop one"
                 )
 
     @classmethod
@@ -114,7 +102,6 @@ class SamplerConfig:
 
         Raises:
             ValueError: If the numbers of the solver do not fit together.
-            ImportError: If the package of ``dopri5`` is missing.
         """
         if self.solver == "euler_maruyama":
             return euler_maruyama(
@@ -127,8 +114,6 @@ class SamplerConfig:
                 eta=self.eta,
             )
         times = ode_times(self.steps, shift=self.shift)
-        if self.solver == "dopri5":
-            return dopri5(velocity, noise, times)
         return ode_solver(self.solver, interpolant)(velocity, noise, times)
 
 

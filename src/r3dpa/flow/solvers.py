@@ -13,7 +13,7 @@ any dtype. Every solver is called ``(velocity, x, times) -> x`` with
 returns the ``(B, ...)`` state at the last time, and raises a ``ValueError`` for other times. The
 orders hold on grids whose steps shrink alike. On a fixed grid ``after_step(x, time, index)`` gets
 the state at ``times[index]`` after every step and returns the state to continue from; multistep
-solvers keep the velocities that they have seen. Only ``dopri5`` waits for a GPU.
+solvers keep the velocities that they have seen. No solver waits for a GPU.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ __all__ = [
     "Velocity",
     "ab2",
     "ab3",
-    "dopri5",
     "dpm_solver_pp_2m",
     "euler",
     "evaluations",
@@ -196,43 +195,6 @@ def unipc(
     Source: UniPC (Zhao et al. 2023), alg. 5 to 8, multistep with data prediction.
     """
     return _data_prediction(velocity, x, times, interpolant, after_step, correct=True)
-
-
-@torch.no_grad()
-def dopri5(
-    velocity: Velocity, x: Tensor, times: Tensor, *, rtol: float = 1e-5, atol: float = 1e-5
-) -> Tensor:
-    """Adaptive Dormand-Prince steps of ``torchdiffeq``; order 5.
-
-    Only the first and the last time count. The solver chooses its steps, the same for the whole
-    batch: a sample depends within the tolerances of a step on the batch it is in, and the number
-    of evaluations is known afterwards (:class:`CountingVelocity`). A state below float32 is carried
-    in float32.
-
-    Raises:
-        ImportError: If ``torchdiffeq`` is not installed.
-    """
-    try:
-        from torchdiffeq import odeint
-    except ImportError as error:
-        raise ImportError(
-            "the solver dopri5 needs the package torchdiffeq: pip install torchdiffeq"
-        ) from error
-    steps = step_pairs(times)
-    start, stop = steps[0][0], steps[-1][1]
-    state = x.to(torch.promote_types(x.dtype, torch.float32))
-
-    def slope(progress: Tensor, now: Tensor) -> Tensor:
-        time = start + (stop - start) * float(progress)
-        return (stop - start) * _slope(velocity, now.to(x.dtype), time).to(now.dtype)
-
-    progress = torch.tensor([0.0, 1.0], dtype=torch.float64, device=x.device)
-    # Step on the end: torchdiffeq would otherwise step past it, where no velocity is defined.
-    options = {"step_t": progress[1:], "dtype": torch.float64}
-    solution = odeint(
-        slope, state, progress, rtol=rtol, atol=atol, method="dopri5", options=options
-    )
-    return solution[-1].to(x.dtype)
 
 
 ODE_SOLVERS: dict[str, Callable[..., Tensor]] = {

@@ -86,11 +86,11 @@ def per_sample(values: Tensor, x: Tensor) -> Tensor:
     return values.reshape(-1, *[1] * (x.dim() - 1))
 
 
-def check_interval(interval: tuple[float, float], what: str) -> None:
+def check_interval(interval: tuple[float, float], name: str) -> None:
     """Raises a ``ValueError`` if the interval is not two increasing times in [0, 1]."""
     if not 0 <= interval[0] < interval[1] <= 1:
         raise ValueError(
-            f"the interval of {what} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "
+            f"{name} must be two times 0 <= first < last <= 1 (0 data, 1 noise), "
             f"got {interval[0]} and {interval[1]}"
         )
 
