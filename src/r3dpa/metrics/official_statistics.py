@@ -7,11 +7,14 @@ and neither names of scans nor hashes of weights. Source: valeoai/R3DPA 2789885.
 
 from __future__ import annotations
 
+import io
+import math
 import pickle
+import pickletools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -122,10 +125,10 @@ class OfficialStatistics:
         """
         path = Path(path)
         try:
-            with path.open("rb") as stream:
-                version = np.lib.format.read_magic(stream)
-                getattr(np.lib.format, f"read_array_header_{version[0]}_0")(stream)
-                content = _ArraysOnly(stream).load().item()
+            stream = io.BytesIO(path.read_bytes())
+            version = np.lib.format.read_magic(stream)
+            getattr(np.lib.format, f"read_array_header_{version[0]}_0")(stream)
+            content = _ArraysOnly(stream).load().item()
             chosen: OfficialSplit = split or ("val" if "val" in content else "all")
             part = content[chosen]
             moments = {}
@@ -138,7 +141,7 @@ class OfficialStatistics:
                 cells = _numbers(part[_HISTOGRAM], 2).view(PUBLISHED.grid.shape).flatten()
             parts = part[_CLOUDS]["points"] if _CLOUDS in part else []
             clouds = [_cells(cloud) for cloud in parts[: PUBLISHED.num_mmd_references]]
-        except UNPICKLING_ERRORS as error:
+        except (*UNPICKLING_ERRORS, SystemError) as error:  # of NumPy, for a damaged type
             raise ValueError(
                 f"{path}: is no official statistics file with the split {split or 'val or all'} "
                 f"({error!r}); give its data_statistics.npy"
@@ -148,14 +151,39 @@ class OfficialStatistics:
         return cls(path, chosen, moments, cells, clouds)
 
 
+class _Array(np.ndarray):
+    """Array that is refused if it claims more elements than its pickled values can have."""
+
+    def __setstate__(self, state: Any) -> None:
+        if math.prod(state[1]) > len(state[4]):
+            raise pickle.UnpicklingError(f"an array of shape {state[1]} is cut short")
+        super().__setstate__(state)
+
+
 class _ArraysOnly(pickle.Unpickler):
-    """Unpickler of NumPy arrays and plain containers; refuses everything else by name."""
+    """Unpickler of NumPy arrays and plain containers; refuses everything else by name.
+
+    No damaged size makes it ask for more memory than the file explains.
+    """
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        start, size = stream.tell(), len(stream.getbuffer())
+        # Reads no more than there is, which leaves the numbers of the memo to be checked.
+        for code, number, _ in pickletools.genops(stream):
+            if code.name in ("PUT", "LONG_BINPUT") and cast(int, number) > size:
+                raise pickle.UnpicklingError(f"number {number} of an object is damaged")
+        stream.seek(start)
+        super().__init__(stream)
 
     def find_class(self, module: str, name: str) -> Any:
         parts = module.replace("numpy._core", "numpy.core").split(".")
-        if (parts[0], name) in {("numpy", "ndarray"), ("numpy", "dtype")}:
-            return super().find_class("numpy", name)
-        if parts == ["numpy", "core", "multiarray"] and name in ("_reconstruct", "scalar"):
+        if (parts[0], name) == ("numpy", "dtype"):
+            return np.dtype
+        if (parts[0], name) == ("numpy", "ndarray"):
+            return None  # only an argument of the next, which needs none
+        if parts == ["numpy", "core", "multiarray"] and name == "_reconstruct":
+            return lambda *_: _Array(0)
+        if parts == ["numpy", "core", "multiarray"] and name == "scalar":
             return super().find_class("numpy._core.multiarray", name)
         raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
 
