@@ -26,19 +26,8 @@ def test_read_metrics_skips_blanks_missing_cells_and_the_unfinished_line(tmp_pat
     assert series["val/error"] == ([100], [0.25])
     assert series["train/flow"][0] == [0, 50]
     assert series["train/flow"][1] == pytest.approx([-1.5, float("nan")], nan_ok=True)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a,b\n1,2\n", "no column 'step'"),
-        ("step,loss\n1,2\n3,oops\n", "line 3, column 'loss'"),
-    ],
-)
-def test_read_metrics_names_what_is_wrong(tmp_path, text, message):
-    path = tmp_path / "metrics.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message):
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="no column 'step'"):
         viz.read_metrics(path)
 
 
@@ -64,23 +53,14 @@ def test_loss_curves_mean_is_centred_and_keeps_gaps():
     assert mean[60:90] == pytest.approx(values[60:90])
 
 
-def test_loss_curves_refuses_nothing():
-    with pytest.raises(ValueError, match="two values or more"):
-        viz.loss_curves({})
-
-
-POINTS = [
-    viz.ParetoPoint("euler 4", "euler", 4, 0.1, 0.5, (0.4, 0.6)),
-    viz.ParetoPoint("euler 8", "euler", 8, 0.2, 0.25, (0.2, 0.3)),
-    viz.ParetoPoint("ab2 8", "ab2", 8, 0.21, 0.05, (0.04, 0.06), filled=True),
-]
-
-
-def test_pareto_picture_has_its_front_labels_and_sentences():
-    front = [POINTS[0], POINTS[2]]
-    text = "From $0.1 to 0.21 s"
-    found = viz.pareto_figure("title", "RMSE", POINTS, front, {"bf16": 0.01}, [text])
-    axes = found.subfigs[0].axes[0]
+def test_pareto_picture_has_its_front_and_labels():
+    points = [
+        viz.ParetoPoint("euler 4", "euler", 0.1, 0.5, (0.4, 0.6)),
+        viz.ParetoPoint("euler 8", "euler", 0.2, 0.25, (0.2, 0.3)),
+        viz.ParetoPoint("ab2 8", "ab2", 0.21, 0.05, (0.04, 0.06), filled=True),
+    ]
+    found = viz.pareto_figure("title", "RMSE", points, points[::2], {"bf16": 0.01})
+    axes = found.axes[0]
     lines = [line.get_xydata().tolist() for line in axes.lines]
     assert [[0.1, 0.5], [0.21, 0.05]] in lines  # the front
     assert {text.get_text() for text in axes.texts} == {"euler 4", "ab2 8"}
@@ -90,4 +70,3 @@ def test_pareto_picture_has_its_front_labels_and_sentences():
     assert axes.get_ylim()[0] < 0.01
     faces = [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"]
     assert faces.count("white") == 2  # in fp32
-    assert text in found.subfigs[1].texts[0].get_text()

@@ -44,11 +44,6 @@ def test_pca_colours_of_constant_empty_and_narrow_features():
     assert np.ptp(narrow[:, 1:]) == 0
 
 
-def test_pca_colours_refuse_nan():
-    with pytest.raises(ValueError, match="1 of 6 features are not finite"):
-        viz.pca_colours(torch.tensor([[1.0, 2.0], [3.0, float("nan")], [0.0, 1.0]]))
-
-
 def test_fitted_colours_are_those_of_equal_rows_in_another_set():
     features = np.random.default_rng(0).normal(size=(400, 6)) * [5, 3, 2, 1, 1, 1] + 2
     colours = fit_colours(features)
@@ -62,12 +57,7 @@ def test_fitted_colours_are_those_of_equal_rows_in_another_set():
     middle = colours(features[[one, other]].mean(axis=0, keepdims=True))[0]
     assert middle == pytest.approx(expected[[one, other]].mean(axis=0))
     assert (colours(np.zeros((1, 6))) == 0).all()
-
-
-def test_fitted_colours_clip_what_lies_beyond():
-    features = np.random.default_rng(0).normal(size=(400, 3)) * [3.0, 2.0, 1.0]
-    far = fit_colours(features)(np.diag([100.0, 100.0, -100.0]) + 0.001)
-    assert far.diagonal() == pytest.approx([1.0, 1.0, DARKEST_FEATURE])
+    assert set(colours(1e9 * features).ravel()) == {DARKEST_FEATURE, 1.0}  # clipped
 
 
 def test_pca_colours_of_single_precision_agree_with_double():
@@ -91,9 +81,6 @@ def test_similarity_picture_is_bright_where_the_direction_is_that_of_the_cell():
     framed = (picture == FRAME).all(axis=-1)
     assert framed.sum() == 4 * 3
     assert framed[:4, :4].sum() == 4 * 3
-
-
-def test_similarity_picture_refuses_empty_cells():
     with pytest.raises(ValueError, match=r"cell \(0, 1\) is empty"):
         viz.similarity_picture(torch.tensor([[1.0], [0.0]]), (1, 2), (0, 1))
 
@@ -113,8 +100,6 @@ def test_feature_figure_paints_points_pixels_and_cells_alike():
     assert cells == pytest.approx(colours(grid).reshape(2, 8, 3) * 255, abs=0.5)
     assert (cells.reshape(-1, 3).any(axis=1) == (counts > 0).numpy()).all()
     figure.draw_without_rendering()
-    with pytest.raises(ValueError, match="16 cells do not fill a grid of 8 x 64"):
-        viz.feature_figure(points, features, grid, projection)
 
 
 def test_latents_picture_separates_what_the_channels_separate():

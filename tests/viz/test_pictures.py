@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -31,11 +32,9 @@ def centre_of(picture, colour):
 def test_range_image_picture_keeps_rows_and_columns_and_enlarges_them():
     range_m = torch.full((8, 32), -1.0)
     range_m[2, 5] = 10.0
-    picture = viz.range_image_picture(range_m, SENSOR)
-    assert (picture.shape, picture.dtype) == ((8, 32, 3), np.uint8)
-    assert np.argwhere(~is_background(picture)).tolist() == [[2, 5]]
-    filled = ~is_background(viz.range_image_picture(range_m, SENSOR, scale=3))
-    assert filled.shape == (24, 96)
+    picture = viz.range_image_picture(range_m, SENSOR, scale=3)
+    assert (picture.shape, picture.dtype) == ((24, 96, 3), np.uint8)
+    filled = ~is_background(picture)
     assert filled[6:9, 15:18].all()
     assert filled.sum() == 9
 
@@ -75,6 +74,8 @@ def test_from_above_forward_is_up_and_left_is_left():
     assert centre_of(picture, RED).tolist() == [50, 50]
     assert centre_of(picture, GREEN).tolist() == [30, 50]
     assert centre_of(picture, BLUE).tolist() == [50, 30]
+    absent = torch.tensor([[50.1, 0.0, 0.0], [0.0, -50.1, 0.0], [1.0, 1.0, float("nan")]])
+    assert is_background(viz.birds_eye_picture(absent, extent_m=50)).all()
 
 
 def test_from_above_the_highest_point_shows_in_any_order():
@@ -82,11 +83,6 @@ def test_from_above_the_highest_point_shows_in_any_order():
     for order in ([0, 1], [1, 0]):
         picture = viz.birds_eye_picture(points[order], colours=np.stack([RED, BLUE])[order])
         assert picture[~is_background(picture)].tolist() == [[255, 0, 0]]
-
-
-def test_from_above_points_outside_or_not_finite_are_not_drawn():
-    points = torch.tensor([[50.1, 0.0, 0.0], [0.0, -50.1, 0.0], [1.0, 1.0, float("nan")]])
-    assert is_background(viz.birds_eye_picture(points, extent_m=50)).all()
 
 
 def test_birds_eye_view_axes_are_metres_with_equal_scale():
@@ -110,12 +106,6 @@ def test_scene_3d_left_is_left_up_is_up_and_forward_is_farther_up():
         assert (np.sign(np.round(row)), np.sign(np.round(column))) == (rows, columns)
 
 
-def test_scene_3d_target_of_the_camera_is_in_the_middle():
-    picture = viz.scene_3d(np.array([CAMERA_TARGET_M]), RED[None], size=(200, 300))
-    assert picture.shape == (200, 300, 3)
-    assert centre_of(picture, RED) == pytest.approx([99.5, 149.5], abs=1.0)
-
-
 def test_scene_3d_near_hides_far_on_the_same_ray_in_any_order():
     eye, target = np.array(CAMERA_EYE_M), np.array(CAMERA_TARGET_M)
     points = np.stack([eye + (target - eye) * 0.5, target])
@@ -123,6 +113,7 @@ def test_scene_3d_near_hides_far_on_the_same_ray_in_any_order():
         picture = viz.scene_3d(points[order], np.stack([RED, BLUE])[order], size=(180, 320))
         assert (centre_of(picture, RED) > 0).all()
         assert not (picture[..., 2] > 100).any()
+        assert centre_of(picture, RED) == pytest.approx([89.5, 159.5], abs=4)
 
 
 def test_scene_3d_nothing_behind_the_camera_is_drawn():
@@ -186,6 +177,52 @@ def test_reconstruction_figure_tells_errors_from_wrong_returns():
     assert "60.0 %" in figure.get_suptitle()
 
 
+EDITED = SphericalProjection(LidarSensor(beams=8, columns=16))
+RANGE_M = torch.full((8, 16), 10.0)
+
+
+def contours(parts):
+    """Places ``(x, y)`` of the outline of parts; pixel centres have whole numbers."""
+    sheet = viz.edit_sheet([viz.EditRow("after", RANGE_M, outline=parts)], ("kept", "new"), EDITED)
+    found = [c for c in sheet.axes[0].collections if isinstance(c, ContourSet)]
+    return {
+        tuple(place) for c in found for path in c.get_paths() for place in path.vertices.tolist()
+    }
+
+
+def test_the_outline_of_one_pixel_goes_around_it():
+    parts = np.zeros((8, 16), np.uint8)
+    parts[3, 5] = 1
+    assert contours(parts) == {(4.5, 3), (5.5, 3), (5, 2.5), (5, 3.5)}
+
+
+def test_no_outline_hides_a_picture_of_dropped_beams():
+    parts = np.zeros((8, 16), np.uint8)
+    parts[1::2] = 1
+    assert not contours(parts)
+
+
+def test_azimuths_stand_below_their_columns():
+    """16 columns of 22.5 degrees from 180 down: 0 degrees is the border before column 8."""
+    sheet = viz.edit_sheet([viz.EditRow("scan", RANGE_M)], (), EDITED)
+    axes = sheet.axes[0]
+    places = dict(
+        zip([t.get_text() for t in axes.get_xticklabels()], axes.get_xticks(), strict=True)
+    )
+    assert places["0°"] == pytest.approx(7.5, abs=0.5)
+    assert places["135°"] == pytest.approx(1.5, abs=0.5)
+    assert places["-90°"] == pytest.approx(11.5, abs=0.5)
+
+
+def test_a_mask_is_drawn_on_grey_and_colours_its_part_alone():
+    parts = np.zeros((8, 16), np.uint8)
+    parts[:, 8:] = 1
+    sheet = viz.edit_sheet([viz.EditRow("mask", RANGE_M, parts)], ("kept", "new"), EDITED)
+    picture = np.asarray(sheet.axes[0].images[0].get_array(), int)
+    assert (np.ptp(picture[:, :8], axis=-1) <= 1).all()
+    assert (picture[:, 8:, 0] > picture[:, 8:, 1] + 20).all()
+
+
 # Files
 
 
@@ -211,15 +248,10 @@ def test_save_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
 
     with pytest.raises(OSError, match="disk full"):
         viz.save(Broken(), path)
+    with pytest.raises(ValueError, match="unknown"):
+        viz.save(np.zeros((2, 2, 3), np.uint8), tmp_path / "picture.unknown")
     assert path.read_bytes() == old
     assert [found.name for found in tmp_path.iterdir()] == ["picture.png"]
-
-
-def test_save_refuses_unknown_formats(tmp_path):
-    for picture in (np.zeros((2, 2, 3), np.uint8), Figure()):
-        with pytest.raises(ValueError, match="unknown"):
-            viz.save(picture, tmp_path / "picture.unknown")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_viz_leaves_the_global_pyplot_alone():

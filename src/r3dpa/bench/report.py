@@ -290,7 +290,6 @@ def _picture(name: str, found: Finding) -> Figure:
         _points(found.rows),
         _points(front),
         {"bf16 against fp32": bf16[0].precision_error or 0.0} if bf16 else {},
-        sentences(front),
     )
 
 
@@ -299,7 +298,6 @@ def _points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
         viz.ParetoPoint(
             row.label,
             row.way.name,
-            row.way.nfe,
             row.seconds,
             row.error,
             row.interval,

@@ -396,7 +396,7 @@ def _figures(
     counted = [half["ranges"] for half in halves if half["ranges"].count("real")]
     return {
         "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
-        "limits_m": ((-protocol.grid.half_m, protocol.grid.half_m),) * 2,
+        "half_m": protocol.grid.half_m,
         "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
         "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
         "halves": torch.stack([half.real_bins for half in counted]).numpy(),

@@ -1,28 +1,20 @@
-"""Pictures of scans, scenes, reconstructions, features and losses.
+"""Pictures of arrays or tensors: a matplotlib ``Figure`` or pixels ``(rows, columns, 3)`` uint8.
 
-Every function takes arrays or tensors and returns a matplotlib ``Figure`` or the pixels of a
-picture, ``(rows, columns, 3)`` uint8 RGB; only :func:`save` and :func:`read_metrics` touch files.
-Colours are perceptually uniform and safe for colour-blind readers, on scales fixed in metres, so
-pictures of different scenes can be compared. Dark means that there is no return.
+Colours are safe for colour-blind readers, on scales fixed in metres. Dark means no return.
 """
 
-from r3dpa.viz.curves import (
-    ParetoPoint,
-    Series,
-    loss_curves,
-    pareto_figure,
-    read_metrics,
-)
-from r3dpa.viz.edits import EditRow, edit_page, edit_sheet
+from r3dpa.viz.curves import ParetoPoint, Series, loss_curves, pareto_figure, read_metrics
 from r3dpa.viz.features import feature_figure, latents_picture, pca_colours, similarity_picture
 from r3dpa.viz.figures import (
+    EditRow,
     birds_eye_sheet,
     birds_eye_view,
+    edit_sheet,
     range_strips,
     reconstruction_figure,
     scenes_sheet,
 )
-from r3dpa.viz.page import Category, PageScan, scan_page
+from r3dpa.viz.page import Category, PageScan, edit_page, scan_page
 from r3dpa.viz.pictures import (
     birds_eye_picture,
     encoded_picture,

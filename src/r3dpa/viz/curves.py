@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ COLOURS = (
     *("#882255", "#117733", "#999933", "#000000"),
 )
 _MARKERS = "osD^vPX<>hpd"
-_WRAP = 150  # characters of a sentence under the picture
 
 
 def loss_curves(curves: Mapping[str, Series]) -> Figure:
@@ -34,14 +33,9 @@ def loss_curves(curves: Mapping[str, Series]) -> Figure:
     values are positive and differ. Quantities with a single value are no curve and left out.
 
     Args:
-        curves: Steps and values by name, as from :func:`read_metrics`.
-
-    Raises:
-        ValueError: If there is nothing to draw.
+        curves: Steps and values by name, at least one of two values, as from :func:`read_metrics`.
     """
     series = {name: pair for name, pair in curves.items() if len(pair[1]) > 1}
-    if not series:
-        raise ValueError("no quantity with two values or more; train with a CSVLogger for longer")
     columns = min(4, len(series))
     rows = math.ceil(len(series) / columns)
     figure = Figure(figsize=(3.6 * columns + 0.2, 2.6 * rows + 0.2), layout="constrained")
@@ -60,7 +54,7 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
     writing). ``step`` and ``epoch`` are no quantities.
 
     Raises:
-        ValueError: If there is no column ``step``, or a cell is not a number.
+        ValueError: If there is no column ``step``.
     """
     with Path(path).open(newline="", encoding="utf-8") as file:
         table = csv.DictReader([line for line in file if line.endswith("\n")], restval="")
@@ -72,14 +66,9 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
     series: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in names}
     for row in table:
         for name in names:
-            if not row[name].strip():
-                continue
-            try:
+            if row[name].strip():
                 series[name][0].append(float(row["step"]))
                 series[name][1].append(float(row[name]))
-            except ValueError as error:
-                where = f"{path}, line {table.line_num}, column {name!r}"
-                raise ValueError(f"{where}: {error}") from None
     return {name: pair for name, pair in series.items() if pair[0]}
 
 
@@ -122,15 +111,10 @@ def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64
 
 
 class ParetoPoint(NamedTuple):
-    """One way to sample: its label, the solver that gives its colour, and its numbers.
-
-    ``seconds`` per scene and ``value`` (better when lower, in ``interval``) are above 0; open
-    markers run in fp32.
-    """
+    """One way to sample: seconds per scene and error, both above 0; open markers run in fp32."""
 
     label: str
-    solver: str
-    nfe: int
+    solver: str  #: gives the colour
     seconds: float
     value: float
     interval: tuple[float, float]
@@ -143,7 +127,6 @@ def pareto_figure(
     points: Sequence[ParetoPoint],
     front: Sequence[ParetoPoint],
     levels: Mapping[str, float],
-    sentences: Sequence[str],
 ) -> Figure:
     """Error against seconds per scene, both logarithmic, with the front as a line.
 
@@ -153,16 +136,11 @@ def pareto_figure(
         points: All ways to sample, at least one.
         front: Points of the Pareto front, from the fastest on.
         levels: Horizontal lines by name, such as the error of bf16; at most three.
-        sentences: Under the picture: one for each step along the front.
     """
-    styles = _styles(points)
-    lines = ["Error and time along the front"]
-    for sentence in sentences:
-        lines += textwrap.wrap(sentence, _WRAP, subsequent_indent="    ")
-    below = 0.19 * len(lines)
-    figure = Figure(figsize=(12.0, 6.8 + below), dpi=110, layout="constrained")
-    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(6.8, below))[:, 0]
-    axes = upper.subplots()
+    looks = cycle(zip(COLOURS, _MARKERS, strict=True))
+    styles = dict(zip(dict.fromkeys(point.solver for point in points), looks, strict=False))
+    figure = Figure(figsize=(12.0, 6.8), dpi=110, layout="constrained")
+    axes = figure.subplots()
     for point in points:
         colour, marker = styles[point.solver]
         low, high = point.interval
@@ -196,16 +174,5 @@ def pareto_figure(
     axes.set(xscale="log", yscale="log", xlabel="seconds per scene", ylabel=value_name)
     axes.set_ylim(min(values) / (max(values) / min(values)) ** 0.13 / 1.1, None)
     axes.grid(alpha=0.25, which="major")
-    upper.suptitle(title, fontsize=12, x=0.02, ha="left")
-    text = "\n".join(lines)
-    lower.text(0.02, 0.98, text, ha="left", va="top", fontsize=8.5, parse_math=False)
+    figure.suptitle(title, fontsize=12, x=0.02, ha="left")
     return figure
-
-
-def _styles(points: Sequence[ParetoPoint]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each solver, in order of appearance."""
-    solvers = dict.fromkeys(point.solver for point in points)
-    return {
-        solver: (COLOURS[place % len(COLOURS)], _MARKERS[place % len(_MARKERS)])
-        for place, solver in enumerate(solvers)
-    }

@@ -1,10 +1,11 @@
 """Figures of an evaluation: where samples and real scans differ, and which scans match.
 
-Letters: H beams, W columns, K bins, X and Y cells of a bird's-eye view.
+Letters: H beams, W columns, K bins, X cells along a side of a bird's-eye view.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,33 +28,24 @@ SHARE_MAP = bright_part("viridis", 0.1)
 DECADES = 4  # of the logarithmic scales
 
 
-def bev_histograms(
-    samples: Array,
-    references: Array,
-    x_m: tuple[float, float] = (-50.0, 50.0),
-    y_m: tuple[float, float] = (-50.0, 50.0),
-) -> Figure:
+def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> Figure:
     """Points of samples and of real scans seen from above, and the difference of their shares.
 
     Forward is up and left is left. Both share one logarithmic scale of four decades; empty cells
     have the dark background. The difference is linear near 0.
 
     Args:
-        samples: ``(X, Y)`` counts, not all 0; index 0 is at the lower limit of x and of y.
+        samples: ``(X, X)`` counts, not all 0; index 0 is at the lower limit of x and of y.
         references: The same of real scans.
-        x_m: Limits of x (forward) in metres.
-        y_m: Limits of y (left) in metres.
+        half_m: Limit of x (forward) and of y (left) to both sides, in metres.
     """
-    drawn, real = (_shares(as_numpy(counts, ("X", "Y"))) for counts in (samples, references))
-    steps = [-(-size // MAX_CELLS) for size in drawn.shape]
-    height_m, width_m = (
-        step * (high - low) / size
-        for step, size, (low, high) in zip(steps, drawn.shape, (x_m, y_m), strict=True)
-    )
-    drawn, real = (_summed(shares, *steps) for shares in (drawn, real))
-    rows, columns = drawn.shape
+    side = len(samples)
+    step = math.ceil(side / MAX_CELLS)
+    cell_m = step * 2 * half_m / side
+    counts = [_summed(as_numpy(cells, ("X", "X")), step) for cells in (samples, references)]
+    drawn, real = (cells / cells.sum() for cells in counts)
     # The last cells may reach beyond the limits, where the axes end.
-    drawn_to = (y_m[0] + columns * width_m, y_m[0], x_m[0], x_m[0] + rows * height_m)
+    end_m = len(drawn) * cell_m - half_m
     difference = drawn - real
     top = max(drawn.max(), real.max())
     share_scale = LogNorm(top / 10**DECADES, top, clip=True)
@@ -74,14 +66,14 @@ def bev_histograms(
             np.ma.array(values, mask=hidden)[:, ::-1],
             cmap=colours,
             norm=scale,
-            extent=drawn_to,  # +y is to the left
+            extent=(end_m, -half_m, -half_m, end_m),  # +y is to the left
             origin="lower",
             interpolation="nearest",
         )
-        axes.set(xlim=y_m[::-1], ylim=x_m, xlabel="y, left (m)")
+        axes.set(xlim=(half_m, -half_m), ylim=(-half_m, half_m), xlabel="y, left (m)")
         axes.set_title(title, fontsize=11)
     panels[0].set_ylabel("x, forward (m)")
-    label = f"share of all counts in a cell of {height_m:.3g} x {width_m:.3g} m"
+    label = f"share of all counts in a cell of {cell_m:.3g} x {cell_m:.3g} m"
     figure.colorbar(ScalarMappable(share_scale, SHARE_MAP), ax=panels[:2], label=label, shrink=0.8)
     difference_map = ScalarMappable(difference_scale, "RdBu_r")
     figure.colorbar(difference_map, ax=panels[2], label="difference of the shares", shrink=0.8)
@@ -106,7 +98,7 @@ def range_histogram(edges_m: Array, samples: Array, references: Array, halves: A
         as_numpy(references, ("K",)),
         *as_numpy(halves, ("S", "K")),
     ]
-    drawn, real, *floor = (_shares(values) / np.diff(edges) for values in counts)
+    drawn, real, *floor = (values / values.sum() / np.diff(edges) for values in counts)
 
     figure = Figure(figsize=(9.0, 6.2), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -154,7 +146,7 @@ def save_figures(
     folder: Path,
     *,
     cells: tuple[Array, Array],
-    limits_m: tuple[tuple[float, float], tuple[float, float]],
+    half_m: float,
     edges_m: Array,
     ranges: tuple[Array, Array],
     halves: Array,
@@ -162,23 +154,13 @@ def save_figures(
     worst: Sequence[Match],
     sensor: LidarSensor,
 ) -> None:
-    """Writes ``birds_eye.png``, ``ranges.png`` and ``matches.png`` of an evaluation to ``folder``.
-
-    Arguments are those of :func:`bev_histograms` (``cells``, ``limits_m``), :func:`range_histogram`
-    (``edges_m``, ``ranges``, ``halves``) and :func:`matches_figure`.
-    """
-    save(bev_histograms(*cells, *limits_m), folder / "birds_eye.png")
+    """Writes ``birds_eye.png`` of ``cells``, ``ranges.png`` and ``matches.png`` to ``folder``."""
+    save(bev_histograms(*cells, half_m), folder / "birds_eye.png")
     save(range_histogram(edges_m, *ranges, halves), folder / "ranges.png")
     save(matches_figure(best, worst, sensor), folder / "matches.png")
 
 
-def _shares(counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    if not counts.sum() > 0:
-        raise ValueError("samples or references hold no point; there is no distribution to draw")
-    return counts / counts.sum()
-
-
-def _summed(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
-    """Sums over blocks of rows x columns; the last blocks may be cut off by the border."""
-    by_row = np.add.reduceat(values, range(0, values.shape[0], rows), axis=0)
-    return np.add.reduceat(by_row, range(0, values.shape[1], columns), axis=1)
+def _summed(values: NDArray[np.float64], step: int) -> NDArray[np.float64]:
+    """Sums over squares of cells; the last squares may be cut off by the border."""
+    first = range(0, len(values), step)
+    return np.add.reduceat(np.add.reduceat(values, first, axis=0), first, axis=1)

@@ -1,8 +1,4 @@
-"""Features and latents as colours.
-
-Letters: P points, N tokens = feature-grid cells, D feature width, C latent channels, h w latent
-size. Shapes other than documented and values that are not finite raise a ``ValueError``.
-"""
+"""Features of points or of N feature-grid cells, and latents, as colours."""
 
 from __future__ import annotations
 
@@ -44,7 +40,7 @@ def fit_colours(features: Array) -> Callable[[Array], NDArray[np.float64]]:
 
     Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
     """
-    fitted = _checked_rows(features)
+    fitted = _rows(features)
     width = fitted.shape[1]
     fitted = fitted[_filled(fitted)]
     mean, loadings = np.zeros(width, fitted.dtype), np.zeros((width, 0), fitted.dtype)
@@ -62,7 +58,7 @@ def fit_colours(features: Array) -> Callable[[Array], NDArray[np.float64]]:
         loadings[:, flat], low[flat], high[flat] = 0.0, -1.0, 1.0
 
     def colours_of(features: Array) -> NDArray[np.float64]:
-        rows = _checked_rows(features)
+        rows = _rows(features)
         share = np.full((len(rows), 3), 0.5)
         share[:, : len(low)] = ((rows - mean) @ loadings - low) / (high - low)
         colours = DARKEST_FEATURE + (1 - DARKEST_FEATURE) * np.clip(share, 0, 1)
@@ -85,8 +81,7 @@ def similarity_picture(
     Cosine 1 is bright, 0 and below dark, empty cells black; the cell itself has a red frame.
     The result is ``(rows * scale, columns * scale, 3)`` uint8.
     """
-    values = _checked_rows(grid)
-    _check_grid(grid, grid_size)
+    values = _rows(grid)
     (row, column), (rows, columns) = cell, grid_size
     filled = _filled(values)
     chosen = row * columns + column
@@ -110,13 +105,10 @@ def feature_figure(
     grid: Array,
     projection: Projection,
     grid_size: tuple[int, int] = (8, 64),
-    extent_m: float = 40.0,
 ) -> Figure:
     """Features of a scan on its points, on its range image and averaged over the grid.
 
     All pictures share the principal components of the points, so that one colour means one feature.
-
-    Source: R3DPA (ICRA 2026), figure of the 3D features and their projection.
 
     Args:
         points: ``(P, 3+)`` x forward, y left, z up, metres.
@@ -124,9 +116,7 @@ def feature_figure(
         grid: ``(N, D)`` means over the cells, row by row, zeros where a cell is empty.
         projection: Projection of the range image below the grid.
         grid_size: Rows and columns of the grid, with product N.
-        extent_m: Half side of the square shown from above.
     """
-    _check_grid(grid, grid_size)
     colours = fit_colours(features)
     of_points = colours(features)
     xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
@@ -140,9 +130,9 @@ def feature_figure(
     image, cells = lower.subplots(2, 1)
     picture = scene_3d(points, of_points, size=(480, 920))
     draw_panorama(behind, picture, f"{len(xyz):,} points, from behind")
-    draw_birds_eye(above, points, extent_m, 480, of_points)
+    draw_birds_eye(above, points, 40.0, 480, of_points)
     above.set(xticks=[], yticks=[])
-    above.set_title(f"from above, {2 * extent_m:g} m wide", loc="left", fontsize=10)
+    above.set_title("from above, 80 m wide", loc="left", fontsize=10)
     title = f"range image, {beams} x {columns} pixels: feature of the nearest point"
     draw_panorama(image, panorama, title)
     title = f"feature grid, {grid_size[0]} x {grid_size[1]} cells: mean of their points"
@@ -162,30 +152,13 @@ def latents_picture(latents: Array, scale: int = 8) -> Pixels:
     return enlarge(as_bytes(colours).reshape(*latent_size, 3), scale)
 
 
-def _checked_rows(features: Array) -> Rows:
-    """The features as finite float32, or float64 where they are wider than that."""
+def _rows(features: Array) -> Rows:
+    """The features as float32, or float64 where they are wider than that."""
     if isinstance(features, torch.Tensor):
         features = features.detach().cpu()
         features = (features if features.dtype == torch.float64 else features.float()).numpy()
-    if features.ndim != 2:
-        raise ValueError(f"expected shape (N, D), got {tuple(features.shape)}")
-    rows: Rows = features.astype(np.result_type(features.dtype, np.float32), copy=False)
-    if not np.isfinite(rows).all():
-        raise ValueError(
-            f"{np.count_nonzero(~np.isfinite(rows))} of {rows.size} features are not finite; "
-            "find out where they come from before drawing them"
-        )
-    return rows
+    return features.astype(np.result_type(features.dtype, np.float32), copy=False)
 
 
 def _filled(rows: Rows) -> NDArray[np.bool_]:
     return np.any(rows != 0, axis=1)
-
-
-def _check_grid(grid: Array, grid_size: tuple[int, int]) -> None:
-    rows, columns = grid_size
-    if len(grid) != rows * columns:
-        raise ValueError(
-            f"{len(grid)} cells do not fill a grid of {rows} x {columns}; "
-            "give grid_size as (rows, columns) with product N"
-        )

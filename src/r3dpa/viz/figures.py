@@ -1,30 +1,31 @@
-"""Figures of scans and scenes with axes, scales and names.
-
-Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``; a
-collection holds one scan or image at least.
-"""
+"""Figures of scans, scenes and edits; a collection holds one scan or image at least."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
+from numpy.typing import NDArray
 
 from r3dpa.geometry import LidarSensor, Projection, points_of, range_image
 from r3dpa.viz.pictures import (
     BACKGROUND,
+    EGO_OUTLINE_M,
     HEIGHT_LIMITS_M,
     HEIGHT_MAP,
+    PALETTE,
     RANGE_MAP,
     Array,
     Pixels,
+    as_bytes,
     as_numpy,
     birds_eye_picture,
     bright_part,
@@ -36,13 +37,17 @@ from r3dpa.viz.pictures import (
 )
 
 ERROR_LIMIT_M = 2.0
-EGO_OUTLINE_M = ((0.0, 2.5), (-0.9, 1.0), (-0.9, -2.0), (0.9, -2.0), (0.9, 1.0))  # (y, x)
+EXTENT_M = 50.0  # shown from above, to each side
 ONLY_INPUT = (0.80, 0.80, 0.80)
 ONLY_RECONSTRUCTION = (0.95, 0.45, 0.75)
 ERROR_MAP = bright_part("viridis", 0.0)
+_TINT = 0.55  # share of the colour of a part
+_GREY_SHARES = (0.299, 0.587, 0.114)  # of red, green and blue in their brightness
+_MOST_BORDERS = 0.2  # of the pixels: lines between every few beams would hide the picture
+_KEPT, _GREY = "kept", "#8a8f98"
 
 
-def birds_eye_view(points: Array, extent_m: float = 50.0) -> Figure:
+def birds_eye_view(points: Array, extent_m: float = EXTENT_M) -> Figure:
     """Points ``(P, 3+)`` in metres seen from above, up to ``extent_m`` to each side, with axes."""
     figure = Figure(figsize=(7.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
@@ -53,13 +58,8 @@ def birds_eye_view(points: Array, extent_m: float = 50.0) -> Figure:
     return figure
 
 
-def scenes_sheet(
-    range_images_m: Sequence[Array], projection: Projection, extent_m: float = 50.0
-) -> Figure:
-    """Contact sheet of range images ``(H, W)`` in metres, one scene per row.
-
-    Each row shows the range image, the points from above (``extent_m`` to each side) and in 3D.
-    """
+def scenes_sheet(range_images_m: Sequence[Array], projection: Projection) -> Figure:
+    """A row for each range image ``(H, W)`` in metres, with its points from above and in 3D."""
     count = len(range_images_m)
     top_in, bottom_in = 0.4, 0.75
     height_in = top_in + count * 1.85 + bottom_in
@@ -74,11 +74,11 @@ def scenes_sheet(
         image, above, scene = row
         draw_panorama(image, range_image_picture(ranges, projection.sensor))
         image.set_ylabel(str(number), rotation=0, ha="right", va="center", fontsize=11)
-        draw_birds_eye(above, points, extent_m, pixels=180)
+        draw_birds_eye(above, points, EXTENT_M, pixels=180)
         scene.imshow(scene_3d(points, size=(310, 550)), aspect="auto")
         for axes in (above, scene):
             axes.set(xticks=[], yticks=[])
-    titles = ("range image", f"from above, {2 * extent_m:g} m wide", "from behind")
+    titles = ("range image", f"from above, {2 * EXTENT_M:g} m wide", "from behind")
     for axes, title in zip(cells[0], titles, strict=True):
         axes.set_title(title, fontsize=11)
     for left, bar in ((0.15, _range_bar), (0.70, _height_bar)):
@@ -145,7 +145,7 @@ def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
     return figure
 
 
-def birds_eye_sheet(scans: Mapping[str, Array], extent_m: float = 50.0) -> Figure:
+def birds_eye_sheet(scans: Mapping[str, Array]) -> Figure:
     """Scans ``(P, 3+)`` by name seen from above, up to four in a row, with the height scale."""
     count = len(scans)
     columns = count if count <= 4 else min((4, 3), key=lambda width: -count % width)  # fewest gaps
@@ -156,12 +156,60 @@ def birds_eye_sheet(scans: Mapping[str, Array], extent_m: float = 50.0) -> Figur
     for axes in cells[count:]:
         axes.set_visible(False)
     for (name, points), axes in zip(scans.items(), cells, strict=False):
-        draw_birds_eye(axes, points, extent_m, round(95 * side_in))
+        draw_birds_eye(axes, points, EXTENT_M, round(95 * side_in))
         axes.set(xticks=[], yticks=[])
         axes.set_title(name, loc="left", fontsize=10, parse_math=False)
-        axes.set_xlabel(f"{2 * extent_m:g} m, {len(points):,} points", fontsize=9)
+        axes.set_xlabel(f"{2 * EXTENT_M:g} m, {len(points):,} points", fontsize=9)
     _height_bar(figure, ax=list(cells), extend="both", shrink=0.8, pad=0.02)
     return figure
+
+
+class EditRow(NamedTuple):
+    """A range image of a sheet, ``(H, W)`` metres, and its name.
+
+    ``parts`` is the part number of each pixel, ``(H, W)``, shown as a tint of a grey picture;
+    ``outline`` likewise, but only the borders between parts are drawn, over the range colours.
+    """
+
+    name: str
+    range_m: Array
+    parts: NDArray[np.integer] | None = None
+    outline: NDArray[np.integer] | None = None
+
+
+def edit_sheet(
+    rows: Sequence[EditRow], part_names: Sequence[str], projection: Projection
+) -> Figure:
+    """Range images one below the other under their names, with the tints of their parts.
+
+    Args:
+        rows: At least one. Azimuths are written below the last.
+        part_names: Names of the parts by number; empty where no row has any.
+        projection: Gives the limits of the colour scale.
+    """
+    pictures = []
+    for row in rows:
+        picture = range_image_picture(row.range_m, projection.sensor)
+        tinted = picture if row.parts is None else _tinted(picture, row.parts, part_names)
+        pictures.append((row.name, tinted))
+    figure, cells = strip_sheet(pictures, projection.sensor, 0.3 if part_names else 0.0)
+    for row, axes in zip(rows, cells, strict=True):
+        outline = row.outline
+        if outline is not None and (np.diff(outline, axis=0) != 0).mean() < _MOST_BORDERS:
+            for part in np.unique(outline)[1:]:
+                axes.contour(outline == part, [0.5], colors="white", linewidths=1.2)
+    _azimuth_ticks(cells[-1], projection)
+    if part_names:
+        named = zip(part_names, part_colours(part_names), strict=True)
+        handles = [Patch(color=colour, label=name) for name, colour in named]
+        figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
+def part_colours(names: Sequence[str]) -> list[str]:
+    """A colour ``#rrggbb`` for each part; grey for ``kept``."""
+    free = iter(("#ff6b6b", *PALETTE))
+    return [_GREY if name == _KEPT else next(free) for name in names]
 
 
 def strip_sheet(
@@ -195,6 +243,23 @@ def draw_birds_eye(
         interpolation="nearest",
     )
     axes.add_patch(Polygon(EGO_OUTLINE_M, facecolor="tab:red", edgecolor="white", lw=0.5))
+
+
+def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
+    """Ticks at eighths of a turn, in degrees as the commands take them."""
+    azimuth = projection.ray_angles()[1].rad2deg().numpy()
+    wanted = np.arange(135, -180, -45)
+    apart = (azimuth[:, None] - wanted + 180) % 360 - 180
+    axes.set_xticks(np.abs(apart).argmin(axis=0), [f"{value}°" for value in wanted], fontsize=8)
+    axes.tick_params(length=2, pad=2)
+
+
+def _tinted(picture: Pixels, parts: NDArray[np.integer], names: Sequence[str]) -> Pixels:
+    """The picture in grey, tinted by part except where it is ``kept``."""
+    picture = (picture @ np.array(_GREY_SHARES))[..., None]
+    over = np.array([to_rgb(colour) for colour in part_colours(names)])[parts]
+    share = np.array([0.0 if name == _KEPT else _TINT for name in names])[parts][..., None]
+    return as_bytes((1 - share) * picture / 255 + share * over)
 
 
 def _range_bar(figure: Figure, sensor: LidarSensor, **place: object) -> None:

@@ -1,7 +1,7 @@
 """One self-contained HTML page that shows scans as point clouds.
 
 The page is ``page.html`` with ``page_cloud.js`` (points to pixels) and ``page_viewer.js`` (panes,
-camera, legend); it loads nothing and needs no GPU. Letters: P points.
+camera, legend); it loads nothing and needs no GPU.
 """
 
 from __future__ import annotations
@@ -12,21 +12,24 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from matplotlib.colors import Colormap
 from numpy.typing import NDArray
 
-from r3dpa.geometry import LidarSensor
-from r3dpa.viz.figures import EGO_OUTLINE_M
+from r3dpa.geometry import LidarSensor, Projection, points_of
+from r3dpa.viz.figures import part_colours
 from r3dpa.viz.pictures import (
     BACKGROUND,
+    EGO_OUTLINE_M,
     HEIGHT_LIMITS_M,
     HEIGHT_MAP,
+    PALETTE,
     Array,
     as_numpy,
     bright_part,
@@ -40,11 +43,6 @@ GROUND_M = -1.73  # KITTI's Velodyne stands 1.73 m above the road
 PAGE_RANGE_MAP = bright_part("plasma", 0.15).reversed()
 INTENSITY_MAP = bright_part("inferno", 0.25)
 _SCRIPTS = ("page_cloud.js", "page_viewer.js")
-# Distinct on the dark background; for categories that come without a colour.
-PALETTE = (
-    *("#4e9bff", "#ffb000", "#3ddc97", "#ff6b6b", "#c792ea", "#5ce1e6", "#f78fb3", "#b5e853"),
-    *("#ff8c42", "#9fa8da", "#e6d690", "#8bd3c7"),
-)
 
 
 class Category(NamedTuple):
@@ -138,6 +136,39 @@ def scan_page(
     template = (folder / "page.html").read_text("utf-8")
     # In one pass, so that a part that holds such a placeholder stays as it is.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+
+
+def edit_page(
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+    parts: NDArray[np.integer] | None,
+    part_names: Sequence[str],
+    projection: Projection,
+    title: str,
+) -> str:
+    """HTML page that opens on the first result, with the first scan beside it.
+
+    Args:
+        before: Range images ``(H, W)`` of the scans by name, may be empty; shown after the results.
+        after: Those of the results; images without a return are left out, a ``ValueError`` if all.
+        parts: ``(H, W)`` part number of each pixel, for the colours; None for none.
+        part_names: Names of the parts by number.
+        projection: Makes the points.
+        title: Of the page.
+    """
+    order = projection.column_order()
+    shown = []
+    for name, range_m in {**after, **before}.items():
+        image = torch.as_tensor(range_m)
+        filled = (image[:, order] > 0).numpy()
+        labels = None if parts is None else parts[:, order.numpy()][filled].astype(np.uint32)
+        if filled.any():
+            shown.append(PageScan(name, points_of(image, projection), labels))
+    named = zip(part_names, part_colours(part_names), strict=True)
+    categories = {number: Category(*part) for number, part in enumerate(named)}
+    first = next((one for one in shown if one.name in before), None)
+    reference = None if first is None else replace(first, name=f"before: {first.name}")
+    return scan_page(shown, title, categories, {}, reference, projection.sensor)
 
 
 def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:

@@ -1,7 +1,4 @@
-"""Range images and points as pixels, and pixels as files.
-
-Letters: H beams, W columns, P points. Shapes other than documented raise a ``ValueError``.
-"""
+"""Range images and points as pixels, and pixels as files."""
 
 from __future__ import annotations
 
@@ -33,6 +30,12 @@ def bright_part(name: str, start: float) -> Colormap:
 
 
 HEIGHT_LIMITS_M = (-2.0, 3.0)  # relative to the sensor, which stands about 1.7 m above the road
+EGO_OUTLINE_M = ((0.0, 2.5), (-0.9, 1.0), (-0.9, -2.0), (0.9, -2.0), (0.9, 1.0))  # (y, x)
+# Distinct on the dark background; for categories that come without a colour.
+PALETTE = (
+    *("#4e9bff", "#ffb000", "#3ddc97", "#ff6b6b", "#c792ea", "#5ce1e6", "#f78fb3", "#b5e853"),
+    *("#ff8c42", "#9fa8da", "#e6d690", "#8bd3c7"),
+)
 CAMERA_EYE_M = (-20.0, 0.0, 10.5)
 CAMERA_TARGET_M = (12.0, 0.0, -1.0)
 CAMERA_WIDTH_DEG = 58.0
