@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from r3dpa.cli import COMMANDS, main
+from r3dpa.cli import COMMANDS, OWN_PARSER, main
 
 
 def python(*words):
@@ -31,16 +31,16 @@ class TestHelp:
     def test_options_of_commands_are_listed_without_torch(self):
         out = python(
             "-c",
-            "import sys; from r3dpa.cli import COMMANDS, main\n"
+            "import sys; from r3dpa.cli import COMMANDS, OWN_PARSER, main\n"
             "for name in COMMANDS:\n"
-            "    if not COMMANDS[name].own_parser:\n"
+            "    if COMMANDS[name].target not in OWN_PARSER:\n"
             "        try: main([*name.split(), '--help'])\n"
             "        except SystemExit as stop: assert stop.code == 0\n"
             "print('loaded', [name for name in ('torch', 'lightning') if name in sys.modules])",
         )
         assert out.splitlines()[-1] == "loaded []"
-        names = [name for name in COMMANDS if not COMMANDS[name].own_parser]
-        assert all(f"{name} [" in out for name in names)
+        read = [name for name in COMMANDS if COMMANDS[name].target not in OWN_PARSER]
+        assert all(f"{name} [" in out for name in read)
 
     @pytest.mark.parametrize("command", ["fit", "data features"])
     def test_of_stages_and_extraction(self, command, capsys):
@@ -65,7 +65,7 @@ class TestHelp:
     ("words", "message"),
     [
         (["smaple"], "unknown command 'smaple': give one of"),
-        (["edit", "vari"], "r3dpa edit: unknown command 'vari': give one of inpaint"),
+        (["edit", "vari"], "unknown command 'edit vari': give one of"),
         (["sample", "--ckpt", "a", "--out", "b", "--stepz", "3"], "--stepz"),
         (["sample", "--ckpt", "a"], "out"),
         (["features", "--dat", "x"], "dat"),

@@ -251,7 +251,7 @@ class TestView:
             assert str(out / name) in text.splitlines()
         for name in written[:2]:
             assert np.asarray(Image.open(out / name)).std() > 10
-        assert names == [self.NAME, f"reference: {self.NAME}"]
+        assert names == [self.NAME, "reference: data/0000000004"]
         assert page["reference"] == 1
         assert {"semantic", "instance", "origin"} < set(page["scans"][0]["columns"])
         assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]

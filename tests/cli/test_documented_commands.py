@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from r3dpa.cli import COMMANDS, _find, main
+from r3dpa.cli import COMMANDS, OWN_PARSER, _find, main
 from r3dpa.cli.features import _parser, _with_data_class
 from r3dpa.cli.parser import function_parser, load
 
@@ -62,7 +62,7 @@ def test_command_is_accepted(words, monkeypatch, capsys):
     name, rest = _find(words)
     if name == "data features":
         _parser().parse_args(_with_data_class(rest))
-    elif COMMANDS[name].own_parser:
+    elif COMMANDS[name].target in OWN_PARSER:
         for place, word in enumerate(words):
             if word == "--config" and not Path(words[place + 1]).is_file():
                 configs = [w for path in JOINT for w in ("--config", str(path))]

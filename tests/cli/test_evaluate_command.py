@@ -136,7 +136,7 @@ def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp
     (samples / "004.bin").write_bytes(b"no points")
     write_bin(samples / "007.bin", torch.tensor([[0.0, 52.0, 0.0, 0.0]]))
     words = ["--samples", samples, "--reference", reference_file, "--allow_few"]
-    with pytest.raises(ValueError, match=r"004\.bin: has 9 bytes.*--skip_bad leaves such"):
+    with pytest.raises(ValueError, match=r"004\.bin: has 9 bytes.*skip_bad leaves such"):
         evaluate(*words)
     with pytest.warns(UserWarning, match="1 bad samples left out"):
         evaluate(*words, "--skip_bad", "--out", tmp_path / "out")
@@ -170,9 +170,9 @@ def images(second=10.0):
     [
         (
             images(second=-1),
-            r"img\.npz, sample .*1.*: has no point within the sensor's range.*--skip_bad",
+            r"img\.npz, sample .*1.*: has no point within the sensor's range.*skip_bad",
         ),
-        (images(second=np.nan), r"img\.npz, sample .*1.*: has NaN or infinite ranges.*--skip_bad"),
+        (images(second=np.nan), r"img\.npz, sample .*1.*: has NaN or infinite ranges.*skip_bad"),
         (images()[:1], r"1 generated scenes; a comparison needs at least 2"),
         (images(), r"3 generated scenes for the 64 features of FGEO.*--allow_few"),
     ],

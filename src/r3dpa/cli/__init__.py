@@ -17,17 +17,13 @@ __all__ = ["COMMANDS", "main"]
 class Command(NamedTuple):
     """Function ``file:name`` below ``r3dpa.cli``, and summary for the help.
 
-    A ``resumable`` command continues its work when it is repeated after an interrupt.
+    A ``resumable`` command continues its work when it is repeated after an interrupt. The functions
+    of :data:`OWN_PARSER` take the words of the command line.
     """
 
     target: str
     summary: str
     resumable: bool = False
-
-    @property
-    def own_parser(self) -> bool:
-        """Whether the function takes the words of the command line."""
-        return self.target in ("stages:run", "features:features")
 
 
 COMMANDS = {
@@ -56,36 +52,31 @@ COMMANDS = {
     "bench sampling": Command("bench:sampling", "measure accuracy against sampling time", True),
     "bench training": Command("bench:training", "measure time and memory of training steps"),
 }
+OWN_PARSER = ("stages:run", "features:features")
 # Commands of `data` and `edit` are known by their own name, too: `r3dpa view` is `r3dpa data view`.
 _ALIASES = {name.split()[1]: name for name in COMMANDS if name.startswith(("data ", "edit "))}
 _GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 
 
-def _help(group: str = "") -> str:
+def _help(group: str) -> str:
     """Usage and summaries of all commands, or of those of a group."""
     shown = {name: command for name, command in COMMANDS.items() if name.startswith(group)}
     lines = [f"  {name:<17}{command.summary}" for name, command in shown.items()]
-    title = "" if group else "\nGenerate LiDAR scenes (R3DPA).\n"
-    return (
-        f"usage: r3dpa {group} COMMAND [options]\n{title}\n".replace("  ", " ")
-        + "\n".join(lines)
-        + "\n\nr3dpa COMMAND --help lists the options. `data` and `edit` may be left out."
-    )
+    title = [] if group else ["Generate LiDAR scenes (R3DPA).", ""]
+    end = "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out."
+    usage = " ".join(filter(None, ("usage: r3dpa", group, "COMMAND [options]")))
+    return "\n".join([usage, "", *title, *lines, "", end])
 
 
 def _find(args: list[str]) -> tuple[str, list[str]]:
     """Full name of the command, and the words after it."""
-    if " ".join(args[:2]) in COMMANDS:
-        return " ".join(args[:2]), args[2:]
-    name = _ALIASES.get(args[0], args[0])
+    name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
+    rest = args[len(name.split()) :]
+    name = _ALIASES.get(name, name)
     if name not in COMMANDS:
-        within = args[0] if args[0] in _GROUPS else ""
-        wrong = args[1] if within else args[0]
-        sys.stderr.write(f"r3dpa {within}".strip() + f": unknown command {wrong!r}: give one of ")
-        known = [n.removeprefix(within).strip() for n in COMMANDS if n.startswith(within)]
-        sys.stderr.write(f"{', '.join(known)}\n")
+        sys.stderr.write(f"r3dpa: unknown command {name!r}: give one of {', '.join(COMMANDS)}\n")
         sys.exit(2)
-    return name, args[1:]
+    return name, rest
 
 
 def _run(args: list[str]) -> None:
@@ -95,8 +86,7 @@ def _run(args: list[str]) -> None:
         sys.stdout.write(f"{__version__}\n")
         return
     group = args[0] if args and args[0] in _GROUPS else ""
-    rest = args[1:] if group else args
-    if not rest or rest[0] in ("-h", "--help"):
+    if args[bool(group) :][:1] in ([], ["-h"], ["--help"]):
         sys.stdout.write(f"{_help(group)}\n")
         return
     name, words = _find(args)
@@ -106,8 +96,8 @@ def _run(args: list[str]) -> None:
     command = COMMANDS[name]
     try:
         function = load(command.target)
-        if command.own_parser:
-            result = function(args if command.target == "stages:run" else words)
+        if command.target in OWN_PARSER:
+            result = function([name, *words])
         else:
             result = run_function(function, words, prog)
     except KeyboardInterrupt:

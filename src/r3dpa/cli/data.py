@@ -126,13 +126,7 @@ def _readers(source: Path) -> list[Callable[[], viz.PageScan]]:
     if source.suffix == ".npz" and source.is_file():
         clouds = read_clouds(source).items()
         return [partial(viz.PageScan, f"{source.stem}/{name}", points) for name, points in clouds]
-    scans = find_scans(source)
-    if not source.is_file():
-        return [partial(read, scan.name, scan.path) for scan in scans]
-    path = scans[0].path
-    in_layout = path.parts[-3:-1] == ("velodyne_points", "data")  # of KITTI-360
-    parent = path.parents[2] if in_layout else path.parent
-    return [partial(read, f"{parent.name}/{path.stem}", path)]
+    return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 
 
 def objects(

@@ -47,7 +47,8 @@ def inpaint(
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    from r3dpa.cli.edit_session import EditSession, Parts
+    from r3dpa.cli.edit_session import EditSession
+    from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.data.objects import ObjectLibrary
     from r3dpa.geometry import regions
 
@@ -68,13 +69,13 @@ def inpaint(
     feature = None
     if objects is not None and object is not None:
         library = ObjectLibrary.load(objects)
-        library.check_source(session.feature_source, session.feature_dim)
+        source_name = feature_source_of(session.checkpoint)
+        library.check_source(source_name, session.feature_dim)
         feature = library.feature(object)
     run = partial(session.editor.inpaint, source.range_m, region, num, session.options.seed)
     run = partial(run, feature=feature, start=start, dilation=dilation)
-    parts = Parts(region, ("kept", object or "generated anew"))
-    scans = {f"scan {scan.stem}": source}
-    return session.write("inpaint", arguments, scans, run, parts, feature is not None)
+    scans, names = {f"scan {scan.stem}": source}, ("kept", object or "generated anew")
+    return session.write("inpaint", arguments, scans, run, region, names, feature is not None)
 
 
 def mix(
@@ -106,7 +107,7 @@ def mix(
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
-    from r3dpa.cli.edit_session import EditSession, Parts
+    from r3dpa.cli.edit_session import EditSession
     from r3dpa.geometry.regions import mask_of_tokens, sector_weights
 
     session = EditSession(EditOptions(**options), num, strength, window)
@@ -117,7 +118,7 @@ def mix(
     size = session.sensor.beams, session.sensor.columns
     numbers = mask_of_tokens(weights.argmax(dim=0), session.grid_size, size)
     run = partial(session.editor.mix, grids, weights, num, session.options.seed)
-    return session.write("mix", arguments, scans, run, Parts(numbers, list(scans)), guided=True)
+    return session.write("mix", arguments, scans, run, numbers, list(scans), guided=True)
 
 
 def complete(
@@ -153,7 +154,7 @@ def complete(
 
     import torch
 
-    from r3dpa.cli.edit_session import EditSession, Parts, held_out_errors
+    from r3dpa.cli.edit_session import EditSession, held_out_errors
     from r3dpa.geometry import SphericalProjection, regions
 
     session = EditSession(EditOptions(**options), num)
@@ -163,10 +164,7 @@ def complete(
         masks.append(regions.sector(projection, *sector))
     if keep_every is not None:
         if not 2 <= keep_every <= rows // 2:
-            raise ValueError(
-                f"--keep_every must be 2 to {rows // 2}, so that two or more of the {rows} beams "
-                f"remain; got {keep_every}"
-            )
+            raise ValueError(f"--keep_every must be 2 to {rows // 2}, got {keep_every}")
         masks.append(regions.dropped_beams(projection, range(0, rows, keep_every)))
     if other_sensor is not None:
         count, low, high = other_sensor
@@ -181,10 +179,7 @@ def complete(
         empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
         masks.append(empty.expand_as(source.range_m))
     if not masks:
-        raise ValueError(
-            "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
-            "--mask"
-        )
+        raise ValueError("nothing is missing: give --sector, --keep_every, ... or --mask")
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
@@ -194,7 +189,8 @@ def complete(
         arguments,
         {f"scan {scan.stem}": source, "known part": known},
         partial(run, start=start),
-        Parts(missing, ("kept", "missing")),
+        missing,
+        ("kept", "missing"),
         measure=partial(held_out_errors, range_m=source.range_m, missing=missing),
     )
 

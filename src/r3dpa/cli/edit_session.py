@@ -35,7 +35,7 @@ from r3dpa.geometry.regions import check_mask
 from r3dpa.io import atomic_path, usable_device
 from r3dpa.nn.backbones import feature_source
 
-__all__ = ["EditSession", "Parts", "ScanView", "held_out_errors"]
+__all__ = ["EditSession", "ScanView", "held_out_errors"]
 
 _SHOWN = 8  # results on the sheet and the page
 
@@ -46,13 +46,6 @@ class ScanView(NamedTuple):
     path: Path
     points: Tensor
     range_m: Tensor
-
-
-class Parts(NamedTuple):
-    """Part ``(H, W)`` of the range image that each pixel belongs to, and names of the parts."""
-
-    numbers: Tensor
-    names: Sequence[str]
 
 
 class EditSession:
@@ -82,11 +75,6 @@ class EditSession:
         self.geometry, self.projection = generator.geometry, generator.geometry.projection
         self.sensor = self.projection.sensor
         self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
-
-    @property
-    def feature_source(self) -> str:
-        """Feature source of the checkpoint; ``ValueError`` if it has none."""
-        return feature_source_of(self.checkpoint)
 
     def read(self, path: Path, check: bool = True) -> ScanView:
         """A scan; with ``check``, one that fills the field of view."""
@@ -119,8 +107,8 @@ class EditSession:
 
     def feature_grids(self, scans: Iterable[ScanView], ckpt: Path | None) -> list[Tensor]:
         """Feature grid ``(N, F)`` of each scan, as ``r3dpa features`` writes them."""
-        extractor: Any = feature_source(self.feature_source, ckpt, self.feature_dim)
-        extractor = extractor.to(self.device)
+        source = feature_source_of(self.checkpoint)
+        extractor: Any = feature_source(source, ckpt, self.feature_dim).to(self.device)
         grids = []
         for path, points, _ in scans:
             file = Scan(path.parent.name, path.stem, path)
@@ -135,9 +123,10 @@ class EditSession:
         arguments: Mapping[str, Any],
         scans: Mapping[str, ScanView],
         run: Callable[[], EditResult],
-        parts: Parts | None = None,
+        parts: Tensor | None = None,
+        part_names: Sequence[str] = (),
         guided: bool = False,
-        measure: Callable[[Tensor], dict[str, Any]] | None = None,
+        measure: Callable[[Tensor], dict[str, Any]] = lambda _: {},
     ) -> str:
         """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
@@ -146,7 +135,8 @@ class EditSession:
             arguments: Its own options, for the metadata.
             scans: The scans by name.
             run: The edit.
-            parts: Parts of the range image.
+            parts: Part ``(H, W)`` of the range image that each pixel belongs to.
+            part_names: Names of the parts.
             guided: Whether features guide it.
             measure: Errors of results ``(B, H, W)`` by method, where the scan was held out.
         """
@@ -171,13 +161,13 @@ class EditSession:
         with SceneWriter(
             options.out, self.num, self.projection, options.formats, request, options.overwrite
         ) as writer:
-            seconds = -time.perf_counter()
+            start = time.perf_counter()
             with self._progress(command):
                 result = run()
-            seconds += time.perf_counter()
+            seconds = time.perf_counter() - start
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
-            self._show(command, scans, result.range_m, parts)
+            self._show(command, scans, result.range_m, parts, part_names)
             figures: dict[str, Any] = {
                 "nfe": result.nfe,
                 "seconds": seconds,
@@ -185,10 +175,22 @@ class EditSession:
                 "vae_error_m": result.vae_error_m,
                 "round_trip_m": result.round_trip_m,
             }
-            if held_out := measure(result.range_m) if measure else {}:
+            if held_out := measure(result.range_m):
                 figures["held_out"] = held_out
             writer.finish(request | figures)
-        return _summary(command, options.out, result, seconds, held_out)
+        lines = [
+            f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
+            f" {seconds:.3g} s"
+        ]
+        errors = {
+            "range error of encoder and decoder alone": result.vae_error_m,
+            "added at most by the inversion": result.round_trip_m,
+        }
+        errors |= {f"range error of held-out pixels, {n}": e["mae_m"] for n, e in held_out.items()}
+        lines += [f"{name}: {e:.3f} m" for name, e in errors.items() if e is not None]
+        if result.cosine is not None:
+            lines.append(f"cosine with the guiding features: {float(result.cosine.mean()):.3f}")
+        return "\n".join([*lines, f"open {options.out / 'edit.png'} and edit.html beside it"])
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:
@@ -199,14 +201,19 @@ class EditSession:
         first = next(self.editor.generator.sit.children())  # called once in each evaluation
         with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
 
-            def count(*_: Any) -> None:
+            def count(*_: Any) -> None:  # what a hook returns would become the output
                 bar.update()
 
             with first.register_forward_hook(count):
                 yield
 
     def _show(
-        self, command: str, scans: Mapping[str, ScanView], made: Tensor, parts: Parts | None
+        self,
+        command: str,
+        scans: Mapping[str, ScanView],
+        made: Tensor,
+        parts: Tensor | None,
+        part_names: Sequence[str],
     ) -> None:
         """Pictures of each scene, the sheet, the page, the mask and the scans before the edit."""
         out = self.options.out
@@ -218,40 +225,19 @@ class EditSession:
             draw_scene(out, index, range_m, self.geometry)
         after = {f"{command} {index}": image for index, image in enumerate(made[:_SHOWN])}
         rows = [viz.EditRow(name, image) for name, image in before.items()]
-        numbers, names = None, parts.names if parts else ()
+        numbers = None
         if parts is not None:
-            numbers, shown = parts.numbers.numpy().astype(np.uint8), images[0]
+            numbers, shown = parts.numpy().astype(np.uint8), images[0]
             if command == "mix":  # each part as in the scan that it follows
-                shown = images.gather(0, parts.numbers.long()[None])[0]
+                shown = images.gather(0, parts.long()[None])[0]
             rows.append(viz.EditRow("mask", shown, numbers))
-            viz.save(numbers * np.uint8(255 // (len(names) - 1)), out / "mask.png")
+            viz.save(numbers * np.uint8(255 // (len(part_names) - 1)), out / "mask.png")
         rows += [viz.EditRow(name, image, outline=numbers) for name, image in after.items()]
-        viz.save(viz.edit_sheet(rows, names, self.projection), out / "edit.png")
-        page = viz.edit_page(before, after, numbers, names, self.projection, f"r3dpa {command}")
+        viz.save(viz.edit_sheet(rows, part_names, self.projection), out / "edit.png")
+        title = f"r3dpa {command}"
+        page = viz.edit_page(before, after, numbers, part_names, self.projection, title)
         with atomic_path(out / "edit.html") as temporary:
             temporary.write_text(page, "utf-8")
-
-
-def _summary(
-    command: str, out: Path, result: EditResult, seconds: float, held_out: Mapping[str, Any]
-) -> str:
-    lines = [
-        f"{command}: {len(result)} scenes in {out}, {result.nfe} network evaluations each, "
-        f"{seconds:.3g} s"
-    ]
-    if result.vae_error_m is not None:
-        lines.append(f"range error of encoder and decoder alone: {result.vae_error_m:.3f} m")
-    if result.round_trip_m is not None:
-        round_trip = f"{result.round_trip_m:.4f} m more at most"
-        lines.append(f"inversion and back, without an edit: {round_trip}")
-    if result.cosine is not None:
-        lines.append(f"cosine with the guiding features: {float(result.cosine.mean()):.3f}")
-    for name, errors in held_out.items():
-        lines.append(
-            f"held out, {name}: {errors['mae_m']:.3f} m, returns as in the scan in "
-            f"{errors['same_returns']:.1%} of the pixels"
-        )
-    return "\n".join([*lines, f"open {out / 'edit.png'} and {out / 'edit.html'}"])
 
 
 def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
@@ -261,19 +247,13 @@ def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str,
     """
     if not ((range_m > 0) & missing).any():
         return {}
-    methods = {
-        "completed": made,
-        "nearest": filled(range_m, missing, "nearest")[None],
-        "linear": filled(range_m, missing, "linear")[None],
-    }
-    common = missing.clone()
-    for images in methods.values():
-        common &= (images > 0).all(dim=0)
-    errors = {}
-    for name, images in methods.items():
-        same = ((images > 0) == (range_m > 0))[:, missing]
-        errors[name] = {
+    methods = {"completed": made}
+    methods |= {how: filled(range_m, missing, how)[None] for how in ("nearest", "linear")}
+    common = missing & (torch.cat(list(methods.values())) > 0).all(dim=0)
+    return {
+        name: {
             "mae_m": range_error_m(images, range_m.expand_as(images), common),
-            "same_returns": float(same.double().mean()),
+            "same_returns": ((images > 0) == (range_m > 0))[:, missing].double().mean().item(),
         }
-    return errors
+        for name, images in methods.items()
+    }

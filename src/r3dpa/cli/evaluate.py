@@ -12,9 +12,6 @@ from r3dpa.cli.options import check_file, check_folder, check_least
 
 MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
 if MYPY:
-    from r3dpa.data.samples import Samples
-    from r3dpa.data.scans import Scan
-    from r3dpa.metrics import ScanStatistics
     from r3dpa.metrics.scene import EvaluationScene
 
 __all__ = ["evaluate", "realism", "reference"]
@@ -116,6 +113,7 @@ def evaluate(
     from r3dpa.data.samples import read_samples
     from r3dpa.metrics import evaluation as metrics
     from r3dpa.metrics.results import report, save_reports
+    from r3dpa.metrics.scene import EvaluationScene
     from r3dpa.viz.evaluation import save_figures
 
     check_folder(out)
@@ -127,7 +125,7 @@ def evaluate(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
     )
     comparison = metrics.evaluate(
-        tqdm(_scenes(files), "samples", disable=None),
+        (EvaluationScene(*sample) for sample in tqdm(files, "samples", disable=None)),
         statistics,
         found,
         label=label or samples.stem,
@@ -146,24 +144,10 @@ def evaluate(
     return report(evaluation, statistics.about.get("split"))
 
 
-def _scenes(samples: Samples) -> Iterator[EvaluationScene]:
-    """Samples as scenes; the message of a bad one names the option that leaves it out."""
-    from r3dpa.data.samples import SampleError
-    from r3dpa.metrics.scene import EvaluationScene
-
-    try:
-        yield from (EvaluationScene(*sample) for sample in samples)
-    except SampleError as error:
-        if samples.skip_bad or error.__cause__ is None:  # that of one sample has a cause
-            raise
-        advice = "--skip_bad leaves such samples out, and lists them"
-        raise SampleError(f"{error}. {advice}") from error
-
-
 def _made_with(samples: Path) -> dict[str, Any]:
     """Entries of the metadata of ``r3dpa sample``; empty for samples of others."""
-    folders = (samples, samples.parent) if samples.is_dir() else (samples.parent,)
-    path = next((f / "metadata.json" for f in folders if (f / "metadata.json").is_file()), None)
+    paths = [folder / "metadata.json" for folder in (samples, samples.parent)]
+    path = next(filter(Path.is_file, paths), None)
     if path is None:
         return {}
     try:
@@ -190,46 +174,37 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
         reference: Folder of real scans (B), of two or more drives; a single one is halved.
         out: JSON file for the table.
     """
-    from r3dpa.data.scans import find_scans
+    from tqdm import tqdm
+
+    from r3dpa.data.scans import ScanError, find_scans, read_scan
     from r3dpa.io import atomic_path
-    from r3dpa.metrics import realism_table
+    from r3dpa.metrics import ScanStatistics, realism_table, scan_statistics
 
     check_file(out)
-    ours, real = find_scans(scans), find_scans(reference)
-    notes = [f"A: {scans}", f"B: {reference}"]
-    drives = [scan.drive for scan in real]
-    if len(real) == 1:
-        notes.append("B is a single scan: there is no floor; give a reference of two drives")
-    elif len(set(drives)) == 1:
-        middle = len(real) // 2
-        drives = ["first half"] * middle + ["second half"] * (len(real) - middle)
-        notes.append(
-            "B is a single drive: the floor compares its first half with its second one, which are "
-            "more alike than two drives; all ratios come out too high"
-        )
-    table = realism_table(
-        _by_drive(ours, [scan.drive for scan in ours], "scans"),
-        _by_drive(real, drives, "reference"),
-        notes,
-    )
+    statistics, notes = {}, []
+    for name, source in (("A", scans), ("B", reference)):
+        found = find_scans(source)
+        notes.append(f"{name}: {source}")
+        drives = [scan.drive for scan in found]
+        if name == "B" and len(found) == 1:
+            notes.append("B is a single scan: there is no floor; give a reference of two drives")
+        elif name == "B" and len(set(drives)) == 1:
+            middle = len(found) // 2
+            drives = ["first half"] * middle + ["second half"] * (len(found) - middle)
+            notes.append(
+                "B is a single drive: the floor compares its first half with its second one, which "
+                "are more alike than two drives; all ratios come out too high"
+            )
+        of_drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
+        for scan, drive in zip(tqdm(found, name, unit="scan", disable=None), drives, strict=True):
+            points = read_scan(scan.path)
+            try:
+                of_drives[drive] += scan_statistics(points)
+            except ValueError as error:
+                raise ScanError(f"{scan.path}: {error}") from error
+        statistics[name] = of_drives
+    table = realism_table(statistics["A"], statistics["B"], notes)
     if out is not None:
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table
-
-
-def _by_drive(scans: list[Scan], drives: list[str], name: str) -> dict[str, ScanStatistics]:
-    """Statistics of all scans of each drive together."""
-    from tqdm import tqdm
-
-    from r3dpa.data.scans import ScanError, read_scan
-    from r3dpa.metrics import ScanStatistics, scan_statistics
-
-    totals: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-    for scan, drive in zip(tqdm(scans, name, unit="scan", disable=None), drives, strict=True):
-        points = read_scan(scan.path)
-        try:
-            totals[drive] += scan_statistics(points)
-        except ValueError as error:
-            raise ScanError(f"{scan.path}: {error}") from error
-    return totals

@@ -28,8 +28,8 @@ _TRAINER_OPTIONS = {
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # others would convert the prepared scans too
 
 
-def features(words: Sequence[str]) -> None:
-    """Runs the command with the words after ``r3dpa data features``.
+def features(args: list[str]) -> None:
+    """Runs the command with its name and the words after it.
 
     Raises:
         ValueError: If an argument is missing or out of its range, or a scan or the store cannot be
@@ -37,7 +37,7 @@ def features(words: Sequence[str]) -> None:
     """
     ignore_harmless_warnings()
     parser = _parser()
-    config = parser.parse_args(_with_data_class(words))
+    config = parser.parse_args(_with_data_class(args[1:]))
     if config.extractor or config.ckpt:
         config.data.init_args.extractor = feature_source(config.extractor or "scalr", config.ckpt)
     if config.out:
@@ -70,17 +70,17 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
             data.setup("predict")
             assert data.all_set is not None
             projection = data.geometry.projection
-            arguments = extractor, projection, sizes, folder, trainer.precision
-            todo = plan(data.all_set.scans, *arguments)
-            if todo.missing:  # complete grids may lie on a read-only disk
+            arguments = data.all_set.scans, extractor, projection, sizes, folder, trainer.precision
+            if plan(*arguments).missing:  # complete grids may lie on a read-only disk
                 job.enter_context(features_lock(folder))
-                todo = plan(data.all_set.scans, *arguments)  # another job may have made some
+            todo = plan(*arguments)  # another job may have made some before the lock was free
             scans = list(todo.missing)
             stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.settings)
-            _say(
+            sys.stdout.write(
                 f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
-                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}"
+                f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
             )
+            sys.stdout.flush()  # into a log file at once
         extraction = FeatureExtraction(extractor, projection, sizes, folder)
         missing = MissingScans(scans, extractor, data.sensor, data.batch_size, data.num_workers)
         started = time.monotonic()
@@ -94,15 +94,10 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
             extraction.close()
     if trainer.is_global_zero:
         rate = len(scans) / (time.monotonic() - started)
-        _say(
+        sys.stdout.write(
             f"feature grids: {len(scans)} made, {todo.num_kept} kept, {rate:.3g} scans per second, "
-            f"in {stores}"
+            f"in {stores}\n"
         )
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()  # into a log file at once
 
 
 def read_data(source: Path) -> LidarDataModule:
@@ -139,7 +134,7 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
             found += ["--config", value]
         elif len(source.parts) > 1:
             raise ValueError(f"--data {value}: is no folder of scans and no data YAML")
-        else:
+        else:  # a class
             found += ["--data", value]
     return found
 

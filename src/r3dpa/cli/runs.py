@@ -49,8 +49,8 @@ def convert(
 def report(run: Path) -> str:
     """Draw the loss curves of a run and list where each loss started and ended.
 
-    The table has the mean of the first and of the last tenth of the values of a quantity, their
-    difference and, if both are positive, their ratio. A value that was logged once stands alone.
+    The table has the mean of the first and of the last tenth of the values of a quantity, and their
+    difference.
 
     Args:
         run: Folder given to ``r3dpa fit`` as ``--run_dir``.
@@ -71,15 +71,13 @@ def report(run: Path) -> str:
     drawn = {name: curve for name, curve in curves.items() if len(curve[1]) > 1}
     if drawn:
         viz.save(viz.loss_curves(drawn), run / "loss_curves.png")
-    rows: list[list[str]] = []
+    rows = []
     for name, (_, values) in curves.items():
         tenth = max(1, len(values) // 10)
         first, last = fmean(values[:tenth]), fmean(values[-tenth:])
-        ratio = f"{last / first:.3f}" if first > 0 and last > 0 else ""
-        change = [f"{last:.5g}", f"{last - first:+.5g}", ratio] if name in drawn else []
-        rows.append([name, f"{first:.5g}", *change])
-    head = ["quantity", "first tenth", "last tenth", "change", "ratio"]
-    table = text_table(rows, head, "lrrrr", "plain")
+        rows.append([name, f"{first:.5g}", f"{last:.5g}", f"{last - first:+.5g}"])
+    head = ["quantity", "first tenth", "last tenth", "change"]
+    table = text_table(rows, head, "lrrr", "plain")
     return f"{table}\ncurves: {run / 'loss_curves.png'}" if drawn else table
 
 
@@ -137,7 +135,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
         for name, found in rows.items()
     ]
     table = text_table(cells, ["", *columns], "l" + "r" * len(columns))
-    return "\n".join([*lines, table, *seen.conclusion(about["world_size"])])
+    return "\n".join([*lines, table, *seen.conclusion()])
 
 
 class _Observer:
@@ -156,7 +154,7 @@ class _Observer:
             note = self.gradients.setdefault
             output.register_hook(lambda grad: None if _finite(grad) else note(name, None))
 
-    def conclusion(self, world_size: int) -> list[str]:
+    def conclusion(self) -> list[str]:
         """Number of layers at fault and the first of them, and where the fault starts."""
         lines = [
             f"layers whose {kind} is not finite: {len(names)} of {len(self.called)}"
@@ -164,15 +162,16 @@ class _Observer:
             for kind, names in (("output", self.outputs), ("gradient", self.gradients))
         ]
         if starts := [name for name, inputs_finite in self.outputs.items() if inputs_finite]:
-            return [*lines, f"layers that turned finite inputs into others: {', '.join(starts)}"]
-        if self.outputs:
+            end = f"layers that turned finite inputs into others: {', '.join(starts)}"
+        elif self.outputs:
             end = "no layer turned finite inputs into others: it came with inputs or latents"
         elif self.gradients:
             end = "all outputs are finite: it starts in a loss or in a gradient"
         else:
-            others = "; it may lie in the batch of another process" if world_size > 1 else ""
-            end = "everything is finite with these weights: give an earlier or later checkpoint"
-            end += others
+            end = (
+                "everything is finite with these weights: give an earlier or later checkpoint, or "
+                "the file of another process"
+            )
         return [*lines, end]
 
 

@@ -74,6 +74,12 @@ class _RecordConfig(SaveConfigCallback):
     def on_train_batch_start(self, *_: Any) -> None:
         self.started = True
 
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Marks errors of a running training, whose traceback ``cli.main`` shows."""
+        exception.during_training = self.started  # type: ignore[attr-defined]
+
 
 class StageCLI(LightningCLI):
     """Wires a stage, a data module and a trainer from YAML files.
@@ -131,16 +137,15 @@ class StageCLI(LightningCLI):
         what = f"runs r3dpa {subcommand} in {run_dir}"
         first = cast(Any, rank_zero_only).rank == 0  # known before there is a trainer
         with only_writer(run_dir / f".{subcommand}.lock", what) if first else nullcontext():
+            checkpoints = run_dir / "checkpoints"
+            if subcommand == "fit" and self._ckpt_path is None and _newest(run_dir) is not None:
+                raise ValueError(
+                    f"{checkpoints} holds an earlier run: resume it with --ckpt_path last, or give "
+                    "another --run_dir"
+                )
             if subcommand == "fit" and first:
-                self._refuse_earlier_run()
-                delete_unfinished(run_dir / "checkpoints")
-            try:
-                super()._run_subcommand(subcommand)
-            except (ValueError, OSError) as error:
-                callbacks = cast(Any, self.trainer).callbacks
-                if any(isinstance(c, _RecordConfig) and c.started for c in callbacks):
-                    error.during_training = True  # type: ignore[union-attr] # for cli.main
-                raise
+                delete_unfinished(checkpoints)
+            super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
         """Loads the stage before: what does not fit is said before hours of data preparation."""
@@ -159,43 +164,24 @@ class StageCLI(LightningCLI):
         return self.config[self.subcommand].ckpt_path
 
     def before_instantiate_classes(self) -> None:
-        """Points every logger at the run's folder; names the wandb run."""
+        """Points loggers at the run's folder; `test` and a resumed `fit` join the wandb run."""
         config = self.config[self.subcommand]
         if self.subcommand == "predict" and config.return_predictions is None:
             config.return_predictions = False  # they are on disk; all of KITTI-360 is 20 GB
-        if self.subcommand == "fit":
-            self._refuse_earlier_run()  # before data are prepared
-        Path(config.run_dir).mkdir(parents=True, exist_ok=True)
+        run_dir = Path(config.run_dir)
+        run_dir.mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
-            if hasattr(logger, "init_args") and "save_dir" in logger.init_args:
-                logger.init_args.save_dir = config.run_dir
-                if logger.class_path.endswith(".WandbLogger"):
-                    self._name_wandb_run(logger.init_args, Path(config.run_dir))
-
-    def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
-        """Fills what the configuration leaves open; `test` and a resumed `fit` join the run."""
-        model = self.config[self.subcommand].get("model")
-        note = run_dir / "wandb_id.txt"
-        if self.subcommand == "fit" and not note.exists():
-            note.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
-        names = {
-            "name": "/".join(run_dir.parts[-2:]),
-            "group": run_dir.resolve().parent.name,
-            "job_type": model.class_path.rpartition(".")[2] if model else None,
-            "id": note.read_text(encoding="utf-8") if note.exists() else None,
-        }
-        for key, value in names.items():
-            if init_args.get(key) is None and value is not None:
-                init_args[key] = value
-
-    def _refuse_earlier_run(self) -> None:
-        run_dir = Path(self.config[self.subcommand].run_dir)
-        if self._ckpt_path is None and _newest(run_dir) is not None:
-            raise ValueError(
-                f"{run_dir / 'checkpoints'} holds an earlier run: resume it with --ckpt_path last, "
-                "or give another --run_dir"
-            )
+            arguments = getattr(logger, "init_args", {})
+            if "save_dir" in arguments:
+                arguments.save_dir = config.run_dir
+            if "save_dir" in arguments and logger.class_path.endswith(".WandbLogger"):
+                note = run_dir / "wandb_id.txt"
+                if self.subcommand == "fit" and not note.exists():
+                    note.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
+                if arguments.get("id") is None and note.exists():
+                    arguments.id = note.read_text(encoding="utf-8")
+                arguments.name = arguments.get("name") or "/".join(run_dir.parts[-2:])
 
 
 def _newest(run_dir: Path) -> str | None:
@@ -215,13 +201,12 @@ def _with_preset(words: list[str]) -> list[str]:
         preset = rest[place + 1]
         del rest[place : place + 2]
     conf, demo = conf_folder(), preset == "demo"
-    data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", f"experiment/{stage}"]
     for folder, name in (("experiment", stage), ("data", preset)):
-        if not (conf / folder / f"{name}.yaml").is_file():
-            known = sorted(path.stem for path in (conf / folder).glob("*.yaml"))
-            known = [name for name in known if not name.endswith("_demo")]
+        known = [path.stem for path in sorted((conf / folder).glob("*.yaml"))]
+        if name not in known:
             raise ValueError(f"there is no {folder} {name!r}; give one of {', '.join(known)}")
+    data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
+    names = ["trainer", *["trainer_demo"] * demo, f"data/{data}", f"experiment/{stage}"]
     if demo and (conf / f"experiment/{stage}_demo.yaml").is_file():
         names.append(f"experiment/{stage}_demo")
     configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
@@ -229,11 +214,7 @@ def _with_preset(words: list[str]) -> list[str]:
 
 
 def run(args: list[str]) -> None:
-    """Runs a stage command.
-
-    Args:
-        args: Words after ``r3dpa``, such as ``["fit", "--config", "x.yaml"]``, or with shipped
-            configurations ``["fit", "joint", "--preset", "demo"]``.
+    """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``.
 
     Raises:
         ValueError: If the configuration cannot be used; errors of a running training have the

@@ -98,7 +98,8 @@ class Samples:
                     break
                 except (ScanError, OSError) as error:
                     if not self.skip_bad:
-                        raise SampleError(error) from error
+                        advice = "skip_bad leaves such samples out, and lists them"
+                        raise SampleError(f"{error}. {advice}") from error
                     self.bad.append(str(error))
                 else:
                     num_read += 1
