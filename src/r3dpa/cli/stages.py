@@ -172,7 +172,7 @@ class StageCLI(LightningCLI):
         run_dir.mkdir(parents=True, exist_ok=True)
         loggers = config.trainer.logger
         for logger in loggers if isinstance(loggers, list) else [loggers]:
-            arguments = getattr(logger, "init_args", {})
+            arguments: Any = getattr(logger, "init_args", {})
             if "save_dir" in arguments:
                 arguments.save_dir = config.run_dir
             if "save_dir" in arguments and logger.class_path.endswith(".WandbLogger"):
