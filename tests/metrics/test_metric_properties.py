@@ -55,7 +55,7 @@ def total_variation(a, b):
 
 
 def matching(a, b):
-    return minimum_matching(cells(a), cells(b), GRID).mmd_squared_normalised
+    return minimum_matching(cells(a), cells(b), GRID).squared_normalised.mean().item()
 
 
 def of_clouds(distance):

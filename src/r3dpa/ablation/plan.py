@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from r3dpa.metrics.results import published_scales
+from r3dpa.metrics.results import PUBLISHED_SCALES
 
 _PRIOR = "prior"  # the command that a file of RGB-pretrained weights replaces
 _NAME = re.compile(r"{(\w+)}")
@@ -225,10 +225,10 @@ def _table(folder: Path, scale: _Scale, seeds: Sequence[int]) -> Table:
     for file in sorted(set(folder.glob("*.yaml")) - {path}):
         row = _read(file, ("label", "commands"), ("published",))
         published = row.get("published", {})
-        if unknown := published.keys() - published_scales().keys():
+        if unknown := published.keys() - PUBLISHED_SCALES.keys():
             raise ValueError(
                 f"{file}: published: {min(unknown)!r} is no metric of the paper; give some of "
-                f"{', '.join(published_scales())}"
+                f"{', '.join(PUBLISHED_SCALES)}"
             )
         if row["label"] in {other.label for other in rows.values()}:
             raise ValueError(f"{file}: another row has the label {row['label']!r}, too")

@@ -87,17 +87,29 @@ class SceneMetric(Metric):
 
     def adopt_real(self, *others: SceneMetric) -> None:
         """Takes over the real scans of other metrics of this kind, one after the other."""
-        if self._empty:
-            for other in others:
-                other._prune("real")
         self.limits["real"] = None  # each of the others kept as many as it should
-        for name in self._defaults:
-            if name in self._empty and name.startswith("real_"):
-                setattr(self, name, [part for other in others for part in getattr(other, name)])
-            elif name.startswith("real_"):
+        states = [other.real_states() for other in others]
+        for name in states[0]:
+            parts: Any = [state[name] for state in states]
+            if name not in self._empty:
                 reduction = cast(Callable[[Tensor], Tensor], self._reductions[name])
-                parts = torch.stack([getattr(other, name) for other in others])
-                setattr(self, name, reduction(parts))
+                parts = reduction(torch.stack(parts))
+            setattr(self, name, parts)
+
+    def real_states(self) -> dict[str, Tensor]:
+        """States of the real scans by name, without those beyond the limit."""
+        if self._empty:
+            self._prune("real")
+        names = [name for name in self._defaults if name.startswith("real_")]
+        return {n: self._joined(n) if n in self._empty else getattr(self, n) for n in names}
+
+    def load_state(self, name: str, value: Tensor) -> None:
+        """Sets one of :meth:`real_states`; a ``ValueError`` if its shape is another."""
+        grows = name in self._empty
+        expected = (self._empty[name] if grows else getattr(self, name)).shape[grows:]
+        if value.shape[grows:] != expected:
+            raise ValueError(f"{name} of shape {tuple(value.shape)} ends not in {tuple(expected)}")
+        setattr(self, name, [value] if grows else value)
 
     def kept(self, side: str) -> tuple[Tensor, Tensor]:
         """Places ``(n,)`` among all scenes, and values ``(n, ...)``, of those that are kept."""
@@ -107,12 +119,6 @@ class SceneMetric(Metric):
     def lowest(self, side: str, limit: int) -> Tensor:
         """Indices of up to ``limit`` kept scenes: those whose names have the lowest hashes."""
         return self._joined(f"{side}_order")[:, 0].argsort(stable=True)[:limit].sort().values
-
-    def load_kept(self, side: str, chosen: Sequence[tuple[str, int]], values: Tensor) -> None:
-        """Sets the scenes that are kept from their names, places and values in a file."""
-        order = [(_rank(scene), place) for scene, place in chosen]
-        setattr(self, f"{side}_order", [torch.tensor(order, dtype=torch.int64).view(-1, 2)])
-        setattr(self, f"{side}_values", [values])
 
     def _add_states(self, name: str, default: Tensor, reduction: Any = "sum") -> None:
         for side in SIDES:

@@ -4,33 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from r3dpa.io import source_commit
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
-from r3dpa.metrics.feature_distances import (
-    metrics_of,
-    scene_metrics,
-    update_with,
-    with_features,
-)
+from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics, is_official
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
-from r3dpa.metrics.scene_features import (
-    FREE_SPACES,
-    SceneFeatures,
-    feature_spaces,
-    scene_features,
-)
+from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures, feature_spaces, scene_features
 
 AnyReference = ReferenceStatistics | OfficialStatistics
 
@@ -40,13 +30,8 @@ _SHOWN_MATCHES = 3
 _SHARES = ("precision", "recall")
 _NEAR, _POOR = 1.5, 0.5  # times the floor; times the share that real scans reach
 _ALIKE = 0.6  # ratio of the numbers of returns below which scenes are of another sensor
-_ROWS = {
-    "JSD": "cells",
-    "TV": "cells",
-    "W1 range": "ranges",
-    "MMD": "matching",
-    "CD 3D": "matching",
-}
+_ROWS = {"JSD": "cells", "TV": "cells", "W1 range": "ranges"}
+_ROWS |= {"MMD": "matching", "CD 3D": "matching"}
 _KINDS = {"": "frechet", "inf": "inf", "KID": "kid"}  # of a feature space; others are shares
 _SKIP_BAD = ". --skip_bad leaves such scenes out, and lists them (`r3dpa test`: --scorer.skip_bad)"
 
@@ -55,17 +40,11 @@ class TooFewScenesError(ValueError):
     """Fewer than two scenes are left that can be compared."""
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """An evaluation, and the data of its figures.
-
-    Args:
-        evaluation: All numbers.
-        figures: Arguments of :func:`r3dpa.viz.evaluation.save_figures`; None without real scans.
-    """
+class Comparison(NamedTuple):
+    """An evaluation, and the data of its figures."""
 
     evaluation: Evaluation
-    figures: dict[str, Any] | None
+    figures: dict[str, Any] | None  # for r3dpa.viz.evaluation.save_figures; None without real scans
 
 
 def evaluate(
@@ -82,13 +61,10 @@ def evaluate(
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
 
-    Real and generated scenes are prepared alike by :func:`r3dpa.metrics.scene.through_sensor`, and
-    the same scenes in the same order give the same numbers.
-
     The floor of a distance is that between the halves of the reference, with as many scenes as are
-    evaluated, or as many as a half keeps; the note of the row says so if these are fewer. For
-    precision and its relatives the note has what the halves reach. Official statistics give no
-    floors, and do not name their weights: those of ``spaces`` must be the same.
+    evaluated, or as many as a half keeps; for precision and its relatives the note of the row has
+    what the halves reach. Official statistics give no floors, and do not name their weights: those
+    of ``spaces`` must be the same.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
@@ -96,11 +72,9 @@ def evaluate(
         spaces: Feature spaces, each one of the reference.
         label: Of the generator or run.
         source: Origin of the scenes.
-        made_with: Provenance: ``solver``, ``steps``, ``seed``, ``precision``, ``feature_source``,
-            and anything else that JSON can hold.
+        made_with: Provenance for JSON: ``solver``, ``steps``, ``seed`` and anything else.
         allow_few: Accept fewer scenes than features.
-        skip_bad: Leave out scenes that are empty, hold NaN or have another size; the result lists
-            them as ``bad_samples`` of ``extra``.
+        skip_bad: Leave out scenes that are empty, hold NaN or have another size, and list them.
         resampling: Seed, and cost of the intervals.
 
     Raises:
@@ -251,10 +225,7 @@ def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReferen
     if is_official(path):
         return OfficialStatistics.load(path, split)
     if split is not None:
-        raise ValueError(
-            f"{path}: is no official statistics file, so the split {split} does not apply to it; "
-            "leave it out"
-        )
+        raise ValueError(f"{path}: is no official file; the split {split} does not apply to it")
     statistics = ReferenceStatistics.load(path)
     statistics.check()
     return statistics
@@ -268,15 +239,15 @@ def reference_spaces(
     protocol: str | None = None,
 ) -> list[SceneFeatures]:
     """Feature spaces of a comparison; default: those of the reference that have what they need."""
-    setting = statistics.protocol
-    if protocol is not None and protocol != setting.name:
+    given = statistics.protocol.name
+    if protocol not in (None, given):
         raise ValueError(
-            f"the reference is of the protocol {setting.name}, not {protocol}: compute another one "
+            f"the reference is of the protocol {given}, not {protocol}: compute another one "
             f"with `r3dpa reference --protocol {protocol}`, or ask for no protocol"
         )
     if names is None:
         names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
-    spaces = feature_spaces(names, ckpt, setting, device)
+    spaces = feature_spaces(names, ckpt, statistics.protocol, device)
     statistics.check(spaces)
     return spaces
 

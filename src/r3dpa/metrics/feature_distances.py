@@ -1,8 +1,4 @@
-"""Distances of two sets of scenes in one feature space, as torchmetrics metrics.
-
-The metrics of a space hold the same states; in the collection of :func:`scene_metrics` they are
-computed once. Letters: N scenes, F feature width.
-"""
+"""Distances of two sets of scenes in one feature space. Letters: N scenes, F feature width."""
 
 from __future__ import annotations
 
@@ -78,11 +74,6 @@ class FeatureMetric(SceneMetric):
         """Add ``(N, F)`` features, or such by space; NaN or another width is a ``ValueError``."""
         side = SIDES[not real]
         values = (features if isinstance(features, Tensor) else features[self.space]).detach()
-        if values.ndim != 2 or values.shape[1] != self.num_features:
-            raise ValueError(
-                f"{side} features: expected (N, {self.num_features}), got {tuple(values.shape)}; "
-                "num_features must be the width of the extractor"
-            )
         added = Moments.of(values, f"{side} features")
         merged = Moments.unpack(getattr(self, f"{side}_moments")).merge(added)
         setattr(self, f"{side}_moments", merged.pack())
@@ -189,27 +180,24 @@ class PolynomialMMD(FeatureMetric):
 
 
 class PrecisionRecall(FeatureMetric):
-    """Precision, recall, density and coverage, see :func:`precision_recall`.
-
-    The bootstrap of ``results`` resamples the scenes that a share is the mean of (real ones for
-    recall and coverage), not the balls.
-    """
+    """Precision, recall, density and coverage, see :func:`shared_balls`."""
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The four shares."""
+        """The four shares; intervals resample the scenes of each mean, but not the balls."""
         real, generated, counts = self._both()
+        fields: dict[str, dict[str, Any]]
         if min(counts) <= _NEIGHBORS:
-            note = f"needs {_NEIGHBORS + 1} scenes of both kinds"
-            return [
-                self._row(f"{self.label} {name}", None, counts, direction="higher", note=note)
-                for name in ("precision", "recall", "density", "coverage")
-            ]
-        rows = []
-        for name, by_scene in shared_balls(real, generated, _NEIGHBORS).items():
-            share, ends = by_scene.mean().item(), resampling.of_mean(by_scene)
-            fields = {"interval": ends, "direction": "higher"}
-            rows.append(self._row(f"{self.label} {name}", share, counts, **fields))
-        return rows
+            unknown = {"value": None, "note": f"needs {_NEIGHBORS + 1} scenes of both kinds"}
+            fields = dict.fromkeys(("precision", "recall", "density", "coverage"), unknown)
+        else:
+            fields = {
+                name: {"value": shares.mean().item(), "interval": resampling.of_mean(shares)}
+                for name, shares in shared_balls(real, generated, _NEIGHBORS).items()
+            }
+        return [
+            self._row(f"{self.label} {name}", counts=counts, direction="higher", **row)
+            for name, row in fields.items()
+        ]
 
 
 _OF_SPACE = {

@@ -1,8 +1,7 @@
-"""The statistics file of the official R3DPA as a reference, see ``evaluate.py`` of valeoai/R3DPA.
+"""The statistics file of the official R3DPA as a reference (valeoai/R3DPA 2789885).
 
-For one or two splits it holds mean and covariance of each network's features and the histogram of
-occupied cells, and for ``val`` the occupied cells of single scans; no features, no range images,
-and neither names of scans nor hashes of weights. Source: valeoai/R3DPA 2789885.
+It holds moments of features and histograms of occupied cells, and for ``val`` the occupied cells
+of single scans; no features, no range images, and neither names of scans nor hashes of weights.
 """
 
 from __future__ import annotations
@@ -43,21 +42,14 @@ def is_official(path: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class OfficialStatistics:
-    """One split of the official file.
-
-    Args:
-        path: The file, for messages.
-        split: ``val`` (drives 00 and 02) or ``all`` (these and the training drives).
-        moments: Mean ``(F,)`` and covariance ``(F, F)`` float64 by official name of the network.
-        cells: ``(cells,)`` float64, scans that occupy each cell seen from above; None without.
-        clouds: Occupied cells ``(n,)`` int64 of single scans, in the random order of the file.
-    """
+    """One split of the official file."""
 
     path: Path
-    split: OfficialSplit
+    split: OfficialSplit  # val: drives 00 and 02; all: these and the training drives
+    #: Mean ``(F,)`` and covariance ``(F, F)`` float64 by official name of the network.
     moments: Mapping[str, tuple[Tensor, Tensor]]
-    cells: Tensor | None
-    clouds: Sequence[Tensor]
+    cells: Tensor | None  # (cells,) float64, scans that occupy each cell seen from above
+    clouds: Sequence[Tensor]  # occupied cells (n,) int64 of single scans
 
     protocol = PUBLISHED
     names = ()  # unknown
@@ -88,19 +80,18 @@ class OfficialStatistics:
         """Mean and covariance of a space; a ``ValueError`` if it is absent or of another width."""
         channels = space.card.get("in_channels", 4)
         key = _FRID.get(channels) if space.name == "frid" else _EVALUATORS.get(space.name)
-        where = f"{self.path}, field {self.split}"
-        if key is None or key not in self.moments:
+        found = self.moments.get(key or "")
+        if found is None:
             raise ValueError(
-                f"{where}: has no moments of {space.name} ({key or 'which is not an official one'})"
+                f"{self.path}, field {self.split}: has no moments of {space.name} ({key or 'ours'})"
                 f", only of {', '.join(self.moments) or 'none'}; choose among these spaces"
             )
-        mean, covariance = self.moments[key]
-        if len(mean) != space.dim:
+        if len(found[0]) != space.dim:
             raise ValueError(
-                f"{where}.{key}: has {len(mean)} features, but {space.name} has {space.dim}; give "
-                "the weights that it was made with"
+                f"{self.path}, field {self.split}.{key}: has {len(found[0])} features, but "
+                f"{space.name} has {space.dim}; give the weights that it was made with"
             )
-        return mean, covariance
+        return found
 
     def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
         """Refuses spaces that the file lacks."""

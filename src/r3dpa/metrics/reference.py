@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from glob import escape
 from pathlib import Path
 from typing import Any, Self
@@ -19,6 +19,7 @@ from torchmetrics import MetricCollection
 from tqdm import tqdm
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
+from r3dpa.metrics.distances import SceneMetric
 from r3dpa.metrics.feature_distances import (
     metrics_of,
     scene_metrics,
@@ -29,7 +30,7 @@ from r3dpa.metrics.scene import EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
-_VERSION = 2
+_VERSION = 3
 _EVERY = 2000  # scans between two saves of an unfinished reference
 
 _log = logging.getLogger(__name__)
@@ -184,31 +185,22 @@ class ReferenceStatistics:
             update_with(part, [batch[i] for i in own], of_half, real=True)
         self.num_done += len(batch)
 
-    def _keeping(self, half: int) -> list[tuple[str, str, Any]]:
-        """Metrics of a half that keep single scans, with names of their tensors and places."""
-        metrics = metrics_of(self.halves[half])
-        found = [(f"{half}.features.{s}", "rows", metrics[f"{s}_frechet"]) for s in self.spaces]
-        return [*found, (f"{half}.images", "images", metrics["matching"])]
+    def _states(self) -> Iterator[tuple[str, SceneMetric, str, Tensor]]:
+        """Key in the file, metric, name and value of each state; a feature space has one set."""
+        for half, collection in enumerate(self.halves):
+            metrics = metrics_of(collection)
+            for name in ("cells", "ranges", "matching", *(f"{s}_frechet" for s in self.spaces)):
+                for state, value in metrics[name].real_states().items():
+                    yield f"{half}.{name}.{state}", metrics[name], state, value
 
     def save(self, path: str | Path) -> None:
         """Writes everything to one ``.safetensors`` file, its card in the metadata."""
         tensors: dict[str, Tensor] = {}
-        chosen = []
-        for index, half in enumerate(self.halves):
-            names = self.names_of_half(index)
-            places: dict[str, list[tuple[str, int]]] = {"rows": [], "images": []}
-            for key, kind, metric in self._keeping(index):
-                kept, tensors[key] = metric.kept("real")
-                places[kind] = [(names[place], place) for place in kept.tolist()]
-            chosen.append(places)
-            metrics = metrics_of(half)
-            for space in self.spaces:
-                tensors[f"{index}.moments.{space}"] = metrics[f"{space}_frechet"].real_moments
-            cells = metrics["cells"].real_bins
-            occupied = cells.nonzero()[:, 0]
-            tensors[f"{index}.cells"] = occupied.int()
-            tensors[f"{index}.cell_counts"] = cells[occupied]
-            tensors[f"{index}.ranges"] = metrics["ranges"].real_bins[None]
+        for key, _, name, value in self._states():
+            if name == "real_bins":  # nearly all are empty
+                filled = value.nonzero()[:, 0]
+                value = torch.stack([filled, value[filled].long()])
+            tensors[key] = value.contiguous()
         card = {
             "version": _VERSION,
             "protocol": self.protocol.to_dict(),
@@ -216,12 +208,9 @@ class ReferenceStatistics:
             "names": self.names,
             "about": self.about,
             "num_done": self.num_done,
-            "counts": [self.count(index) for index in (0, 1)],
-            "chosen": chosen,
         }
         with atomic_path(path) as temporary:
-            contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
-            save_file(contiguous, temporary, metadata={_ABOUT: json.dumps(card)})
+            save_file(tensors, temporary, metadata={_ABOUT: json.dumps(card)})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -237,36 +226,20 @@ class ReferenceStatistics:
                 raise ValueError(f"name of a scan {refused[0]}")
             reference = cls(protocol, card["spaces"], card["names"], card["about"])
             reference.num_done = card["num_done"]
-            for index in (0, 1):
-                reference._load_half(tensors, index, card)
+            for key, metric, name, value in reference._states():
+                if key not in tensors:
+                    raise ValueError(f"tensor {key} is missing")
+                if name == "real_bins":
+                    filled, counts = tensors[key]
+                    value[filled] = counts.to(value)
+                else:
+                    metric.load_state(name, tensors[key])
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
                 f"{path} holds no reference statistics ({first_line(error)}): give the "
                 "file that `r3dpa reference` wrote"
             ) from error
         return reference
-
-    def _load_half(self, tensors: dict[str, Tensor], index: int, card: dict[str, Any]) -> None:
-        def tensor(key: str, shape: Sequence[int]) -> Tensor:
-            found = tensors.get(key)
-            if found is None or found.shape != tuple(shape):
-                given = "is missing" if found is None else f"has shape {tuple(found.shape)}"
-                raise ValueError(f"tensor {key} {given}, expected {tuple(shape)}")
-            return found
-
-        metrics = metrics_of(self.halves[index])
-        for metric in metrics.values():
-            metric.real_count = torch.tensor(card["counts"][index])
-        for space in self.spaces:
-            metric = metrics[f"{space}_frechet"]
-            metric.real_moments = tensor(f"{index}.moments.{space}", metric.real_moments.shape)
-        for key, kind, metric in self._keeping(index):
-            chosen, (_, width) = card["chosen"][index][kind], metric.kept("real")
-            metric.load_kept("real", chosen, tensor(key, (len(chosen), *width.shape[1:])))
-        cells, bins = tensors.get(f"{index}.cells", torch.zeros(0)), metrics["ranges"].real_bins
-        counts = tensor(f"{index}.cell_counts", cells.shape)
-        metrics["cells"].real_bins[cells.long()] = counts
-        metrics["ranges"].real_bins = tensor(f"{index}.ranges", (1, *bins.shape))[0]
 
 
 def compute_reference(

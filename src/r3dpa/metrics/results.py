@@ -27,10 +27,11 @@ Split = Literal["train-val", "val-only"]
 Mark = Literal["", "best", "second", "tie"]
 
 _PUBLISHED: Any = json.loads(files(__package__).joinpath("published.json").read_text("utf-8"))
+#: Power of ten of the printed column of each metric of the paper.
+PUBLISHED_SCALES: dict[str, int] = _PUBLISHED["scales"]
 _SHOWN_BAD = 20  # samples left out that are printed
-_PAPER_ORDER = ("FRID", "FLD", "FSVD", "FPVD", "JSD", "MMD")
 _FLOOR = "real vs. real (floor)"
-_DISTANCES = (*_PAPER_ORDER, "FWID", "FGEO")
+_DISTANCES = (*PUBLISHED_SCALES, "FWID", "FGEO")
 #: Provenance of an evaluation, by default unknown.
 _ABOUT: dict[str, Any] = {
     "backbones": {},  # card of each feature network
@@ -71,9 +72,6 @@ class MetricResult:
         num_samples: Generated scans that were used, None if unknown.
         num_references: Real scans that were used, None if unknown.
         note: Remark for the reader; may be empty.
-
-    Raises:
-        ValueError: If a number is not finite, or the ends of the interval are out of order.
     """
 
     name: str
@@ -231,7 +229,7 @@ class EvaluationTable:
     def columns(self) -> dict[str, list[MetricResult | None]]:
         """Results of each metric that has a value, one per evaluation; those of the paper first."""
         given = [row.name for e in self.evaluations for row in e.rows]
-        names = dict.fromkeys((*_PAPER_ORDER, *given))
+        names = dict.fromkeys((*PUBLISHED_SCALES, *given))
         columns = {name: [e.row(name) for e in self.evaluations] for name in names}
         return {name: column for name, column in columns.items() if any(column)}
 
@@ -274,16 +272,13 @@ class EvaluationTable:
 
         Intervals, which would make it too wide for a page, are left out; notes are comments.
         """
-
-        def cell(result: MetricResult, mark: Mark) -> str:
-            return _LATEX[mark].format(result.printed(result.value))
-
         arrows = {"lower": r"$\downarrow$", "higher": r"$\uparrow$"}
         heads = []
         for result in map(_first, self.columns.values()):
             scale = rf"$\times 10^{{{result.scale}}}$" * bool(result.scale)
             heads.append(f"{_latex(result.name)} {arrows[result.direction]} {scale}{result.unit}")
-        lines = [[_latex(first), *cells] for first, *cells in self._lines(cell)]
+        found = self._lines(lambda result, mark: _LATEX[mark].format(result.printed(result.value)))
+        lines = [[_latex(first), *cells] for first, *cells in found]
         table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
         for rule in ("toprule", "midrule", "bottomrule"):
             table = table.replace(r"\hline", f"\\{rule}", 1)
@@ -381,17 +376,16 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
-    counts = {"MMD": (_PUBLISHED["num_mmd_samples"], _PUBLISHED["num_mmd_references"])}
+    source, of_mmd = _PUBLISHED["source"], _PUBLISHED["counts_of_mmd"]
     return tuple(
         published_evaluation(
             method["label"],
             method[split],
             f"KITTI-360, {split}",
-            f"{_PUBLISHED['source']}, line {method['line']}",
-            dict.fromkeys(method[split], (method["num_samples"], None)) | counts,
+            f"{source}, line {method['line']}",
+            dict.fromkeys(method[split], (method["num_samples"], None)) | {"MMD": of_mmd},
             solver=method["solver"],
             steps=method["steps"],
-            extra={"venue": method["venue"]},
         )
         for method in _PUBLISHED["methods"]
     )
@@ -406,24 +400,14 @@ def published_evaluation(
     **about: Any,
 ) -> Evaluation:
     """Evaluation of numbers as the paper printed them, with counts of scenes by metric."""
-    scales, rows = published_scales(), []
+    rows = []
     for name, number in printed.items():
-        num_samples, num_references = (counts or {}).get(name, (None, None))
-        row = MetricResult(
-            name,
-            float(f"{number}e{scales[name]}"),  # decimal shift, free of rounding
-            scale=scales[name],
-            num_samples=num_samples,
-            num_references=num_references,
-        )
-        rows.append(row)
+        value = float(f"{number}e{PUBLISHED_SCALES[name]}")  # decimal shift, free of rounding
+        row = MetricResult(name, value, scale=PUBLISHED_SCALES[name])
+        samples, references = (counts or {}).get(name, (None, None))
+        rows.append(replace(row, num_samples=samples, num_references=references))
     about |= {"protocol": {"name": "published"}, "reference": reference, "source": source}
     return Evaluation(label, tuple(rows), about | {"published": True})
-
-
-def published_scales() -> dict[str, int]:
-    """Power of ten of the printed column of each metric of the paper."""
-    return dict(_PUBLISHED["scales"])
 
 
 def _cells(row: MetricResult) -> tuple[str, ...]:
