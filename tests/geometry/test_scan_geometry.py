@@ -35,7 +35,6 @@ def test_to_plain_values_and_back(projection):
 def test_limits_in_radians():
     sensor = LidarSensor(inclination_max_deg=45.0, inclination_min_deg=-90.0)
     assert sensor.inclination_max_rad == pytest.approx(math.pi / 4)
-    assert sensor.inclination_min_rad == pytest.approx(-math.pi / 2)
     assert sensor.field_of_view_rad == pytest.approx(0.75 * math.pi)
 
 

@@ -51,8 +51,8 @@ def check_view(
         raise ValueError(
             f"{outside.double().mean():.0%} of the points lie outside the field of view of the "
             f"checkpoint, {lowest:.1f} to {highest:.1f} degrees above the horizon: those of the "
-            f"scan reach from {low:.1f} to {high:.1f}. It is of another sensor, whose scans need a "
-            "checkpoint of their own, or not in the frame of the sensor (x forward, z up, metres)"
+            f"scan reach from {low:.1f} to {high:.1f}. It is of another sensor, or not in its "
+            "frame (x forward, z up, metres)"
         )
     returns = (range_m > 0) & expected
     for name, axis, least in (("beams", 1, _LEAST_ROWS), ("columns", 0, _LEAST_COLUMNS)):
@@ -69,10 +69,9 @@ def check_view(
     dense = returns[1:][above].double().mean().item()
     if dense < _LEAST_DENSE:  # not with NaN, where beams are missing between all others
         raise ValueError(
-            f"only {dense:.0%} of the returns have another one right below them, where scans that "
-            f"fill {sensor.beams} beams from {lowest:.1f} to {highest:.1f} degrees have "
-            f"{_LEAST_DENSE:.0%} or more: it has fewer beams than the checkpoint was trained on, "
-            "or was thinned out"
+            f"only {dense:.0%} of the returns have another one right below them, not "
+            f"{_LEAST_DENSE:.0%} or more as in scans of {sensor.beams} beams: it has fewer beams "
+            "than the checkpoint was trained on, or was thinned out"
         )
 
 

@@ -16,7 +16,7 @@ import torch
 from einops import rearrange, repeat
 from torch import Tensor
 
-from r3dpa.geometry.projection import Projection
+from r3dpa.geometry.projection import Projection, ray_directions
 from r3dpa.geometry.sensor import column_azimuths
 
 _TURN_DEG = 360.0
@@ -48,10 +48,10 @@ def angle_box(
     if not inclination_min_deg < inclination_max_deg:
         raise ValueError(f"{what} is empty: give the lower inclination first")
     columns = _between(projection, azimuth_from_deg, azimuth_to_deg, what)
-    inclination = _inclinations_deg(projection)
+    inclination, _ = _rays_deg(projection)
     rows = (inclination >= inclination_min_deg) & (inclination < inclination_max_deg)
     if not rows.any():
-        raise ValueError(_missed(projection, what))
+        raise _missed(projection, what)
     return check_mask(rows[:, None] & columns, what)
 
 
@@ -105,36 +105,25 @@ def box3d(
     half = torch.tensor(size_m, dtype=torch.float64) / 2
     if (centre.abs() <= half).all():
         raise ValueError(f"{what} holds the sensor, so that every ray meets it: move it away")
-    directions = projection.ray_directions(dtype=torch.float64) @ axes.T
+    directions = ray_directions(projection, dtype=torch.float64) @ axes.T
     # A ray in the plane of a face gives 0 / 0: it touches the slab everywhere.
     low = ((centre - half) / directions).nan_to_num(-math.inf, math.inf, -math.inf)
     high = ((centre + half) / directions).nan_to_num(math.inf, math.inf, -math.inf)
     entry = torch.minimum(low, high).amax(dim=-1)
     end = torch.maximum(low, high).amin(dim=-1)
     met = (entry <= end) & (entry < sensor.range_max_m) & (end > sensor.range_min_m)
-    if met.any():
-        return check_mask(met, what)
-    nearest, farthest = (centre.abs() - half).clamp(min=0), centre.abs() + half
-    near, far = nearest[:2].norm().item(), farthest[:2].norm().item()
-    bottom, top = (centre[2] - half[2]).item(), (centre[2] + half[2]).item()
-    lowest = math.degrees(math.atan2(bottom, near if bottom < 0 else far))
-    highest = math.degrees(math.atan2(top, far if top < 0 else near))
-    where = (
-        f"{what}, {nearest.norm():.1f} to {farthest.norm():.1f} m away and {lowest:.1f} to "
-        f"{highest:.1f} degrees above the horizon"
-    )
-    raise ValueError(_missed(projection, where))
+    if not met.any():
+        raise _missed(projection, what)
+    return check_mask(met, what)
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
     """Pixels ``(H, W)`` bool of the beams that a scan with only the rows ``kept`` lacks.
 
     Raises:
-        ValueError: If a row does not exist, or none or all remain.
+        ValueError: If none or all remain.
     """
     beams = projection.sensor.beams
-    if outside := [row for row in kept if not 0 <= row < beams]:
-        raise ValueError(f"rows of beams must lie in 0..{beams - 1}, got {outside}")
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
     missing[list(kept)] = False
     return check_mask(missing, f"{len(set(kept))} of {beams} beams kept: the mask of the others")
@@ -150,19 +139,19 @@ def sensor_pair(projection: Projection, other: Projection) -> Tensor:
         ValueError: If it fills no pixel, or all.
     """
     sensor = projection.sensor
-    beams = _inclinations_deg(other)
+    inclination, azimuth = _rays_deg(projection)
+    beams, columns = _rays_deg(other)
     in_view = (beams < sensor.inclination_max_deg) & (beams >= sensor.inclination_min_deg)
-    apart = beams[in_view, None] - _inclinations_deg(projection)
     seen_rows = torch.zeros(sensor.beams, dtype=torch.bool)
     if in_view.any():
-        seen_rows[_nearest(apart)] = True
-    apart = _azimuths_deg(other)[:, None] - _azimuths_deg(projection)
+        seen_rows[_nearest(beams[in_view, None] - inclination)] = True
+    apart = columns[:, None] - azimuth
     seen_columns = torch.zeros(sensor.columns, dtype=torch.bool)
     seen_columns[_nearest((apart + _TURN_DEG / 2) % _TURN_DEG - _TURN_DEG / 2)] = True
     return check_mask(
         ~(seen_rows[:, None] & seen_columns),
-        f"what a sensor of {other.sensor.beams} beams and {_view(other)} does not see in one of "
-        f"{sensor.beams} beams and {_view(projection)}",
+        f"what a sensor of {other.sensor.beams} beams and {other.sensor.columns} columns does not "
+        f"see in one of {sensor.beams} beams and {sensor.columns} columns",
     )
 
 
@@ -190,15 +179,10 @@ def token_mask(pixel_mask: Tensor, grid_size: tuple[int, int], dilation: int = 0
         ``(N,)`` bool, row after row, as feature grids are.
 
     Raises:
-        ValueError: If the grid does not divide the mask, or no or every token is selected.
+        ValueError: If no or every token is selected.
     """
-    (height, width), (rows, columns) = pixel_mask.shape, grid_size
-    if height % rows or width % columns:
-        raise ValueError(
-            f"a grid of {rows} x {columns} tokens does not divide a mask of {height} x {width}"
-        )
-    cells = rearrange(pixel_mask, "(h p) (w q) -> h w (p q)", h=rows, w=columns)
-    what = f"tokens with any of their {height // rows} x {width // columns} pixels selected"
+    cells = rearrange(pixel_mask, "(h p) (w q) -> h w (p q)", h=grid_size[0], w=grid_size[1])
+    what = f"tokens with any of their {cells.shape[-1]} pixels selected"
     return check_mask(dilated(cells.any(dim=-1), dilation).flatten(), what)
 
 
@@ -209,18 +193,10 @@ def mask_of_tokens(tokens: Tensor, grid_size: tuple[int, int], size: tuple[int, 
         tokens: ``(..., N)``, bool or weights.
         grid_size: Rows and columns (h, w) of the tokens.
         size: Rows and columns of the result; multiples of h and w.
-
-    Raises:
-        ValueError: If the sizes do not fit each other.
     """
     (rows, columns), (height, width) = grid_size, size
-    if tokens.shape[-1] != rows * columns or height % rows or width % columns:
-        raise ValueError(
-            f"{tokens.shape[-1]} tokens in a grid of {rows} x {columns} do not fill {height} x "
-            f"{width} with equal patches"
-        )
     p, q = height // rows, width // columns
-    return repeat(tokens, "... (h w) -> ... (h p) (w q)", h=rows, p=p, q=q)
+    return repeat(tokens, "... (h w) -> ... (h p) (w q)", h=rows, w=columns, p=p, q=q)
 
 
 def dilated(mask: Tensor, steps: int) -> Tensor:
@@ -290,44 +266,32 @@ def _covered(place: Tensor, width: float) -> Tensor:
 
 def _between(projection: Projection, from_deg: float, to_deg: float, what: str) -> Tensor:
     """Columns ``(W,)`` bool whose rays lie between two azimuths."""
-    if not max(abs(from_deg), abs(to_deg)) <= _TURN_DEG:  # NaN too
-        raise ValueError(f"{what}: azimuths must lie in -360..360 degrees")
+    if not max(abs(from_deg), abs(to_deg), to_deg - from_deg) <= _TURN_DEG:  # NaN too
+        raise ValueError(f"{what}: azimuths must lie in -360..360 degrees, at most 360 apart")
     if from_deg == to_deg:
         raise ValueError(f"{what} is empty: for a full turn give -180 and 180")
-    if to_deg - from_deg > _TURN_DEG:
-        raise ValueError(f"{what} is more than a turn: give at most 360 degrees")
     width = _TURN_DEG if to_deg - from_deg == _TURN_DEG else (to_deg - from_deg) % _TURN_DEG
-    columns = (_azimuths_deg(projection) - from_deg) % _TURN_DEG < width
+    columns = (_rays_deg(projection)[1] - from_deg) % _TURN_DEG < width
     if not columns.any():
         pitch = _TURN_DEG / projection.sensor.columns
         raise ValueError(f"{what} lies between two columns, which are {pitch:.3g} degrees apart")
     return columns
 
 
-def _missed(projection: Projection, what: str) -> str:
-    """Message that no ray meets a region, with what the rays reach."""
-    inclination, sensor = _inclinations_deg(projection), projection.sensor
-    bottom, top = inclination.min().item(), inclination.max().item()
-    rows = (top - bottom) / max(len(inclination) - 1, 1)
-    return (
+def _missed(projection: Projection, what: str) -> ValueError:
+    """Error that no ray meets a region, with what the rays reach."""
+    bottom, top = _rays_deg(projection)[0].aminmax()
+    sensor = projection.sensor
+    return ValueError(
         f"{what}: no ray meets it. The rays of the sensor reach from {bottom:.1f} to {top:.1f} "
-        f"degrees above the horizon and {sensor.range_min_m:g} to {sensor.range_max_m:g} m, "
-        f"{rows:.2g} degrees apart in inclination and {_TURN_DEG / sensor.columns:.2g} in azimuth; "
-        "move the region there or make it larger"
+        f"degrees above the horizon and {sensor.range_min_m:g} to {sensor.range_max_m:g} m; move "
+        "the region there or make it larger"
     )
 
 
-def _view(projection: Projection) -> str:
-    s = projection.sensor
-    return f"{s.columns} columns, {s.inclination_min_deg:g}..{s.inclination_max_deg:g} degrees"
-
-
-def _inclinations_deg(projection: Projection) -> Tensor:
-    return _degrees(projection.ray_angles()[0])
-
-
-def _azimuths_deg(projection: Projection) -> Tensor:
-    return _degrees(projection.ray_angles()[1])
+def _rays_deg(projection: Projection) -> tuple[Tensor, Tensor]:
+    inclination, azimuth = projection.ray_angles()
+    return _degrees(inclination), _degrees(azimuth)
 
 
 def _nearest(apart_deg: Tensor) -> Tensor:

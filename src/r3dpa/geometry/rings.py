@@ -15,7 +15,6 @@ from torch import Tensor
 
 from r3dpa.geometry.sensor import (
     LidarSensor,
-    PixelRays,
     angles_of,
     check_points,
     column_azimuths,
@@ -29,7 +28,7 @@ _STRAY_SHARE = 0.01  # a ring with fewer returns than this share of the median r
 
 
 @dataclass(frozen=True)
-class RingProjection(PixelRays):
+class RingProjection:
     """One row per laser ring ("scan unfolding") for scans stored ring after ring.
 
     The lasers of a real sensor neither start at one point nor have one pitch, so that rows of
@@ -56,14 +55,12 @@ class RingProjection(PixelRays):
     def __post_init__(self) -> None:
         # A list, as YAML gives it, would not be hashable.
         object.__setattr__(self, "ring_inclinations_deg", tuple(self.ring_inclinations_deg))
-        if len(self.ring_inclinations_deg) != self.sensor.beams:
+        inclinations = self.ring_inclinations_deg
+        inside = all(-90.0 <= angle <= 90.0 for angle in inclinations)
+        if len(inclinations) != self.sensor.beams or not inside:
             raise ValueError(
-                f"a sensor of {self.sensor.beams} beams needs as many ring inclinations, "
-                f"got {len(self.ring_inclinations_deg)}"
-            )
-        if not all(-90.0 <= angle <= 90.0 for angle in self.ring_inclinations_deg):
-            raise ValueError(
-                f"ring inclinations must lie in [-90, 90] degrees, got {self.ring_inclinations_deg}"
+                f"a sensor of {self.sensor.beams} beams needs as many ring inclinations in "
+                f"[-90, 90] degrees, got {len(inclinations)}: {inclinations}"
             )
 
     @classmethod
@@ -107,27 +104,17 @@ class RingProjection(PixelRays):
 
         Args:
             points: ``(P, 3)`` or ``(B, P, 3)`` metres, each scan whole and in the order of the
-                file. Points that are not finite (padding) or not beyond the shortest range get
-                pixel (0, 0).
+                file. Points that are not finite (padding) or too near get pixel (0, 0).
 
         Returns:
             ``(row, column)``, each ``(P,)`` or ``(B, P)`` int64, in ``[0, H)`` and ``[0, W)``.
 
         Raises:
-            ValueError: If a scan is not stored as above, shows more than H rings, or if
-                ``points`` has another shape.
+            ValueError: If a scan is not stored as above, or shows more than H rings.
         """
         if points.ndim == 3:
-            pixels = [self.pixel_of(scan) for scan in points]
-            if not pixels:
-                empty = torch.zeros(points.shape[:2], dtype=torch.int64, device=points.device)
-                return empty, empty
-            rows, columns = zip(*pixels, strict=True)
+            rows, columns = zip(*map(self.pixel_of, points), strict=True)
             return torch.stack(rows), torch.stack(columns)
-        if points.ndim != 2:
-            raise ValueError(
-                f"points must be (P, 3) or (B, P, 3) whole scans, got shape {tuple(points.shape)}"
-            )
         is_return = _is_return(points, self.sensor)
         inclination, azimuth = angles_of(points[is_return])
         row = torch.zeros(len(points), dtype=torch.int64, device=points.device)

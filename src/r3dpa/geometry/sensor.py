@@ -1,14 +1,9 @@
-"""The LiDAR sensor, range and angles of points, and the rays of pixels.
-
-Axes are x forward, y left, z up, in metres, with the sensor at the origin.
-"""
+"""The LiDAR sensor, range and angles of points, and the columns of pixels."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -79,51 +74,9 @@ class LidarSensor:
         return math.radians(self.inclination_max_deg)
 
     @property
-    def inclination_min_rad(self) -> float:
-        """Lower border of the last row, radians."""
-        return math.radians(self.inclination_min_deg)
-
-    @property
     def field_of_view_rad(self) -> float:
         """Height of the vertical field of view, radians."""
-        return self.inclination_max_rad - self.inclination_min_rad
-
-
-class PixelRays(ABC):
-    """Rays of the pixels of a projection; its settings are hashable, so that rays are kept."""
-
-    @abstractmethod
-    def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
-        """Inclination of each row and azimuth of each column, ``(H,)`` and ``(W,)`` radians."""
-
-    def ray_directions(
-        self,
-        corner: bool = False,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-    ) -> Tensor:
-        """Unit vectors ``(H, W, 3)`` along the rays of the pixels.
-
-        With ``corner`` they pass the upper left corner of the pixel, not its centre, as in the
-        official code: half a pixel (0.22 degrees up, 0.18 sideways).
-        """
-        return kept_directions(self, corner, dtype, torch.device(device)).clone()
-
-
-@lru_cache(maxsize=16)
-def kept_directions(
-    rays: PixelRays, corner: bool, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Directions ``(H, W, 3)`` that are shared by all callers and must not be written to."""
-    # A tensor made in inference mode could never take part in a backward pass again.
-    with torch.inference_mode(False):
-        inclination, azimuth = rays.ray_angles(corner)
-        inclination, azimuth = torch.meshgrid(inclination, azimuth, indexing="ij")
-        horizontal = inclination.cos()
-        directions = torch.stack(
-            [horizontal * azimuth.cos(), horizontal * azimuth.sin(), inclination.sin()], dim=-1
-        )
-        return directions.to(device=device, dtype=dtype)
+        return self.inclination_max_rad - math.radians(self.inclination_min_deg)
 
 
 def check_points(points: Tensor) -> None:
@@ -151,12 +104,7 @@ def column_of(azimuth: Tensor, columns: int, legacy_seam: bool = False) -> Tenso
     return column.clamp(max=columns - 1) if legacy_seam else column % columns
 
 
-def pixel_offset(corner: bool) -> float:
-    """Where in the pixel its ray passes, as a share of the pixel from its upper left corner."""
-    return 0.0 if corner else 0.5
-
-
 def column_azimuths(columns: int, corner: bool) -> Tensor:
     """Azimuth ``(W,)`` of the centres or left borders of the columns, float64 radians."""
-    index = torch.arange(columns, dtype=torch.float64) + pixel_offset(corner)
+    index = torch.arange(columns, dtype=torch.float64) + (0.0 if corner else 0.5)
     return math.pi - index * (2 * math.pi / columns)
