@@ -190,6 +190,6 @@ def test_a_simulator_gives_the_scans_of_its_drive():
     key = (3, "effects", 5, 7)
     expected = simulate_scan(scene, hdl64e(32), key, {"range_noise": False})
     assert scan.points.tobytes() == expected.points.tobytes()
-    assert (scan.scene, list(scan.parts_ms)) == (scene, ["scene", "rays", "cast", "points"])
+    assert (scan.scene, list(scan.parts_ms)) == (scene, ["rays", "cast", "points"])
     assert Simulator(sensor="vls128").sensor.num_beams == 128
     assert doctest.testmod(scan_module).failed == 0

@@ -35,8 +35,8 @@ def simulate(
 ) -> Any:
     """Write simulated scans in the KITTI-360 layout.
 
-    The same command completes an interrupted run. Prints what each effect did and cost;
-    ``report.json`` and, for each scan, ``sim/*.json`` keep what it did.
+    The same command completes an interrupted run. Prints what each effect did, as
+    ``report.json`` and, for each scan, ``sim/*.json`` keep it.
 
     Args:
         out: Root of the data set to write.

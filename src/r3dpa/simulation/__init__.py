@@ -1,17 +1,9 @@
 """Simulated lidar: seeded streets, ray casting, effects that a scene calls for, data sets."""
 
-from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.drive_files import drive_name
-from r3dpa.simulation.drives import (
-    TRAIN_DRIVES,
-    VAL_DRIVES,
-    SimulationReport,
-    expected_scans,
-    simulate,
-    split_scans,
-)
+from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate
 from r3dpa.simulation.effects import EFFECTS
-from r3dpa.simulation.scan import EffectRecord, SimulatedScan, Simulator, effect_name, simulate_scan
+from r3dpa.simulation.scan import SimulatedScan, Simulator, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
     Material,
@@ -32,7 +24,6 @@ __all__ = [
     "TRAIN_DRIVES",
     "VAL_DRIVES",
     "Effect",
-    "EffectRecord",
     "EgoMotion",
     "Lasers",
     "Material",
@@ -44,19 +35,15 @@ __all__ = [
     "Semantic",
     "Shape",
     "SimulatedScan",
-    "SimulationReport",
     "Simulator",
     "SpinningLidar",
     "Street",
     "Sweep",
     "Weather",
     "drive_name",
-    "effect_name",
     "expected_scans",
-    "generator_for",
     "hdl64e",
     "load_sensor",
     "simulate",
     "simulate_scan",
-    "split_scans",
 ]

@@ -18,7 +18,6 @@ import os
 import signal
 import statistics
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -46,8 +45,6 @@ _LOCK = ".lock"
 _SIMULATOR_VERSION = 2
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
-# Steps of a scan besides its effects.
-_PARTS = ("scene", "rays", "cast", "points", "write")
 
 
 class EffectTotal(NamedTuple):
@@ -68,7 +65,6 @@ class SimulationReport:
     num_empty: int  # without a single point
     effects: dict[str, EffectTotal]  # in the order in which they are applied
     num_written: int  # by this call; the others existed before
-    mean_ms: dict[str, float]  # a scan, by effect and part, and in total; empty if none was written
 
     def to_dict(self) -> dict[str, Any]:
         """What does not depend on the call, as plain values."""
@@ -80,15 +76,13 @@ class SimulationReport:
         }
 
     def __str__(self) -> str:
-        heads = ["effect", "ran", "not called", "off", "rays/scan", "ms/scan", "share"]
+        heads = ["effect", "ran", "not called", "off", "rays/scan"]
         rows = []
         for name, total in self.effects.items():
             counts = [str(count) for count in (total.ran, total.not_called, total.off)]
             rays = f"{total.rays_per_scan:.0f}"
-            rows.append([name, *counts, rays, *self._costs(name), total.why])
-        rows.append([])
-        rows += [[name, *[""] * 4, *self._costs(name), ""] for name in (*_PARTS, "total")]
-        table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrrrl", "plain")
+            rows.append([name, *counts, rays, total.why])
+        table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrl", "plain")
         per_drive = ", ".join(f"{drive} {num}" for drive, num in self.scans_per_drive.items())
         num_scans = sum(self.scans_per_drive.values())
         lines = [f"{num_scans} scans ({per_drive}), {self.num_written} of them simulated now"]
@@ -97,11 +91,6 @@ class SimulationReport:
                 f"{self.num_empty} of them hold no points: in this weather the sensor sees nothing"
             )
         return "\n".join([table, "", *lines])
-
-    def _costs(self, name: str) -> list[str]:
-        if name not in self.mean_ms:
-            return ["-", "-"]
-        return [f"{self.mean_ms[name]:.2f}", f"{self.mean_ms[name] / self.mean_ms['total']:.1%}"]
 
 
 def simulate(
@@ -134,7 +123,7 @@ def simulate(
         weather: Of all scans; drawn for each stretch of street if None.
 
     Returns:
-        Contents of the data set by effect, also written to ``report.json``, and simulation times.
+        Contents of the data set by effect, also written to ``report.json``.
 
     Raises:
         ValueError: If a value is out of range, an effect or a drive is unknown, a drive is named
@@ -161,7 +150,7 @@ def simulate(
     files = {DriveFiles(out, drive): count for drive, count in counts.items()}
     read_only = out.is_dir() and not os.access(out, os.W_OK)
     if read_only and not any(drive.missing(count) for drive, count in files.items()):
-        return make_report([one for drive in files for one in drive.summaries(files[drive])], [])
+        return make_report([one for drive in files for one in drive.summaries(files[drive])], 0)
     out.mkdir(parents=True, exist_ok=True)
     with only_writer(out / _LOCK, f"simulates into {out}", wait=True):
         _check_folder(out, request)  # again: another process may have written meanwhile
@@ -171,14 +160,13 @@ def simulate(
             missing, simulator = drive.missing(count), simulators[drive.drive]
             for start in range(0, len(missing), _SCANS_PER_TASK):
                 tasks.append(_Task(drive, simulator, missing[start : start + _SCANS_PER_TASK]))
-        timings: list[dict[str, float]] = []
-        complete = scans - sum(len(task.numbers) for task in tasks)
+        num_missing = sum(len(task.numbers) for task in tasks)
+        complete = scans - num_missing
         # disable=None: no bar without a terminal.
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
-            for rows in _run_all(tasks, workers):
-                timings += rows
-                bar.update(len(rows))
-        return _finish(out, files, timings)
+            for num_written in _run_all(tasks, workers):
+                bar.update(num_written)
+        return _finish(out, files, num_missing)
 
 
 def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
@@ -281,8 +269,8 @@ def _read_json(path: Path) -> dict[str, Any]:
     return values
 
 
-def _run_all(tasks: list[_Task], workers: int) -> Iterator[list[dict[str, float]]]:
-    """Milliseconds of the scans of each task, as it ends, in any order."""
+def _run_all(tasks: list[_Task], workers: int) -> Iterator[int]:
+    """Number of scans of each task, as it ends, in any order."""
     if workers == 1 or len(tasks) < 2:
         yield from map(_run, tasks)
         return
@@ -318,24 +306,14 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _run(task: _Task) -> list[dict[str, float]]:
-    """Simulate and write the scans of a task; milliseconds of each."""
-    timings = []
+def _run(task: _Task) -> int:
+    """Simulate and write the scans of a task; their number."""
     for number in task.numbers:
-        start = time.perf_counter()
-        scan = task.simulator.scan(number)
-        scanned = time.perf_counter()
-        task.files.write_scan(number, scan)
-        written = time.perf_counter()
-        ms = scan.parts_ms | {"write": 1000 * (written - scanned)}
-        ms |= {effect.name: effect.ms for effect in scan.effects}
-        timings.append(ms | {"total": 1000 * (written - start)})
-    return timings
+        task.files.write_scan(number, task.simulator.scan(number))
+    return len(task.numbers)
 
 
-def _finish(
-    out: Path, files: Mapping[DriveFiles, int], timings: list[dict[str, float]]
-) -> SimulationReport:
+def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
     """Write timestamps, poses and the report."""
     summaries = []
     for drive, count in files.items():
@@ -346,26 +324,22 @@ def _finish(
         drive.delete_unfinished()
     for path in out.glob(".*.partial.json"):
         path.unlink(missing_ok=True)
-    report = make_report(summaries, timings)
+    report = make_report(summaries, num_written)
     write(out / _REPORT, to_json(report.to_dict()))
     return report
 
 
-def make_report(
-    summaries: Sequence[Mapping[str, Any]], timings: Sequence[Mapping[str, float]]
-) -> SimulationReport:
-    """Report from ``sim/*.json`` of all scans and the milliseconds of the written ones."""
+def make_report(summaries: Sequence[Mapping[str, Any]], num_written: int) -> SimulationReport:
+    """Report from ``sim/*.json`` of all scans."""
     effects = {
         name: _effect_total([summary["effects"][name] for summary in summaries])
         for name in summaries[0]["effects"]
     }
-    names = timings[0] if timings else ()
     return SimulationReport(
         scans_per_drive=dict(Counter(summary["drive"] for summary in summaries)),
         num_empty=sum(summary["points"] == 0 for summary in summaries),
         effects=effects,
-        num_written=len(timings),
-        mean_ms={name: statistics.fmean(row[name] for row in timings) for name in names},
+        num_written=num_written,
     )
 
 

@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -151,18 +151,11 @@ class Simulator:
         self.sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
         self.switches = check_switches(effects or {})
 
-    def scene(self, number: int) -> Scene:
-        """The scene of scan ``number`` of the drive, 0 or greater."""
-        return self.street.scene(number, self.sensor.mount_height_m)
-
     def scan(self, number: int) -> SimulatedScan:
         """Scan ``number`` of the drive, 0 or greater; neighbours are 0.1 s apart."""
-        scene_ms: dict[str, float] = {}
-        with _timed(scene_ms, "scene"):
-            scene = self.scene(number)
+        scene = self.street.scene(number, self.sensor.mount_height_m)
         key = (self.street.seed, "effects", self.street.drive, number)
-        scan = simulate_scan(scene, self.sensor, key, self.switches)
-        return replace(scan, parts_ms=scene_ms | scan.parts_ms)
+        return simulate_scan(scene, self.sensor, key, self.switches)
 
 
 def _run(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -30,6 +30,7 @@ _AZIMUTH_COLUMNS_DEG = (-8.5, 3.7, -2.4, 9.9)
 _LATERAL_OFFSET_M = 0.026
 _BIAS_SD_M = 0.025
 _GAIN_SD = 0.2
+_IRREGULARITIES_SEED = 64
 
 
 class Rays(NamedTuple):
@@ -143,16 +144,9 @@ class SpinningLidar:
         return _time_s(self.lasers, self.shots, self.spin_hz)
 
 
-def hdl64e(shots: int = 2083, calibration_seed: int = 64) -> SpinningLidar:
-    """Velodyne HDL-64E as mounted on the recording car of KITTI-360.
-
-    Args:
-        shots: Shots of each laser per turn, 2083 at 10 Hz.
-        calibration_seed: Seed of the irregularities of the beam table, 0 or greater.
-    """
-    if calibration_seed < 0:
-        raise ValueError(f"calibration_seed must be 0 or greater, got {calibration_seed}")
-    return SpinningLidar(_hdl64e_lasers(calibration_seed), shots)
+def hdl64e(shots: int = 2083) -> SpinningLidar:
+    """Velodyne HDL-64E as mounted on the recording car of KITTI-360, 2083 shots at 10 Hz."""
+    return SpinningLidar(_hdl64e_lasers(), shots)
 
 
 def hdl32e() -> SpinningLidar:
@@ -249,9 +243,9 @@ def _block_inclinations(
     return highest - np.append(0.0, steps.cumsum() * (highest - lowest) / steps.sum())
 
 
-@lru_cache(maxsize=8)
-def _hdl64e_lasers(seed: int) -> Lasers:
-    generator = np.random.Generator(np.random.Philox(seed))
+@cache
+def _hdl64e_lasers() -> Lasers:
+    generator = np.random.Generator(np.random.Philox(_IRREGULARITIES_SEED))
     inclination_deg = np.concatenate(
         [_block_inclinations(block, generator) for block in (_UPPER_BLOCK_DEG, _LOWER_BLOCK_DEG)]
     )

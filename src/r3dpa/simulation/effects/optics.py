@@ -19,6 +19,11 @@ from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
 from r3dpa.simulation.sweep import Effect, Origin, Sweep
 
+_GLASS_INDEX, _WATER_INDEX = 1.52, 1.33
+# Solids of glass that are thinner than this are single panes.
+_PANE_M = 0.1
+# Depth from which on water covers the ground.
+_FULL_FILM_MM = 1.2
 # Largest distance of a pane from the wall that it belongs to.
 _ATTACHED_M = 0.25
 # Water stands only where the normal of the ground is this close to upright.
@@ -42,7 +47,6 @@ def fresnel_reflectance(cos_incidence: Floats, index: float) -> Floats:
     return (across * across + along * along) / 2
 
 
-@dataclass(frozen=True)
 class Glass(Effect):
     """Glass returns the strongest of three echoes: its dirt, the object behind, the mirror image.
 
@@ -62,14 +66,7 @@ class Glass(Effect):
     pane. A thin pane attached to a closed solid of the same instance is a window: through it the
     solid is seen from inside. The glint of a pane that faces the sensor to within the beam's
     divergence is not modelled.
-
-    Args:
-        index: Refractive index of the glass.
-        pane_m: Solids of glass that are thinner than this are single panes.
     """
-
-    index: float = 1.52
-    pane_m: float = 0.1
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         count = sum(p.material is Material.GLASS for p in scene.primitives)
@@ -81,7 +78,7 @@ class Glass(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Add the echoes from behind the panes, then the mirrored ones."""
         struck = _struck(sweep, rays)
-        is_shell = 2 * sweep.solids.half_size[struck.surface].min(axis=1) >= self.pane_m
+        is_shell = 2 * sweep.solids.half_size[struck.surface].min(axis=1) >= _PANE_M
         hollow = np.where(is_shell, NO_SURFACE, _attached_solid(sweep, struck.surface))
         passed = self._transmittance(_cosine(struck.direction, struck.normal))
         seen = _look(sweep, struck, struck.direction, hollow.astype(np.int32))
@@ -93,7 +90,7 @@ class Glass(Effect):
         _offer_mirrored(sweep, struck, 1 - passed)
 
     def _transmittance(self, cos_incidence: Floats) -> Floats:
-        reflectance = fresnel_reflectance(cos_incidence, self.index)
+        reflectance = fresnel_reflectance(cos_incidence, _GLASS_INDEX)
         return (1 - reflectance) / (1 + reflectance)
 
     def _leaving(self, sweep: Sweep, struck: _Struck, distance_m: Floats) -> Floats:
@@ -141,7 +138,6 @@ class PolishedMetal(Effect):
         _offer_mirrored(sweep, struck, np.full_like(struck.leg_m, self.reflectance))
 
 
-@dataclass(frozen=True)
 class WetGround(Effect):
     """Water darkens the ground, most at grazing incidence; puddles mirror.
 
@@ -156,14 +152,7 @@ class WetGround(Effect):
     the full film; its area is proportional to the film.
 
     Source: film model of Hahner et al. (LiDAR snowfall simulation, CVPR 2022), depth 1.2 mm.
-
-    Args:
-        index: Refractive index of water.
-        full_film_mm: Depth from which on the film covers the ground.
     """
-
-    index: float = 1.33
-    full_film_mm: float = 1.2
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         film_mm = scene.weather.water_film_mm
@@ -175,16 +164,16 @@ class WetGround(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Attenuate the echoes of the ground and add mirror images in puddles."""
         assert not isinstance(rays, slice)
-        film = min(sweep.scene.weather.water_film_mm / self.full_film_mm, 1.0)
+        film = min(sweep.scene.weather.water_film_mm / _FULL_FILM_MM, 1.0)
         cover = np.full(len(rays), film, dtype=np.float32)
         cosine = sweep.cos_incidence[rays]
         standing = self._in_puddles(sweep, rays, film)
         cover[standing] = 1
         # Water stands level, whatever the slope of the ground.
         cosine[standing] = np.abs(sweep.direction[2, rays[standing]])
-        reflectance = fresnel_reflectance(cosine, self.index)
+        reflectance = fresnel_reflectance(cosine, _WATER_INDEX)
         passed = 1 - reflectance
-        sweep.first.power[rays] *= 1 - cover + cover * passed * passed / np.float32(self.index**2)
+        sweep.first.power[rays] *= 1 - cover + cover * passed * passed / np.float32(_WATER_INDEX**2)
         struck = _struck(sweep, rays[standing])
         struck.normal[:] = np.array([0, 0, 1], dtype=np.float32)[:, None]
         _offer_mirrored(sweep, struck, reflectance[standing])

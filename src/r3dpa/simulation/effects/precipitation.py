@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,6 @@ class DropTable(NamedTuple):
     expected: NDArray[np.float32]  # (P, K) mean number of stronger drops before each range
 
 
-@dataclass(frozen=True)
 class _Hydrometeors(Effect):
     """Drops or flakes with an exponential size distribution, which may be detected singly.
 
@@ -59,12 +57,11 @@ class _Hydrometeors(Effect):
     the density dM/dp there. This is exact and needs two draws per ray for any number of drops.
     """
 
-    reflectivity: float
-    intercept: tuple[float, float]
-    slope: tuple[float, float]
-
-    origin: ClassVar[Origin]
-    field: ClassVar[str]  # of Weather, its rate in mm/h
+    reflectivity: float  # of one as wide as the beam, beside a diffuse surface
+    intercept: tuple[float, float]  # n per m^3 and mm, and a
+    slope: tuple[float, float]  # l per mm, and b
+    origin: Origin
+    field: str  # of Weather, its rate in mm/h
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         rate = getattr(scene.weather, self.field)
@@ -142,7 +139,6 @@ class _Hydrometeors(Effect):
         return DropTable(edges, powers, expected.astype(np.float32))
 
 
-@dataclass(frozen=True)
 class Rain(_Hydrometeors):
     """Rain attenuates every echo, and a drop in the beam may outshine a weak target.
 
@@ -151,22 +147,15 @@ class Rain(_Hydrometeors):
     echo of a white disk, with F = 0.02. At 10 mm/h the extinction is 1.6e-3 per metre.
 
     Source: Marshall and Palmer 1948 for the sizes.
-
-    Args:
-        reflectivity: Of a drop as wide as the beam, beside a diffuse surface.
-        intercept: n per m^3 and mm, and a.
-        slope: l per mm, and b.
     """
 
-    reflectivity: float = 0.02
-    intercept: tuple[float, float] = (8000.0, 0.0)
-    slope: tuple[float, float] = (4.1, -0.21)
+    reflectivity = 0.02
+    intercept = (8000.0, 0.0)
+    slope = (4.1, -0.21)
+    origin = Origin.RAIN
+    field = "rain_mm_h"
 
-    origin: ClassVar[Origin] = Origin.RAIN
-    field: ClassVar[str] = "rain_mm_h"
 
-
-@dataclass(frozen=True)
 class Snow(_Hydrometeors):
     """Snow attenuates every echo, and flakes may outshine weak targets.
 
@@ -176,19 +165,13 @@ class Snow(_Hydrometeors):
 
     Source: Gunn and Marshall 1958 for the sizes, with twice their number as in LISA (molten
     flakes hide less than real ones).
-
-    Args:
-        reflectivity: Of a flake as wide as the beam, beside a diffuse surface.
-        intercept: n per m^3 and mm, and a.
-        slope: l per mm, and b.
     """
 
-    reflectivity: float = 0.3
-    intercept: tuple[float, float] = (7600.0, -0.87)
-    slope: tuple[float, float] = (2.55, -0.48)
-
-    origin: ClassVar[Origin] = Origin.SNOW
-    field: ClassVar[str] = "snow_mm_h"
+    reflectivity = 0.3
+    intercept = (7600.0, -0.87)
+    slope = (2.55, -0.48)
+    origin = Origin.SNOW
+    field = "snow_mm_h"
 
 
 def _between(table: NDArray, row: NDArray[np.intp], column: NDArray) -> NDArray:
