@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from r3dpa.metrics import results as results_module
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.results import (
     Evaluation,
@@ -81,14 +80,11 @@ def test_a_number_that_is_none_is_refused(fields):
         MetricResult("FRID", **fields)
 
 
-def test_half_widths_add_in_squares():
-    # half widths 3 and 4: values tie up to a difference of 5
+def test_a_difference_below_the_larger_floor_or_the_half_widths_is_a_tie():
+    # half widths 3 and 4, in squares: values tie up to a difference of 5
     a = MetricResult("M", 20.0, interval=(17.0, 23.0))
     assert a.ties_with(MetricResult("M", 25.0, interval=(21.0, 29.0)))
     assert not a.ties_with(MetricResult("M", 25.01, interval=(21.01, 29.01)))
-
-
-def test_a_difference_below_the_larger_floor_is_a_tie():
     a = MetricResult("M", 1.0, floor=0.5)
     assert a.ties_with(MetricResult("M", 3.0, floor=2.0))
     assert MetricResult("M", 3.0, floor=2.0).ties_with(a)
@@ -151,6 +147,7 @@ def test_printed_evaluation_shows_how_sure_it_is():
         "JSD x1e-2", "5.67", "[5.51, 5.72]", "2.80", "lower", "10,000", "-",
     ]  # fmt: skip
     assert "steps: 256" in text
+    assert (row.printed(0.00123), row.printed(0.0), row.printed(None)) == ("0.12", "0.00", "-")
     assert "feature_source" not in text
 
 
@@ -167,9 +164,6 @@ def test_values_that_tie_for_a_place_do_not_get_it():
     # tolerance 0.1 * sqrt(2)
     assert marks([1.0, 1.1, 2.0, 9.0], interval=(0.0, 0.2)) == ["tie", "tie", "", ""]
     assert marks([1.0, 2.0, 2.1, 9.0], interval=(0.0, 0.2)) == ["best", "tie", "tie", ""]
-
-
-def test_a_column_with_one_value_has_no_best():
     assert marks([1.0, {"value": None, "note": "no returns"}]) == ["", ""]
 
 
@@ -254,11 +248,6 @@ def test_csv_holds_every_row_as_computed(table, tmp_path):
     assert (rows[0]["published"], rows[6]["note"]) == ("True", "no net")
 
 
-def test_small_numbers_keep_their_digits():
-    row = MetricResult("M", 0.00123)
-    assert (row.printed(row.value), row.printed(0.0), row.printed(None)) == ("0.0012", "0.00", "-")
-
-
 def test_unlike_evaluations_are_noted():
     a = evaluation("a", MetricResult("FRID", 1.0, num_samples=500))
     b = evaluation("b", MetricResult("FRID", 2.0, num_samples=10_000), protocol={"name": "other"})
@@ -303,32 +292,12 @@ def test_published_numbers_are_marked_as_in_the_paper(split):
 
 def test_published_values_are_unscaled_and_print_as_in_the_paper():
     evaluations = published_evaluations("val-only")
+    mmd = evaluations[1].row("MMD")
+    assert (mmd.num_samples, mmd.num_references) == (2000, 1000)
+    assert [row.name for row in evaluations[0].rows] == ["FSVD", "FPVD", "JSD", "MMD"]
     ours = evaluations[-1]
     assert (ours.label, ours.published, ours.about["steps"]) == ("R3DPA", True, 256)
     assert [row.value for row in ours.rows] == [8.46, 0.634, 9.83, 11.0, 0.0567, 8.72e-5]
     last = EvaluationTable(evaluations).latex().splitlines()[-3]
     numbers = r"8.46 & 6.34 & 9.83 & 11.00 & 5.67 & 8.72 \\"
     assert re.sub(" +", " ", last) == f" R3DPA (published) & {numbers}"
-
-
-def test_what_the_paper_leaves_open_is_none():
-    ultralidar = published_evaluations("train-val")[0]
-    assert [row.name for row in ultralidar.rows] == ["FSVD", "FPVD", "JSD"]
-    assert ultralidar.row("FRID") is None
-    mmd = published_evaluations("val-only")[1].row("MMD")
-    assert (mmd.num_samples, mmd.num_references) == (2000, 1000)
-
-
-def test_published_numbers_are_the_lines_of_the_paper():
-    paper = Path(__file__).resolve().parents[3] / "shared" / "paper" / "r3dpa.tex"
-    if not paper.exists():
-        pytest.skip(f"no {paper.name} beside the repository")
-    lines = paper.read_text().splitlines()
-    table = json.loads(Path(results_module.__file__).with_name("published.json").read_text())
-    for method in table["methods"]:
-        cells = lines[method["line"] - 1].rstrip("\\ ").split("&")[2:]
-        found = [re.sub(r"[^\d.]", "", cell) for cell in cells]
-        names = ["FRID", "FLD", "FSVD", "FPVD", "JSD"]
-        wanted = [method["train-val"].get(name) for name in names]
-        wanted += [method["val-only"].get(name) for name in (*names, "MMD")]
-        assert [float(cell) if cell else None for cell in found] == wanted, method["label"]

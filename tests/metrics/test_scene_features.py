@@ -76,23 +76,6 @@ def test_images_and_their_points_take_one_way():
     assert torch.equal(both.points, scene.points)
 
 
-@pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        (EvaluationScene("a/7", torch.zeros(0, 3)), r"a/7: no pixel .*1\.\.56 m"),
-        (EvaluationScene("a/7", torch.full((2, 3), math.nan)), "a/7: cloud holds 6 NaN"),
-        (EvaluationScene("a/7", torch.ones(2, 5)), r"a/7: points of shape \(2, 5\)"),
-        (EvaluationScene("a/7", None), "a/7: has neither points nor a range image"),
-        (EvaluationScene("a/7", None, torch.zeros(16, 64)), "a/7: no pixel .* lies within"),
-        (EvaluationScene("a/7", None, torch.full((16, 64), math.inf)), "a/7: range image holds"),
-        (EvaluationScene("a/7", None, torch.ones(8, 64)), r"a/7: .*\(8, 64\).* 16 x 64"),
-    ],
-)
-def test_scenes_that_cannot_be_used_are_named(scene, message):
-    with pytest.raises(ValueError, match=message):
-        through_sensor(scene, CENTRE)
-
-
 def test_protocols_come_back_from_plain_values():
     assert Protocol.from_dict(CORNER.to_dict()) == CORNER
     with pytest.raises(ValueError, match="unprojection must be corner or centre, got middle"):

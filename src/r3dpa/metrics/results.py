@@ -376,14 +376,14 @@ def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
-    source, of_mmd = _PUBLISHED["source"], _PUBLISHED["counts_of_mmd"]
     return tuple(
         published_evaluation(
             method["label"],
             method[split],
             f"KITTI-360, {split}",
-            f"{source}, line {method['line']}",
-            dict.fromkeys(method[split], (method["num_samples"], None)) | {"MMD": of_mmd},
+            _PUBLISHED["source"],
+            dict.fromkeys(method[split], (method["num_samples"], None))
+            | {"MMD": _PUBLISHED["counts_of_mmd"]},
             solver=method["solver"],
             steps=method["steps"],
         )
