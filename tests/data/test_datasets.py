@@ -10,7 +10,7 @@ from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset
 from r3dpa.data.augmentation import View
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
-from r3dpa.data.store import CachedTensors, TensorCache
+from r3dpa.data.store import CachedTensors, tensor_cache
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
 
 
@@ -90,7 +90,7 @@ def scans(tmp_path, make_scans):
 
 @pytest.fixture
 def posteriors(tmp_path, scans):
-    cache = TensorCache(tmp_path / "c", "posterior", {"vae": "abc"}, (4, 2, 16))
+    cache = tensor_cache(tmp_path / "c", "posterior", {"vae": "abc"}, (4, 2, 16))
     with cache.writer() as writer:
         moments = torch.randn(5, 4, 2, 16, generator=torch.Generator().manual_seed(3))
         writer.add([scan.cache_key for scan in scans], moments)

@@ -3,6 +3,7 @@ import re
 import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from threading import Event
 
 import pytest
@@ -280,19 +281,17 @@ def test_damaged_settings_are_named(made, projection, text):
 
 
 def test_other_settings_are_refused_when_writing(made, projection, scaled_points):
-    _, root = made
+    scans, root = made
+    new = replace(scans[0], frame="new")
 
-    def settings(size=GRID, gain=1.0, **options):
-        return GridSettings.of(scaled_points(gain), projection, size, **options)
+    def planned(scans, size=GRID, precision="bf16-mixed"):
+        return len(plan(scans, scaled_points(), projection, [size], root, precision).missing)
 
-    for other, words in (
-        (settings(precision="bf16-mixed"), "precision 32-true, but precision bf16-mixed"),
-        (settings(gain=3.0), r"'gain': 1\.0.*, but .*'gain': 3\.0"),
-        (settings((4, 4), gain=3.0), r"'gain': 1\.0.*, but .*'gain': 3\.0"),
-    ):
-        with pytest.raises(StoreError, match=f"{words}.*features_dir .*r3dpa features"):
-            other.writer(root)
-    settings((4, 4), precision="bf16-mixed").writer(root)  # another size may be made otherwise
+    words = "precision 32-true, but precision bf16-mixed.*features_dir .*r3dpa features"
+    with pytest.raises(StoreError, match=words):
+        planned([*scans, new])
+    assert planned(scans) == 0  # complete grids serve any precision
+    assert planned(scans, (4, 4)) == 5  # another size may be made otherwise
     assert any_settings(root).extractor["name"] == "scaled"
     with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
         any_settings(root / "nothing")
@@ -304,7 +303,7 @@ def test_a_disk_that_fills_up(made, projection, scaled_points):
     settings = GridSettings.of(scaled_points(), projection, GRID)
     keys = [("new/1", 1, 1), ("new/2", 1, 1)]
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    writer = settings.writer(root)
+    writer = settings.store(root).writer()
     resource.setrlimit(resource.RLIMIT_FSIZE, (64 + 32, hard))
     try:
         with pytest.raises(StoreError, match=r"cannot be written to .*2x4 \(.*\): give a folder"):

@@ -16,7 +16,7 @@ from PIL import Image
 from r3dpa.data import DeadLeaves, ImageDataModule, ImageFolder
 from r3dpa.data.image_datamodule import latent_statistics
 from r3dpa.data.images import ImageEntry, ImageError, center_crop, dead_leaves
-from r3dpa.data.store import CachedTensors, TensorCache
+from r3dpa.data.store import CachedTensors, tensor_cache
 
 
 def encoded(pixels):
@@ -225,7 +225,7 @@ def test_dead_leaves_have_the_spectrum_and_the_edges_of_photographs():
 
 def test_statistics_of_cached_latents(tmp_path):
     entries = [ImageEntry(str(i), tmp_path / "x", i) for i in range(5)]
-    cache, moments = TensorCache(tmp_path, "posterior", {}, (4, 2, 3)), torch.randn(5, 4, 2, 3)
+    cache, moments = tensor_cache(tmp_path, "posterior", {}, (4, 2, 3)), torch.randn(5, 4, 2, 3)
     with cache.writer() as writer:
         writer.add([entry.cache_key for entry in entries], moments)
     posteriors = CachedTensors(cache, entries)

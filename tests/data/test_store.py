@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data import StoreError, store
-from r3dpa.data.store import CachedTensors, Store, TensorCache
+from r3dpa.data.store import CachedTensors, Store, tensor_cache
 
 SHAPE = (8, 4)
 
@@ -94,7 +94,7 @@ def test_wrong_shapes_and_unwritable_folders_are_named(halves, tmp_path):
                 writer.add(keys, wrong)
     assert not list(halves.folder.glob("*.rows"))
     (tmp_path / "file").write_text("")
-    cache = TensorCache(tmp_path / "file", "a", {}, SHAPE)
+    cache = tensor_cache(tmp_path / "file", "a", {}, SHAPE)
     with pytest.raises(StoreError, match="cannot be written to"), cache.writer():
         pass
 
@@ -155,13 +155,13 @@ def test_a_replaced_file_is_noticed_and_has_a_row_of_its_own(halves, change):
     ("name", "settings", "shape"), [("b", {"x": 1}, SHAPE), ("a", {"x": 2}, SHAPE), ("a", {}, (4,))]
 )
 def test_other_settings_never_find_these_rows(tmp_path, name, settings, shape):
-    cache = TensorCache(tmp_path, "a", {"x": 1}, SHAPE)
+    cache = tensor_cache(tmp_path, "a", {"x": 1}, SHAPE)
     fill(cache, (0, 5))
-    other = TensorCache(tmp_path, name, settings, shape)
+    other = tensor_cache(tmp_path, name, settings, shape)
     assert other.missing(items(0, 5)) == items(0, 5)
     with pytest.raises(StoreError, match=r"No cached tensors of drive.*0000\.bin and 4 more"):
         CachedTensors(other, items(0, 5))
-    assert TensorCache(tmp_path, "a", {"x": 1}, SHAPE) == cache
+    assert tensor_cache(tmp_path, "a", {"x": 1}, SHAPE) == cache
 
 
 def in_child(function):

@@ -155,7 +155,7 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
     scans = [Scan("drive", f"{n}", folder / f"{n}.bin") for n in range(3)]
     for scan in scans:
         scan.path.write_bytes(bytes(160))
-    with settings.writer(store) as writer:
+    with settings.store(store).writer() as writer:
         writer.add([scan.cache_key for scan in scans], torch.randn(3, 8, 3))
 
     def read() -> None:

@@ -66,9 +66,9 @@ def check(path: Path) -> None:
     """
     from r3dpa.data.scans import check as check_scans
 
-    report = check_scans(path)
-    sys.stdout.write(f"{report}\n")
-    if not report.ok:
+    text, usable = check_scans(path)
+    sys.stdout.write(f"{text}\n")
+    if not usable:
         sys.exit(1)
 
 

@@ -75,7 +75,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
                 job.enter_context(features_lock(folder))
             todo = plan(*arguments)  # another job may have made some before the lock was free
             scans = list(todo.missing)
-            stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.settings)
+            stores = ", ".join(str(folder / f"{h}x{w}") for h, w in todo.stores)
             sys.stdout.write(
                 f"feature grids of {extractor.name}: {len(scans)} scans to do, {todo.num_kept} "
                 f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"

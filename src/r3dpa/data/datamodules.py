@@ -14,13 +14,7 @@ from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import DrawnPoints, LidarDataset, list_collate
-from r3dpa.data.feature_grids import (
-    Extractor,
-    FeatureGrids,
-    any_settings,
-    plan,
-    write_feature_grids,
-)
+from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
 from r3dpa.data.loaders import LoaderModule, at_least, ready
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.data.store import CachedTensors
@@ -56,9 +50,7 @@ class LidarDataModule(LoaderModule):
         scans: Folder (searched with its sub-folders), ``.bin`` file, glob, or list of these.
         sensor: Image size, field of view and range limits.
         projection: ``"spherical"``: rows of equal pitch; ``"rings"``: one row per laser, for scans
-            stored ring after ring.
-        ring_inclinations_deg: Inclination of each row for ``"rings"``, degrees above the horizon;
-            measured in the first training scans if None, whatever ``limit``.
+            stored ring after ring, at inclinations measured in the first training scans.
         codec: Metres to [-1, 1].
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
@@ -90,7 +82,6 @@ class LidarDataModule(LoaderModule):
         scans: str | list[str],
         sensor: LidarSensor = _SENSOR,
         projection: Literal["spherical", "rings"] = "spherical",
-        ring_inclinations_deg: list[float] | None = None,
         codec: RangeCodec = _CODEC,
         grid_size: tuple[int, int] = (8, 64),
         extractor: nn.Module | None = None,
@@ -111,7 +102,7 @@ class LidarDataModule(LoaderModule):
         at_least(2, val_every=val_every)
         at_least(1, limit=limit)
         self.scans, self.sensor, self.codec = scans, sensor, codec
-        self.projection_kind, self.ring_inclinations_deg = projection, ring_inclinations_deg
+        self.projection_kind = projection
         self.grid_size = (grid_size[0], grid_size[1])
         self.extractor = extractor
         self.features_dir = self._find_features_dir(features_dir)
@@ -170,13 +161,8 @@ class LidarDataModule(LoaderModule):
         train, val, projection = self._scans_and_projection()
         extractor = cast(Extractor, self.extractor.eval())
         arguments = train + val, extractor, projection, [self.grid_size], self.features_dir
-        todo = plan(*arguments)
-        rank_zero_info(
-            f"feature grids: {len(todo.missing)} to make, {todo.num_bytes / 1e9:.3g} GB, "
-            f"{todo.num_kept} kept, in {self.features_dir}"
-        )
         num_made = write_feature_grids(*arguments, workers=self.num_workers)
-        rank_zero_info(f"feature grids: {num_made} made")
+        rank_zero_info(f"feature grids: {num_made} made, in {self.features_dir}")
 
     def setup(self, stage: str) -> None:
         """Index the scans and open the store of feature grids, but to ``"predict"``."""
@@ -225,9 +211,7 @@ class LidarDataModule(LoaderModule):
             raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
         return []
 
-    def test_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
-        """The same as for validation."""
-        return self.val_dataloader()
+    test_dataloader = val_dataloader
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """All scans in order, none twice."""
@@ -248,9 +232,7 @@ class LidarDataModule(LoaderModule):
         """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
         projection: Projection = SphericalProjection(self.sensor)
-        if self.projection_kind == "rings" and self.ring_inclinations_deg is not None:
-            projection = RingProjection(self.sensor, tuple(self.ring_inclinations_deg))
-        elif self.projection_kind == "rings":
+        if self.projection_kind == "rings":
             files = [scan.path for scan in (train or val)[:_SCANS_TO_FIT]]
             points = (torch.from_numpy(read_scan(file, self.sensor)[:, :3]) for file in files)
             projection = RingProjection.fit(points, self.sensor)

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from r3dpa.data.datasets import PointDataset, PointSample, list_collate
 from r3dpa.data.scans import Scan
-from r3dpa.data.store import CachedTensors, Store, StoreError, StoreWriter, writing
+from r3dpa.data.store import CachedTensors, Store, StoreError, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
 from r3dpa.io import only_writer
 
@@ -88,9 +88,10 @@ class GridSettings:
     ) -> Self:
         """Settings of an extractor; ``ValueError`` if the grid does not divide the image."""
         projection.sensor.cell_size(grid_size)
-        size = (grid_size[0], grid_size[1])
         wanted = _wanted(projection, extractor)
-        return cls(grid_size=size, dtype="float16", precision=precision, **wanted)
+        return cls(
+            grid_size=(grid_size[0], grid_size[1]), dtype="float16", precision=precision, **wanted
+        )
 
     def store(self, features_dir: str | Path) -> Store:
         """Store of these grids, each ``(N, D)``."""
@@ -102,18 +103,6 @@ class GridSettings:
             what="feature grids",
             remedy=f"{REMEDY}, or give the data module an extractor",
         )
-
-    def writer(self, features_dir: str | Path, shard: int = 0) -> StoreWriter:
-        """Writer of such grids; ``StoreError`` if the folder was made with other settings."""
-        self.check(features_dir)
-        return self.store(features_dir).writer(shard)
-
-    def check(self, features_dir: str | Path) -> None:
-        """Raise ``StoreError`` where a folder holds grids of other settings or extractors."""
-        for size, stored in stored_settings(features_dir).items():
-            same_size = size == self.grid_size
-            keys = [*vars(self)] if same_size else ["extractor", "dim"]
-            stored.compare({key: getattr(self, key) for key in keys}, Path(features_dir))
 
     def compare(self, wanted: Mapping[str, Any], features_dir: Path) -> None:
         """Raise ``StoreError`` where these, the stored settings, differ from the wanted ones."""
@@ -196,9 +185,9 @@ class FeatureGrids(CachedTensors[Scan]):
 
 @dataclass(frozen=True)
 class GridPlan:
-    """Grids to make: settings by size, scans that lack one (sorted), disk space in bytes."""
+    """Grids to make: stores by size, scans that lack one (sorted), disk space in bytes."""
 
-    settings: Mapping[tuple[int, int], GridSettings]
+    stores: Mapping[tuple[int, int], Store]
     missing: Sequence[Scan]
     num_kept: int
     num_bytes: int
@@ -221,18 +210,20 @@ def plan(
     if not grid_sizes:
         raise ValueError("grid_sizes is empty: give at least one, for example [[8, 64]].")
     features_dir, scans = Path(features_dir), sorted(scans)
-    settings, missing, num_bytes = {}, set(), 0
+    wanted, stored = _wanted(projection, extractor), stored_settings(features_dir)
+    stores, missing, num_bytes = {}, set(), 0
     for h, w in grid_sizes:
-        own = GridSettings.of(extractor, projection, (h, w), precision)
-        stored = stored_settings(features_dir).get((h, w), own)
-        stored.compare(_wanted(projection, extractor), features_dir)
-        new = stored.store(features_dir).missing(scans)
-        if new:
-            own.check(features_dir)
-        settings[h, w] = own
+        settings = GridSettings.of(extractor, projection, (h, w), precision)
+        for size, other in stored.items():
+            keys = wanted if size == (h, w) else ("extractor", "dim")
+            other.compare({key: wanted[key] for key in keys}, features_dir)
+        stores[h, w] = store = settings.store(features_dir)
+        new = store.missing(scans)
+        if new and (h, w) in stored:
+            stored[h, w].compare({"precision": precision}, features_dir)
         missing |= set(new)
-        num_bytes += len(new) * own.store(features_dir).row_bytes
-    return GridPlan(settings, sorted(missing), len(scans) - len(missing), num_bytes)
+        num_bytes += len(new) * store.row_bytes
+    return GridPlan(stores, sorted(missing), len(scans) - len(missing), num_bytes)
 
 
 @torch.inference_mode()
@@ -298,8 +289,7 @@ def write_feature_grids(
         )
         with ExitStack() as stack:
             writers = {
-                size: stack.enter_context(settings.writer(features_dir))
-                for size, settings in todo.settings.items()
+                size: stack.enter_context(store.writer()) for size, store in todo.stores.items()
             }
             for samples in tqdm(loader, desc="feature grids", disable=None):
                 grids = pooled_grids(extractor, samples, projection, grid_sizes)

@@ -354,85 +354,53 @@ def _rows(points: np.ndarray | torch.Tensor) -> np.ndarray:
     return rows
 
 
-@dataclass(frozen=True)
-class CheckReport:
-    """Result of :func:`check`; ``str`` gives the text that the command prints.
-
-    ``num_scans`` counts by drive, bad ones included; ``bad`` holds ``(file, reason)`` of unusable
-    scans, ``missing`` folders that should exist or hold scans; ``intensity`` the smallest and
-    largest intensity of the usable scans.
-    """
-
-    root: Path
-    num_scans: dict[str, int]
-    bad: tuple[tuple[Path, str], ...]
-    missing: tuple[Path, ...]
-    intensity: tuple[float, float] | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether every scan is usable and no folder is missing."""
-        return not self.bad and not self.missing
-
-    def __str__(self) -> str:
-        lines = [f"{drive}: {count} scans" for drive, count in self.num_scans.items()]
-        lines += [f"missing: {folder}" for folder in self.missing]
-        lines += [f"bad: {file}: {reason}" for file, reason in self.bad]
-        if self.intensity is not None:
-            low, high = self.intensity
-            outside = " (expected 0..1: divide by 255)" if low < 0 or high > 1 else ""
-            lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
-        total = sum(self.num_scans.values())
-        problems = f"{len(self.bad)} bad, {len(self.missing)} folders missing or without scans"
-        verdict = "all usable" if self.ok else problems
-        lines.append(f"{self.root}: {total} scans in {len(self.num_scans)} drives, {verdict}")
-        return "\n".join(lines)
-
-
-def check(path: str | Path, sensor: LidarSensor | None = None, workers: int = 8) -> CheckReport:
-    """Read every scan of a data set, folder or file, and report all that is wrong with it.
+def check(path: str | Path) -> tuple[str, bool]:
+    """Text about every scan of a data set, folder or file, and whether nothing is wrong with it.
 
     A folder with ``data_3d_raw``, or without any scan, is compared with the KITTI-360 layout and
     its nine LiDAR drives; a simulated one with its manifest (``ValueError`` if that is damaged).
-    Every scan needs a point within the range limits of ``sensor``.
+    Every scan needs a point within the range limits of :class:`LidarSensor`.
     """
-    root = Path(path).absolute()
-    sensor = sensor or LidarSensor()
+    root, sensor = Path(path).absolute(), LidarSensor()
     scans = find_scans(root) if any(scan_files(root)) else []
     counts = dict(sorted(Counter(scan.drive for scan in scans).items()))
-    missing, bad = _compare_layout(root, counts)
-    scales: list[float] = []
+    problems = _compare_layout(root, counts)
 
-    def examine(scan: Scan) -> None:
+    def examine(scan: Scan) -> tuple[float, float] | str:
         try:
             intensity = read_scan(scan.path, sensor)[:, 3]
-            scales.extend((float(intensity.min()), float(intensity.max())))
         except ScanError as error:
-            bad.append((scan.path, str(error).removeprefix(f"{scan.path}: ")))
+            return f"bad: {error}"
+        return float(intensity.min()), float(intensity.max())
 
-    with ThreadPool(workers) as pool:
-        for _ in tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None):
-            pass
-    scale = (min(scales), max(scales)) if scales else None
-    return CheckReport(root, counts, tuple(sorted(bad)), tuple(missing), scale)
+    with ThreadPool(8) as pool:
+        examined = pool.imap(examine, scans)
+        results = list(tqdm(examined, total=len(scans), unit="scan", disable=None))
+    problems += [result for result in results if isinstance(result, str)]
+    lines = [*(f"{drive}: {count} scans" for drive, count in counts.items()), *problems]
+    if limits := [result for result in results if not isinstance(result, str)]:
+        low, high = min(low for low, _ in limits), max(high for _, high in limits)
+        outside = " (expected 0..1: divide by 255)" if low < 0 or high > 1 else ""
+        lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
+    verdict = f"problems: {len(problems)}" if problems else "all usable"
+    lines.append(f"{root}: {len(scans)} scans in {len(counts)} drives, {verdict}")
+    return "\n".join(lines), not problems
 
 
-def _compare_layout(
-    root: Path, counts: dict[str, int]
-) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Missing folders, and incomplete drives with the reason."""
+def _compare_layout(root: Path, counts: dict[str, int]) -> list[str]:
+    """Lines about missing folders and incomplete drives."""
     raw, simulated = root / RAW, expected_scans(root)
     if not root.exists():
-        return [root], []
+        return [f"missing: {root}"]
     if not raw.is_dir():
-        return ([] if counts and simulated is None else [raw]), []
-    missing, incomplete = [], []
+        return [] if counts and simulated is None else [f"missing: {raw}"]
+    problems = []
     official = dict.fromkeys(KITTI360_DRIVES["train"] + KITTI360_DRIVES["val"], 1)
     for drive, expected in sorted((simulated or official).items()):
         folder, count = raw / drive, counts.get(drive, 0)
         if not count:
-            missing.append(folder / VELODYNE if folder.is_dir() else folder)
+            problems.append(f"missing: {folder / VELODYNE if folder.is_dir() else folder}")
         elif count < expected:
-            reason = f"holds {count} of {expected} scans; simulate again to complete it"
-            incomplete.append((folder, reason))
-    return missing, incomplete
+            advice = "simulate again to complete it"
+            problems.append(f"bad: {folder}: holds {count} of {expected} scans; {advice}")
+    return problems

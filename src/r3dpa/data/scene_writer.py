@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from io import BytesIO, FileIO
@@ -123,13 +123,7 @@ class SceneWriter:
         """
         while len(self._waiting) >= _MOST_WAITING:
             self._waiting.popleft().result()
-        ready = None
-        if range_m.is_cuda:
-            host = torch.empty(range_m.shape, dtype=range_m.dtype, pin_memory=True)
-            range_m = host.copy_(range_m, non_blocking=True)
-            ready = torch.cuda.Event()
-            ready.record()
-        self._waiting.append(self._thread.submit(self._write, range_m, nfe, ready))
+        self._waiting.append(self._thread.submit(self._write, range_m.cpu(), nfe))
 
     def close(self) -> None:
         """Wait until all scenes are written, and give ``range_m.npy`` its name."""
@@ -139,7 +133,12 @@ class SceneWriter:
         self._file.close()
         assert self.num_done == self.num, "closed before all scenes were put"
         if "npz" in self._formats:
-            write_npz(self.out / "scenes.npz", self._clouds())
+            images = enumerate(np.load(self._unfinished, mmap_mode="r"))
+            clouds = (
+                (f"{index:06d}", points_of(torch.from_numpy(np.array(range_m)), self._projection))
+                for index, range_m in images
+            )
+            write_npz(self.out / "scenes.npz", clouds)
         self._unfinished.replace(self.range_path)
 
     def finish(self, metadata: dict[str, Any]) -> None:
@@ -208,13 +207,11 @@ class SceneWriter:
         file.seek(end)
         return file
 
-    def _write(self, range_m: Tensor, nfe: int, ready: torch.cuda.Event | None) -> None:
+    def _write(self, range_m: Tensor, nfe: int) -> None:
         """Write one batch; none after one that failed, whose error the next call raises."""
         if self._failed:
             return
         self._failed = True
-        if ready is not None:
-            ready.synchronize()
         for index, scene in enumerate(range_m, self.num_done):
             if scene.isnan().any():
                 raise ValueError(
@@ -224,8 +221,7 @@ class SceneWriter:
             points = points_of(scene, self._projection)
             for name in self._formats:
                 if name in _CLOUD_WRITERS:
-                    path = self.out / name / f"{index:06d}.{name}"
-                    _CLOUD_WRITERS[name](path, points)
+                    _CLOUD_WRITERS[name](self.out / name / f"{index:06d}.{name}", points)
         try:
             append(self._file, range_m.numpy().astype("<f4", copy=False).tobytes())
         except OSError as error:
@@ -241,8 +237,3 @@ class SceneWriter:
         state = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
         with atomic_path(self._state) as temporary:
             temporary.write_text(json.dumps(state))
-
-    def _clouds(self) -> Iterator[tuple[str, Tensor]]:
-        for index, range_m in enumerate(np.load(self._unfinished, mmap_mode="r")):
-            scene = torch.from_numpy(np.array(range_m))
-            yield f"{index:06d}", points_of(scene, self._projection)

@@ -110,18 +110,6 @@ class Store:
         """Writer of a new shard, the first free one from this number on."""
         return StoreWriter(self, shard)
 
-    def pack(self, tensors: Tensor) -> bytes:
-        """Bytes of the rows of tensors ``(B, *shape)``."""
-        values, dtype = tensors.float().cpu().numpy(), _DTYPES[self.dtype]
-        largest = np.finfo(dtype).max
-        return values.clip(-largest, largest).astype(dtype).tobytes()
-
-    def unpack(self, data: mmap.mmap, start: int) -> Tensor:
-        """Float32 copy of the row that starts at a byte."""
-        values = np.frombuffer(data, _DTYPES[self.dtype], math.prod(self.shape), start)
-        # Torch converts half precision eight times as fast as NumPy.
-        return torch.from_numpy(values.reshape(self.shape).copy()).float()
-
     def damaged(self, journal: Path, what: str) -> StoreError:
         """Error that names a shard, what is wrong, and the remedy."""
         rows = journal.with_suffix(".rows")
@@ -166,19 +154,17 @@ def writing(what: str, folder: Path) -> Iterator[None]:
         ) from error
 
 
-class TensorCache(Store):
-    """Store whose folder ``root/<name>_<hash>`` follows from its settings.
+def tensor_cache(
+    root: Path, name: str, settings: Mapping[str, Any], shape: tuple[int, ...]
+) -> Store:
+    """Store of float32 tensors whose folder ``root/<name>_<hash>`` follows from its settings.
 
-    ``settings`` are all that the float32 tensors depend on beside the item, as JSON values.
+    ``settings`` are all that the tensors depend on beside the item, as JSON values.
     """
-
-    def __init__(
-        self, root: Path, name: str, settings: Mapping[str, Any], shape: tuple[int, ...]
-    ) -> None:
-        about = {"version": _VERSION, "shape": shape, "settings": settings}
-        text = json.dumps(about, indent=1, sort_keys=True)
-        folder = root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-        super().__init__(folder, text, shape)
+    about = {"version": _VERSION, "shape": shape, "settings": settings}
+    text = json.dumps(about, indent=1, sort_keys=True)
+    folder = root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    return Store(folder, text, shape)
 
 
 class StoreWriter:
@@ -218,10 +204,13 @@ class StoreWriter:
             json.dumps({"scan": name, "bytes": size, "mtime_ns": time, "row": row}) + "\n"
             for row, (name, size, time) in enumerate(new, start=self._num_rows)
         ]
+        dtype = _DTYPES[self._store.dtype]
+        largest = np.finfo(dtype).max
+        values = kept.float().cpu().numpy().clip(-largest, largest).astype(dtype)
         with writing(self._store.what, self._store.folder):
             try:
                 rows, journal = self._open()
-                append(rows, self._store.pack(kept))
+                append(rows, values.tobytes())
                 os.fdatasync(rows)
                 append(journal, "".join(lines).encode())
             except BaseException:
@@ -286,7 +275,10 @@ class CachedTensors(Generic[Item]):
         # Read as a whole: page by page, as they are touched, a disk is slower.
         page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
         mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + size)
-        return self.store.unpack(mapping, start)
+        store = self.store
+        values = np.frombuffer(mapping, _DTYPES[store.dtype], math.prod(store.shape), start)
+        # Torch converts half precision eight times as fast as NumPy.
+        return torch.from_numpy(values.reshape(store.shape).copy()).float()
 
     def _mapped(self, shard: int) -> mmap.mmap:
         if shard not in self._maps:

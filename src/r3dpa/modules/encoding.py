@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.checkpoints import weights_sha256
-from r3dpa.data.store import Cacheable, CachedTensors, TensorCache
+from r3dpa.data.store import Cacheable, CachedTensors, tensor_cache
 from r3dpa.nn import VAE, ImageVAE
 
 __all__ = ["encoded_once"]
@@ -52,7 +52,7 @@ def encoded_once(
     trainer = module.trainer
     datamodule = cast(Any, trainer).datamodule
     about = {**settings, "vae": weights_sha256(vae.state_dict())}
-    cache = TensorCache(root, "posterior", about, shape)
+    cache = tensor_cache(root, "posterior", about, shape)
     missing = cache.missing(items)
     trainer.strategy.barrier("cached latents: all have looked")
     # Where each node has a disk of its own, its processes encode everything.

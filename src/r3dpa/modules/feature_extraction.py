@@ -31,8 +31,7 @@ class FeatureExtraction(LightningModule):
         features_dir: Folder of the grids of this extractor.
 
     Raises:
-        StoreError: While it runs, if the store was made with other settings or cannot be
-            written, or features are not finite.
+        StoreError: While it runs, if the store cannot be written, or features are not finite.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class FeatureExtraction(LightningModule):
         extractor, projection = self._parts()
         for size in self.grid_sizes:
             settings = GridSettings.of(extractor, projection, size, self.trainer.precision)
-            self._writers[size] = settings.writer(self.features_dir, self.global_rank)
+            self._writers[size] = settings.store(self.features_dir).writer(self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:
         """Pools the features of scans prepared by the extractor and writes their grids."""
