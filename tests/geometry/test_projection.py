@@ -16,7 +16,6 @@ from r3dpa.geometry import (
 from r3dpa.geometry.projection import ray_directions
 
 SMALL = LidarSensor(beams=8, columns=16, inclination_max_deg=20.0, inclination_min_deg=-20.0)
-SENSORS = [LidarSensor(), SMALL, LidarSensor(5, 37, 60.0, -90.0, 0.0, 120.0)]
 
 
 def random_points(count, seed=0, farthest=70.0):
@@ -25,27 +24,6 @@ def random_points(count, seed=0, farthest=70.0):
     direction = direction * torch.tensor([1.0, 1.0, 0.2])
     distance = farthest * torch.rand(count, 1, generator=generator)
     return torch.nn.functional.normalize(direction, dim=-1) * distance
-
-
-def range_image_by_loop(points, projection, values):
-    """Independent version: one point after the other, float64 of the standard library."""
-    sensor = projection.sensor
-    range_m = torch.full((sensor.beams, sensor.columns), EMPTY_RANGE_M)
-    image = torch.zeros(values.shape[1], sensor.beams, sensor.columns)
-    top, bottom = sensor.inclination_max_deg, sensor.inclination_min_deg
-    for (x, y, z), value in zip(points.tolist(), values, strict=True):
-        distance = math.sqrt(x * x + y * y + z * z)
-        if not sensor.range_min_m < distance < sensor.range_max_m:
-            continue
-        inclination = math.degrees(math.asin(z / distance))
-        row = math.floor((top - inclination) / (top - bottom) * sensor.beams)
-        row = min(max(row, 0), sensor.beams - 1)
-        column = math.floor((180 - math.degrees(math.atan2(y, x))) / 360 * sensor.columns)
-        column %= sensor.columns
-        if range_m[row, column] < 0 or distance < range_m[row, column]:
-            range_m[row, column] = distance
-            image[:, row, column] = value
-    return range_m, image
 
 
 def test_axes():
@@ -57,16 +35,6 @@ def test_axes():
     row, column = SphericalProjection(LidarSensor()).pixel_of(torch.tensor([10.0, 0.0, 0.0]))
     assert (row.item(), column.item()) == (6, 512)  # as documented
     assert row.dtype == column.dtype == torch.int64
-
-
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: f"{sensor.beams}x{sensor.columns}")
-def test_equals_a_loop(sensor):
-    points, projection = random_points(1000), SphericalProjection(sensor)
-    values = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1))
-    range_m, image = range_image(points, projection, values)
-    expected_range, expected_image = range_image_by_loop(points, projection, values)
-    torch.testing.assert_close(range_m, expected_range)
-    assert torch.equal(image, expected_image)
 
 
 def test_nearest_return_wins_whatever_the_order_and_the_first_of_equal_ones():
@@ -126,25 +94,6 @@ def test_scans_of_no_or_one_point(shape):
         assert means.isfinite().all()
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: f"{sensor.beams}x{sensor.columns}")
-def test_rays_are_unit_vectors_and_corners_lie_half_a_pixel_aside(sensor):
-    projection = SphericalProjection(sensor)
-    for corner in (False, True):
-        rays = ray_directions(projection, corner, torch.float64)
-        assert rays.shape == (sensor.beams, sensor.columns, 3)
-        torch.testing.assert_close(rays.norm(dim=-1), torch.ones_like(rays[..., 0]))
-    inclination, azimuth = (
-        at_corner - at_centre
-        for at_corner, at_centre in zip(
-            projection.ray_angles(corner=True), projection.ray_angles(), strict=True
-        )
-    )
-    half_row = sensor.field_of_view_rad / sensor.beams / 2
-    torch.testing.assert_close(inclination, torch.full_like(inclination, half_row))
-    half_column = math.pi / sensor.columns
-    torch.testing.assert_close(azimuth, torch.full_like(azimuth, half_column))
-
-
 def test_unproject_batches_and_gradients():
     projection = SphericalProjection(SMALL)
     empty = unproject(torch.full((8, 16), EMPTY_RANGE_M), projection)
@@ -185,17 +134,16 @@ def test_pooling_equals_a_loop():
 
 
 def test_wrong_shapes_are_refused():
-    projection = SphericalProjection(SMALL)
-    with pytest.raises(ValueError, match=r"\(7, 4\)"):
-        projection.pixel_of(torch.zeros(7, 4))
-    with pytest.raises(ValueError, match=r"\(2, 2, 5, 3\)"):
-        range_image(torch.zeros(2, 2, 5, 3), projection)
-    with pytest.raises(ValueError, match="one by one"):
-        points_of(torch.zeros(1, 8, 16), projection)
-    with pytest.raises(ValueError, match="3 x 4"):
-        pool_cells(torch.zeros(5, 3), torch.zeros(5, 1), projection, (3, 4))
-    with pytest.raises(ValueError, match=r"\(4, 1\)"):
-        pool_cells(torch.zeros(5, 3), torch.zeros(4, 1), projection, (2, 4))
+    projection, points = SphericalProjection(SMALL), torch.zeros(5, 3)
+    for function, arguments, message in (
+        (projection.pixel_of, (torch.zeros(7, 4),), r"\(7, 4\)"),
+        (range_image, (torch.zeros(2, 2, 5, 3), projection), r"\(2, 2, 5, 3\)"),
+        (points_of, (torch.zeros(1, 8, 16), projection), "one by one"),
+        (pool_cells, (points, torch.zeros(5, 1), projection, (3, 4)), "3 x 4"),
+        (pool_cells, (points, torch.zeros(4, 1), projection, (2, 4)), r"\(4, 1\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            function(*arguments)
 
 
 @pytest.mark.gpu

@@ -27,6 +27,7 @@ COARSE = SphericalProjection(LidarSensor(4, 36, 20.0, -20.0))
 FINE = SphericalProjection(LidarSensor(32, 128, 20.0, -30.0))
 DENSE = SphericalProjection(LidarSensor(16, 72, 20.0, -20.0, range_max_m=25.0))
 DENSE_RINGS = RingProjection(DENSE.sensor, tuple(17.0 - 2 * row - row**2 / 70 for row in range(16)))
+ABOVE = SphericalProjection(LidarSensor(4, 36, 60, 25))
 RINGS = RingProjection(LidarSensor(4, 36, 20.0, -20.0), (18.0, 2.0, -1.0, -19.0))
 
 
@@ -85,10 +86,7 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: dropped_beams(COARSE, range(4)), "selects nothing"),
         (lambda: dropped_beams(COARSE, []), "selects all"),
         (lambda: sensor_pair(COARSE, COARSE), "selects nothing"),
-        (
-            lambda: sensor_pair(COARSE, SphericalProjection(LidarSensor(4, 36, 60, 25))),
-            "selects all",
-        ),
+        (lambda: sensor_pair(COARSE, ABOVE), "selects all"),
         # Every token has a pixel of every second beam.
         (lambda: token_mask(dropped_beams(FINE, range(0, 32, 2)), (8, 16)), "selects all of 128"),
         (lambda: check_mask(torch.zeros(2, 3, dtype=torch.bool), "mask a.png"), "mask a.png: sel"),
