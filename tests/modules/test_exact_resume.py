@@ -8,8 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import torch
-from test_stages import from_previous, load
+from test_stages import QUICK, STAGES, assert_equal_runs, from_previous
 
 from r3dpa.data import kitti360_scans
 
@@ -29,19 +28,15 @@ def seen(run_dir):
 
 @pytest.mark.ddp
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "stage",
-    ["vae_alignment", "joint", "flow_matching"],
-)
+@pytest.mark.parametrize("stage", STAGES)
 def test_three_steps_a_resume_and_three_more(
     stage, smoke_args, resume_root, vae_checkpoint, tmp_path
 ):
     """Bit for bit, within the first epoch, of which each scan is seen once and none twice."""
-    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+    more = [*QUICK, *from_previous(stage, vae_checkpoint)]
     more += ["--trainer.devices=2", "--trainer.strategy=ddp", "--trainer.accumulate_grad_batches=2"]
     more += ["--data.init_args.batch_size=1", "--data.init_args.num_workers=2"]
     more += ["--data.init_args.num_scans=24", "--data.init_args.root", str(resume_root)]
-    more += from_previous(stage, vae_checkpoint)
 
     def fit(run_dir, *words):
         arguments = smoke_args(stage, run_dir, *more, *words)
@@ -61,11 +56,4 @@ def test_three_steps_a_resume_and_three_more(
     first = Counter(name for names in seen(tmp_path / "parts") for name in names[:epoch])
     assert len(first) == 2 * epoch
     assert set(first.values()) == {1}
-    whole, parts = load(tmp_path / "whole"), load(tmp_path / "parts")
-    assert whole["global_step"] == parts["global_step"] == 6
-    for key, value in whole["state_dict"].items():
-        assert torch.equal(value, parts["state_dict"][key]), key
-    whole, parts = (run["optimizer_states"][0]["state"] for run in (whole, parts))
-    for index, state in whole.items():
-        for key, value in state.items():
-            assert torch.equal(value, parts[index][key]), (index, key)
+    assert_equal_runs(tmp_path / "whole", tmp_path / "parts", 6)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from lightning import Trainer
 
+from r3dpa.data import LidarDataModule, write_bin
 from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.datasets import DrawnPoints
 from r3dpa.modules import PointPretraining
@@ -98,34 +99,19 @@ def test_a_scan_without_hidden_points_has_no_hidden_loss(module):
 @pytest.fixture
 def data(tmp_path):
     """Data module of four random scans, three to train on."""
-    from r3dpa.data import LidarDataModule, write_bin
-
     for seed in range(4):
         write_bin(tmp_path / "scans" / f"{seed}.bin", cloud(seed))
     source = LidarDataModule(str(tmp_path / "scans"), val_every=4)
     return PointDataModule(source, Masking(GRID), batch_size=1)
 
 
-def fit(tmp_path, module, data, max_steps, **options):
-    trainer = Trainer(
-        max_steps=max_steps,
-        max_epochs=-1,
-        accelerator="cpu",
-        default_root_dir=tmp_path,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        **options,
-    )
-    trainer.fit(module, data)
-    return trainer
-
-
 def test_training_learns_and_writes_weights_that_extract_the_same(tmp_path, module, data):
     module.edges.fill_(torch.nan)
     module.warmup, module.lr = 2, 1e-2
-    trainer = fit(tmp_path, module, data, 30, enable_checkpointing=False)
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_model_summary"), False)
+    quiet |= {"enable_progress_bar": False, "num_sanity_val_steps": 0}
+    trainer = Trainer(max_steps=30, accelerator="cpu", default_root_dir=tmp_path, **quiet)
+    trainer.fit(module, data)
     assert module.edges.isfinite().all()
     assert (module.edges.diff(dim=1) >= 0).all()
     chance = np.log(8)
@@ -155,8 +141,6 @@ def test_draws_are_a_function_of_seed_epoch_and_scan(data):
 
 
 def test_what_does_not_fit_is_refused(tmp_path, module, data):
-    from r3dpa.data import LidarDataModule
-
     trainer = SimpleNamespace(datamodule=data)
     other = PointPretraining(WaffleIron(16, 3, (4, 4, 4)))
     other._trainer = trainer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from test_stages import STAGES, from_previous, load
+from test_stages import QUICK, STAGES, assert_equal_runs, from_previous, load
 
 from r3dpa.cli import main
 from r3dpa.data import LidarDataset, find_scans, read_scan, write_bin
@@ -58,8 +58,7 @@ def test_torture(stage, precision, smoke_args, vae_checkpoint, hard_scans, tmp_p
     monkeypatch.setattr(LidarDataset, "__getitem__", get_hard)
 
     def fit(run_dir, *words):
-        more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
-        more += [*from_previous(stage, vae_checkpoint), "--trainer.precision", precision]
+        more = [*QUICK, *from_previous(stage, vae_checkpoint), "--trainer.precision", precision]
         more += ["--data.class_path", "r3dpa.data.LidarDataModule"]
         more += ["--data.init_args.scans", str(hard_scans / "scans")]
         more += ["--data.init_args.features_dir", str(hard_scans / "grids")]
@@ -80,14 +79,9 @@ def test_torture(stage, precision, smoke_args, vae_checkpoint, hard_scans, tmp_p
     monkeypatch.setattr("test_torture.BAD_ENCODING", -1)  # it lies before the resume
     fit(tmp_path / "parts", "--trainer.max_steps", str(WHOLE), "--ckpt_path", last)
 
-    whole, parts = load(tmp_path / "whole"), load(tmp_path / "parts")
-    counts = {"skipped": 1, "in_a_row": 0}
-    assert whole["callbacks"]["StepGuard"] == parts["callbacks"]["StepGuard"] == counts
+    assert_equal_runs(tmp_path / "whole", tmp_path / "parts", WHOLE)
+    for name in ("whole", "parts"):
+        content = load(tmp_path / name)
+        assert content["callbacks"]["StepGuard"] == {"skipped": 1, "in_a_row": 0}
+        assert all(value.isfinite().all() for value in content["state_dict"].values())
     assert len(list((tmp_path / "whole" / "bad_batches").iterdir())) == 1
-    for key, value in whole["state_dict"].items():
-        assert value.isfinite().all(), key
-        assert torch.equal(value, parts["state_dict"][key]), key
-    whole, parts = (run["optimizer_states"][0]["state"] for run in (whole, parts))
-    for index, state in whole.items():
-        for key, value in state.items():
-            assert torch.equal(value, parts[index][key]), (index, key)

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from test_stages import QUICK, load
 from tiny_stages import QUIET, TinyData, stage_module, train
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -20,8 +21,11 @@ pytestmark = QUIET
 CHANNELS_LAST = {"memory_format": torch.channels_last}
 
 
-def load(run_dir):
-    return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)
+def passes_through(network):
+    """Grows by one with each pass through a network."""
+    calls = []
+    network.register_forward_hook(lambda *_: calls.append(1))
+    return calls
 
 
 class TestCachedLatents:
@@ -34,8 +38,7 @@ class TestCachedLatents:
         The convolutions of the encoder may sum in another order where scans come in other batches
         or rotated: 1e-6 of a latent, which AdamW (eps 1e-3) keeps as small.
         """
-        more = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
-        more += ["--model.init_args.init_from", str(vae_checkpoint)]
+        more = [*QUICK, "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--model.init_args.optimizer", "{lr: 1.0e-2, eps: 1.0e-3}"]
         more += [f"--data.init_args.augmentation.rotate={str(rotate).lower()}"]
         read = []
@@ -141,61 +144,37 @@ class TestLayout:
                 torch.testing.assert_close(two[name], value, atol=1e-4, rtol=1e-3, msg=name)
 
 
-class Calls(torch.nn.Module):
-    """Counts the passes through a network."""
-
-    def __init__(self, network):
-        super().__init__()
-        self.count = 0
-        network.register_forward_hook(self.add)
-
-    def add(self, *args):
-        self.count += 1
-
-
 class TestWorkLeftOut:
     def test_the_discriminator_rests_before_its_start(self):
         """And is moved as by a loss of factor 0: by the weight decay alone."""
         weights = LossWeights(adversarial_start=1)
         module = stage_module("joint", weights=weights)
-        calls = Calls(module.discriminator)
+        calls = passes_through(module.discriminator)
         weight = module.discriminator.main[0].weight.detach().clone()
         train(module, TinyData([False] * 2))
-        assert calls.count == 3  # of the second step: generator, real, fake
+        assert len(calls) == 3  # of the second step: generator, real, fake
         first, _ = module.states
         config = module.optimizer_config
         expected = weight * (1 - config.lr * config.weight_decay)
         torch.testing.assert_close(first[0]["discriminator.main.0.weight"], expected)
-        grads = {n: g for n, g in module.grads[0].items() if n.startswith("discriminator")}
-        assert grads.keys() == {f"discriminator.{n}" for n, _ in module.discriminator.named_parameters()}  # fmt: skip  # noqa: E501
-        assert not any(g.count_nonzero() for g in grads.values())
+        grads = [g for n, g in module.grads[0].items() if n.startswith("discriminator")]
+        assert len(grads) == len(list(module.discriminator.parameters()))
+        assert not any(g.count_nonzero() for g in grads)
 
-    @pytest.mark.parametrize(
-        ("name", "left"),
-        [
-            ("reconstruction", {"kl", "adversarial"}),
-            ("kl", {"reconstruction", "adversarial"}),
-        ],
-    )
-    def test_a_loss_of_the_vae_with_weight_0(self, name, left):
-        module = train(stage_module("joint", weights=LossWeights(**{name: 0.0})))
-        assert module.parts[0].keys() & {"reconstruction", "kl", "adversarial"} == left
+    def test_a_loss_of_the_vae_with_weight_0(self):
+        for name in ("reconstruction", "kl"):
+            module = train(stage_module("joint", weights=LossWeights(**{name: 0.0})))
+            left = {"reconstruction", "kl", "adversarial"} - {name}
+            assert module.parts[0].keys() & {"reconstruction", "kl", "adversarial"} == left
 
     def test_without_denoising_the_last_blocks_rest(self):
         module = stage_module("joint", weights=LossWeights(denoising=0.0))
-        calls = Calls(module.sit.blocks[-1])
+        calls = passes_through(module.sit.blocks[-1])
         train(module)
-        assert calls.count == 0
+        assert not calls
         assert module.parts[0]["denoising"] == 0
         assert module.parts[0]["sit_alignment"] != 0
         assert all(p.grad is not None or not p.requires_grad for p in module.sit.parameters())
-
-    def test_every_trained_weight_gets_a_gradient_whatever_is_left_out(self):
-        """Or plain DDP would wait for it for ever."""
-        off = {"reconstruction": 0.0, "adversarial": 0.0, "discriminator": 0.0, "denoising": 0.0}
-        module = train(stage_module("joint", weights=LossWeights(**off)))
-        trained = {n for n, p in module.named_parameters() if p.requires_grad}
-        assert module.grads[0].keys() == trained
 
 
 class Syncs(TorchDispatchMode):

@@ -14,42 +14,21 @@ from r3dpa.modules import LossWeights
 from r3dpa.nn import UNet
 
 pytestmark = QUIET
+SIZES = {"in_channels": 4, "channels": 32, "channel_multipliers": [1, 2], "num_res_blocks": 1}
 # In place of the SiT of conf/smoke.yaml: the same latents, grid and features.
-SMOKE = {
-    "input_size": [4, 16],
-    "in_channels": 4,
-    "channels": 32,
-    "channel_multipliers": [1, 2],
-    "num_res_blocks": 1,
-    "feature_dim": 16,
-    "projector_dim": 32,
-}
+SMOKE = SIZES | {"input_size": [4, 16], "feature_dim": 16, "projector_dim": 32}
 
 
 def tiny_unet():
-    return UNet(
-        input_size=(4, 8),
-        in_channels=4,
-        channels=32,
-        channel_multipliers=(1, 2),
-        num_res_blocks=1,
-        feature_dim=FEATURE_DIM,
-        projector_dim=8,
-    )
+    return UNet(**SIZES, input_size=(4, 8), feature_dim=FEATURE_DIM, projector_dim=8)
 
 
 VAE_PARTS = {"vae.encoder", "vae.quant_conv"}
-DOWN = {f"sit.{part}" for part in ("input_blocks", "ape", "time_embed", "label_emb")} | {
-    "sit.middle_block"
-}
+DOWN = {"sit.input_blocks", "sit.ape", "sit.time_embed", "sit.label_emb", "sit.middle_block"}
 UP, HEAD = {"sit.output_blocks", "sit.out"}, {"sit.projector"}
 REACH = {
     "vae_alignment": {"vae_alignment": VAE_PARTS | HEAD | {"sit.input_blocks"}},
-    "joint": {
-        "vae_alignment": VAE_PARTS,
-        "denoising": DOWN | UP,
-        "sit_alignment": DOWN | HEAD,
-    },
+    "joint": {"vae_alignment": VAE_PARTS, "denoising": DOWN | UP, "sit_alignment": DOWN | HEAD},
     "flow_matching": {"denoising": DOWN | UP, "sit_alignment": DOWN | HEAD},
 }
 
