@@ -118,5 +118,3 @@ def test_arguments_out_of_range_are_refused(sit, norm):
     for decay in (1.0, -0.1):
         with pytest.raises(ValueError, match=rf"decay must be in \[0, 1\), got {decay}"):
             EMA(sit, norm, decay=decay)
-    with pytest.raises(ValueError, match="'copy' or 'decay', got 'average'"):
-        EMA(sit, norm, buffers="average")

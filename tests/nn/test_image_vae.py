@@ -46,9 +46,8 @@ def test_sides_of_latents_and_back(vae):
     posterior = vae.encode(torch.rand(2, 3, 12, 20) * 2 - 1)
     assert posterior.mean.shape == (2, 4, *vae.latent_size((12, 20))) == (2, 4, 6, 10)
     assert vae.decode(posterior.mean).shape == (2, 3, 12, 20)
-    for shape in ((1, 1, 8, 8), (1, 3, 9, 8)):
-        with pytest.raises(ValueError, match=r"must be (\(B, 3|a multiple of \(2, 2\))"):
-            vae.encode(torch.zeros(shape))
+    with pytest.raises(ValueError, match=r"must be a multiple of \(2, 2\)"):
+        vae.encode(torch.zeros(1, 3, 9, 8))
 
 
 @torch.no_grad()

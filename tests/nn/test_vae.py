@@ -43,8 +43,6 @@ def test_impossible_layouts_are_refused(options, message):
 
 
 def test_images_that_do_not_fit_are_refused(vae):
-    with pytest.raises(ValueError, match=r"\(B, 1, H, W\), got \(2, 3, 8, 64\)"):
-        vae.encode(torch.randn(2, 3, 8, 64))
     with pytest.raises(ValueError, match=r"multiple of \(4, 8\), got \(8, 60\)"):
         vae.encode(torch.randn(2, 1, 8, 60))
 

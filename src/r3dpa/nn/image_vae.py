@@ -5,10 +5,13 @@ Letters: B batch, C latent channels, H x W image size, h x w latent size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
+from r3dpa.nn.layers import named_layers
 from r3dpa.nn.vae import Autoencoder
 
 _NORM_EPS = 1e-6
@@ -57,7 +60,7 @@ class _Encoder(nn.Module):
     def __init__(self, out_channels: int, widths: list[int], num_blocks: int, groups: int) -> None:
         super().__init__()
         self.conv_in = nn.Conv2d(_RGB, widths[0], 3, padding=1)
-        self.down_blocks = _levels(widths, num_blocks, groups, "downsamplers", _Downsample)
+        self.down_blocks = _levels(widths, num_blocks, groups, "downsamplers", _downsample)
         self.mid_block = _Middle(widths[-1], groups)
         self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
         self.conv_out = nn.Conv2d(widths[-1], out_channels, 3, padding=1)
@@ -75,7 +78,7 @@ class _Decoder(nn.Module):
         widths = widths[::-1]  # up_blocks.0 is the lowest resolution
         self.conv_in = nn.Conv2d(in_channels, widths[0], 3, padding=1)
         self.mid_block = _Middle(widths[0], groups)
-        self.up_blocks = _levels(widths, num_blocks, groups, "upsamplers", _Upsample)
+        self.up_blocks = _levels(widths, num_blocks, groups, "upsamplers", _upsample)
         self.conv_norm_out = nn.GroupNorm(groups, widths[-1], _NORM_EPS)
         self.conv_out = nn.Conv2d(widths[-1], _RGB, 3, padding=1)
 
@@ -87,7 +90,11 @@ class _Decoder(nn.Module):
 
 
 def _levels(
-    widths: list[int], num_blocks: int, groups: int, name: str, resampler: type[nn.Module]
+    widths: list[int],
+    num_blocks: int,
+    groups: int,
+    name: str,
+    resampler: Callable[[int], nn.Module],
 ) -> nn.ModuleList:
     """Levels of the given widths; all but the last end with a resampling layer called ``name``."""
     before = [widths[0], *widths[:-1]]
@@ -103,7 +110,7 @@ class _Level(nn.Module):
         self,
         in_channels: int,
         out_channels: int,
-        resampler: type[nn.Module] | None,
+        resampler: Callable[[int], nn.Module] | None,
         num_blocks: int,
         groups: int,
         name: str,
@@ -122,22 +129,14 @@ class _Level(nn.Module):
         return hidden
 
 
-class _Downsample(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, channels, 3, stride=2)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.conv(F.pad(hidden, (0, 1, 0, 1)))  # right and bottom only, as released
+def _downsample(channels: int) -> nn.Module:
+    pad = nn.ZeroPad2d((0, 1, 0, 1))  # right and bottom only, as released
+    return named_layers(pad=pad, conv=nn.Conv2d(channels, channels, 3, stride=2))
 
 
-class _Upsample(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.conv(F.interpolate(hidden, scale_factor=2, mode="nearest"))
+def _upsample(channels: int) -> nn.Module:
+    conv = nn.Conv2d(channels, channels, 3, padding=1)
+    return named_layers(up=nn.Upsample(scale_factor=2), conv=conv)
 
 
 class _Middle(nn.Module):

@@ -43,8 +43,6 @@ class LatentNorm(nn.Module):
         replace_non_finite: bool = False,
     ) -> None:
         super().__init__()
-        if channels < 1 or eps <= 0:
-            raise ValueError(f"channels >= 1 and eps > 0 are needed, got {channels} and {eps}")
         self.channels = channels
         self.eps = eps
         self.momentum = momentum
@@ -64,7 +62,7 @@ class LatentNorm(nn.Module):
 
     def normalise(self, latents: Tensor) -> Tensor:
         """Latents ``(x - mean) / sqrt(var + eps)`` of raw latents, with the running statistics."""
-        latents = self._repair(self._widen(latents))
+        latents = self._repair(at_least_float32(latents))
         # The root is a new tensor, so the graph holds no buffer that a later update overwrites
         # (an eval-mode BatchNorm2d reads its buffers again in backward).
         return (latents - _per_channel(self.running_mean, latents)) * _per_channel(
@@ -82,7 +80,7 @@ class LatentNorm(nn.Module):
         Raises:
             ValueError: If there is a single value per channel, which has no variance.
         """
-        latents = self._widen(latents)
+        latents = at_least_float32(latents)
         positions = latents.numel() // self.channels
         if positions * num_processes() < 2:
             raise ValueError(
@@ -108,18 +106,11 @@ class LatentNorm(nn.Module):
 
     def denormalise(self, latents: Tensor) -> Tensor:
         """Raw latents ``x * sqrt(var + eps) + mean``, the exact inverse of :meth:`normalise`."""
-        latents = self._widen(latents)
+        latents = at_least_float32(latents)
         variance = self.running_var if self.legacy_inverse else self.running_var + self.eps
         return latents * _per_channel(variance.sqrt(), latents) + _per_channel(
             self.running_mean, latents
         )
-
-    def _widen(self, latents: Tensor) -> Tensor:
-        if latents.dim() != 4 or latents.shape[1] != self.channels:
-            raise ValueError(
-                f"latents must have shape (B, {self.channels}, h, w), got {tuple(latents.shape)}"
-            )
-        return at_least_float32(latents)
 
     def _repair(self, latents: Tensor) -> Tensor:
         return latents.nan_to_num() if self.replace_non_finite else latents

@@ -5,9 +5,10 @@ Letters: B batch, C channels, H x W image or latent size, N tokens, D token widt
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
@@ -46,6 +47,11 @@ def zeroed(layer: _Layer) -> _Layer:
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer
+
+
+def named_layers(**layers: nn.Module) -> nn.Sequential:
+    """Sequential layers with the names that an official state dict gives them."""
+    return nn.Sequential(OrderedDict(layers))
 
 
 class CircularConv2d(nn.Conv2d):
@@ -274,10 +280,7 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
         if not self.training:
             return super().forward(image)
         moved = self.running_mean.clone(), self.running_var.clone()
-        # None, as StochasticWeightAveraging sets it, is the plain mean over all batches.
-        momentum = self.momentum
-        if momentum is None:
-            momentum = 1.0 / (int(self.num_batches_tracked) + 1)
+        momentum = cast(float, self.momentum)
         if num_processes() > 1:
             mean, variance, count = _global_moments(image)
             unbiased = variance * (count / (count - 1))

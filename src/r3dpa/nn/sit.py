@@ -14,9 +14,10 @@ from typing import Self
 import torch
 import torch.nn.functional as F
 from einops import rearrange
+from einops.layers.torch import Rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32, zeroed
+from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32, named_layers, zeroed
 from r3dpa.nn.velocity_network import (
     TIME_WIDTH,
     VelocityNetwork,
@@ -122,9 +123,15 @@ class SiT(VelocityNetwork):
         self.feature_dim = feature_dim
         self.num_classes = num_classes
 
-        self.x_embedder = _PatchEmbedding(in_channels, hidden_size, patch_size)
+        patches = nn.Conv2d(in_channels, hidden_size, patch_size, stride=patch_size)
+        nn.init.xavier_uniform_(patches.weight.flatten(1))
+        nn.init.zeros_(patches.get_parameter("bias"))
+        to_tokens = Rearrange("B D row column -> B (row column) D")
+        self.x_embedder = named_layers(proj=patches, tokens=to_tokens)
         self.t_embedder = _TimeEmbedding(hidden_size)
-        self.y_embedder = _ClassEmbedding(num_classes + int(class_dropout), hidden_size)
+        classes = nn.Embedding(num_classes + int(class_dropout), hidden_size)
+        nn.init.normal_(classes.weight, std=_TABLE_STD)
+        self.y_embedder = named_layers(embedding_table=classes)
         position = sincos_position_embedding(hidden_size, self.grid_size)
         if learn_pos_embed:
             self.pos_embed = nn.Parameter(position)
@@ -141,11 +148,6 @@ class SiT(VelocityNetwork):
             _xavier_linear(projector_dim, feature_dim),
         )
         self.final_layer = _FinalLayer(hidden_size, patch_size**2 * in_channels)
-
-    @property
-    def modulation_width(self) -> int:
-        """Six vectors for each block, two for the output."""
-        return (6 * len(self.blocks) + 2) * self.hidden_size
 
     @property
     def input_layer(self) -> nn.Module:
@@ -222,17 +224,6 @@ def _xavier_linear(in_features: int, out_features: int) -> nn.Linear:
     return layer
 
 
-class _PatchEmbedding(nn.Module):
-    def __init__(self, in_channels: int, hidden_size: int, patch_size: int) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(in_channels, hidden_size, patch_size, stride=patch_size)
-        nn.init.xavier_uniform_(self.proj.weight.flatten(1))
-        nn.init.zeros_(self.proj.get_parameter("bias"))
-
-    def forward(self, latents: Tensor) -> Tensor:
-        return rearrange(self.proj(latents), "B D row column -> B (row column) D")
-
-
 class _TimeEmbedding(nn.Module):
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
@@ -244,16 +235,6 @@ class _TimeEmbedding(nn.Module):
 
     def forward(self, time: Tensor) -> Tensor:
         return self.mlp(time_frequencies(at_least_float32(time)))
-
-
-class _ClassEmbedding(nn.Module):
-    def __init__(self, num_rows: int, hidden_size: int) -> None:
-        super().__init__()
-        self.embedding_table = nn.Embedding(num_rows, hidden_size)
-        nn.init.normal_(self.embedding_table.weight, std=_TABLE_STD)
-
-    def forward(self, labels: Tensor) -> Tensor:
-        return self.embedding_table(labels)
 
 
 def _modulation(hidden_size: int, num_vectors: int) -> nn.Sequential:

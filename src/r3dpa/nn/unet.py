@@ -20,6 +20,7 @@ from r3dpa.nn.layers import (
     GroupNorm,
     WideCircularConv2d,
     at_least_float32,
+    named_layers,
     zeroed,
 )
 from r3dpa.nn.velocity_network import VelocityNetwork, WideLinear, time_frequencies
@@ -116,7 +117,8 @@ class UNet(VelocityNetwork):
                 width = wider
                 kept.append(width)
             if level < len(widths) - 1:
-                self.input_blocks.append(_Layers(_HalfSize(width)))
+                halved = CircularConv2d(width, width, _KERNEL, (2, 2))
+                self.input_blocks.append(_Layers(named_layers(op=halved)))
                 kept.append(width)
         self.ape = _PositionBias(channels, self.input_size)
         self.middle_block = _Layers(*blocks(width, width), _TimedResBlock(width, width, embedding))
@@ -133,16 +135,12 @@ class UNet(VelocityNetwork):
                 layers = blocks(width + kept.pop(), wider, attends[level])
                 width = wider
                 if level and index == num_res_blocks:
-                    layers.append(_DoubleSize(width))
+                    doubled = CircularConv2d(width, width, _KERNEL)
+                    layers.append(named_layers(up=nn.Upsample(scale_factor=2), conv=doubled))
                 self.output_blocks.append(_Layers(*layers))
         self.out = nn.Sequential(
             _norm(width), nn.SiLU(), zeroed(WideCircularConv2d(width, in_channels, _KERNEL))
         )
-
-    @property
-    def modulation_width(self) -> int:
-        """Width E of the embedding that every residual block receives."""
-        return 4 * self.channels
 
     @property
     def input_layer(self) -> nn.Module:
@@ -257,24 +255,6 @@ class _HeadsAttention(nn.Module):
         mixed = F.scaled_dot_product_attention(query, key, value)
         mixed = self.proj_out(rearrange(mixed, "B head N d -> B (head d) N"))
         return hidden + mixed.view(hidden.shape)
-
-
-class _HalfSize(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.op = CircularConv2d(channels, channels, _KERNEL, (2, 2))
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.op(hidden)
-
-
-class _DoubleSize(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv = CircularConv2d(channels, channels, _KERNEL)
-
-    def forward(self, hidden: Tensor) -> Tensor:
-        return self.conv(F.interpolate(hidden, scale_factor=2, mode="nearest"))
 
 
 class _PositionBias(nn.Module):

@@ -112,12 +112,8 @@ class Autoencoder(nn.Module):
         """Posterior of the raw latents of images ``(B, in_channels, H, W)`` in [-1, 1].
 
         Raises:
-            ValueError: If the channels differ, or the strides do not divide the size.
+            ValueError: If the strides do not divide the size.
         """
-        if image.dim() != 4 or image.shape[1] != self.in_channels:
-            raise ValueError(
-                f"image must be (B, {self.in_channels}, H, W), got {tuple(image.shape)}"
-            )
         self.latent_size((image.shape[-2], image.shape[-1]))
         return Posterior(self.quant_conv(self.encoder(image)))
 

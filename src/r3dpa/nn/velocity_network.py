@@ -10,7 +10,6 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal, NamedTuple, Self
 
 import torch
@@ -25,25 +24,14 @@ _MAX_PERIOD = 10_000.0
 
 
 class VelocityOutput(NamedTuple):
-    """Result of one evaluation of a :class:`VelocityNetwork`.
-
-    Attributes:
-        velocity: ``(B, C, h, w)`` d x_t / d t of the normalised latents.
-        features: ``(B, N, F)`` projected features, not of unit length.
-    """
+    """Velocity ``(B, C, h, w)`` and projected features ``(B, N, F)``, not of unit length."""
 
     velocity: Tensor
     features: Tensor
 
 
-@dataclass(frozen=True)
-class AlignedPass:
-    """Evaluation up to the features, which :attr:`velocity` completes.
-
-    Args:
-        features: ``(B, N, F)`` projected features, differentiable in latents and weights.
-        velocity: Returns the velocity ``(B, C, h, w)``, without a gradient.
-    """
+class AlignedPass(NamedTuple):
+    """Features ``(B, N, F)`` and a function that returns the velocity ``(B, C, h, w)``."""
 
     features: Tensor
     velocity: Callable[[], Tensor]
@@ -59,7 +47,7 @@ class VelocityNetwork(nn.Module, ABC):
 
     Arguments of all evaluations: ``latents`` ``(B, C, h, w)`` noisy normalised latents, ``time``
     ``(B,)`` flow times (0 data, 1 noise), ``labels`` ``(B,)`` int64 classes, which a one-class
-    model does not need. A wrong shape, or missing labels, is a ``ValueError``.
+    model does not need. Wrong latents or times, or missing labels, are a ``ValueError``.
 
     Attributes:
         input_size: Latent rows and columns ``(h, w)``.
@@ -80,7 +68,7 @@ class VelocityNetwork(nn.Module, ABC):
     def forward(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
     ) -> VelocityOutput:
-        """Velocity ``(B, C, h, w)`` and projected features ``(B, N, F)``, from one pass."""
+        """Velocity and projected features, from one pass."""
         self._check(latents, time)
         modulations = self.modulations(time, labels)
         activations = self._begin(latents, modulations)
@@ -129,27 +117,8 @@ class VelocityNetwork(nn.Module, ABC):
         Args:
             latents: ``(B, C, h, w)`` noisy normalised latents.
             modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
-
-        Raises:
-            ValueError: If a shape does not fit the network.
         """
-        self._check_latents(latents)
-        if modulations.dim() != 2 or modulations.shape[1] != self.modulation_width:
-            raise ValueError(
-                f"modulations must be rows of {self.modulation_width} numbers, got "
-                f"{tuple(modulations.shape)}; take them from {type(self).__name__}.modulations"
-            )
-        if len(modulations) not in (1, len(latents)):
-            raise ValueError(
-                f"modulations must hold 1 row or one for each of {len(latents)} samples, "
-                f"got {len(modulations)}"
-            )
         return self._finish(self._begin(latents, modulations), modulations)
-
-    @property
-    @abstractmethod
-    def modulation_width(self) -> int:
-        """Width M of :meth:`modulations`."""
 
     @property
     @abstractmethod
@@ -190,34 +159,19 @@ class VelocityNetwork(nn.Module, ABC):
         return self.modulations(time, labels)
 
     def _labels(self, time: Tensor, labels: Tensor | None) -> Tensor:
-        """Checked classes ``(T,)`` of the times ``(T,)``."""
-        if time.dim() != 1:
-            raise ValueError(f"times must be given as (T,), got {tuple(time.shape)}")
-        if labels is None:
-            if self.num_classes > 1:
-                raise ValueError(f"a model of {self.num_classes} classes needs labels")
-            return torch.zeros(len(time), dtype=torch.long, device=time.device)
-        if labels.shape != time.shape:
-            raise ValueError(
-                f"labels must hold one class per time, shape ({len(time)},), "
-                f"got {tuple(labels.shape)}"
-            )
-        return labels
+        """Classes ``(T,)`` of the times ``(T,)``."""
+        if labels is not None:
+            return labels
+        if self.num_classes > 1:
+            raise ValueError(f"a model of {self.num_classes} classes needs labels")
+        return torch.zeros(len(time), dtype=torch.long, device=time.device)
 
     def _check(self, latents: Tensor, time: Tensor) -> None:
-        self._check_latents(latents)
-        if time.shape != latents.shape[:1]:
+        expected = (len(time), self.in_channels, *self.input_size)
+        if latents.shape != expected or time.dim() != 1:
             raise ValueError(
-                f"time must hold one value per sample, shape ({len(latents)},), "
-                f"got {tuple(time.shape)}"
-            )
-
-    def _check_latents(self, latents: Tensor) -> None:
-        expected = (self.in_channels, *self.input_size)
-        if latents.shape[1:] != expected:
-            raise ValueError(
-                f"{type(self).__name__} was built for latents of shape "
-                f"(B, {', '.join(map(str, expected))}), got {tuple(latents.shape)}"
+                f"{type(self).__name__} takes latents {expected} for {len(time)} times, got "
+                f"{tuple(latents.shape)} and times {tuple(time.shape)}"
             )
 
 
@@ -246,8 +200,6 @@ class EMA(nn.Module):
         super().__init__()
         if not 0.0 <= decay < 1.0:
             raise ValueError(f"EMA decay must be in [0, 1), got {decay}")
-        if buffers not in ("copy", "decay"):
-            raise ValueError(f"EMA buffers must be 'copy' or 'decay', got {buffers!r}")
         self.decay = decay
         self.decays_buffers = buffers == "decay"
         self.sit = copy.deepcopy(sit).float().eval().requires_grad_(False)

@@ -114,8 +114,6 @@ def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tens
         range_m: ``(B, H, W)`` metres, -1 without a return, all finite.
         size: Rows and columns of the pictures.
     """
-    if range_m.ndim != 3 or not range_m.numel():
-        raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
     grey = wrapped_grey_levels(range_m).float()[:, None] / 255
     grey = F.interpolate(grey, size, mode="bilinear", align_corners=False, antialias=True)
     mean, std = (grey.new_tensor(v).view(3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
@@ -129,8 +127,6 @@ def wrapped_grey_levels(range_m: Tensor) -> Tensor:
     again. The official code leaves this to a C cast, which is undefined outside of 0..255 and gives
     the same on x86.
     """
-    if not range_m.isfinite().all():
-        raise ValueError("range images must be finite, got NaN or infinite values; drop these")
     levels = torch.trunc(range_m.float() * GREY_LEVELS_PER_M)
     return torch.remainder(levels, 256).to(torch.uint8)
 

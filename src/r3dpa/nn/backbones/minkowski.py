@@ -112,8 +112,6 @@ class MinkowskiNet(nn.Module):
         num_classes: int = 20,
     ) -> None:
         super().__init__()
-        if len(widths) != len(WIDTHS) or min(widths) < 1:
-            raise ValueError(f"widths must be {len(WIDTHS)} positive numbers, got {widths}.")
         self.widths, self.in_channels = tuple(widths), in_channels
         stem = self.widths[0]
         self.stem = nn.ModuleList([ConvNorm(in_channels, stem, 3), ConvNorm(stem, stem, 3)])
@@ -158,26 +156,15 @@ class MinkowskiNet(nn.Module):
             coordinates: ``(P, 4)`` integers x, y, z, batch, each voxel once.
             features: ``(P, C)``.
         """
-        self._check(coordinates, features)
         voxels, rows = Voxels.from_coordinates(coordinates)
         if len(voxels) != len(coordinates):
-            raise ValueError(
-                f"each voxel must be given once, but {len(coordinates)} rows are only "
-                f"{len(voxels)} voxels: keep one point per voxel."
-            )
+            raise ValueError(f"{len(coordinates)} rows are only {len(voxels)} voxels")
         features = torch.empty_like(features).index_copy(0, rows, features)
         levels = self._encode(self._stem(features, voxels), voxels)
         features = levels[-1][1]
         for index in range(_DEPTH):
             features = self._up(index, features, levels)
         return features[rows]
-
-    def _check(self, coordinates: Tensor, features: Tensor) -> None:
-        if features.shape != (len(coordinates), self.in_channels):
-            raise ValueError(
-                f"features must be (P, {self.in_channels}) for the {len(coordinates)} rows of "
-                f"coordinates, got {tuple(features.shape)}."
-            )
 
     def _stem(self, features: Tensor, voxels: Voxels) -> Tensor:
         for layer in self.stem:
@@ -300,7 +287,6 @@ class SPVCNN(MinkowskiNet):
             coordinates: ``(P, 4)`` integers x, y, z, batch; rows of one voxel are averaged.
             features: ``(P, C)``.
         """
-        self._check(coordinates, features)
         points = self._points(coordinates)
         voxels, _ = Voxels.from_coordinates(points.voxel_of(1))
         stem = self._stem(to_voxels(features, points, voxels), voxels)

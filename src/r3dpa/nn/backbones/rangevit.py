@@ -85,10 +85,6 @@ class RangeViT(nn.Module):
     ) -> None:
         super().__init__()
         sensor = sensor or LidarSensor()
-        if not 1 <= in_channels <= len(_MEAN):
-            raise ValueError(f"in_channels must be in 1..{len(_MEAN)}, got {in_channels}")
-        if any(side < 2 or side % 2 for side in patch_size):
-            raise ValueError(f"patch_size must hold even numbers, got {patch_size}")
         if sensor.beams % band_rows:
             raise ValueError(f"{sensor.beams} beams do not divide into bands of {band_rows} rows")
         for size in ((sensor.beams, sensor.columns), trained_size):
@@ -214,19 +210,12 @@ def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | Non
     Returns:
         ``(B, 4, H, W)`` float32, with intensity ``(B, 5, H, W)``.
     """
-    if range_m.ndim != 3:
-        raise ValueError(f"range images must be (B, H, W), got shape {tuple(range_m.shape)}")
     range_m = range_m.float()
     points = unproject(range_m, SphericalProjection(sensor), corner=True)
     valid_mask = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
     points = torch.where(valid_mask[..., None], points, EMPTY_RANGE_M)
     channels = [range_m, *points.unbind(dim=-1)]
     if intensity is not None:
-        if intensity.shape != range_m.shape:
-            raise ValueError(
-                f"intensity must have the shape of the range images {tuple(range_m.shape)}, got "
-                f"{tuple(intensity.shape)}"
-            )
         channels.append(intensity.float())
     return torch.stack(channels, dim=1)
 

@@ -42,8 +42,6 @@ class TransformerTrunk(nn.Module):
         self, width: int, depth: int, num_heads: int, grid_size: Size, norm_eps: float
     ) -> None:
         super().__init__()
-        if num_heads < 1 or width % num_heads:
-            raise ValueError(f"num_heads must divide the width {width}, got {num_heads}")
         rows, columns = self.grid_size = grid_size
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.randn(1, 1 + rows * columns, width) * _TABLE_STD)

@@ -171,8 +171,6 @@ def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> P
 
 def collate_scans(scans: Sequence[PreparedScan]) -> PointCloudBatch:
     """Batch of at least one scan; ``torch.split`` by ``num_points`` takes it apart."""
-    if not scans:
-        raise ValueError("a batch needs at least one scan, got none.")
     num_points = torch.tensor([len(scan.features) for scan in scans])
     starts = (num_points.cumsum(0) - num_points).tolist()
     return PointCloudBatch(

@@ -47,8 +47,6 @@ class WaffleIron(nn.Module):
         head_dim: int | None = None,
     ) -> None:
         super().__init__()
-        if width < 1 or depth < 1:
-            raise ValueError(f"width and depth must be positive, got {width} and {depth}.")
         self.width, self.depth, self.cells = width, depth, cells
         self.plane_sizes = [(cells[row], cells[column]) for row, column in PLANES]
         self.embedding = Embedding(width)
