@@ -5,9 +5,8 @@ import torch
 
 from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, ode_solver
-from r3dpa.flow.times import ode_times, sde_times
+from r3dpa.flow.times import ode_times
 
 
 def latents():
@@ -84,11 +83,10 @@ class TestInvert:
 
 class TestKept:
     @pytest.mark.parametrize("start", [1.0, 0.6])
-    @pytest.mark.parametrize("solver", [*ODE_SOLVERS, "euler_maruyama"])
+    @pytest.mark.parametrize("solver", ODE_SOLVERS)
     def test_latents_outside_the_mask_come_back_bit_by_bit(self, solver, start):
         """And at every time on the way they are those of the inversion, whatever the velocity."""
-        times = sde_times(6) if solver == "euler_maruyama" else ode_times(6, start=start)
-        way = invert(growth, latents(), times, "euler")
+        way = invert(growth, latents(), ode_times(6, start=start), "euler")
         noise = latents().flip(0)
         put_back, seen = kept(way, edit_mask()), []
 
@@ -101,12 +99,7 @@ class TestKept:
             return 3 * torch.ones_like(x) - growth(x, time)
 
         begin = renoised(way, edit_mask(), noise)
-        if solver == "euler_maruyama":
-            end = euler_maruyama(
-                elsewhere, begin, times, iter(lambda: noise, None), after_step=after_step
-            )
-        else:
-            end = ode_solver(solver, after_step=after_step)(elsewhere, begin, times)
+        end = ode_solver(solver, after_step=after_step)(elsewhere, begin, way.times)
         mask = edit_mask().expand_as(end)
         assert torch.equal(end[~mask], latents()[~mask])
         assert (end - latents())[mask].abs().min() > 0

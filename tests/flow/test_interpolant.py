@@ -129,4 +129,4 @@ def test_sampled_times_repeat_with_the_generator(kind):
     first = sample_time(4, kind, generator=torch.Generator().manual_seed(3))
     assert torch.equal(first, sample_time(4, kind, generator=torch.Generator().manual_seed(3)))
     torch.manual_seed(3)
-    assert torch.equal(first, sample_time(4, kind, device="cpu"))
+    assert torch.equal(first, sample_time(4, kind))

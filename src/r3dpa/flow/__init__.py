@@ -7,7 +7,6 @@ from r3dpa.flow.interpolant import Interpolant, sample_time
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import (
     ODE_SOLVERS,
-    CountingVelocity,
     Velocity,
     ab2,
     ab3,
@@ -24,7 +23,6 @@ from r3dpa.flow.times import ode_times, sde_times
 
 __all__ = [
     "ODE_SOLVERS",
-    "CountingVelocity",
     "FeatureGuidance",
     "FeatureTarget",
     "Interpolant",

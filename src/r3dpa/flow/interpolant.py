@@ -117,7 +117,6 @@ def sample_time(
     kind: Literal["uniform", "lognormal"] = "uniform",
     *,
     generator: torch.Generator | None = None,
-    device: torch.device | str | None = None,
 ) -> Tensor:
     """Draw one flow time per sample, ``(B,)`` float32 in [0, 1].
 
@@ -128,18 +127,14 @@ def sample_time(
         batch_size: Number of samples B.
         kind: Distribution of the times.
         generator: Source of randomness; the draw is made on its device. Default: torch's own.
-        device: Device of the result; default: that of the generator.
 
     Raises:
         ValueError: If ``kind`` is neither ``uniform`` nor ``lognormal``.
     """
-    drawn_on = device if generator is None else generator.device
+    device = None if generator is None else generator.device
+    time = torch.empty(batch_size, device=device, dtype=torch.float32)
     if kind == "uniform":
-        time = torch.rand(batch_size, generator=generator, device=drawn_on, dtype=torch.float32)
-    elif kind == "lognormal":
-        time = torch.randn(
-            batch_size, generator=generator, device=drawn_on, dtype=torch.float32
-        ).sigmoid()
-    else:
-        raise ValueError(f"times are drawn 'uniform' or 'lognormal', got {kind!r}")
-    return time if device is None else time.to(device)
+        return time.uniform_(generator=generator)
+    if kind == "lognormal":
+        return time.normal_(generator=generator).sigmoid()
+    raise ValueError(f"times are drawn 'uniform' or 'lognormal', got {kind!r}")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.solvers import AfterStep, Velocity, unchanged
+from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import batch_time, step_pairs
 
 __all__ = ["DriftChange", "euler_maruyama"]
@@ -31,7 +31,6 @@ def euler_maruyama(
     interpolant: Interpolant = _LINEAR,
     last: Literal["denoise", "mean"] = "denoise",
     change_drift: DriftChange | None = None,
-    after_step: AfterStep = unchanged,
 ) -> Tensor:
     """Solve the reverse SDE with diffusion ``w = 2 eta t`` by Euler-Maruyama steps.
 
@@ -57,7 +56,6 @@ def euler_maruyama(
             step of drift, which for ``eta=1`` removes the noise twice and shrinks detail (data of
             standard deviation 0.1 comes out at 0.077 from t = 0.04).
         change_drift: ``(drift, x, time) -> drift`` applied in every step but the last.
-        after_step: See :mod:`r3dpa.flow.solvers`.
 
     Raises:
         ValueError: If ``times`` do not decrease, the ``denoise`` step does not end at 0, ``last``
@@ -79,21 +77,19 @@ def euler_maruyama(
         return (1 - eta) * slope + eta * interpolant.sde_drift(slope, x, time)
 
     draws = _draws(noise, x, len(steps))
-    for index, (step_now, step_then) in enumerate(steps, 1):
+    for step_now, step_then in steps:
         time = batch_time(step_now, x)
         drift = drift_of(velocity(x, time), time)
         if change_drift is not None:
             drift = change_drift(drift, x, time)
         step = step_then - step_now
         spread = math.sqrt(2 * eta * step_now * -step)
-        x = after_step(x + step * drift.to(x.dtype) + spread * next(draws), step_then, index)
+        x = x + step * drift.to(x.dtype) + spread * next(draws)
     time = batch_time(now, x)
     final_velocity = velocity(x, time)
     if last == "denoise":
-        x = interpolant.denoise(final_velocity, x, time).to(x.dtype)
-    else:
-        x = x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
-    return after_step(x, then, len(steps) + 1)
+        return interpolant.denoise(final_velocity, x, time).to(x.dtype)
+    return x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
 
 
 def _draws(

@@ -32,7 +32,6 @@ from r3dpa.flow.times import batch_time, step_pairs
 __all__ = [
     "ODE_SOLVERS",
     "AfterStep",
-    "CountingVelocity",
     "OdeSolver",
     "Velocity",
     "ab2",
@@ -58,19 +57,6 @@ _LINEAR = Interpolant("linear")
 def unchanged(x: Tensor, time: float, index: int) -> Tensor:
     """The :data:`AfterStep` that does nothing."""
     return x
-
-
-class CountingVelocity:
-    """A velocity function that counts its evaluations in ``nfe``."""
-
-    def __init__(self, velocity: Velocity) -> None:
-        self._velocity = velocity
-        self.nfe = 0
-
-    def __call__(self, x: Tensor, time: Tensor) -> Tensor:
-        """Evaluate the velocity and count it."""
-        self.nfe += 1
-        return self._velocity(x, time)
 
 
 @torch.no_grad()
