@@ -78,7 +78,6 @@ def checkpoint():
         step=30,
         geometry=GEOMETRY.to_dict(),
         feature_source="geometric",
-        commit="abc",
     )
 
 
@@ -155,7 +154,7 @@ class TestOurFiles:
 
     def test_a_failed_save_leaves_no_file(self, checkpoint, tmp_path):
         odd = replace(checkpoint, official_args={"device": torch.device("cpu")})
-        with pytest.raises(ValueError, match="plain values"):
+        with pytest.raises(yaml.YAMLError, match="cannot represent"):
             save_checkpoint(odd, tmp_path / "a.safetensors")
         with pytest.raises(ValueError, match=r"<name>.safetensors"):
             save_checkpoint(checkpoint, tmp_path / "a.pt")
@@ -349,7 +348,7 @@ class TestOfficial:
         del official["args"]
         with pytest.raises(ValueError, match=r"\['alignment_depth', 'input_size', 'num_heads'\]"):
             from_official(official, Path("a.pt"))
-        with pytest.raises(ValueError, match="UNet"):
+        with pytest.raises(ValueError, match="not those of an official network"):
             from_official({**official, "model": {"conv.weight": torch.zeros(1)}}, Path("a.pt"))
 
     def test_an_image_vae_is_left_out_by_name(self, official):
@@ -481,8 +480,6 @@ class TestConvert:
             convert(out, tmp_path / "a.pt", "official")
         with pytest.raises(ValueError, match=r"<name>.pt"):
             convert(out, tmp_path / "b.ckpt", "official")
-        with pytest.raises(ValueError, match="'official' checkpoints"):
-            convert(out, tmp_path / "b.pt", "other")
 
 
 class TestTransfer:
@@ -496,7 +493,7 @@ class TestTransfer:
         return Checkpoint(Path("rgb.pt"), "rgb", networks)
 
     def results(self, report):
-        return {row.group: row.result for row in report.rows}
+        return {row.group: row.result for row in report}
 
     def test_a_twin_keeps_everything(self):
         source, sit, norm = self.source(), SiT(**SIT_ARGS), LatentNorm(4)
@@ -522,10 +519,7 @@ class TestTransfer:
                 assert torch.equal(value, before[key]), key
             else:
                 assert torch.equal(value, rgb[key]), key
-        line = (
-            r"x_embedder +2 +fresh +\(8, 3, 2, 2\) +\(8, 4, 2, 2\) +other number of latent channels"
-        )
-        assert re.search(line, report.table())
+        assert ("x_embedder", 2, "fresh", "other number of latent channels") in report
         assert self.results(report)["y_embedder"] == "truncated"
 
     @pytest.mark.parametrize(
@@ -544,7 +538,7 @@ class TestTransfer:
     def test_what_does_not_fit_is_fresh_and_says_why(self, changes, group, expected):
         sit = SiT(**SIT_ARGS)
         report = transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
-        row = next(row for row in report.rows if row.group == group)
+        row = next(row for row in report if row.group == group)
         assert row.result == expected[0]
         assert row.reason.startswith(expected[1])
 

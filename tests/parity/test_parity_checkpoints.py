@@ -123,7 +123,7 @@ def test_vae_state_dicts(official_listing):
 def test_discriminator_state_dict(official_listing):
     listing = official_listing("discriminator_state_dict")
     official = weights_of(listing["state_dict"])
-    checkpoint = from_official(official, PATH)
+    checkpoint = from_official({"discriminator": official}, PATH)
     state = checkpoint.network("discriminator")
     assert_defaults(state, *state.arguments)
     assert (
@@ -235,7 +235,7 @@ def test_rgb_transfer_of_the_imagenet_variants(official_listing):
                 assert not value.any(), (name, key)
         assert torch.equal(norm.running_var, torch.ones(config["in_channels"]))
 
-        results = {row.group: row.result for row in report.rows}
+        results = {row.group: row.result for row in report}
         cut = rgb["config"]["class_dropout_prob"] > 0
         expected = {
             "x_embedder": "fresh",
@@ -246,7 +246,7 @@ def test_rgb_transfer_of_the_imagenet_variants(official_listing):
             "y_embedder": "truncated" if cut else "kept",
         }
         assert results == dict.fromkeys(results, "kept") | expected
-        assert sum(row.num_tensors for row in report.rows) == len(kitti["state_dict"])
+        assert sum(row.num_tensors for row in report) == len(kitti["state_dict"])
 
 
 @pytest.mark.parametrize("change", ["missing", "unknown", "shape"])

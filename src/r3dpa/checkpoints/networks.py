@@ -16,10 +16,8 @@ from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS
 
-__all__ = ["FACTS", "Checkpoint", "NetworkState", "load_into", "path_of", "weights_sha256"]
-
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
-FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
+FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant")
 
 _ALLOWED_PACKAGE = "r3dpa.nn."
 _NUM_LISTED = 10
@@ -161,8 +159,6 @@ class Checkpoint:
     augmentation: Mapping[str, Any] | None = None  #: plain values of its ``Augmentation``
     feature_source: str | None = None  #: feature source of its last training stage
     interpolant: Literal["linear", "cosine"] = "linear"  #: path from latents to noise of its SiT
-    version: str | None = None  #: version of r3dpa that wrote it
-    commit: str | None = None  #: commit of r3dpa that wrote it
     official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options
     left_out: Mapping[str, str] = field(default_factory=dict)  #: unread entries, and the reason
 

@@ -1,9 +1,8 @@
 """Official R3DPA checkpoints: keys and options of valeoai/R3DPA, translated in both directions.
 
 An official SiT or UNet holds the latent batch norm as ``bn.*`` and its projector as
-``projectors.0.*``; everything else has the same name here. Arguments are inferred from the weights
-and the training options. Training checkpoints that we write also hold an entry ``r3dpa``, which the
-official code ignores: all facts without a place in the official layout.
+``projectors.0.*``; everything else has the same name here. What we write also holds an entry
+``r3dpa``, which the official code ignores: all facts without a place in the official layout.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,8 +23,6 @@ from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
-
-__all__ = ["OURS", "from_official", "is_official", "statistics_of", "to_official"]
 
 StateDict = Mapping[str, Tensor]
 Options = Mapping[str, Any]
@@ -57,12 +53,10 @@ _PROJECTION: dict[str, Any] = {
 
 
 def is_official(content: Any) -> bool:
-    """Whether the content of a ``.pt`` file is one of the four official layouts."""
-    return isinstance(content, Mapping) and (
-        any(isinstance(content.get(key), Mapping) for key in _SIT_NETWORKS)
-        or set(content) == _STATISTICS
-        or _is_vae(content)
-        or _is_discriminator(content)
+    """Whether the content of a ``.pt`` file is an official training checkpoint or VAE."""
+    return _is_vae(content) or (
+        isinstance(content, Mapping)
+        and any(isinstance(content.get(key), Mapping) for key in _SIT_NETWORKS)
     )
 
 
@@ -76,13 +70,8 @@ def from_official(
 ) -> Checkpoint:
     """Checkpoint from the content of an official file; every key is translated or left out by name.
 
-    Args:
-        content: A training checkpoint, or a VAE, a discriminator or latent statistics alone.
-        path: File that held it.
-        args: Options of the official training script, where ``content`` has no ``args``.
-        sit_args: Arguments of SiT or UNet that override those of the file.
-        encoding: Encoding of the range image; None takes that of the options. Without either the
-            geometry is unknown, unless the file has an entry ``r3dpa``.
+    ``args`` are the options of the official training script, where ``content`` has none; without
+    an encoding, there or given, the geometry is unknown.
 
     Raises:
         ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
@@ -93,29 +82,29 @@ def from_official(
         return _from_ours(content, path, given)
     found = content.get("args", args)
     options = dict(vars(found) if isinstance(found, argparse.Namespace) else found or {})
-    if _is_vae(content):
-        content = {"vae": content}
-    elif _is_discriminator(content):
-        content = {"discriminator": content}
     networks: dict[str, NetworkState] = {}
     left_out: dict[str, str] = {}
     if set(content) >= _STATISTICS:
         networks["latent_norm"] = _norm_from_statistics(content)
-    strides = _vae_strides(content.get("vae", {}), options)
-    for key, value in content.items():
-        if key in _SIT_NETWORKS:
-            parts = _sit(_weights(key, value), options, given, strides)
-            networks |= dict(zip(_SIT_NETWORKS[key], parts, strict=True))
-        elif key == "vae" and _is_vae(value):
-            networks[key] = _vae(_weights(key, value))
-        elif key == "vae":
-            left_out[key] = "that of the file is not for range images"
-        elif key == "discriminator":
-            networks[key] = _discriminator(_weights(key, value))
-        elif key in _OPTIMISERS:
-            left_out[key] = f"optimiser of the {_OPTIMISERS[key]}: training starts with a new one"
-        elif key not in {"args", "steps"} | _STATISTICS:
-            left_out[key] = "no part of an official checkpoint"
+    try:
+        strides = _vae_strides(content.get("vae", {}), options)
+        for key, value in content.items():
+            if key in _SIT_NETWORKS:
+                parts = _sit(_weights(key, value), options, given, strides)
+                networks |= dict(zip(_SIT_NETWORKS[key], parts, strict=True))
+            elif key == "vae" and _is_vae(value):
+                networks[key] = _vae(_weights(key, value))
+            elif key == "vae":
+                left_out[key] = "that of the file is not for range images"
+            elif key == "discriminator":
+                networks[key] = _discriminator(_weights(key, value))
+            elif key in _OPTIMISERS:
+                left_out[key] = f"optimiser of the {_OPTIMISERS[key]}: training starts a new one"
+            elif key not in {"args", "steps"} | _STATISTICS:
+                left_out[key] = "no part of an official checkpoint"
+    except (LookupError, TypeError) as error:
+        reason = f"the weights are not those of an official network ({type(error).__name__}: "
+        raise ValueError(f"{reason}{error})") from error
     return Checkpoint(
         path=path,
         stage="official",
@@ -151,10 +140,6 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
 
     The statistics of ``ema`` are those of ``latent_norm`` if the checkpoint has no others. Without
     the options of an official run, ``args`` is made from the arguments of the networks.
-
-    Returns:
-        The networks it has under ``model``, ``ema``, ``vae``, ``discriminator``; ``steps``, and
-        ``args`` as a ``Namespace``.
 
     Raises:
         ValueError: If a network has no official counterpart.
@@ -205,10 +190,6 @@ def _is_vae(content: Any) -> bool:
     return isinstance(conv_in, Tensor) and conv_in.dim() == 4 and conv_in.shape[1] == 1
 
 
-def _is_discriminator(content: Mapping[str, Any]) -> bool:
-    return len(content) > 0 and all(str(key).startswith("main.") for key in content)
-
-
 def _weights(key: str, value: Any) -> StateDict:
     if not isinstance(value, Mapping) or not all(isinstance(v, Tensor) for v in value.values()):
         raise ValueError(f"entry {key!r} holds no weights but {type(value).__name__}")
@@ -243,34 +224,22 @@ def _sit(
     return network, NetworkState(path_of(LatentNorm), norm_args, norm)
 
 
-@contextmanager
-def _inferring(what: str) -> Iterator[None]:
-    """Turns a missing key or an unexpected shape into a ``ValueError``."""
-    try:
-        yield
-    except (LookupError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"the weights are not those of an official {what} ({type(error).__name__}: {error})"
-        ) from error
-
-
 def _sit_arguments(
     sit: StateDict, args: Options, given: Options, strides: Strides
 ) -> dict[str, Any]:
-    with _inferring("SiT or UNet"):
-        hidden_size, in_channels, patch_size, _ = sit["x_embedder.proj.weight"].shape
-        num_rows = len(sit["y_embedder.embedding_table.weight"])
-        inferred: dict[str, Any] = {
-            "in_channels": in_channels,
-            "patch_size": patch_size,
-            "hidden_size": hidden_size,
-            "depth": len({key.split(".")[1] for key in sit if key.startswith("blocks.")}),
-            "mlp_ratio": len(sit["blocks.0.mlp.fc1.weight"]) / hidden_size,
-            "feature_dim": len(sit["projector.4.weight"]),
-            "projector_dim": len(sit["projector.0.weight"]),
-            "qk_norm": "blocks.0.attn.q_norm.weight" in sit,
-        }
-        num_tokens = sit["pos_embed"].shape[1]
+    hidden_size, in_channels, patch_size, _ = sit["x_embedder.proj.weight"].shape
+    num_rows = len(sit["y_embedder.embedding_table.weight"])
+    inferred: dict[str, Any] = {
+        "in_channels": in_channels,
+        "patch_size": patch_size,
+        "hidden_size": hidden_size,
+        "depth": len({key.split(".")[1] for key in sit if key.startswith("blocks.")}),
+        "mlp_ratio": len(sit["blocks.0.mlp.fc1.weight"]) / hidden_size,
+        "feature_dim": len(sit["projector.4.weight"]),
+        "projector_dim": len(sit["projector.0.weight"]),
+        "qk_norm": "blocks.0.attn.q_norm.weight" in sit,
+    }
+    num_tokens = sit["pos_embed"].shape[1]
     num_classes = {**args, **given}.get("num_classes", max(1, num_rows - 1))
     if num_rows not in (num_classes, num_classes + 1):
         raise ValueError(
@@ -299,24 +268,23 @@ def _sit_arguments(
 
 
 def _unet_arguments(unet: StateDict, given: Options) -> dict[str, Any]:
-    with _inferring("UNet"):
-        _, channels, *input_size = unet["ape.bias"].shape
-        num_levels = 1 + sum(key.endswith(".op.weight") for key in unet)
-        num_up = len({key.split(".")[1] for key in unet if key.startswith("output_blocks.")})
-        num_res_blocks = num_up // num_levels - 1
-        # A level is its residual blocks and, but for the last, a step down; first comes the input.
-        last_blocks = [(level + 1) * (num_res_blocks + 1) - 1 for level in range(num_levels)]
-        widths = [len(unet[f"input_blocks.{i}.0.out_layers.3.weight"]) for i in last_blocks]
-        inferred: dict[str, Any] = {
-            "input_size": list(input_size),
-            "in_channels": unet["input_blocks.0.0.weight"].shape[1],
-            "channels": channels,
-            "channel_multipliers": [width // channels for width in widths],
-            "num_res_blocks": num_res_blocks,
-            "feature_dim": len(unet["projector.4.weight"]),
-            "projector_dim": len(unet["projector.0.weight"]),
-            "num_classes": len(unet["label_emb.weight"]),
-        }
+    _, channels, *input_size = unet["ape.bias"].shape
+    num_levels = 1 + sum(key.endswith(".op.weight") for key in unet)
+    num_up = len({key.split(".")[1] for key in unet if key.startswith("output_blocks.")})
+    num_res_blocks = num_up // num_levels - 1
+    # A level is its residual blocks and, but for the last, a step down; first comes the input.
+    last_blocks = [(level + 1) * (num_res_blocks + 1) - 1 for level in range(num_levels)]
+    widths = [len(unet[f"input_blocks.{i}.0.out_layers.3.weight"]) for i in last_blocks]
+    inferred: dict[str, Any] = {
+        "input_size": list(input_size),
+        "in_channels": unet["input_blocks.0.0.weight"].shape[1],
+        "channels": channels,
+        "channel_multipliers": [width // channels for width in widths],
+        "num_res_blocks": num_res_blocks,
+        "feature_dim": len(unet["projector.4.weight"]),
+        "projector_dim": len(unet["projector.0.weight"]),
+        "num_classes": len(unet["label_emb.weight"]),
+    }
     attends = [f"input_blocks.{i}.1.qkv.weight" in unet for i in last_blocks]
     if not all(attends):
         inferred["attention_resolutions"] = [2**i for i in range(num_levels) if attends[i]]
@@ -350,29 +318,27 @@ def _whole(strides: Sequence[tuple[int, int]]) -> tuple[int, int]:
 
 
 def _vae(weights: StateDict) -> NetworkState:
-    with _inferring("VAE"):
-        levels = range(len({k.split(".")[2] for k in weights if k.startswith("encoder.down.")}))
-        channels = len(weights["encoder.conv_in.weight"])
-        widths = [len(weights[f"encoder.down.{i}.block.0.conv1.weight"]) for i in levels]
-        ups = [weights[f"decoder.up.{i}.upsample.conv.weight"] for i in levels[1:]]
-        blocks = {key.split(".")[4] for key in weights if key.startswith("encoder.down.0.block.")}
-        attends = [i for i in levels if f"encoder.down.{i}.attn.0.q.weight" in weights]
-        init_args = {
-            "in_channels": weights["encoder.conv_in.weight"].shape[1],
-            "latent_channels": len(weights["post_quant_conv.weight"]),
-            "channels": channels,
-            "channel_multipliers": [width // channels for width in widths],
-            "strides": [_UPSAMPLING[(int(up.shape[2]), int(up.shape[3]))] for up in ups],
-            "num_res_blocks": len(blocks),
-            "attention_levels": attends,
-            "legacy_upsample": True,
-        }
+    levels = range(len({k.split(".")[2] for k in weights if k.startswith("encoder.down.")}))
+    channels = len(weights["encoder.conv_in.weight"])
+    widths = [len(weights[f"encoder.down.{i}.block.0.conv1.weight"]) for i in levels]
+    ups = [weights[f"decoder.up.{i}.upsample.conv.weight"] for i in levels[1:]]
+    blocks = {key.split(".")[4] for key in weights if key.startswith("encoder.down.0.block.")}
+    attends = [i for i in levels if f"encoder.down.{i}.attn.0.q.weight" in weights]
+    init_args = {
+        "in_channels": weights["encoder.conv_in.weight"].shape[1],
+        "latent_channels": len(weights["post_quant_conv.weight"]),
+        "channels": channels,
+        "channel_multipliers": [width // channels for width in widths],
+        "strides": [_UPSAMPLING[(int(up.shape[2]), int(up.shape[3]))] for up in ups],
+        "num_res_blocks": len(blocks),
+        "attention_levels": attends,
+        "legacy_upsample": True,
+    }
     return NetworkState(path_of(VAE), init_args, dict(weights))
 
 
 def _discriminator(weights: StateDict) -> NetworkState:
-    with _inferring("discriminator"):
-        channels, in_channels, _, _ = weights["main.0.weight"].shape
+    channels, in_channels, _, _ = weights["main.0.weight"].shape
     num_layers = sum(value.dim() == 4 for value in weights.values()) - 2  # less first and last
     init_args = {"in_channels": in_channels, "channels": channels, "num_layers": num_layers}
     return NetworkState(path_of(PatchDiscriminator), init_args, dict(weights))

@@ -14,66 +14,29 @@ from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
 from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of, weights_sha256
-from r3dpa.io import text_table
 from r3dpa.nn import LatentNorm, SiT, VelocityNetwork
-
-__all__ = [
-    "NORM_TOLERANCE",
-    "TransferReport",
-    "TransferRow",
-    "WeakModel",
-    "read_snapshot",
-    "transfer_rgb",
-    "vae_fingerprint",
-]
 
 Weights = Mapping[str, Tensor]
 Result = Literal["kept", "fresh", "resized", "truncated", "extended"]
 
+# Largest difference between channels in how the latent scales of two models differ: on a frozen
+# VAE, running statistics 100 to 900 steps apart differ by up to 0.031 (batch 4) or 0.014 (32).
 NORM_TOLERANCE = 0.05
-"""Largest difference between channels in how the latent scales of two models differ.
-
-On the latents of a frozen VAE at demo size, two running statistics 100 to 900 steps apart differ by
-up to 0.031 at batch 4 and 0.014 at batch 32. For Gaussian latents a difference d moves what the
-weak model expects by at most 0.77 d standard deviations.
-"""
-
 _NORM = "latent_norm."
 
 
 class TransferRow(NamedTuple):
-    """One group of weights, whose keys start alike.
-
-    ``result`` is ``kept``; ``fresh`` (initial value of this run, that of the file is dropped);
-    ``resized`` (positions, which are computed for this run's token grid); ``truncated`` or
-    ``extended`` (label table).
-    """
+    """One group of weights, whose keys start alike, and where its values come from."""
 
     group: str
     num_tensors: int  #: in the receiving network
-    result: Result
-    source: str  #: shape of the largest tensor in the RGB checkpoint, ``-`` if absent
-    target: str  #: the same in the receiving network
+    result: Result  #: ``fresh``: initial value; ``resized``: positions of this run's token grid
     reason: str
 
 
-@dataclass(frozen=True)
-class TransferReport:
-    """Result of :func:`transfer_rgb`, one row per group."""
-
-    path: Path
-    rows: tuple[TransferRow, ...]
-
-    def table(self) -> str:
-        """The report as text, one line per group."""
-        heads = ("weights", "tensors", "result", "largest tensor, RGB", "here", "reason")
-        rows = [tuple(map(str, row)) for row in self.rows]
-        return f"RGB weights from {self.path}\n{text_table(rows, heads)}"
-
-
 def transfer_rgb(
-    checkpoint: Checkpoint, sit: SiT, latent_norm: LatentNorm, *, keep_projector: bool
-) -> TransferReport:
+    checkpoint: Checkpoint, sit: SiT, latent_norm: LatentNorm, keep_projector: bool
+) -> list[TransferRow]:
     """Starts a range-image SiT and its latent statistics from an RGB checkpoint.
 
     ``sit`` and ``latent_norm`` are changed in place. Fresh, that is unchanged, stay: patch
@@ -81,7 +44,7 @@ def transfer_rgb(
     former two also if the patch size does; the position table if the token grid differs; the
     projector without ``keep_projector``, or if it does not fit; rows of the label table that the
     file lacks. A longer label table is cut to its first rows, and its last one if this run has a
-    row for "no class". All other weights must fit.
+    row for "no class". All other weights must fit. Returns a row for each group of weights.
 
     Source: tuning stages of valeoai/R3DPA, which always cut the label table to one row and keep the
     position table of another latent size if it has as many tokens.
@@ -114,17 +77,16 @@ def transfer_rgb(
             merged |= rgb_part
         else:
             merged |= {key: _label_rows(rgb_part[key], value) for key, value in own_part.items()}
-        source, target = (str(_largest(part) or "-") for part in (rgb_part, own_part))
-        rows.append(TransferRow(group, len(own_part), result, source, target, reason))
+        rows.append(TransferRow(group, len(own_part), result, reason))
     norm = {k.removeprefix(_NORM): v for k, v in merged.items() if k.startswith(_NORM)}
     weights = {k: v for k, v in merged.items() if not k.startswith(_NORM)}
     networks = {
         "sit": replace(rgb, init_args=init_args, state_dict=weights),
         "latent_norm": replace(statistics, state_dict=norm),
     }
-    merged_checkpoint = replace(checkpoint, networks=networks)
-    load_into({"sit": sit, "latent_norm": latent_norm}, merged_checkpoint, stage="RGB transfer")
-    return TransferReport(checkpoint.path, tuple(rows))
+    fitting = replace(checkpoint, networks=networks)
+    load_into({"sit": sit, "latent_norm": latent_norm}, fitting, stage="RGB transfer")
+    return rows
 
 
 def _transfer_result(
@@ -189,7 +151,6 @@ class WeakModel:
     see :func:`r3dpa.flow.renormalised`; ``shift`` is ``(C,)`` float32.
     """
 
-    path: Path
     sit: VelocityNetwork
     scale: float
     shift: Tensor
@@ -263,7 +224,7 @@ def read_snapshot(
     sit = weak.network("ema").build()
     assert isinstance(sit, VelocityNetwork)  # _latent_size
     sit.eval().requires_grad_(False)
-    return WeakModel(Path(path), sit, scale.item(), shift, weak.step, weak.feature_source)
+    return WeakModel(sit, scale.item(), shift, weak.step, weak.feature_source)
 
 
 def vae_fingerprint(vae: Weights) -> str:

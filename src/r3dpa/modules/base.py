@@ -17,6 +17,7 @@ from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
 from r3dpa.geometry import ScanGeometry
+from r3dpa.io import text_table
 from r3dpa.modules import steps
 from r3dpa.modules.checks import (
     check_features,
@@ -182,13 +183,10 @@ class GenerativeModule(L.LightningModule):
                     "leave rgb_weights out"
                 )
             rgb = read_checkpoint(self.rgb_weights)
-            report = transfer_rgb(
-                rgb,
-                self.sit,
-                self.latent_norm,
-                keep_projector=self.keep_projector,
-            )
-            rank_zero_info(report.table())
+            found = transfer_rgb(rgb, self.sit, self.latent_norm, self.keep_projector)
+            heads = ("weights", "tensors", "result", "reason")
+            table = text_table([tuple(map(str, row)) for row in found], heads)
+            rank_zero_info(f"RGB weights from {self.rgb_weights}\n{table}")
         if self.init_from is not None:
             before = read_checkpoint(self.init_from)
             networks = {name: self.get_submodule(name) for name in self.init_networks}
