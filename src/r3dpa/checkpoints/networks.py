@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from r3dpa.io import UNPICKLING_ERRORS
 
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
-FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant")
+FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
 
 _ALLOWED_PACKAGE = "r3dpa.nn."
 _NUM_LISTED = 10
@@ -159,6 +159,8 @@ class Checkpoint:
     augmentation: Mapping[str, Any] | None = None  #: plain values of its ``Augmentation``
     feature_source: str | None = None  #: feature source of its last training stage
     interpolant: Literal["linear", "cosine"] = "linear"  #: path from latents to noise of its SiT
+    version: str | None = None  #: version of r3dpa that wrote it
+    commit: str | None = None  #: commit of r3dpa that wrote it
     official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options
     left_out: Mapping[str, str] = field(default_factory=dict)  #: unread entries, and the reason
 
