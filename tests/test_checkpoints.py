@@ -1,7 +1,6 @@
 import argparse
 import json
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
