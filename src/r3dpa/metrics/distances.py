@@ -1,7 +1,5 @@
 """Distances of two sets of scenes that need no network, as torchmetrics metrics.
 
-Every metric is updated with real and with generated scenes, synchronises under DDP, and gives its
-numbers by ``compute()`` under their names in tables, or by ``results()`` with bootstrap intervals.
 Letters: B scenes, H x W range image, G groups of a bootstrap, n scenes that are kept.
 """
 
@@ -62,11 +60,7 @@ class SceneMetric(Metric):
         raise NotImplementedError
 
     def compute(self) -> dict[str, float]:
-        """Values of :meth:`results` by name, of the scenes of all processes.
-
-        Raises:
-            ValueError: If there are too few scenes.
-        """
+        """Values of :meth:`results` by name, of the scenes of all processes."""
         if not self.count("generated") or not self.has_reference:
             raise ValueError("update with real and with generated scenes: one side has none yet")
         values = {}
@@ -225,12 +219,11 @@ class BEVHistogramDistance(_Histograms):
     """JSD and TV of how many clouds occupy each cell seen from above.
 
     Args:
-        grid: Cells; default: those of the published numbers.
+        grid: Cells.
         num_groups: Groups of generated scenes that the bootstrap resamples.
     """
 
-    def __init__(self, grid: BEVGrid | None = None, num_groups: int = 1) -> None:
-        grid = BEVGrid() if grid is None else grid
+    def __init__(self, grid: BEVGrid, num_groups: int = 1) -> None:
         super().__init__(math.prod(grid.shape), num_groups, torch.int32)
         self.grid = grid
 

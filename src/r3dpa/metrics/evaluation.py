@@ -315,9 +315,8 @@ def _other_sensor(match: MinimumMatchingDistance) -> str:
     """A warning if scenes and real scans differ in their number of returns by much."""
     if not match.count("real"):
         return ""
-    made, real = (
-        int((match.kept(side)[1] > 0).sum(dim=(1, 2)).median()) for side in ("generated", "real")
-    )
+    images = (match.kept(side)[1] for side in ("generated", "real"))
+    made, real = (int((range_m > 0).sum(dim=(1, 2)).median()) for range_m in images)
     if _ALIKE <= made / max(real, 1) <= 1 / _ALIKE:
         return ""
     return (

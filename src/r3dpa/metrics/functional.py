@@ -142,14 +142,10 @@ def frechet_distance_of(real: Tensor, generated: Tensor) -> float:
 
 
 class FDInfinity(NamedTuple):
-    """Fréchet distance for infinitely many samples.
+    """Fréchet distance for infinitely many samples: the intercept of a line over 1/N."""
 
-    ``value`` is the intercept of the line through the distances over 1/N, and may be slightly
-    negative. Its ``standard_error`` is too low, since the subsets overlap.
-    """
-
-    value: float
-    standard_error: float
+    value: float  # may be slightly negative
+    standard_error: float  # too low, since the subsets overlap
 
 
 def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> FDInfinity:
@@ -159,9 +155,6 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
     equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all of it.
 
     Source: Chong and Forsyth, "Effectively unbiased FID and Inception score", CVPR 2020.
-
-    Raises:
-        ValueError: If a quarter of the smaller set is less than F + 1 samples.
     """
     real, generated = checked_pair(real, generated)
     width = real.shape[1]
@@ -220,9 +213,6 @@ def polynomial_mmd(
 
     Subsets of ``subset_size`` rows are drawn without replacement from ``(N, F)`` and ``(M, F)``;
     as they overlap, the standard error of the mean is above ``std / sqrt(num_subsets)``.
-
-    Raises:
-        ValueError: If a set is smaller than a subset.
     """
     smaller = min(len(real), len(generated))
     if not 2 <= subset_size <= smaller or num_subsets < 2:
@@ -296,9 +286,6 @@ def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dic
         ``recall`` ``(N,)``, 1 for a real sample in a generated ball; ``density`` ``(M,)``, real
         balls around a generated sample divided by k; ``coverage`` ``(N,)``, 1 for a real sample
         whose ball holds a generated one.
-
-    Raises:
-        ValueError: If a set has k samples or fewer or holds NaN, or if widths differ.
     """
     real, generated = checked_pair(real, generated, num_neighbors + 1)
     centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances

@@ -272,11 +272,7 @@ def realism_table(
     reference: Mapping[str, ScanStatistics],
     notes: Iterable[str] = (),
 ) -> RealismTable:
-    """Compare drives of scans with drives of a reference; see the text of the module.
-
-    Raises:
-        ValueError: If one of them has no drive.
-    """
+    """Compare drives of scans with drives of a reference, at least one of each."""
     if not scans or not reference:
         raise ValueError("realism needs at least one drive of scans and one of the reference")
     a = sum(scans.values(), ScanStatistics())

@@ -20,12 +20,7 @@ from tqdm import tqdm
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
 from r3dpa.metrics.distances import SceneMetric
-from r3dpa.metrics.feature_distances import (
-    metrics_of,
-    scene_metrics,
-    update_with,
-    with_features,
-)
+from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
 from r3dpa.metrics.scene import EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -112,11 +107,7 @@ class ReferenceStatistics:
         return self.num_done == len(self.names)
 
     def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
-        """Refuses incomplete statistics, and spaces that they lack or that are not the same.
-
-        Raises:
-            ValueError: Naming the space and the fields that differ.
-        """
+        """Refuses incomplete statistics, and spaces that they lack or that are not the same."""
         if not self.complete:
             raise ValueError(
                 f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
@@ -157,9 +148,6 @@ class ReferenceStatistics:
             spaces: Those that the statistics were prepared for.
             partial: File to save to every ``every`` scans and on a ``KeyboardInterrupt``.
             every: Rounded up to whole batches.
-
-        Raises:
-            ValueError: If a scan is not the next one or cannot be used; names it.
         """
         saved, whole = self.num_done, True  # never saved in the middle of a batch
         try:
@@ -255,12 +243,8 @@ def compute_reference(
         job: Empty statistics of the scans.
         scans_from: Scans of the job from a number on.
         spaces: Those that the statistics were prepared for.
-        out: File to write.
-        renew: Replace files of other jobs, such as those of other scans.
-
-    Raises:
-        ValueError: If, without ``renew``, a file is of another job; if another process computes
-            ``out``, or a scan cannot be used.
+        out: File to write; a ``ValueError`` if another process does.
+        renew: Replace files of other jobs, such as those of other scans; else a ``ValueError``.
     """
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
@@ -286,11 +270,7 @@ def compute_reference(
 
 
 def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
-    """Statistics that an interrupted job has saved, or the given ones without a file.
-
-    Raises:
-        ValueError: If the file is of another job.
-    """
+    """Statistics that an interrupted job has saved, or the given ones without a file."""
     if not partial.exists():
         return reference
     stored = ReferenceStatistics.load(partial)

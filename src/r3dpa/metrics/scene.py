@@ -124,8 +124,7 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
         ``EMPTY_RANGE_M`` without a return; the intensity ``(H, W)`` if it was known.
 
     Raises:
-        ValueError: If there are neither points nor image, values are NaN or infinite, a shape is
-            wrong, or nothing lies within the range limits; the message names the scene.
+        ValueError: If the scene, which the message names, cannot be used.
     """
     projection, sensor = protocol.projection, protocol.sensor
     if scene.range_m is not None:
@@ -170,9 +169,7 @@ def usable_scenes(
 ) -> Iterator[EvaluationScene]:
     """Scenes through the sensor that every metric can use; the others' faults go to ``bad``.
 
-    Raises:
-        ValueError: Without ``bad``, as :func:`through_sensor`, or if nothing lies on the grid seen
-            from above.
+    Without ``bad``, a ``ValueError`` as of :func:`through_sensor` and :meth:`BEVGrid.kept`.
     """
     for scene in scenes:
         try:

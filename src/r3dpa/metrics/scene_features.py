@@ -63,11 +63,7 @@ class SceneFeatures:
 
     @torch.inference_mode()
     def __call__(self, scenes: Sequence[EvaluationScene]) -> Tensor:
-        """Features ``(B, F)`` float32 on the CPU of one or more scenes of :func:`through_sensor`.
-
-        Raises:
-            ValueError: If a feature is NaN or infinite; names the scene.
-        """
+        """Features ``(B, F)`` float32 on the CPU; NaN is a ``ValueError`` that names the scene."""
         # GPUs round the factors of a convolution to 10 bits (TF32) unless disabled.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             features = self.extract(scenes).float().cpu()
@@ -86,12 +82,7 @@ def scene_features(
     protocol: Protocol = DEFAULT,
     device: str = "cpu",
 ) -> SceneFeatures:
-    """Feature space by its name.
-
-    Raises:
-        ValueError: If the name is unknown, a file is missing, given where there are no weights, or
-            holds something else; the message names it.
-    """
+    """Feature space by its name; a ``ValueError`` names what is unknown, missing or unfit."""
     if name not in SPACES:
         raise ValueError(f"there is no feature space {name!r}; there are {', '.join(SPACES)}")
     if name == "fgeo" and ckpt is not None:
@@ -210,12 +201,8 @@ def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
 
 
 def _card(network: nn.Module, layer: str, preprocessing: str) -> dict[str, Any]:
-    return {
-        "backbone": type(network).__name__,
-        "layer": layer,
-        "weights": sha256(network),
-        "preprocessing": preprocessing,
-    }
+    card = {"backbone": type(network).__name__, "layer": layer, "weights": sha256(network)}
+    return {**card, "preprocessing": preprocessing}
 
 
 def _stack(scenes: Sequence[EvaluationScene], field: str, device: torch.device) -> Tensor:
