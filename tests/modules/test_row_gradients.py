@@ -48,7 +48,7 @@ STARTS = {  # networks that the last stage takes from the stage before; from the
 @pytest.fixture(scope="module")
 def rows():
     """Stages on scans of each row."""
-    plan = make_plan(TABLES, TABLES / "scale" / "paper.yaml", (0,), resolved)
+    plan = make_plan(TABLES, TABLES / "scale" / "paper.yaml", (0,), Path(), resolved)
     return {
         (table.name, row.key): [stage for stage in row.stages[0] if stage.on_scans]
         for table in plan.tables

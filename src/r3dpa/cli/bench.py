@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.options import check_file, check_folder
 
@@ -94,15 +95,15 @@ def ablate(
     scale: str = "demo",
     seeds: tuple[int, ...] = (0,),
     out: Path | None = None,
-    jobs: int = 1,
+    jobs: PositiveInt = 1,
     rgb_weights: Path | None = None,
     wandb: Literal["offline", "online", "off"] = "offline",
     budget_only: bool = False,
 ) -> None:
     """Train, test and compare the rows of the paper's ablations.
 
-    Prints the estimated cost, then trains each stage once, however many rows and tables share it,
-    and writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json``. The same command continues an
+    Prints number and length of the trainings, runs each once, however many rows and tables share
+    it, and writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json``. The same command continues an
     interrupted run. A row that fails does not stop the others; the exit status is then 1.
 
     Args:
@@ -116,7 +117,7 @@ def ablate(
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
         wandb: One run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
             ``online``.
-        budget_only: Print the cost, and start nothing.
+        budget_only: Print number and length of the trainings, and start nothing.
     """
     from r3dpa import ablation
     from r3dpa.cli.stages import conf_folder
@@ -127,20 +128,17 @@ def ablate(
     scale_file = _scale_file(tables, scale)
     folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
-    plan = ablation.make_plan(tables, scale_file, seeds, _resolved, rgb_weights)
-    if plan.missing_weights and not budget_only:
-        listed = ", ".join(map(str, plan.missing_weights))
-        raise ValueError(f"scale {plan.scale} needs files that are not there: {listed}")
+    plan = ablation.make_plan(tables, scale_file, seeds, folder, _resolved, rgb_weights)
     _say(ablation.budget_of(plan))
     if budget_only:
         return
     with only_writer(folder / ".ablate.lock", f"runs r3dpa ablate in {folder}"):
-        failed = ablation.run_plan(plan, folder, _say, jobs)
+        failed = ablation.run_plan(plan, _say, jobs)
         for table in plan.tables:
-            text, results = ablation.write_table(plan, table, folder, failed)
+            text, results = ablation.write_table(plan, table, failed)
             _say(f"\n{text}")
             if wandb != "off":
-                ablation.log_rows(plan, table, results, folder, wandb)
+                ablation.log_rows(plan, table, results, wandb)
     for name, reason in failed.items():
         _say(f"failed: {name}: {reason}")
     files = [folder / f"{table.name}.md" for table in plan.tables]

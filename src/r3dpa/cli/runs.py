@@ -60,14 +60,9 @@ def report(run: Path) -> str:
     from r3dpa import viz
     from r3dpa.io import text_table
 
-    paths = sorted(run.glob("version_*/metrics.csv"), key=lambda path: path.stat().st_mtime)
-    if not paths:
+    curves = viz.read_curves(run)
+    if not curves:
         raise ValueError(f"{run} holds no version_*/metrics.csv; give the --run_dir of a fit")
-    curves: dict[str, viz.Series] = {}
-    for path in paths:  # one for each start of the run
-        for name, (steps, values) in viz.read_metrics(path).items():
-            before = curves.get(name, ([], []))
-            curves[name] = ([*before[0], *steps], [*before[1], *values])
     drawn = {name: curve for name, curve in curves.items() if len(curve[1]) > 1}
     if drawn:
         viz.save(viz.loss_curves(drawn), run / "loss_curves.png")

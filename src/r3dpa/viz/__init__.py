@@ -3,7 +3,14 @@
 Colours are safe for colour-blind readers, on scales fixed in metres. Dark means no return.
 """
 
-from r3dpa.viz.curves import ParetoPoint, Series, loss_curves, pareto_figure, read_metrics
+from r3dpa.viz.curves import (
+    ParetoPoint,
+    Series,
+    loss_curves,
+    pareto_figure,
+    read_curves,
+    read_metrics,
+)
 from r3dpa.viz.features import feature_figure, latents_picture, pca_colours, similarity_picture
 from r3dpa.viz.figures import (
     EditRow,
@@ -44,6 +51,7 @@ __all__ = [
     "pca_colours",
     "range_image_picture",
     "range_strips",
+    "read_curves",
     "read_metrics",
     "reconstruction_figure",
     "save",

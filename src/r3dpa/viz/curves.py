@@ -72,6 +72,20 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
     return {name: pair for name, pair in series.items() if pair[0]}
 
 
+def read_curves(run: Path) -> dict[str, Series]:
+    """Quantities of a training by step, from the ``version_*/metrics.csv`` of each start.
+
+    Where a start repeats steps of an earlier one its values count.
+    """
+    curves: dict[str, dict[float, float]] = {}
+    paths = run.glob("version_*/metrics.csv")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        for name, (steps, values) in read_metrics(path).items():
+            curves.setdefault(name, {}).update(zip(steps, values, strict=True))
+    ordered = {name: sorted(curve.items()) for name, curve in curves.items()}
+    return {name: ([s for s, _ in c], [v for _, v in c]) for name, c in ordered.items()}
+
+
 def _draw_curve(
     axes: Axes, name: str, steps: NDArray[np.float64], values: NDArray[np.float64]
 ) -> None:
