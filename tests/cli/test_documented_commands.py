@@ -19,7 +19,7 @@ import pytest
 
 from r3dpa.cli import COMMANDS, OWN_PARSER, _find, main
 from r3dpa.cli.features import _parser, _with_data_class
-from r3dpa.cli.parser import function_parser, load
+from r3dpa.cli.parser import load, parse
 
 TOP = Path(__file__).resolve().parents[2]
 CONF = TOP / "conf"
@@ -72,7 +72,7 @@ def test_command_is_accepted(words, monkeypatch, capsys):
             main([*words, "--print_config"])
         assert ended.value.code == 0, capsys.readouterr().err
     else:
-        function_parser(load(COMMANDS[name].target), name).parse_args(rest)
+        parse(load(COMMANDS[name].target), rest, name)
 
 
 def test_readme_shows_every_group():

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from r3dpa.cli import main
-from r3dpa.cli.parser import function_parser
+from r3dpa.cli.parser import parse
 from r3dpa.cli.sample import sample as sample_command
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.flow.solvers import ODE_SOLVERS
@@ -129,9 +129,8 @@ class TestSample:
         assert ": 5 network evaluations each, " in capsys.readouterr().out
 
     def test_every_solver_can_be_chosen(self):
-        parser = function_parser(sample_command, "sample")
         for solver in (*ODE_SOLVERS, "euler_maruyama"):
-            parser.parse_args(["--ckpt", "a", "--out", "b", "--solver", solver])
+            parse(sample_command, ["--ckpt", "a", "--out", "b", "--solver", solver], "sample")
 
     def test_a_quality_chooses_the_sampler_and_says_so(self, tiny_file, tmp_path, capsys):
         words = ["--num", 1, "--quality", "draft"]

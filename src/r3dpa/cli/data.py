@@ -135,7 +135,6 @@ def objects(
     ckpt: Path,
     out: Path,
     features_ckpt: Path | None = None,
-    classes: list[str] | None = None,
     limit: int = 200,
     device: str = "auto",
 ) -> str:
@@ -148,7 +147,6 @@ def objects(
             sensor and grid.
         out: File to write, ``.safetensors``.
         features_ckpt: Weights of the feature source, if it has none of its own.
-        classes: Names of classes; default: all in the scans.
         limit: Number of scans at most, evenly spread.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
@@ -174,12 +172,12 @@ def objects(
     extractor = extractor.to(usable_device(device))
     scans = evenly(find_scans(data), limit)
     shown = tqdm(scans, unit="scan", desc="objects", disable=None)
-    library = object_library(iter(shown), extractor, projection, sit.grid_size, classes)
+    library = object_library(iter(shown), extractor, projection, sit.grid_size)
     library.save(out)
-    rows = []
-    for entry in library.classes:
-        counts = entry.num_scans, entry.num_cells, entry.num_points
-        rows.append([entry.name, *map(str, counts), f"{entry.spread:.3f}"])
+    rows = [
+        [one.name, f"{one.num_scans}", f"{one.num_cells}", f"{one.num_points}", f"{one.spread:.3f}"]
+        for one in library.classes
+    ]
     head = ["class", "scans", "cells", "points", "spread"]
     table = text_table(rows, head, "rrrrr", "plain")
     spread = "Spread: mean of 1 - cosine between the class's feature and its cells."

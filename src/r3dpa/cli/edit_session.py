@@ -168,7 +168,7 @@ class EditSession:
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
             self._show(command, scans, result.range_m, parts, part_names)
-            figures: dict[str, Any] = {
+            request |= {
                 "nfe": result.nfe,
                 "seconds": seconds,
                 "cosine": None if result.cosine is None else result.cosine.tolist(),
@@ -176,21 +176,13 @@ class EditSession:
                 "round_trip_m": result.round_trip_m,
             }
             if held_out := measure(result.range_m):
-                figures["held_out"] = held_out
-            writer.finish(request | figures)
-        lines = [
+                request["held_out"] = held_out
+            writer.finish(request)
+        return (
             f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
-            f" {seconds:.3g} s"
-        ]
-        errors = {
-            "range error of encoder and decoder alone": result.vae_error_m,
-            "added at most by the inversion": result.round_trip_m,
-        }
-        errors |= {f"range error of held-out pixels, {n}": e["mae_m"] for n, e in held_out.items()}
-        lines += [f"{name}: {e:.3f} m" for name, e in errors.items() if e is not None]
-        if result.cosine is not None:
-            lines.append(f"cosine with the guiding features: {float(result.cosine.mean()):.3f}")
-        return "\n".join([*lines, f"open {options.out / 'edit.png'} and edit.html beside it"])
+            f" {seconds:.3g} s; errors are in metadata.json\n"
+            f"open {options.out / 'edit.png'} and {options.out / 'edit.html'}"
+        )
 
     @contextmanager
     def _progress(self, command: str) -> Iterator[None]:

@@ -66,13 +66,12 @@ def check_least(least: int, **values: int | None) -> None:
 def check_folder(out: Path | None) -> None:
     """Refuses an output folder whose place is taken by a file, before the work starts."""
     for folder in () if out is None else (out, *out.parents):
-        if folder.exists() and not folder.is_dir():
+        if folder.is_file():
             raise ValueError(f"{folder} is a file; give another --out")
 
 
 def check_file(out: Path | None) -> None:
     """Refuses an output file whose place is taken by a folder, before the work starts."""
-    if out is not None:
-        if out.is_dir():
-            raise ValueError(f"{out} is a folder; give --out the name of a file")
-        check_folder(out.parent)
+    if out is not None and out.is_dir():
+        raise ValueError(f"{out} is a folder; give --out the name of a file")
+    check_folder(None if out is None else out.parent)

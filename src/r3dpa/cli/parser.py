@@ -13,7 +13,7 @@ from typing import Any, NoReturn, Union, get_args, get_origin
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
-__all__ = ["OneLineErrors", "Parser", "function_parser", "load", "run_function"]
+__all__ = ["OneLineErrors", "load", "parse", "run_function"]
 
 # jsonargparse denies os.system and its like already when a YAML file names them.
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
@@ -46,10 +46,7 @@ def _short(message: str) -> str:
 
 
 class Parser(OneLineErrors):
-    """Parser of a function: ``--quick`` stands for ``--quick true``, and lists are words.
-
-    ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
-    """
+    """Parser of a function; ``--quick`` stands for ``--quick true``."""
 
     def add_argument(self, *args: Any, **kwargs: Any) -> Any:
         """Adds an argument; boolean ones need no value."""
@@ -57,36 +54,33 @@ class Parser(OneLineErrors):
             kwargs |= {"nargs": "?", "const": True}
         return super().add_argument(*args, **kwargs)
 
-    def parse_args(  # type: ignore[override] # of argparse; jsonargparse's has more, too
-        self, args: Sequence[str] | None = None, *more: Any, **options: Any
-    ) -> Namespace:
-        """Parses as usual, after the words of a list became one."""
-        words = sys.argv[1:] if args is None else list(args)
-        return super().parse_args(self._with_lists(words), *more, **options)
 
-    def _with_lists(self, words: Sequence[str]) -> list[str]:
-        types = {
-            name: item_types
-            for action in self._actions
-            for name in action.option_strings
-            if (item_types := _item_types(getattr(action, "_typehint", None)))
-        }
-        joined: list[str] = []
-        rest = list(words)
-        while rest:
-            name, equals, value = rest[0].partition("=")
-            joined.append(rest.pop(0))
-            if name not in types:
-                continue
-            items = [value] if equals else []
-            while rest and not equals and re.match(r"[^-]|-\.?\d|$", rest[0]):  # no option
-                items.append(rest.pop(0))
-            if items and not items[0].lstrip().startswith("["):
-                parts = [part.strip() for item in items for part in item.split(",")]
-                quoted = parts if types[name] <= {int, float} else map(json.dumps, parts)
-                items = [f"[{', '.join(quoted)}]"]
-            joined = [*joined[:-1], name, *items]
-        return joined
+def _with_lists(parser: Parser, words: Sequence[str]) -> list[str]:
+    """The words, those of a list as one.
+
+    ``--box -10 10 -20 0``, ``--box -10,10,-20,0`` and ``--box '[-10, 10, -20, 0]'`` are the same.
+    """
+    types = {
+        name: _item_types(getattr(action, "_typehint", None))
+        for action in parser._actions
+        for name in action.option_strings
+    }
+    joined: list[str] = []
+    rest = list(words)
+    while rest:
+        name, equals, value = rest[0].partition("=")
+        joined.append(rest.pop(0))
+        if not types.get(name):
+            continue
+        items = [value] if equals else []
+        while rest and not equals and re.match(r"[^-]|-\.?\d|$", rest[0]):  # no option
+            items.append(rest.pop(0))
+        if items and not items[0].lstrip().startswith("["):
+            parts = [part.strip() for item in items for part in item.split(",")]
+            quoted = parts if types[name] <= {int, float} else map(json.dumps, parts)
+            items = [f"[{', '.join(quoted)}]"]
+        joined = [*joined[:-1], name, *items]
+    return joined
 
 
 def _item_types(kind: Any) -> set[Any]:
@@ -104,19 +98,23 @@ def load(target: str) -> Callable[..., Any]:
     return function
 
 
-def function_parser(function: Callable[..., Any], prog: str) -> Parser:
-    """Parser of a function; keyword-only arguments are options, others may be positional."""
+def parse(
+    function: Callable[..., Any], words: Sequence[str], prog: str
+) -> tuple[Parser, Namespace]:
+    """Parser of a function and the values of a command line.
+
+    Keyword-only arguments are options, others may be positional.
+    """
     description = cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]
     parser = Parser(prog=prog, description=description)
     parser.add_argument("--config", action="config", help="YAML file with options")
     parser.add_function_arguments(function, as_positional=True, as_group=False)
-    return parser
+    return parser, parser.parse_args(_with_lists(parser, words))
 
 
 def run_function(function: Callable[..., Any], words: Sequence[str], prog: str) -> Any:
     """Calls a function with the arguments of a command line; returns its result."""
-    parser = function_parser(function, prog)
-    config = parser.parse_args(words)
+    parser, config = parse(function, words, prog)
     try:
         arguments = parser.instantiate(config).as_dict()
     except ValueError as error:  # of an optional dataclass: the cause is its own check
