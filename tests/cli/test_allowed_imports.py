@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 
 import pytest
@@ -54,13 +53,12 @@ def hostile(tmp_path, monkeypatch):
 class TestCheckpoints:
     """Class paths stored in checkpoints: networks of ``r3dpa.nn`` and nothing else."""
 
-    def lightning(self, path, class_path, init_args=None, **more):
+    def lightning(self, path, class_path, init_args=None):
         config = {"class_path": class_path, "init_args": init_args or {}}
         content = {
             "pytorch-lightning_version": "2.6.6",
             "state_dict": {"vae.weight": torch.zeros(1)},
             "hyper_parameters": {"vae": config},
-            **more,
         }
         torch.save(content, path)
         return path
@@ -68,21 +66,6 @@ class TestCheckpoints:
     def test_hostile_class_is_not_imported(self, hostile, tmp_path):
         path = self.lightning(tmp_path / "a.ckpt", f"{hostile}.Model")
         with pytest.raises(ValueError, match=rf"a\.ckpt: vae: class '{hostile}.Model' is not all"):
-            read_checkpoint(path)
-        assert not (tmp_path / "imported").exists()
-
-    @pytest.mark.parametrize("name", ["", None, "r3dpa.nn..vae.VAE"])
-    def test_other_names(self, name, tmp_path):
-        with pytest.raises(ValueError, match=r"a\.ckpt: vae: class"):
-            read_checkpoint(self.lightning(tmp_path / "a.ckpt", name))
-
-    def test_pickled_code_is_not_run(self, tmp_path):
-        class Evil:
-            def __reduce__(self):
-                return os.mkdir, (str(tmp_path / "imported"),)
-
-        path = self.lightning(tmp_path / "a.ckpt", "r3dpa.nn.VAE", extra=Evil())
-        with pytest.raises(ValueError, match=r"a\.ckpt: the file would run \S*mkdir when loaded"):
             read_checkpoint(path)
         assert not (tmp_path / "imported").exists()
 

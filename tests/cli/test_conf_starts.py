@@ -5,21 +5,16 @@ Networks and images are tiny here; the slow tests start them at their own sizes.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from PIL import Image
-from safetensors.torch import save_file
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn import VAE, ImageVAE, LatentNorm, SiT, UNet
-from r3dpa.nn.backbones import DINOv2
 from r3dpa.simulation import simulate
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -171,17 +166,6 @@ def test_velocity_networks_are_built_at_their_own_size(name):
 
 
 @pytest.mark.slow
-def test_nodes(smoke_root, tmp_path):
-    """A process of its own: the group that it founds would stay for all tests after it."""
-    settings = SIMULATED | {"data.init_args.root": smoke_root, "trainer.num_nodes": 1}
-    configs = ("trainer", "launch/nodes", "experiment/vae_alignment", "smoke")
-    words = [sys.executable, "-m", "r3dpa", *words_of(configs, settings, tmp_path)]
-    result = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "distributed_backend=gloo" in result.stderr
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("stage", EXPERIMENTS)
 def test_experiments_at_their_own_size(stage, start, smoke_root, tmp_path):
     """With 64 x 1024 range images of the scans there are."""
@@ -210,22 +194,3 @@ def test_a_size_is_three_overrides(width, depth, heads, millions):
     head = sum(p.numel() for p in sit.projector.parameters())
     count = sum(p.numel() for p in sit.parameters()) - head
     assert count / 1e6 == pytest.approx(millions, rel=0.02)
-
-
-@pytest.mark.slow
-def test_rgb_pretraining_at_its_own_size(start, tmp_path):
-    """With random weights in the place of Stable Diffusion's VAE and of DINOv2."""
-    torch.manual_seed(0)
-    for index in range(3):
-        path = tmp_path / "imagenet" / f"{index}.png"
-        path.parent.mkdir(exist_ok=True)
-        Image.new("RGB", (300, 260), (80 * index, 100, 20)).save(path)
-    save_file(ImageVAE(**net("sd_vae")).state_dict(), tmp_path / "vae.safetensors")
-    torch.save(DINOv2().state_dict(), tmp_path / "dino.pth")
-    settings = {
-        "data.init_args.source.init_args.root": tmp_path / "imagenet",
-        "data.init_args.val_every": 3,
-        "model.init_args.init_from": tmp_path / "vae.safetensors",
-        "model.init_args.teacher.init_args.weights": tmp_path / "dino.pth",
-    }
-    start(("trainer", "data/images", "experiment/rgb_pretraining"), settings)

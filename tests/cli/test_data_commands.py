@@ -88,21 +88,6 @@ class TestSimulate:
             simulate(*words)
         assert not (tmp_path / "out").exists()
 
-    def test_a_data_module_asks_for_the_same_before_features_are_made(self, simulate, tmp_path):
-        config = tmp_path / "data.yaml"
-        config.write_text(
-            "data: {class_path: r3dpa.data.SimulatedDataModule, init_args: {"
-            f"root: {tmp_path / 'data'}, num_scans: 2, simulation_sensor: "
-            f"{tmp_path / 'lasers.yaml'}, effects: {{range_noise: off}}, "
-            "weather: {rain_mm_h: 2}, extractor: r3dpa.nn.backbones.GeometricFeatures}}\n"
-        )
-        words = ["--scans", 2, "--effects.range_noise", "off", "--weather.rain_mm_h", 2]
-        manifest = simulate(*words)
-        main(["features", "--config", str(config)])
-        assert json.loads((tmp_path / "data" / "simulation.json").read_text()) == manifest
-        (rows,) = (tmp_path / "data" / "feature_grids" / "geometric").rglob("*.jsonl")
-        assert len(rows.read_text().splitlines()) == 2
-
 
 def check(root, capsys):
     """Exit status, and lines, of ``r3dpa check``."""

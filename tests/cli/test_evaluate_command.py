@@ -173,24 +173,12 @@ def images(second=10.0):
             r"img\.npz, sample .*1.*: has no point within the sensor's range.*skip_bad",
         ),
         (images(second=np.nan), r"img\.npz, sample .*1.*: has NaN or infinite ranges.*skip_bad"),
-        (images()[:1], r"1 generated scenes; a comparison needs at least 2"),
-        (images(), r"3 generated scenes for the 64 features of FGEO.*--allow_few"),
     ],
 )
 def test_unusable_images_are_named(reference_file, tmp_path, content, message):
     np.savez(tmp_path / "img.npz", content)
     with pytest.raises(ValueError, match=message):
         evaluate("--samples", tmp_path / "img.npz", "--reference", reference_file)
-
-
-def test_another_protocol_is_recorded(data, no_figures, samples, tmp_path):
-    published = tmp_path / "published.safetensors"
-    words = ["--data", data, "--out", published, "--spaces", "fgeo", "--protocol", "published"]
-    main(["reference", *map(str, words), "--device", "cpu"])
-    words = ["--samples", samples, "--allow_few", "--reference", published, "--out", tmp_path / "o"]
-    evaluate(*words)
-    stored = Evaluation.load(tmp_path / "o" / "evaluation.json")
-    assert stored.about["protocol"]["unprojection"] == "corner"
 
 
 def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path):

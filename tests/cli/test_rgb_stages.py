@@ -13,7 +13,6 @@ from PIL import Image
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.modules import LossWeights, RGBPretraining
-from r3dpa.modules import image_vae as image_vae_stage
 from r3dpa.nn import ImageVAE, SiT
 from r3dpa.nn.backbones import DINOv2
 
@@ -146,21 +145,6 @@ def test_a_teacher_is_moved_to_the_images():
     module = RGBPretraining(vae, sit, teacher, weights=LossWeights(sit_alignment=0.5))
     features = module._features({"image": torch.empty(1, 3, 16, 16, device="meta")})
     assert features.device.type == "meta"
-
-
-@pytest.mark.filterwarnings("ignore:step . was skipped")
-def test_broken_steps_of_images_are_skipped_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(image_vae_stage, "reconstruction_loss", lambda image, *_: image.mean() / 0)
-    guard = "[{class_path: r3dpa.callbacks.StepGuard, init_args: {max_skipped_steps: 2}}]"
-    with pytest.raises(RuntimeError, match=r"2 steps in a row had a non-finite loss"):
-        fit(
-            tmp_path,
-            (*DEMO, "experiment/image_vae"),
-            LEAVES,
-            VAE,
-            steps(4),
-            {"trainer.callbacks": guard},
-        )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -32,18 +33,6 @@ def words(model, data, run_dir):
     return ["--model", model, "--data", data, "--run_dir", str(run_dir), *fixed]
 
 
-@pytest.fixture
-def refused(capsys):
-    """``refused(*args)``: what the command line says to a fit that does not start."""
-
-    def run(*args):
-        with pytest.raises((SystemExit, ValueError)) as stop:
-            main(["fit", *args])
-        return str(stop.value) + capsys.readouterr().err
-
-    return run
-
-
 def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys):
     arguments = words(f"{__name__}.LoggingModel", f"{BORING}.BoringDataModule", tmp_path)
     main(["fit", *arguments])
@@ -70,18 +59,17 @@ def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("model", "data", "field"),
+    ("model", "data", "message"),
     [
-        ("r3dpa.modules.Nothing", f"{BORING}.BoringDataModule", "model"),
-        (f"{BORING}.BoringDataModule", f"{BORING}.BoringDataModule", "model"),
-        (f"{BORING}.BoringModel", f"{BORING}.BoringModel", "data"),
+        ("r3dpa.modules.Nothing", "BoringDataModule", "r3dpa fit: --model: .*r3dpa.modules.Noth"),
+        (f"{BORING}.BoringModel", "BoringModel", "r3dpa fit: --data: .*BoringModel"),
     ],
 )
-def test_a_class_that_is_none_or_of_the_wrong_kind_is_named(refused, tmp_path, model, data, field):
-    message = refused(*words(model, data, tmp_path))
-    assert f"r3dpa fit: --{field}: " in message
-    assert message.count("\n") == 1
-    assert (model if field == "model" else data) in message
+def test_a_class_that_is_none_or_of_the_wrong_kind_is_named(model, data, message, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", *words(model, f"{BORING}.{data}", tmp_path)])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(message, line)
 
 
 def test_presets_are_the_shipped_configurations(capsys, tmp_path, monkeypatch):

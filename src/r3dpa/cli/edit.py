@@ -208,7 +208,6 @@ def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str
     from r3dpa.cli.edit_session import EditSession
 
     session = EditSession(EditOptions(**options), num)
-    session.settings.times(start)
     source = session.read(scan)
     run = partial(session.editor.vary, source.range_m, num, session.options.seed, start=start)
     return session.write("vary", arguments, {f"scan {scan.stem}": source}, run)
