@@ -9,7 +9,6 @@ from r3dpa.data import Augmentation, LidarDataModule, find_scans, read_scan
 from r3dpa.data.augmentation import View
 from r3dpa.geometry import (
     LidarSensor,
-    RingProjection,
     SphericalProjection,
     pool_cells,
     range_image,
@@ -109,23 +108,6 @@ def test_a_view_of_a_grid_equals_extracting_from_the_view(extractor, simulated_s
         filled = expected.norm(dim=-1) > 0
         assert filled.float().mean() > 0.5
         assert torch.cosine_similarity(actual[filled], expected[filled]).min() > 0.999
-
-
-def in_ring_order(points, row):
-    """Points ring after ring, azimuth rising from 0, as a scan of them would be stored."""
-    azimuth = torch.atan2(points[:, 1].double(), points[:, 0].double()) % (2 * np.pi)
-    return points[np.lexsort((azimuth.numpy(), row.numpy()))]
-
-
-def test_ring_images_are_reordered_alike(simulated_scans):
-    view = View(8, True, 64)
-    projection = RingProjection.fit([points[:, :3] for points in simulated_scans], LidarSensor())
-    for points in simulated_scans:
-        row, _ = projection.pixel_of(points[:, :3])
-        image, _ = range_image(in_ring_order(points, row)[:, :3], projection)
-        stored = in_ring_order(seen_from(view, points), row)
-        expected, _ = range_image(stored[:, :3], projection)
-        assert ((view.image(image) - expected).abs() > 1e-4).sum() <= FEW_PIXELS
 
 
 BOTH = Augmentation(rotate=True, flip=True, approximate_grids=True)

@@ -10,11 +10,8 @@ from r3dpa.data import (
     SimulatedDataModule,
     StoreError,
     check,
-    pooled_grids,
     write_bin,
 )
-from r3dpa.data.datasets import PointDataset
-from r3dpa.data.feature_grids import plan
 from r3dpa.data.scans import KITTI360_DRIVES
 from r3dpa.geometry import LidarSensor
 
@@ -90,24 +87,6 @@ def test_missing_grids_are_made_once_and_need_their_extractor(
     assert data().feature_source is None
     with pytest.raises(StoreError, match="No feature grids in"):
         _ = data(features_dir=str(tmp_path / "none")).feature_source
-
-
-def test_stored_grids_need_not_be_made_as_they_would_be_here(tmp_path, data, scaled_points):
-    """Complete grids of another precision, as `r3dpa features` may have made them."""
-    module, extractor = data(extractor=scaled_points()), scaled_points()
-    module.setup("predict")
-    scans, projection = module.all_set.scans, module.projection
-    arguments = scans, extractor, projection, [(2, 4)], module.features_dir, "bf16-mixed"
-    todo = plan(*arguments)
-    samples = PointDataset(todo.missing, module.sensor, extractor.prepare)
-    grids = pooled_grids(extractor, [*samples], projection, [(2, 4)])
-    with todo.stores[2, 4].writer() as writer:
-        writer.add([sample.key for sample in samples], grids[2, 4])
-    module.prepare_data()
-    module.setup("fit")
-    assert module.extractor.calls == 0
-    read = module.all_set[3]["feature_grid"]
-    assert torch.equal(read, grids[2, 4][3].half().float())
 
 
 def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):

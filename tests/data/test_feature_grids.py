@@ -1,6 +1,5 @@
 import os
 import re
-import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,7 +17,7 @@ from r3dpa.data import (
     write_feature_grids,
 )
 from r3dpa.data.datasets import PointDataset
-from r3dpa.data.feature_grids import GridSettings, any_settings, plan
+from r3dpa.data.feature_grids import any_settings, plan
 from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
@@ -295,22 +294,3 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
     assert any_settings(root).extractor["name"] == "scaled"
     with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
         any_settings(root / "nothing")
-
-
-def test_a_disk_that_fills_up(made, projection, scaled_points):
-    """A limit on the size of files, in the middle of the second row."""
-    scans, root = made
-    settings = GridSettings.of(scaled_points(), projection, GRID)
-    keys = [("new/1", 1, 1), ("new/2", 1, 1)]
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    writer = settings.store(root).writer()
-    resource.setrlimit(resource.RLIMIT_FSIZE, (64 + 32, hard))
-    try:
-        with pytest.raises(StoreError, match=r"cannot be written to .*2x4 \(.*\): give a folder"):
-            writer.add(keys, torch.ones(2, 8, 4))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert_grids(root, scans, projection)
-    writer.add(keys, torch.ones(2, 8, 4))
-    writer.close()
-    assert set(settings.store(root).places()) >= set(keys)

@@ -1,10 +1,11 @@
+import io
 import pickle
 
 import numpy as np
 import pytest
 import torch
 
-from r3dpa.data.samples import SampleError, read_samples
+from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import ScanError, write_bin, write_npz, write_ply
 from r3dpa.geometry import (
     EMPTY_RANGE_M,
@@ -88,7 +89,7 @@ def test_folder_of_r3dpa_sample_is_read_once(tmp_path):
         write_bin(tmp_path / "bin" / f"{name}.bin", points[:, :3])
         write_ply(tmp_path / "ply" / f"{name}.ply", points[:, :3])
     write_npz(tmp_path / "scenes.npz", {"000000": CLOUDS[0][:, :3], "000001": CLOUDS[1][:, :3]})
-    with pytest.raises(SampleError, match=r"several formats \(2 \.bin, 1 \.npz, 2 \.ply\).*"):
+    with pytest.raises(ScanError, match=r"several formats \(2 \.bin, 1 \.npz, 2 \.ply\).*"):
         read_samples(tmp_path, SENSOR)
     (tmp_path / "metadata.json").touch()
     names, points, _, _ = zip(*read_samples(tmp_path, SENSOR), strict=True)
@@ -230,7 +231,7 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
     else:
         {"npy": np.save, "npz": np.savez}[suffix](file, objects)
     reason = {"pcd": "no known format", "pth": "cannot be read as tensors alone"}
-    with pytest.raises(SampleError, match=rf"evil\.{suffix}.*{reason.get(suffix, '(?i:object)')}"):
+    with pytest.raises(ScanError, match=rf"evil\.{suffix}.*{reason.get(suffix, '(?i:object)')}"):
         list(read_samples(file, SENSOR))
     assert capsys.readouterr().out == ""
 
@@ -263,6 +264,12 @@ def bytes_file(name, content):
     return lambda path: (path / name).write_bytes(content)
 
 
+def encoded_array(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
 def cut(path):
     write_npz(path / "a.npz", {"x": CLOUDS[0]})
     (path / "a.npz").write_bytes((path / "a.npz").read_bytes()[:-30])
@@ -286,6 +293,10 @@ BAD = {
     "no image": (array_file(np.zeros((0, 5, 4, 8), np.float32)), r"a\.npy: no sample .* empty"),
     "bytes": (array_file(np.ones((2, 5, 4, 8), np.uint8)), r"a\.npy: holds uint8 numbers; metres"),
     "vector": (array_file(np.ones(3)), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
+    "cut .npy": (
+        bytes_file("a.npy", encoded_array(np.ones((2, 5, 4, 8), np.float32))[:-300]),
+        r"a\.npy: cannot be read as an array \(mmap length",
+    ),
     "cut .npz": (cut, r"a\.npz: "),
     "damaged .npz": (flipped, r"a\.npz.* is damaged"),
     "no member": (lambda path: np.savez(path / "a.npz"), r"a\.npz: "),
@@ -317,17 +328,16 @@ BAD = {
 def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
     write, message = BAD[kind]
     write(tmp_path)
-    with pytest.raises(SampleError, match=message) as caught:
+    with pytest.raises(ScanError, match=message) as caught:
         list(read_samples(tmp_path, SENSOR))
     assert str(tmp_path) in str(caught.value)
-    assert isinstance(caught.value, ScanError)
 
 
 def test_missing_path_and_unknown_format_are_named(tmp_path):
     (tmp_path / "a.pcd").write_bytes(b"# .PCD v0.7")
-    with pytest.raises(SampleError, match=r"a\.pcd: is of no known format; what can be read"):
+    with pytest.raises(ScanError, match=r"a\.pcd: is of no known format; what can be read"):
         list(read_samples(tmp_path / "a.pcd", SENSOR))
-    with pytest.raises(SampleError, match="there is no such file or folder"):
+    with pytest.raises(ScanError, match="there is no such file or folder"):
         read_samples(tmp_path / "gone", SENSOR)
 
 
@@ -347,27 +357,11 @@ def test_bad_samples_are_counted_and_listed(tmp_path):
         "a.npz",
         "b.npz",
     ]
-    with pytest.raises(SampleError, match=r"a\.npz.*sample 000001: has NaN"):
+    with pytest.raises(ScanError, match=r"a\.npz.*sample 000001: has NaN"):
         list(read_samples(tmp_path, SENSOR))
 
 
 def test_only_bad_samples_are_an_error(tmp_path):
     (tmp_path / "a.bin").write_bytes(b"123")
-    with pytest.raises(SampleError, match=r"no sample can be used; all are bad; .*a\.bin: has 3 b"):
+    with pytest.raises(ScanError, match=r"no sample can be used; all are bad; .*a\.bin: has 3 b"):
         list(read_samples(tmp_path, SENSOR, skip_bad=True))
-
-
-def test_a_stack_cut_short_is_refused(tmp_path):
-    file = tmp_path / "a.npy"
-    np.save(file, torch.stack([image(0), image(1)]).numpy())
-    file.write_bytes(file.read_bytes()[:-300])
-    with pytest.raises(SampleError, match=r"a\.npy: cannot be read as an array \(mmap length"):
-        list(read_samples(file, SENSOR))
-
-
-def test_real_scan_is_its_own_sample(real_scans_dir):
-    file = next(iter(sorted(real_scans_dir.rglob("*.bin"))))
-    (sample,) = read_samples(file, LidarSensor())
-    rows = np.fromfile(file, "<f4").reshape(-1, 4)
-    length = np.linalg.norm(rows[:, :3].astype(float), axis=1)
-    assert len(sample.points) == np.count_nonzero((length > 1) & (length < 56))

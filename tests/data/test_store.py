@@ -257,14 +257,6 @@ def test_a_damaged_journal_is_named(halves, change, reason):
     assert_holds(halves, items(0, 3))
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_folder_is_named(halves):
-    fill(halves, (0, 1))
-    halves.folder.chmod(0o500)
-    with pytest.raises(StoreError, match=f"cannot be written to {halves.folder}"):
-        fill(halves, (1, 2))
-
-
 class Reading(Dataset):
     def __init__(self, tensors):
         self.tensors = tensors

@@ -32,7 +32,7 @@ from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_ch
 from r3dpa.data import FeatureGrids, Scan, read_samples
 from r3dpa.data.feature_grids import GridSettings
 from r3dpa.data.images import read_mask
-from r3dpa.data.objects import ObjectClass, ObjectLibrary, read_labels
+from r3dpa.data.objects import ObjectClass, ObjectLibrary
 from r3dpa.data.scans import read_beside, read_npz, read_ply, read_scan, write_npz, write_ply
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
 from r3dpa.metrics.official_statistics import OfficialStatistics
@@ -40,7 +40,6 @@ from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import PROTOCOLS
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.simulation import expected_scans
-from r3dpa.simulation.drive_files import DriveFiles
 
 SECONDS = 10.0  # a file of a few kilobytes takes milliseconds; the machine may be busy
 MEMORY = 2**30  # more than the process has when it starts
@@ -137,12 +136,12 @@ def readers(folder: Path) -> dict[str, Reader]:
     _add_stores(folder, add)
     _add_official(folder, add)
     _add_checkpoints(folder, add)
-    _add_edits(folder, points, add)
+    _add_edits(folder, add)
     return found
 
 
 def _add_stores(folder: Path, add: Callable[..., None]) -> None:
-    """Feature store and what the simulator writes."""
+    """Feature store and the manifest of the simulator."""
     projection, store = SphericalProjection(SENSOR), folder / "grids"
     settings = GridSettings(
         projection=json.loads(json.dumps(projection_to_dict(projection))),
@@ -171,15 +170,6 @@ def _add_stores(folder: Path, add: Callable[..., None]) -> None:
     manifest.write_text(json.dumps({"scans": 10, "seed": 0, "drives": ["0003", "0000"]}))
     assert expected_scans(root) is not None
     add("simulation.json", manifest, lambda: expected_scans(root))
-    drive = DriveFiles(root, "0003")
-    summary = drive.points_folder / "sim" / "0000000000.json"
-    summary.parent.mkdir(parents=True)
-    pose = dict.fromkeys(("x_m", "y_m", "z_m", "heading_rad", "pitch_rad", "roll_rad"), 0.1)
-    effect = {"status": "ran", "reason": "", "rays": 3}
-    summary.write_text(
-        json.dumps({"scan": 0, "points": 12, "pose": pose, "effects": {"fog": effect}})
-    )
-    add("sim/*.json", summary, lambda: drive.summaries(1))
 
 
 def _add_official(folder: Path, add: Callable[..., None]) -> None:
@@ -234,8 +224,8 @@ def _add_checkpoints(folder: Path, add: Callable[..., None]) -> None:
     )
 
 
-def _add_edits(folder: Path, points: np.ndarray, add: Callable[..., None]) -> None:
-    """Masks, object libraries, and labels of SemanticKITTI."""
+def _add_edits(folder: Path, add: Callable[..., None]) -> None:
+    """Masks and object libraries."""
     mask = folder / "mask.png"
     Image.new("L", (SENSOR.columns, SENSOR.beams), 255).save(mask)
     add("mask .png", mask, lambda: read_mask(mask, SENSOR))
@@ -252,11 +242,6 @@ def _add_edits(folder: Path, points: np.ndarray, add: Callable[..., None]) -> No
         assert isinstance(library.source, str)
 
     add("objects .safetensors", objects, load)
-    semantic = folder / "semantic" / "velodyne" / "0.bin"
-    label = semantic.parents[1] / "labels" / "0.label"
-    label.parent.mkdir(parents=True)
-    label.write_bytes(np.full(len(points), 10, np.uint32).tobytes())
-    add("SemanticKITTI .label", label, lambda: read_labels(semantic, len(points)))
 
 
 def archive(members: dict[str, bytes]) -> bytes:

@@ -13,7 +13,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import DrawnPoints, LidarDataset, list_collate
+from r3dpa.data.datasets import DrawnPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
 from r3dpa.data.loaders import LoaderModule, at_least, ready
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
@@ -355,8 +355,8 @@ class PointDataModule(LoaderModule):
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
         points = ready(self.train_set)
-        return self.loader(points, train=True, with_epoch=True, collate_fn=list_collate)
+        return self.loader(points, train=True, with_epoch=True, collate_fn=list)
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out scans in order, none twice, each drawn the same every time."""
-        return self.loader(ready(self.val_set), train=False, collate_fn=list_collate)
+        return self.loader(ready(self.val_set), train=False, collate_fn=list)

@@ -142,8 +142,3 @@ class DrawnPoints(PointDataset):
         epoch, index = key if isinstance(key, tuple) else (0, key)
         points = torch.from_numpy(read_scan(self.scans[index].path, self.sensor))
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
-
-
-def list_collate(samples: Sequence[Any]) -> list[Any]:
-    """A batch as a list, for scans, which differ in length."""
-    return list(samples)

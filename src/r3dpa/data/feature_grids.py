@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from r3dpa.data.datasets import PointDataset, PointSample, list_collate
+from r3dpa.data.datasets import PointDataset, PointSample
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, Store, StoreError, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
@@ -283,7 +283,7 @@ def write_feature_grids(
         loader = DataLoader(
             PointDataset(todo.missing, projection.sensor, extractor.prepare),
             batch_size=batch_size,
-            collate_fn=list_collate,
+            collate_fn=list,
             num_workers=workers,
             generator=torch.Generator(),  # the default draws from the global random state
         )

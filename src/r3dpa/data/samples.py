@@ -53,10 +53,6 @@ READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
 _LENGTH_TOLERANCE = 0.02
 
 
-class SampleError(ScanError):
-    """A sample that cannot be used; the message names the file and the reason."""
-
-
 class Sample(NamedTuple):
     """One scene of a generator.
 
@@ -99,14 +95,14 @@ class Samples:
                 except (ScanError, OSError) as error:
                     if not self.skip_bad:
                         advice = "skip_bad leaves such samples out, and lists them"
-                        raise SampleError(f"{error}. {advice}") from error
+                        raise ScanError(f"{error}. {advice}") from error
                     self.bad.append(str(error))
                 else:
                     num_read += 1
                     yield sample
         if not num_read:
             first = f"all are bad; the first: {self.bad[0]}" if self.bad else "the files are empty"
-            raise SampleError(f"{self.files[0][1]}: no sample can be used; {first}")
+            raise ScanError(f"{self.files[0][1]}: no sample can be used; {first}")
         if self.bad:
             warnings.warn(
                 f"{len(self.bad)} bad samples left out beside {num_read} good ones. "
@@ -135,7 +131,7 @@ def read_samples(
         skip_bad: Leave bad samples out, list them in ``bad`` and warn of them.
 
     Raises:
-        SampleError: If nothing is found, or a folder holds several formats; while iterating, if a
+        ScanError: If nothing is found, or a folder holds several formats; while iterating, if a
             sample cannot be used.
     """
     path = Path(path)
@@ -146,7 +142,7 @@ def read_samples(
 def _find(folder: Path) -> list[tuple[str, Path]]:
     """Names and paths of the sample files of a folder."""
     if not folder.is_dir():
-        raise SampleError(f"{folder}: there is no such file or folder")
+        raise ScanError(f"{folder}: there is no such file or folder")
     ours = (folder / "metadata.json").is_file()
     for place, known in (("numpy/img.npz", True), ("scenes.npz", ours)):
         if known and (folder / place).is_file():
@@ -158,13 +154,13 @@ def _find(folder: Path) -> list[tuple[str, Path]]:
         if file.suffix.lower() in _READERS:
             files.setdefault(file.suffix.lower(), []).append(file)
     if not files:
-        raise SampleError(f"{folder}: holds no samples; what can be read: {READABLE}")
+        raise ScanError(f"{folder}: holds no samples; what can be read: {READABLE}")
     if ".bin" in files and (len(files) == 1 or (folder / "data_3d_raw").is_dir()):
         # Named as scans are; beside those of KITTI-360 there are time stamps.
         return [(scan.name, scan.path) for scan in find_scans(folder)]
     if len(files) > 1:
         found = ", ".join(f"{len(files[suffix])} {suffix}" for suffix in sorted(files))
-        raise SampleError(
+        raise ScanError(
             f"{folder}: holds several formats ({found}), perhaps each scene more than once; "
             "give one file or sub-folder"
         )
@@ -175,9 +171,9 @@ def _find(folder: Path) -> list[tuple[str, Path]]:
 def _arrays_of(file: Path) -> Arrays:
     read = _READERS.get(file.suffix.lower())
     if read is None:
-        raise SampleError(f"{file}: is of no known format; what can be read: {READABLE}")
+        raise ScanError(f"{file}: is of no known format; what can be read: {READABLE}")
     if not file.stat().st_size:
-        raise SampleError(f"{file}: is empty")
+        raise ScanError(f"{file}: is empty")
     yield from read(file)
 
 
@@ -185,7 +181,7 @@ def _text_rows(file: Path) -> Arrays:
     try:
         rows = np.loadtxt(file, dtype=np.float32, ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
-        raise SampleError(f"{file}: is not text rows of numbers ({error})") from error
+        raise ScanError(f"{file}: is not text rows of numbers ({error})") from error
     yield "", rows[:, :3] if rows.shape[1] == 6 else rows  # without colours
 
 
@@ -193,7 +189,7 @@ def _npy_parts(file: Path) -> Arrays:
     try:
         array = np.lib.format.open_memmap(file, mode="r")
     except UNPICKLING_ERRORS as error:
-        raise SampleError(f"{file}: cannot be read as an array ({first_line(error)})") from error
+        raise ScanError(f"{file}: cannot be read as an array ({first_line(error)})") from error
     yield from _parts(str(file), array)
 
 
@@ -207,12 +203,12 @@ def _npz_parts(file: Path) -> Arrays:
 def _parts(where: str, array: np.ndarray) -> Arrays:
     """A cloud, or each cloud or image of a stack; images without a channel axis are ranges."""
     if array.dtype.kind != "f":
-        raise SampleError(f"{where}: holds {array.dtype} numbers; metres must be floats")
+        raise ScanError(f"{where}: holds {array.dtype} numbers; metres must be floats")
     if array.ndim == 2:
         yield "", array
         return
     if array.ndim not in (3, 4) or 0 in array.shape[1:]:
-        raise SampleError(
+        raise ScanError(
             f"{where}: has shape {array.shape}; needs (P, 3) or (P, 4) points, "
             "(N, P, 3) clouds or (N, C, H, W) images"
         )
@@ -230,7 +226,7 @@ def _tensors(file: Path) -> Arrays:
             parts = [content[key] for key in ("depth", "xyz", "reflectance") if key in content]
         values = torch.cat([part.detach().float() for part in parts], dim=-3 if parts[1:] else 0)
     except UNPICKLING_ERRORS as error:
-        raise SampleError(
+        raise ScanError(
             f"{file}: cannot be read as tensors alone ({first_line(error)}); needs a tensor "
             "(C, H, W) or (N, C, H, W), or a dictionary of depth, xyz and reflectance"
         ) from error
@@ -255,12 +251,12 @@ def _sample(name: str, where: str, array: np.ndarray, sensor: LidarSensor, corne
     if values.ndim == 3:
         return _image_sample(name, where, values, sensor, corner)
     if values.shape[1] not in (3, 4):
-        raise SampleError(f"{where}: has rows of {values.shape[1]} numbers; needs 3 or 4 (x, y, z)")
+        raise ScanError(f"{where}: has rows of {values.shape[1]} numbers; needs 3 or 4 (x, y, z)")
     if bad := int((~values.isfinite().all(dim=1)).sum()):
-        raise SampleError(f"{where}: has NaN or infinite values in {bad} of {len(values)} points")
+        raise ScanError(f"{where}: has NaN or infinite values in {bad} of {len(values)} points")
     kept = in_range(values[:, :3], sensor)
     if not kept.any():
-        raise SampleError(out_of_range(where, sensor))
+        raise out_of_range(where, sensor)
     return Sample(name, values[kept])
 
 
@@ -269,12 +265,12 @@ def _image_sample(
 ) -> Sample:
     channels, *size = image.shape
     if size != [sensor.beams, sensor.columns]:
-        raise SampleError(
+        raise ScanError(
             f"{where}: has an image of {size[0]} x {size[1]} pixels, but the sensor has "
             f"{sensor.beams} x {sensor.columns}; use images of that size, or a reference for theirs"
         )
     if channels not in (1, 2, 4, 5):
-        raise SampleError(
+        raise ScanError(
             f"{where}: has {channels} channels; needs range, range and intensity, or range, x, y, "
             "z without or with intensity"
         )
@@ -283,10 +279,10 @@ def _image_sample(
     intensity = torch.where(valid, image[-1], 0.0) if channels in (2, 5) else None
     read = distance if intensity is None else torch.stack([distance, intensity])
     if bad := int((~read.isfinite()).sum()):
-        raise SampleError(f"{where}: has NaN or infinite ranges or intensities in {bad} pixels")
+        raise ScanError(f"{where}: has NaN or infinite ranges or intensities in {bad} pixels")
     if not valid.any():
         span = f"{distance.min():g} to {distance.max():g}"
-        raise SampleError(
+        raise ScanError(
             f"{out_of_range(where, sensor)}; values go from {span}, and must be metres, not an "
             "encoded image"
         )
@@ -297,7 +293,7 @@ def _image_sample(
         points = image[1:4, valid].T
         error = (torch.linalg.vector_norm(points, dim=1) - distance[valid]).abs()
         if wrong := int((~(error <= _LENGTH_TOLERANCE * distance[valid])).sum()):  # NaN too
-            raise SampleError(
+            raise ScanError(
                 f"{where}: channel 0 is not the length of channels 1 to 3 in {wrong} of "
                 f"{len(points)} pixels; their order must be range, x, y, z, in metres"
             )

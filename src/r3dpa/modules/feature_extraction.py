@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import LightningDataModule, LightningModule
 from torch.utils.data import DataLoader, DistributedSampler
 
-from r3dpa.data.datasets import PointDataset, PointSample, list_collate
+from r3dpa.data.datasets import PointDataset, PointSample
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import StoreWriter
@@ -135,7 +135,7 @@ class MissingScans(LightningDataModule):
             batch_size=self.batch_size,
             sampler=_Share(dataset, self.trainer.world_size, self.trainer.global_rank),
             num_workers=self.num_workers,
-            collate_fn=list_collate,
+            collate_fn=list,
             generator=torch.Generator(),  # the default would draw from the global random state
         )
 
