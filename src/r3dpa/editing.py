@@ -181,23 +181,17 @@ class SceneEditor:
         latents = self.encode(range_m[None])
         trajectory = self._inverted(latents, times)
 
-        def solve(noise: Tensor) -> tuple[Tensor, Tensor | None]:
+        def solve(noise: Tensor) -> tuple[Tensor, FeatureGuidance | None]:
             own = trajectory._replace(states=trajectory.states.expand(-1, len(noise), -1, -1, -1))
             guidance = None
             if feature is not None:
                 target = feature.to(noise).expand(len(noise), tokens.numel(), -1)
                 guidance = self._guidance(FeatureTarget(target, tokens.expand(len(noise), -1)))
-            made = self._solve(
-                guidance or self._sit.velocity,
-                renoised(own, edited, noise),
-                times,
-                kept(own, edited),
-            )
-            return made, _cosine(guidance, made)
+            velocity, state = guidance or self._sit.velocity, renoised(own, edited, noise)
+            return self._solve(velocity, state, times, kept(own, edited)), guidance
 
         made, cosine = self._each(indices, seed, solve)
-        decoded = self._decoded(made)
-        pasted = torch.where(pixel_mask, decoded, range_m)
+        pasted = torch.where(pixel_mask, self._decoded(made), range_m)
         errors = self._errors(range_m[None], latents, trajectory)
         return self._result(pasted, made, 2 * self._nfe, *errors, cosine)
 
@@ -225,10 +219,9 @@ class SceneEditor:
         times = self.settings.times(1.0)
         stitched = FeatureTarget.stitched([grid[None] for grid in features], token_weights).features
 
-        def solve(noise: Tensor) -> tuple[Tensor, Tensor | None]:
+        def solve(noise: Tensor) -> tuple[Tensor, FeatureGuidance]:
             guidance = self._guidance(FeatureTarget(stitched.to(noise).expand(len(noise), -1, -1)))
-            made = self._solve(guidance, noise, times)
-            return made, _cosine(guidance, made)
+            return self._solve(guidance, noise, times), guidance
 
         made, cosine = self._each(indices, seed, solve)
         return self._result(self._decoded(made), made, self._nfe, cosine=cosine)
@@ -344,12 +337,8 @@ class SceneEditor:
         trajectory = self._inverted(latents, times)
         first, second = trajectory.states[0].split(1)
         noises = [spherical_mean(first, second, k / (frames - 1)) for k in range(frames)]
-        made = torch.cat(
-            [
-                self._solve(self._sit.velocity, noise, times)
-                for noise in torch.cat(noises).split(self.batch_size)
-            ]
-        )
+        batches = torch.cat(noises).split(self.batch_size)
+        made = torch.cat([self._solve(self._sit.velocity, noise, times) for noise in batches])
         errors = self._errors(scans, latents, trajectory)
         return self._result(self._decoded(made), made, 2 * self._nfe, *errors)
 
@@ -396,14 +385,17 @@ class SceneEditor:
         self,
         indices: int | Sequence[int],
         seed: int,
-        solve: Callable[[Tensor], tuple[Tensor, Tensor | None]],
+        solve: Callable[[Tensor], tuple[Tensor, FeatureGuidance | None]],
     ) -> tuple[Tensor, Tensor | None]:
-        """Latents of scenes, made of their noise in batches, and their cosines."""
+        """Latents of scenes, made of their noise in batches, and their cosines if guided."""
         numbers, size = scene_indices(indices), self.batch_size
-        batches = [numbers[first : first + size] for first in range(0, len(numbers), size)]
-        parts = [solve(next(self._draws(batch, seed))) for batch in batches]
-        cosines = [cosine.cpu() for _, cosine in parts if cosine is not None]
-        return torch.cat([made for made, _ in parts]), torch.cat(cosines) if cosines else None
+        parts, cosines = [], []
+        for first in range(0, len(numbers), size):
+            made, guidance = solve(next(self._draws(numbers[first : first + size], seed)))
+            parts.append(made)
+            if guidance is not None:
+                cosines.append(-guidance.energy(made, batch_time(0.0, made)).cpu())
+        return torch.cat(parts), torch.cat(cosines) if cosines else None
 
     def _decoded(self, latents: Tensor) -> Tensor:
         """Range images ``(B, H, W)`` on the CPU."""
@@ -435,7 +427,3 @@ class SceneEditor:
             return error, None
         back = self._solve(self._sit.velocity, trajectory.states[0], trajectory.times)
         return error, range_error_m(self._decoded(back), plain)
-
-
-def _cosine(guidance: FeatureGuidance | None, latents: Tensor) -> Tensor | None:
-    return None if guidance is None else -guidance.energy(latents, batch_time(0.0, latents))

@@ -275,8 +275,7 @@ class SceneGenerator:
         sensor = self.geometry.projection.sensor
         parts = []
         for part in self.latent_norm.denormalise(latents).split(size):
-            whole = part if self.batch_size is None else _filled(part, size)
-            image = self._decode(whole)[: len(part), 0]
+            image = self._decode(_filled(part, size))[: len(part), 0]
             range_m = self.geometry.codec.decode(image.float(), sensor)
             finite = image.isfinite().all(dim=(1, 2), keepdim=True)
             parts.append(torch.where(finite, range_m, torch.nan))

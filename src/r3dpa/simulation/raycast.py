@@ -67,21 +67,17 @@ def cast(
         for index in windows.order:
             sloped = bool(solids.grade[index].any())
             solid = _Solid(solids.matrix[index], solids.offset[index], sloped)
-            moving = actor_time_s is not None and solids.velocity[index].any()
-            foliage = optical_depth is not None and solids.extinction[index] > 0
             for window in pieces(index, windows, origin.shape[2]):
                 near = nearest[window]
                 if near.max() <= windows.near_m[index]:
                     continue
                 rays = (slice(None), *window)
                 start = origin[rays].reshape(3, -1)
-                if moving:
-                    assert actor_time_s is not None
+                if actor_time_s is not None and solids.velocity[index].any():
                     start = _relative(start, solids.velocity[index], actor_time_s[window].ravel())
                 towards = direction[rays].reshape(3, -1)
                 distance, leave = _crossing(solids.shape[index], solid, start, towards)
-                if foliage:
-                    assert optical_depth is not None
+                if optical_depth is not None and solids.extinction[index] > 0:
                     drawn = _draws_of(index, window, optical_depth)
                     deep = distance + drawn.ravel() / solids.extinction[index]
                     distance = np.where(distance > 0, deep, np.float32(np.nan))
