@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fuzz_readers import Hang, Reader, fuzz, readers
 
-INPUTS = 40
+INPUTS = 20
 
 
 @pytest.fixture(scope="module")

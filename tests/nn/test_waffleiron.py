@@ -72,10 +72,6 @@ def test_cells_of_unequal_edges():
     network = WaffleIron(4, 3, grid.cells)
     assert network.plane_sizes == [(64, 48), (64, 16), (48, 16)]
     assert network(collate_scans([scan, scan])).shape == (2, 4)
-    with pytest.raises(ValueError, match="whole number"):
-        ScanGrid(cell_m=(1.0, 1.0, 0.3))
-    with pytest.raises(ValueError, match="cell_m must be positive"):
-        ScanGrid(cell_m=(1.0, 0.0, 1.0))
 
 
 def test_single_points_and_empty_scans(network):
@@ -103,14 +99,16 @@ def test_refused_input(network):
     with pytest.raises(ValueError, match=r"must be \(P, 4\).*got \(3, 3\)"):
         prepare(points[:, :3])
     points[1, 3] = torch.nan
-    with pytest.raises(ValueError, match="1 of 3 points are NaN or infinite"):
-        prepare(points)
-    with pytest.raises(ValueError, match=r"whole number of cells of 0\.3 m"):
-        ScanGrid(cell_m=0.3)
-    with pytest.raises(ValueError, match="voxel_m must be positive, got 0"):
-        ScanGrid(voxel_m=0)
-    with pytest.raises(ValueError, match=r"cells \(16, 16, 4\), but grid has \(256, 256, 32\)"):
-        ScaLR(network)
+    for call, message in (
+        (lambda: prepare(points), "1 of 3 points are NaN or infinite"),
+        (lambda: ScanGrid(cell_m=0.3), r"whole number of cells of 0\.3 m"),
+        (lambda: ScanGrid(cell_m=(1.0, 1.0, 0.3)), "whole number"),
+        (lambda: ScanGrid(cell_m=(1.0, 0.0, 1.0)), "cell_m must be positive"),
+        (lambda: ScanGrid(voxel_m=0), "voxel_m must be positive, got 0"),
+        (lambda: ScaLR(network), r"\(16, 16, 4\), but grid has \(256, 256, 32\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_spatial_mixing_agrees_with_matrices(network):
