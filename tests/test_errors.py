@@ -88,8 +88,7 @@ def test_an_option_or_key_that_cannot_be_is_named(option, named, tmp_path, refus
         ("data.init_args.extractor=null", "joint aligns with 3D features, but the data module has"),
         (
             "model.init_args.sit.init_args.input_size=[4, 8]",
-            "(16, 64) range image gives (4, 16) latents, but sit.input_size is (4, 8); "
-            "set sit.input_size to (4, 16)",
+            "(16, 64) pixels give (4, 16) latents, but sit.input_size is (4, 8); set it to the",
         ),
         (
             "data.init_args.grid_size=[4, 16]",

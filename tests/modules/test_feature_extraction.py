@@ -118,8 +118,3 @@ def test_bad_features_name_the_scan_and_what_was_made_before_stays(scans, tmp_pa
     with pytest.raises(StoreError, match=r"bad\.bin: extractor threefold gave NaN"):
         extract([*scans[:2], *find_scans(bad)], tmp_path, Threefold(), batch_size=1)
     assert len((tmp_path / "2x8" / "shard_00000.jsonl").read_text().splitlines()) == 2
-
-
-def test_batch_size_out_of_range(scans):
-    with pytest.raises(ValueError, match="batch_size must be at least 1, got 0"):
-        MissingScans(scans, Threefold(), PROJECTION.sensor, batch_size=0)

@@ -42,18 +42,21 @@ def geometry_of(datamodule: object, module: object) -> ScanGeometry:
 
 def check_sizes(vae: VAE, sit: VelocityNetwork, geometry: ScanGeometry) -> None:
     """Refuses a velocity network of other latents than those of the range images."""
+    check_latents(vae, sit, (geometry.projection.sensor.beams, geometry.projection.sensor.columns))
+
+
+def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
+    """Refuses a velocity network of other latents than those of the images."""
     if sit.in_channels != vae.latent_channels:
         raise ValueError(
             f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} latent "
             "channels; give both the same number"
         )
-    sensor = geometry.projection.sensor
-    image_size = (sensor.beams, sensor.columns)
     latent_size = vae.latent_size(image_size)
-    if tuple(latent_size) != tuple(sit.input_size):
+    if latent_size != tuple(sit.input_size):
         raise ValueError(
-            f"a {image_size} range image gives {latent_size} latents, but sit.input_size is "
-            f"{tuple(sit.input_size)}; set sit.input_size to {latent_size}"
+            f"images of {image_size} pixels give {latent_size} latents, but sit.input_size is "
+            f"{tuple(sit.input_size)}; set it to the former"
         )
 
 
@@ -81,20 +84,13 @@ def check_features(
 
 def check_geometry(there: ScanGeometry, here: ScanGeometry, source: str) -> None:
     """Refuses weights that were trained on other range images than this run's."""
-    parts = {
-        "projection": (there.projection, here.projection),
-        "codec": (there.codec, here.codec),
-    }
-    different = [
-        f"{name} {theirs} there, {ours} here"
-        for name, (theirs, ours) in parts.items()
-        if theirs != ours
-    ]
-    if different:
-        raise ValueError(
-            f"{source} was trained on other range images: {'; '.join(different)}. Set sensor, "
-            "projection and codec of the data module to those of the checkpoint"
-        )
+    for name in ("projection", "codec"):
+        theirs, ours = getattr(there, name), getattr(here, name)
+        if theirs != ours:
+            raise ValueError(
+                f"{source} was trained on other range images: {name} {theirs} there, {ours} here. "
+                "Set sensor, projection and codec of the data module to those of the checkpoint"
+            )
 
 
 def image_datamodule(module: L.LightningModule, vae: ImageVAE) -> ImageDataModule:

@@ -15,8 +15,6 @@ from r3dpa.checkpoints import weights_sha256
 from r3dpa.data.store import Cacheable, CachedTensors, tensor_cache
 from r3dpa.nn import VAE, ImageVAE
 
-__all__ = ["encoded_once"]
-
 Item = TypeVar("Item", bound=Cacheable)
 
 
@@ -33,8 +31,7 @@ def encoded_once(
 ) -> CachedTensors[Item]:
     """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
 
-    They are kept for the whole training, and thus computed in float32 whatever the precision of the
-    steps.
+    They are computed in float32 whatever the precision of the steps.
 
     Args:
         module: In training, on its device.

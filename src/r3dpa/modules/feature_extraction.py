@@ -21,12 +21,11 @@ class FeatureExtraction(LightningModule):
     """Writes the feature grids of the scans that it is given, as ``trainer.predict`` runs it.
 
     Each process appends to a shard of its own, so that what is made survives whatever ends the
-    run. Nothing is returned: the grids of KITTI-360 are 63 GB.
+    run. Nothing is returned.
 
     Args:
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`.
-        projection: That of the range images; only that of the first process counts, the others may
-            give None.
+        projection: That of the range images; needed in the first process only.
         grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
         features_dir: Folder of the grids of this extractor.
 
@@ -42,7 +41,7 @@ class FeatureExtraction(LightningModule):
         features_dir: str | Path,
     ) -> None:
         super().__init__()
-        self.extractor = extractor
+        self.extractor: Extractor = extractor
         self.projection = projection
         self.grid_sizes = list(grid_sizes)
         self.features_dir = Path(features_dir)
@@ -60,15 +59,15 @@ class FeatureExtraction(LightningModule):
 
     def on_predict_start(self) -> None:
         """Opens a shard for each grid size; not called in a process that has nothing to do."""
-        extractor, projection = self._parts()
+        projection = cast(Projection, self.projection)
         for size in self.grid_sizes:
-            settings = GridSettings.of(extractor, projection, size, self.trainer.precision)
+            settings = GridSettings.of(self.extractor, projection, size, self.trainer.precision)
             self._writers[size] = settings.store(self.features_dir).writer(self.global_rank)
 
     def predict_step(self, batch: list[PointSample]) -> None:
         """Pools the features of scans prepared by the extractor and writes their grids."""
-        extractor, projection = self._parts()
-        grids = pooled_grids(extractor, batch, projection, self.grid_sizes)
+        projection = cast(Projection, self.projection)
+        grids = pooled_grids(self.extractor, batch, projection, self.grid_sizes)
         keys = [sample.key for sample in batch]
         for size, writer in self._writers.items():
             writer.add(keys, grids[size])
@@ -84,25 +83,16 @@ class FeatureExtraction(LightningModule):
             writer.close()
         self._writers.clear()
 
-    def _parts(self) -> tuple[Extractor, Projection]:
-        if self.projection is None:
-            raise ValueError("projection is needed in the first process.")
-        return cast(Extractor, self.extractor), self.projection
-
 
 class MissingScans(LightningDataModule):
     """Scans for :class:`FeatureExtraction`: each process gets its share, none is given twice.
 
     Args:
-        scans: Scans to extract; only the list of the first process counts, as those of the others
-            may be younger.
+        scans: Scans to extract; only the list of the first process counts.
         extractor: Its ``prepare`` runs in the loader processes.
         sensor: At least one point of a scan must lie within its range limits.
         batch_size: Scans per batch and process.
         num_workers: Loader processes per process.
-
-    Raises:
-        ValueError: If ``batch_size`` is below 1.
     """
 
     def __init__(
@@ -114,8 +104,6 @@ class MissingScans(LightningDataModule):
         num_workers: int = 0,
     ) -> None:
         super().__init__()
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
         self.allow_zero_length_dataloader_with_multiple_devices = True  # fewer scans than processes
         self.scans = list(scans)
         self.extractor, self.sensor = extractor, sensor

@@ -15,8 +15,6 @@ from r3dpa.modules.checks import check_trainer, image_datamodule
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.nn import ImageVAE
 
-__all__ = ["ImageVAETraining"]
-
 
 class ImageVAETraining(L.LightningModule):
     """An image VAE by reconstruction and KL alone.

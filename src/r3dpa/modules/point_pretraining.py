@@ -27,9 +27,7 @@ class PointPretraining(LightningModule):
     Blocks of rays are hidden; the hidden points are known by their cells alone. From the token of
     every point, hidden or not, a linear layer predicts in which of ``num_bins`` quantiles each
     descriptor of the point lies, see :meth:`r3dpa.nn.backbones.Masking.describe`; the loss is the
-    mean cross-entropy. What is predicted is fixed, so that nothing can collapse; quantiles have no
-    units to weigh; and as they are read linearly from the tokens, so is all of that geometry, and
-    of its surroundings, by a linear probe.
+    mean cross-entropy.
 
     Source: masked prediction of quantised hand-made features, as in HuBERT (Hsu et al., 2021) and
     BEST-RQ (Chiu et al., 2022) for speech and MaskFeat (Wei et al., 2022) for images.
@@ -64,7 +62,7 @@ class PointPretraining(LightningModule):
 
     def setup(self, stage: str) -> None:
         """Takes the preparation of the scans from the data module and checks its cells."""
-        masking = getattr(getattr(self.trainer, "datamodule", None), "prepare", None)
+        masking = getattr(cast(Any, self.trainer).datamodule, "prepare", None)
         if not isinstance(masking, Masking):
             raise ValueError(
                 "PointPretraining needs r3dpa.data.PointDataModule with prepare "
@@ -84,8 +82,7 @@ class PointPretraining(LightningModule):
             chosen = evenly(range(len(scans)), _SCANS_TO_QUANTISE)
             values = torch.cat([scans[index].targets for index in chosen]).numpy()
             levels = np.linspace(0, 1, self.edges.shape[1] + 2)[1:-1]
-            edges = np.quantile(values, levels, axis=0).T
-            self.edges.copy_(torch.from_numpy(edges))
+            self.edges.copy_(torch.from_numpy(np.quantile(values, levels, axis=0).T))
 
     def tokens(self, batch: PointCloudBatch, hidden: Tensor) -> Tensor:
         """Standardised tokens ``(N, F)`` of all points, of which those hidden are not seen."""
@@ -130,13 +127,11 @@ class PointPretraining(LightningModule):
         """AdamW with warm-up and cosine."""
         matrices = [p for p in self.parameters() if p.ndim > 1]
         others = [p for p in self.parameters() if p.ndim <= 1]
-        optimizer = torch.optim.AdamW(
-            [
-                {"params": matrices, "weight_decay": self.weight_decay},
-                {"params": others, "weight_decay": 0.0},
-            ],
-            lr=self.lr,
-        )
+        groups: list[dict[str, Any]] = [
+            {"params": matrices},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        optimizer = torch.optim.AdamW(groups, lr=self.lr, weight_decay=self.weight_decay)
         total = self.trainer.max_steps
 
         def factor(step: int) -> float:
@@ -146,10 +141,7 @@ class PointPretraining(LightningModule):
             return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        return [optimizer], [{"scheduler": scheduler, "interval": "step"}]
 
     def on_fit_end(self) -> None:
         """Write ``waffleiron_s.safetensors`` for ``WaffleIronS`` into the run's folder."""

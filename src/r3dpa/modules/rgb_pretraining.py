@@ -21,12 +21,10 @@ from r3dpa.data.store import CachedTensors
 from r3dpa.flow import Interpolant
 from r3dpa.losses import alignment_loss, flow_matching_loss
 from r3dpa.modules import steps
-from r3dpa.modules.checks import check_trainer, image_datamodule
+from r3dpa.modules.checks import check_latents, check_trainer, image_datamodule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
-
-__all__ = ["ImageTeacher", "RGBPretraining"]
 
 
 class ImageTeacher(Protocol):
@@ -45,8 +43,8 @@ class RGBPretraining(L.LightningModule):
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
     latent statistics are those of the data set.
-    With a teacher the tokens are aligned with its features of the image (REPA), which are computed
-    in each step. The checkpoint is what ``rgb_weights`` of the other stages takes.
+    With a teacher the tokens are aligned with its features of the image (REPA). The checkpoint is
+    what ``rgb_weights`` of the other stages takes.
 
     Source: R3DPA (ICRA 2026), section "Implementation Details", with the recipe of REPA-E (Leng et
     al. 2025): 1 M steps at batch 256 on the latents 4 x 32 x 32 of ImageNet.
@@ -69,7 +67,7 @@ class RGBPretraining(L.LightningModule):
         seed: Key of the training draws.
 
     Raises:
-        ValueError: If networks, teacher and weights do not belong together.
+        ValueError: If SiT, teacher and weights do not belong together.
     """
 
     stage = "rgb_pretraining"
@@ -96,11 +94,6 @@ class RGBPretraining(L.LightningModule):
                 "teacher and weights.sit_alignment go together: give a teacher and a weight above "
                 f"0, or neither; got teacher {type(teacher).__name__} and weight "
                 f"{weights.sit_alignment}"
-            )
-        if sit.in_channels != vae.latent_channels:
-            raise ValueError(
-                f"sit.in_channels is {sit.in_channels}, but the VAE has {vae.latent_channels} "
-                "latent channels; give both the same number"
             )
         if teacher is not None and cast(ImageTeacher, teacher).dim != sit.feature_dim:
             raise ValueError(
@@ -129,17 +122,12 @@ class RGBPretraining(L.LightningModule):
         """Checks trainer and data against the networks, and that a teacher has weights."""
         check_trainer(self.trainer)
         size = self._datamodule.image_size
-        latent_size = self.vae.latent_size((size, size))
+        check_latents(self.vae, self.sit, (size, size))
         if stage == "fit" and not all(cast(ImageTeacher, one).trained for one in self._teacher):
             raise ValueError(
                 "the teacher has random weights: give model.init_args.teacher.init_args.weights "
                 "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "
                 "(model.init_args.teacher null, model.init_args.weights.sit_alignment 0)"
-            )
-        if latent_size != tuple(self.sit.input_size):
-            raise ValueError(
-                f"images of {size} pixels give {latent_size} latents, "
-                f"but sit.input_size is {tuple(self.sit.input_size)}; set it to the former"
             )
 
     def on_fit_start(self) -> None:
