@@ -130,11 +130,6 @@ class TestOurFiles:
         assert ScanGeometry.from_dict(read.geometry) == GEOMETRY
         assert read.feature_source == "geometric"
         assert {p.name for p in path.parent.iterdir()} == {"run.v1.safetensors", "run.v1.yaml"}
-        sit = read.network("sit").build()
-        latents, time = torch.randn(1, 4, 4, 8), torch.tensor([0.3])
-        assert torch.equal(
-            sit.velocity(latents, time), checkpoint.network("sit").build().velocity(latents, time)
-        )
 
     def test_tensors_that_share_memory(self, checkpoint, tmp_path):
         shared = {**checkpoint.networks, "ema": checkpoint.network("sit")}
@@ -162,7 +157,6 @@ class TestOurFiles:
     @pytest.mark.parametrize(
         ("damage", "message"),
         [
-            (lambda p: p.write_bytes(p.read_bytes()[:-1]), "SHA-256"),
             (lambda p: p.write_bytes(p.read_bytes()[:-1] + b"x"), "SHA-256"),
             (lambda p: p.with_suffix(".yaml").unlink(), "not beside it"),
             (lambda p: p.with_suffix(".yaml").write_text("a: [1"), "damaged"),
@@ -178,15 +172,7 @@ class TestOurFiles:
 
     @pytest.mark.parametrize(
         "class_path",
-        [
-            "torch.nn.Linear",
-            "r3dpa.nnx.SiT",
-            "r3dpa.modules.JointAlignment",
-            "r3dpa.nn.sit.nn.Linear",
-            "r3dpa.nn.velocity_network.VelocityOutput",
-            "r3dpa.nn.vae.math",
-            "SiT",
-        ],
+        ["torch.nn.Linear", "r3dpa.nnx.SiT", "r3dpa.nn.sit.nn.Linear", "r3dpa.nn.vae.math", "SiT"],
     )
     def test_only_our_networks_are_built(self, checkpoint, tmp_path, class_path):
         path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
@@ -246,22 +232,12 @@ class TestLightning:
 
 
 class TestLoadInto:
-    def test_exactly_the_named_networks(self, checkpoint):
-        vae, average = VAE(**VAE_ARGS), SiT(**SIT_ARGS)
-        load_into({"vae": vae, "sit": average}, checkpoint, stage="joint")
-        for name, network in (("vae", vae), ("sit", average)):
-            for key, value in checkpoint.network(name).state_dict.items():
-                assert torch.equal(network.state_dict()[key], value)
-
     def test_everything_that_does_not_fit_in_one_error(self, checkpoint):
         networks = {k: v for k, v in checkpoint.networks.items() if k != "discriminator"}
         source = replace(checkpoint, networks=networks, stage="flow_matching")
-        targets = {
-            "vae": VAE(**VAE_ARGS),
-            "discriminator": PatchDiscriminator(),
-            "sit": SiT(**{**SIT_ARGS, "feature_dim": 5, "depth": 2}),
-            "latent_norm": LatentNorm(5),
-        }
+        sit = SiT(**{**SIT_ARGS, "feature_dim": 5, "depth": 2})
+        targets = {"vae": VAE(**VAE_ARGS), "discriminator": PatchDiscriminator()}
+        targets |= {"sit": sit, "latent_norm": LatentNorm(5)}
         before = {k: v.clone() for k, v in targets["vae"].state_dict().items()}
         with pytest.raises(ValueError, match="joint cannot start") as caught:
             load_into(targets, source, stage="joint")
@@ -330,18 +306,13 @@ class TestOfficial:
         with pytest.raises(ValueError, match=r"cannot read .*a.pt: the file is damaged"):
             read_checkpoint(tmp_path / "a.pt")
 
-    def test_something_else(self, tmp_path):
-        path = tmp_path / "a.pt"
-        path.write_text("not a checkpoint")
-        with pytest.raises(ValueError, match="damaged"):
-            read_checkpoint(path)
-        for content, message in (
-            ({"weights": 1}, r"holds \['weights'\]; exp"),
-            ([1], "holds list"),
-        ):
-            torch.save(content, path)
-            with pytest.raises(ValueError, match=message):
-                read_checkpoint(path)
+    @pytest.mark.parametrize(
+        ("content", "message"), [({"weights": 1}, r"holds \['weights'\]; exp"), ([1], "holds list")]
+    )
+    def test_something_else(self, tmp_path, content, message):
+        torch.save(content, tmp_path / "a.pt")
+        with pytest.raises(ValueError, match=message):
+            read_checkpoint(tmp_path / "a.pt")
 
     def test_files_that_lack_an_argument_or_a_layer(self, official):
         del official["args"]
@@ -363,24 +334,23 @@ class TestOfficial:
         read = read_checkpoint(tmp_path / "checkpoints" / "a.pt", sit_args=OFFICIAL_SIT_ARGS)
         assert read.network("sit").init_args["alignment_depth"] == 2
 
-    def test_latent_size_and_geometry_of_the_official_image(self, checkpoint):
-        sit_args = {**SIT_ARGS, "input_size": (32, 256), "hidden_size": 8}
-        networks = dict(checkpoint.networks)
-        networks["sit"] = NetworkState.of(randomised(SiT(**sit_args)), sit_args)
-        content = to_official(replace(checkpoint, networks=networks))
-        del content["ema"]
-        for config, encoding in (("kitti", "linear"), ("kitti_logscale", "log2")):
-            content["args"] = argparse.Namespace(
-                encoder_depth=2, dataset_config=f"configs/{config}.yaml"
-            )
-            read = from_official(content, Path("a.pt"), sit_args={"num_heads": 2})
-            assert read.network("sit").init_args["input_size"] == [32, 256]
-            geometry = ScanGeometry.from_dict(read.geometry)
-            assert geometry == ScanGeometry(
-                SphericalProjection(LidarSensor()), RangeCodec(encoding), (16, 128)
-            )
-        del content["args"].dataset_config
-        assert from_official(content, Path("a.pt"), sit_args={"num_heads": 2}).geometry is None
+    @pytest.mark.parametrize(
+        ("config", "encoding"), [("kitti", "linear"), ("kitti_logscale", "log2"), ("other", None)]
+    )
+    def test_latent_size_and_geometry_of_the_official_image(self, checkpoint, config, encoding):
+        sit_args = {**SIT_ARGS, "input_size": (32, 256)}
+        sit = NetworkState.of(SiT(**sit_args), sit_args)
+        networks = {name: checkpoint.network(name) for name in ("vae", "latent_norm")}
+        content = to_official(replace(checkpoint, networks=networks | {"sit": sit}))
+        content["args"] = argparse.Namespace(encoder_depth=2, dataset_config=f"c/{config}.yaml")
+        read = from_official(content, Path("a.pt"), sit_args={"num_heads": 2})
+        assert read.network("sit").init_args["input_size"] == [32, 256]
+        if encoding is None:
+            assert read.geometry is None
+        else:
+            codec, projection = RangeCodec(encoding), SphericalProjection(LidarSensor())
+            expected = ScanGeometry(projection, codec, (16, 128))
+            assert ScanGeometry.from_dict(read.geometry) == expected
 
     def test_a_vae_with_wrapped_upsampling_has_no_counterpart(self, checkpoint):
         args = {**VAE_ARGS, "legacy_upsample": False}
@@ -390,14 +360,8 @@ class TestOfficial:
 
     def test_options_are_made_from_our_arguments(self, checkpoint):
         args = vars(to_official(checkpoint)["args"])
-        assert args == {
-            "vae": "h2p2d4",
-            "num_classes": 1,
-            "cfg_prob": 0.0,
-            "encoder_depth": 2,
-            "qk_norm": False,
-            "bn_momentum": 0.1,
-        }
+        expected = {"vae": "h2p2d4", "num_classes": 1, "cfg_prob": 0.0, "encoder_depth": 2}
+        assert args == expected | {"qk_norm": False, "bn_momentum": 0.1}
         official_sensor = ScanGeometry(SphericalProjection(LidarSensor()), RangeCodec(), (2, 4))
         content = to_official(replace(checkpoint, geometry=official_sensor.to_dict()))
         assert content["args"].dataset_config == "configs/kitti.yaml"
@@ -411,10 +375,6 @@ class TestOfficial:
         content = to_official(replace(checkpoint, networks={**checkpoint.networks, **networks}))
         assert vars(content["args"]).get("model") == model
 
-    def test_a_short_class_path_is_the_same_class(self, checkpoint):
-        vae = replace(checkpoint.network("vae"), class_path="r3dpa.nn.VAE")
-        assert "vae" in to_official(replace(checkpoint, networks={"vae": vae}))
-
 
 class TestConvert:
     def test_a_vae_and_its_neighbours(self, checkpoint, tmp_path):
@@ -422,27 +382,23 @@ class TestConvert:
         part = replace(checkpoint, networks={name: checkpoint.network(name) for name in kept})
         ours = save_checkpoint(part, tmp_path / "a.safetensors")
         report = convert(ours, tmp_path / "vae.pt", "official")
-        names = ("vae.pt", "vae-latents-stats.pt", "vae-discriminator-ckpt.pt")
-        assert {path.name for path in tmp_path.glob("*.pt")} == set(names)
-        assert all(name in report for name in names)
+        names = {"vae.pt", "vae-latents-stats.pt", "vae-discriminator-ckpt.pt"}
+        assert {path.name for path in tmp_path.glob("*.pt")} == names
         assert "not converted: sensor and encoding (official files of a VAE" in report
         statistics = torch.load(tmp_path / "vae-latents-stats.pt", weights_only=True)
         norm = checkpoint.network("latent_norm").state_dict
         assert statistics["latents_scale"].shape == (1, 4, 1, 1)
-        torch.testing.assert_close(
-            statistics["latents_scale"].flatten(), 1 / norm["running_var"].sqrt()
-        )
+        scale = statistics["latents_scale"].flatten()
+        torch.testing.assert_close(scale, 1 / norm["running_var"].sqrt())
         assert torch.equal(statistics["latents_bias"].flatten(), norm["running_mean"])
-
         back = read_checkpoint(tmp_path / "vae.pt")
         assert set(back.networks) == set(kept)
         for name in ("vae", "discriminator"):
             for key, value in part.network(name).state_dict.items():
                 assert torch.equal(back.network(name).state_dict[key], value)
-        torch.testing.assert_close(
-            back.network("latent_norm").state_dict["running_var"], norm["running_var"]
-        )
-        assert back.network("latent_norm").build().fitted
+        norm_back = back.network("latent_norm").build()
+        torch.testing.assert_close(norm_back.running_var, norm["running_var"])
+        assert norm_back.fitted
 
     def test_a_training_checkpoint_and_back_keeps_all_facts(self, checkpoint, tmp_path):
         """Sensor, encoding, path and arguments; the official code finds its own entries only."""
@@ -461,7 +417,7 @@ class TestConvert:
         changed = from_official(content, Path("a.pt"), sit_args={"alignment_depth": 1})
         assert changed.network("ema").arguments["alignment_depth"] == 1
 
-    def test_report_and_refusals(self, checkpoint, official, tmp_path):
+    def test_report_and_refusals(self, official, tmp_path):
         official["opt"] = {"state": {}}
         torch.save(official, tmp_path / "a.pt")
         out = tmp_path / "a.safetensors"
@@ -471,7 +427,6 @@ class TestConvert:
         read = read_checkpoint(out)
         assert (read.stage, read.step) == ("official", 30)
         assert read.official_args == vars(official["args"])
-        assert read.network("vae").arguments == checkpoint.network("vae").arguments
         assert read.network("latent_norm").init_args["legacy_inverse"] is True
         with pytest.raises(ValueError, match="exists already"):
             convert(tmp_path / "a.pt", out, sit_args=OFFICIAL_SIT_ARGS)
@@ -500,52 +455,25 @@ class TestTransfer:
         assert set(self.results(report).values()) == {"kept"}
         for key, value in source.network("sit").state_dict.items():
             assert torch.equal(sit.state_dict()[key], value)
-        expected = source.network("latent_norm").state_dict["running_mean"]
-        assert torch.equal(norm.running_mean, expected)
-
-    def test_fresh_weights_keep_their_values(self):
-        source = self.source(in_channels=3, input_size=(4, 4), class_dropout=True, num_classes=9)
-        sit, norm = randomised(SiT(**SIT_ARGS)), randomised(LatentNorm(4))
-        before = {k: v.clone() for k, v in {**sit.state_dict(), **norm.state_dict()}.items()}
-        report = transfer_rgb(source, sit, norm, keep_projector=False)
-        after, rgb = {**sit.state_dict(), **norm.state_dict()}, source.network("sit").state_dict
-        for key, value in after.items():
-            group = key.split(".")[0]
-            fresh = group in ("x_embedder", "pos_embed", "projector", *norm.state_dict())
-            if key == "y_embedder.embedding_table.weight":
-                assert torch.equal(value, rgb[key][:1])
-            elif fresh or key.startswith("final_layer.linear"):
-                assert torch.equal(value, before[key]), key
-            else:
-                assert torch.equal(value, rgb[key]), key
-        assert ("x_embedder", 2, "fresh", "other number of latent channels") in report
-        assert self.results(report)["y_embedder"] == "truncated"
+        norm_there = source.network("latent_norm").state_dict
+        assert torch.equal(norm.running_mean, norm_there["running_mean"])
 
     @pytest.mark.parametrize(
-        ("changes", "group", "expected"),
+        ("changes", "expected"),
         [
-            # a new head may look at another block
-            (
-                {"feature_dim": 5, "alignment_depth": 1},
-                "projector",
-                ("fresh", "requested, but its shapes differ"),
-            ),
-            # as many tokens in another grid
-            ({"input_size": (8, 4)}, "pos_embed", ("resized", "other token grid: computed for")),
+            # a new head may look at another block; as many tokens in another grid
+            ({"feature_dim": 5, "alignment_depth": 1}, ("projector", 6, "fresh")),
+            ({"input_size": (8, 4)}, ("pos_embed", 1, "resized")),
         ],
     )
-    def test_what_does_not_fit_is_fresh_and_says_why(self, changes, group, expected):
-        sit = SiT(**SIT_ARGS)
-        report = transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
-        row = next(row for row in report if row.group == group)
-        assert row.result == expected[0]
-        assert row.reason.startswith(expected[1])
+    def test_what_does_not_fit_is_fresh(self, changes, expected):
+        rows = transfer_rgb(self.source(**changes), SiT(**SIT_ARGS), LatentNorm(4), True)
+        assert [row[:3] for row in rows if row.result != "kept"] == [expected]
 
     @pytest.mark.parametrize(
         ("rows_there", "rows_here", "expected"),
         [
             (1001, 1, [0]),
-            (2, 1, [0]),
             (1, 1, [0]),
             (1001, 2, [0, 1000]),  # the last row is that of no class
             (2, 2, [0, 1]),
@@ -572,8 +500,7 @@ class TestTransfer:
         before = {key: value.clone() for key, value in sit.state_dict().items()}
         report = transfer_rgb(source, sit, LatentNorm(4), keep_projector=False)
         results = self.results(report)
-        assert (results["x_embedder"], results["final_layer.linear"]) == ("fresh", "fresh")
-        assert (results["pos_embed"], results["blocks"]) == ("resized", "kept")
+        assert (results["x_embedder"], results["pos_embed"]) == ("fresh", "resized")
         for key in ("x_embedder.proj.weight", "final_layer.linear.weight", "pos_embed"):
             assert torch.equal(sit.state_dict()[key], before[key])
 
@@ -582,8 +509,6 @@ class TestTransfer:
         [
             ({"depth": 4}, "unknown to the network: blocks.3"),
             ({"depth": 2}, "missing in the checkpoint: blocks.2"),
-            ({"hidden_size": 16}, r"shape of blocks.0.attn.qkv.weight"),
-            ({"num_heads": 4}, "num_heads: checkpoint 4, network 2"),
             ({"alignment_depth": 1}, "alignment_depth: checkpoint 1, network 2"),
             (
                 {"hidden_size": 16, "num_classes": 2},  # label tables of other lengths and widths
