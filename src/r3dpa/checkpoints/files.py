@@ -62,9 +62,8 @@ def read_checkpoint(
         encoding: Official files only: range encoding, if the options do not name it.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is damaged, of no known layout, or names a class that is not
-            allowed.
+        ValueError: If the file is damaged, of no known layout, or names a class not allowed; a
+            ``FileNotFoundError`` if there is none.
     """
     path = Path(path)
     if not path.is_file():
@@ -149,8 +148,8 @@ def convert(
         size = sum(value.numel() for value in state.state_dict.values())
         kind = state.class_path.rpartition(".")[2]
         rows.append((name, kind, str(len(state.state_dict)), f"{size:,}"))
-    lines = [f"{source} -> {', '.join(map(str, outputs))}"]
-    lines.append(text_table(rows, ("network", "class", "tensors", "elements")))
+    table = text_table(rows, ("network", "class", "tensors", "elements"))
+    lines = [f"{source} -> {', '.join(map(str, outputs))}", table]
     return "\n".join(lines + [f"not converted: {k} ({why})" for k, why in left_out.items()])
 
 
@@ -294,11 +293,7 @@ def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkSt
 
 
 def _from_diffusers(path: Path) -> Checkpoint:
-    """Image VAE in the layout of diffusers; every tensor is used.
-
-    Widths and depths are read from the weights, ``norm_num_groups`` from ``config.json`` beside the
-    file, if there is one.
-    """
+    """Image VAE of diffusers: sizes from the weights, number of groups from its config.json."""
     weights = {
         _OLD_KEY.sub(lambda found: f"{found[1]}{_OLD_ATTENTION[found[2]]}.", key): value
         for key, value in load_file(path).items()

@@ -158,9 +158,8 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
             content[key] = dict(_official_part(checkpoint, key, kind).state_dict)
     if "vae" in content and not checkpoint.network("vae").arguments["legacy_upsample"]:
         raise ValueError(
-            f"the VAE of {checkpoint.path} wraps columns when it upsamples, the official one "
-            "does not, so its weights would decode to other images there: only a VAE built "
-            "with legacy_upsample=True has an official counterpart"
+            f"the VAE of {checkpoint.path} wraps columns when it upsamples: only one built with "
+            "legacy_upsample=True has an official counterpart"
         )
     if checkpoint.step is not None:
         content["steps"] = checkpoint.step
@@ -177,10 +176,8 @@ def statistics_of(norm: StateDict) -> dict[str, Tensor]:
 def _official_part(checkpoint: Checkpoint, name: str, *kinds: type[nn.Module]) -> NetworkState:
     state = checkpoint.network(name)
     if state.kind not in kinds:
-        raise ValueError(
-            f"{name} of {checkpoint.path} is a {state.class_path}, which has no official "
-            f"counterpart; {' or '.join(map(path_of, kinds))} has"
-        )
+        found = f"{name} of {checkpoint.path} is a {state.class_path}"
+        raise ValueError(f"{found}, which has no official counterpart")
     return state
 
 

@@ -18,7 +18,6 @@ from r3dpa.nn import LatentNorm, SiT, VelocityNetwork
 
 Weights = Mapping[str, Tensor]
 Result = Literal["kept", "fresh", "resized", "truncated", "extended"]
-
 # Largest difference between channels in how the latent scales of two models differ: on a frozen
 # VAE, running statistics 100 to 900 steps apart differ by up to 0.031 (batch 4) or 0.014 (32).
 NORM_TOLERANCE = 0.05
@@ -249,8 +248,5 @@ def _latent_size(checkpoint: Checkpoint, name: str) -> tuple[int, ...]:
 def _norm(checkpoint: Checkpoint, name: str) -> LatentNorm:
     norm = checkpoint.network(name).build()
     if not isinstance(norm, LatentNorm) or not norm.fitted:
-        raise ValueError(
-            f"{checkpoint.path}: {name} holds no fitted latent statistics; give a checkpoint of "
-            "stage joint or flow_matching"
-        )
+        raise ValueError(f"{checkpoint.path}: {name} holds no fitted latent statistics")
     return norm

@@ -31,8 +31,7 @@ DECADES = 4  # of the logarithmic scales
 def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> Figure:
     """Points of samples and of real scans seen from above, and the difference of their shares.
 
-    Forward is up and left is left. Both share one logarithmic scale of four decades; empty cells
-    have the dark background. The difference is linear near 0.
+    Both share one logarithmic scale of four decades; that of the difference is linear near 0.
 
     Args:
         samples: ``(X, X)`` counts, not all 0; index 0 is at the lower limit of x and of y.
@@ -81,10 +80,9 @@ def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> F
 
 
 def range_histogram(edges_m: Array, samples: Array, references: Array, halves: Array) -> Figure:
-    """Returns per metre of range, and the ratio of samples to real scans.
+    """Returns per metre of range, and the ratio of samples to real scans, if a bin has any.
 
-    The band is the floor: the range of parts of the real scans. Bins without a real return have no
-    ratio.
+    The band is the floor: the range of parts of the real scans.
 
     Args:
         edges_m: ``(K + 1,)`` ascending borders of the bins in metres.

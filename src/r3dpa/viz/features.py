@@ -146,10 +146,9 @@ def latents_picture(latents: Array, scale: int = 8) -> Pixels:
     Returns ``(h * scale, w * scale, 3)`` uint8. Source: R3DPA (ICRA 2026), figure of the effect of
     end-to-end training on latents.
     """
-    channels = as_numpy(latents, ("C", "h", "w"))
-    count, *latent_size = channels.shape
-    colours = pca_colours(channels.reshape(count, -1).T)
-    return enlarge(as_bytes(colours).reshape(*latent_size, 3), scale)
+    pixels = np.moveaxis(as_numpy(latents, ("C", "h", "w")), 0, -1)
+    colours = pca_colours(pixels.reshape(-1, pixels.shape[-1]))
+    return enlarge(as_bytes(colours).reshape(*pixels.shape[:2], 3), scale)
 
 
 def _rows(features: Array) -> Rows:

@@ -79,8 +79,7 @@ def scan_page(
 ) -> str:
     """HTML page with one scan at a time, turned, moved and coloured by the reader.
 
-    Coordinates are rounded to steps of 5 mm (larger for a scan that reaches beyond 163 m),
-    intensities to 1/255 of their maximum. A scan of 120 000 points takes half a megabyte.
+    Coordinates are rounded to 5 mm (more beyond 163 m). 120 000 points take half a megabyte.
 
     Args:
         scans: At least one.
