@@ -265,6 +265,89 @@ def test_matching_equals_all_against_all(threads, monkeypatch):
     torch.testing.assert_close(result.squared_normalised, best.values, rtol=1e-6, atol=0)
     assert torch.equal(result.nearest, best.indices)
     assert len(lookups) < 1.5 * len(references) * len(samples)
-    assert result.squared_normalised.mean().item() == pytest.approx(
-        best.values.mean().item(), rel=1e-6
-    )
+
+
+# What holds whatever the data
+
+
+def feature_sets(seed):
+    """Two sets of unequal sizes, means and covariances."""
+    real = draw(60, 5, seed=seed) @ draw(5, 5, seed=seed + 50)
+    return real, 1.5 * draw(45, 5, seed=seed + 100) + draw(5, seed=seed + 150)
+
+
+def clouds(seed, count):
+    return [draw(20 + 5 * i, 3, seed=1000 * seed + i) for i in range(count)]
+
+
+def sets_of_clouds(seed):
+    return clouds(seed, 7), clouds(seed + 20, 6)
+
+
+def of_histograms(field):
+    return lambda *sets: getattr(histogram_distance(*map(GRID.histogram, sets)), field)
+
+
+def matching(*sets):
+    found = minimum_matching(*([GRID.cells(cloud) for cloud in part] for part in sets), GRID)
+    return found.squared_normalised.mean().item()
+
+
+DISTANCES = {
+    "frechet": (frechet_distance_of, feature_sets),
+    "kernel": (lambda a, b: squared_mmd(a, b).item(), feature_sets),
+    "chamfer": (chamfer_squared, lambda seed: clouds(seed, 2)),
+    "jsd": (of_histograms("jsd_distance"), sets_of_clouds),
+    "tv": (of_histograms("total_variation"), sets_of_clouds),
+    "mmd": (matching, sets_of_clouds),
+}
+
+
+def shuffled(samples, seed):
+    order = torch.randperm(len(samples), generator=torch.Generator().manual_seed(seed)).tolist()
+    return [samples[i] for i in order] if isinstance(samples, list) else samples[order]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("case", DISTANCES)
+def test_order_does_not_count_and_other_samples_do(case, seed):
+    distance, sets = DISTANCES[case]
+    a, b = sets(seed)
+    apart = pytest.approx(distance(a, b), rel=1e-9)
+    assert distance(shuffled(a, seed), shuffled(b, seed + 1)) == apart
+    assert distance(a, b[:-5]) != pytest.approx(distance(a, b), rel=1e-6)
+    if case != "mmd":
+        assert distance(b, a) == apart
+    if case != "kernel":  # unbiased: below 0 for a set with itself
+        assert distance(a, shuffled(a, seed)) == pytest.approx(0, abs=1e-9)
+        assert distance(a, b) > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_scale_and_motion(seed):
+    """Twice as large: squared distances fourfold; a common motion: none changes."""
+    a, b = feature_sets(seed)
+    apart = frechet_distance_of(a, b)
+    assert frechet_distance_of(2 * a, 2 * b) == pytest.approx(4 * apart, rel=1e-9)
+    moved = [x @ torch.linalg.qr(draw(5, 5, seed=seed)).Q + 3 for x in (a, b)]
+    assert frechet_distance_of(*moved) == pytest.approx(apart, rel=1e-9)
+    assert precision_recall(*moved) == precision_recall(a, b) == precision_recall(2 * a, 2 * b)
+    x, y = clouds(seed, 2)
+    assert chamfer_squared(2 * x, 2 * y) == pytest.approx(4 * chamfer_squared(x, y), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "compare",
+    [
+        precision_recall,
+        squared_mmd,
+        lambda a, b: polynomial_mmd(a, b, torch.Generator(), 2, 4),
+        lambda a, b: fd_infinity(a, b, torch.Generator()),
+        lambda a, b: Moments.of(a).merge(Moments.of(b)),
+    ],
+)
+def test_features_of_other_widths_do_not_compare(compare):
+    """Width 1 would stretch to any other without an error."""
+    for first, second in ((3, 1), (1, 3), (2, 3)):
+        with pytest.raises(ValueError, match=rf"{first}.* {second}\b"):
+            compare(draw(60, first), draw(60, second, seed=1))

@@ -186,12 +186,7 @@ class TestLoad:
                 changed("rangevit_wo_i", {"mu": np.full(2, np.nan), "sigma": np.eye(2)}),
                 r"an array of shape \(2,\) instead of 1 axes of numbers",
             ),
-            (changed("dataset_bev_hist", np.ones((200, 200))), "for input of size 40000"),
             (changed("dataset_bev_hist", "x"), "no attribute 'ndim'"),
-            (
-                changed("valset_voxelized_bev", {"points": [np.full((1, 2), 1.5)]}),
-                "occupied cells that are not multiples of 1 / 2000",
-            ),
             (
                 changed("valset_voxelized_bev", {"points": [np.full((1, 2), 0.00025)]}),
                 "occupied cells that are not multiples of 1 / 2000",

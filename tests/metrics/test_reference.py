@@ -191,24 +191,16 @@ def test_a_file_is_read_resumed_or_renewed(tmp_path):
     half_done.save(partial)  # as if killed before it was removed
     assert compute_reference(empty(27), scans_from, [TOY], out).complete
     assert started == [16]
-    with pytest.raises(ValueError, match="of another job: its names differ"):
-        compute_reference(empty(11), scans_from, [TOY], out)
+    for other, key in (
+        (empty(11), "names"),
+        (empty(27, unprojection="corner"), "protocol"),
+        (empty(27, spaces=(replace(TOY, card={**CARD, "weights": "x"}),)), "spaces"),
+    ):
+        with pytest.raises(ValueError, match=f"of another job: its {key} differ.*delete the file"):
+            compute_reference(other, scans_from, [TOY], out)
     compute_reference(empty(27, unprojection="corner"), scans_from, [TOY], out, renew=True)
     assert started == [16, 0]
     assert ReferenceStatistics.load(out).protocol.unprojection == "corner"
-
-
-def test_what_another_job_has_left_is_refused(tmp_path):
-    partial = tmp_path / "partial.safetensors"
-    empty().save(partial)
-    assert resume_or_start(empty(), tmp_path / "none").num_done == 0
-    for other, key in (
-        (empty(12), "names"),
-        (empty(unprojection="corner"), "protocol"),
-        (empty(spaces=(replace(TOY, card={**CARD, "weights": "x"}),)), "spaces"),
-    ):
-        with pytest.raises(ValueError, match=f"of another job: its {key} differ.*delete the file"):
-            resume_or_start(other, partial)
 
 
 def test_scans_must_come_as_announced():

@@ -59,8 +59,6 @@ def test_interval_surrounds_a_value_that_resampling_shifts():
 def test_intervals_need_samples_and_resamples():
     assert Resampling().of_mean(torch.ones(1)) is None
     assert Resampling(num_resamples=0).of_mean(torch.ones(9)) is None
-    with pytest.raises(ValueError, match="39 resamples cannot tell the ends of a 95% interval"):
-        Resampling(num_resamples=39)
 
 
 # One result

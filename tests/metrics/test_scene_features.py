@@ -78,8 +78,6 @@ def test_images_and_their_points_take_one_way():
 
 def test_protocols_come_back_from_plain_values():
     assert Protocol.from_dict(CORNER.to_dict()) == CORNER
-    with pytest.raises(ValueError, match="unprojection must be corner or centre, got middle"):
-        replace(DEFAULT, unprojection="middle")
 
 
 # --- spaces ---

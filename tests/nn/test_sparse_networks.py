@@ -158,3 +158,17 @@ def test_pooling_by_hand():
     assert not pool_voxels(features[:2], beyond, 1).any()
     above = torch.tensor([[120, 0, 160, 0], [-120, 0, -160, 0]])  # 6 m aside, 10 m in space
     assert pool_voxels(features[:2], above, 1).view(16, 2)[1].tolist() == [2, 20]
+
+
+def test_pooled_features_do_not_depend_on_the_order_of_voxels():
+    """The mean of the coordinates is exact, so that no voxel changes its ring."""
+    generator = torch.Generator().manual_seed(0)
+    xyz = torch.randint(2000, (20_000, 3), generator=generator)
+    coordinates = torch.cat([xyz, torch.randint(2, (20_000, 1), generator=generator)], dim=1)
+    features = torch.randn(20_000, 2, generator=generator)
+    pooled = pool_voxels(features, coordinates, 2)
+    order = torch.randperm(20_000, generator=generator)
+    again = pool_voxels(features[order], coordinates[order], 2)
+    torch.testing.assert_close(again, pooled, rtol=0, atol=1e-7)
+    moved = coordinates + torch.tensor([30_000, -30_000, 11, 0])  # float32 sums would round by 0.1
+    torch.testing.assert_close(pool_voxels(features, moved, 2), pooled, rtol=0, atol=1e-6)

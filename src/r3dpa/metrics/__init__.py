@@ -12,15 +12,13 @@ from r3dpa.metrics.feature_distances import (
     FrechetInfinity,
     PolynomialMMD,
     PrecisionRecall,
-    scene_metrics,
 )
 from r3dpa.metrics.functional_bev import BEVGrid
-from r3dpa.metrics.realism import RealismTable, measures, realism_table
+from r3dpa.metrics.realism import measures, realism_table
 from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.results import Evaluation, EvaluationTable, MetricResult
+from r3dpa.metrics.results import Evaluation, EvaluationTable
 from r3dpa.metrics.scan_statistics import ScanStatistics, scan_statistics
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol
-from r3dpa.metrics.scene_features import SceneFeatures, feature_spaces, scene_features
 
 __all__ = [
     "DEFAULT",
@@ -32,23 +30,17 @@ __all__ = [
     "EvaluationTable",
     "FrechetDistance",
     "FrechetInfinity",
-    "MetricResult",
     "MinimumMatchingDistance",
     "PolynomialMMD",
     "PrecisionRecall",
     "Protocol",
     "RangeHistogramDistance",
-    "RealismTable",
     "ReferenceStatistics",
     "Resampling",
     "ScanStatistics",
-    "SceneFeatures",
     "evaluate",
-    "feature_spaces",
     "measures",
     "realism_table",
     "scan_statistics",
     "scene_distance",
-    "scene_features",
-    "scene_metrics",
 ]

@@ -11,7 +11,6 @@ from torch import Tensor
 Ends = tuple[float, float]
 
 _LEVEL = 0.95
-_MIN_RESAMPLES = 40  # that tell the ends of a 95 % interval
 
 
 @dataclass(frozen=True)
@@ -20,18 +19,11 @@ class Resampling:
 
     Args:
         seed: Of each metric on its own.
-        num_resamples: Of each interval, at least 40; 0 for no intervals.
+        num_resamples: Of each interval; fewer than 40 cannot tell its ends, 0 gives none.
     """
 
     seed: int = 0
     num_resamples: int = 100
-
-    def __post_init__(self) -> None:
-        if 0 < self.num_resamples < _MIN_RESAMPLES:
-            raise ValueError(
-                f"{self.num_resamples} resamples cannot tell the ends of a {_LEVEL:.0%} interval; "
-                f"give at least {_MIN_RESAMPLES}, or 0 for no intervals"
-            )
 
     def generator(self) -> torch.Generator:
         """A new generator with the seed."""

@@ -89,7 +89,6 @@ def evaluate(
         protocol,
         {space.name: (space.label, space.dim) for space in spaces},
         num_groups=_GROUPS,
-        max_rows=(None, protocol.num_samples),
         max_images=(None, protocol.num_mmd_samples),
     )
     bad: list[str] | None = [] if skip_bad else None

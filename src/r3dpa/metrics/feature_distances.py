@@ -45,21 +45,15 @@ class FeatureMetric(SceneMetric):
         label: Of the feature space, in results.
         space: Key of the features if ``update`` gets those of several spaces.
         max_real: Real scans whose features are kept; default: all.
-        max_generated: Generated scenes whose features are kept; default: all.
     """
 
     real_moments: Tensor
     generated_moments: Tensor
 
     def __init__(
-        self,
-        num_features: int,
-        label: str = "",
-        space: str = "",
-        max_real: int | None = None,
-        max_generated: int | None = None,
+        self, num_features: int, label: str = "", space: str = "", max_real: int | None = None
     ) -> None:
-        super().__init__(max_real, max_generated)
+        super().__init__(max_real)
         self.num_features, self.label, self.space = num_features, label, space
         empty = torch.zeros(1 + num_features + num_features**2, dtype=torch.float64)
         self._add_states("moments", empty, merge_packed)
@@ -212,7 +206,7 @@ def scene_metrics(
     protocol: Protocol,
     spaces: Mapping[str, tuple[str, int]],
     num_groups: int = 1,
-    max_rows: tuple[int | None, int | None] = (None, None),
+    max_rows: int | None = None,
     max_images: tuple[int | None, int | None] = (None, None),
 ) -> MetricCollection:
     """All metrics of scenes: ``cells``, ``ranges``, ``matching`` and four for each feature space.
@@ -228,7 +222,7 @@ def scene_metrics(
     groups = [[name] for name in metrics]
     for name, (label, width) in spaces.items():
         own = {
-            f"{name}_{kind}": metric(width, label, name, *max_rows)
+            f"{name}_{kind}": metric(width, label, name, max_rows)
             for kind, metric in _OF_SPACE.items()
         }
         metrics |= own

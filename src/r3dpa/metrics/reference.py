@@ -67,7 +67,7 @@ class ReferenceStatistics:
             for limit in (protocol.num_samples, protocol.num_mmd_references)
         )
         self.halves = tuple(
-            self.metrics(max_rows=(rows[i], None), max_images=(images[i], None)) for i in (0, 1)
+            self.metrics(max_rows=rows[i], max_images=(images[i], None)) for i in (0, 1)
         )
 
     @classmethod

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -48,11 +48,6 @@ class Protocol:
     num_mmd_samples: int = 2000
     num_mmd_references: int = 1000
     sensor: LidarSensor = LidarSensor()
-
-    def __post_init__(self) -> None:
-        if self.unprojection not in get_args(Unprojection):
-            known = " or ".join(get_args(Unprojection))
-            raise ValueError(f"unprojection must be {known}, got {self.unprojection}")
 
     @property
     def corner(self) -> bool:
