@@ -198,25 +198,24 @@ def test_an_error_while_writing_stops_the_run_with_its_message(tmp_path, monkeyp
 
 
 def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
-    """Two batches may wait; the third `put` comes back only when one has been written."""
+    """One batch may wait; the second `put` comes back only when it has been written."""
     gate = threading.Event()
     real = scene_writer.write_bin
     monkeypatch.setitem(
         scene_writer._CLOUD_WRITERS, "bin", lambda *args: gate.wait(10) and real(*args)
     )
-    range_m = scenes(3)
-    with writer(tmp_path, 3) as open_writer:
-        for index in range(2):
-            open_writer.put(range_m[index : index + 1])
+    range_m = scenes(2)
+    with writer(tmp_path, 2) as open_writer:
+        open_writer.put(range_m[:1])
         assert open_writer.num_done == 0
-        third = threading.Thread(target=open_writer.put, args=(range_m[2:],))
-        third.start()
-        third.join(0.1)
-        assert third.is_alive()
+        second = threading.Thread(target=open_writer.put, args=(range_m[1:],))
+        second.start()
+        second.join(0.1)
+        assert second.is_alive()
         gate.set()
-        third.join(10)
+        second.join(10)
         open_writer.close()
-        assert open_writer.num_done == 3
+        assert open_writer.num_done == 2
 
 
 def test_40_scenes_are_never_in_memory_together(tmp_path):
@@ -230,7 +229,7 @@ def test_40_scenes_are_never_in_memory_together(tmp_path):
             most = max(most, len(batches))
         open_writer.close()
         open_writer.finish({})
-    assert most <= 4  # three and the one that is being handed over
+    assert most <= 3  # two and the one that is being handed over
     assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 40
 
 

@@ -287,11 +287,10 @@ def object_library(
 
 def _wanted(classes: Sequence[str] | None) -> dict[str, int]:
     """Ids of classes by name."""
-    ids = {name: number for number, name in CLASS_NAMES.items()}
     if classes is None:
-        return ids
+        return _ID
     if not classes or len(set(classes)) < len(classes):
         raise ValueError(f"classes must be different names, at least one, got {list(classes)}")
-    if unknown := [name for name in classes if name not in ids]:
-        raise ValueError(f"there is no class {', '.join(unknown)}; there are {', '.join(ids)}")
-    return {name: ids[name] for name in classes}
+    if unknown := [name for name in classes if name not in _ID]:
+        raise ValueError(f"there is no class {', '.join(unknown)}; there are {', '.join(_ID)}")
+    return {name: _ID[name] for name in classes}

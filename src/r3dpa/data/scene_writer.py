@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -29,7 +28,6 @@ _WRITTEN = (
     *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
     *("before.npy", "mask.png", "edit.png", "edit.html"),
 )
-_MOST_WAITING = 2
 
 
 class SceneWriter:
@@ -43,7 +41,7 @@ class SceneWriter:
     ===================== =====================================================================
 
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
-    request and the number of scenes written. At most three batches are in memory. An error of the
+    request and the number of scenes written. At most two batches are in memory. An error of the
     thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block.
     ``ValueError`` if a format is unknown, another process writes to ``out``, or it holds scenes, or
     unfinished ones of another request.
@@ -92,8 +90,7 @@ class SceneWriter:
             self._file = self._open()
             self._alone = alone.pop_all()
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scene-writer")
-        self._waiting: deque[Future[None]] = deque()
-        self._failed = False
+        self._batch: Future[None] | None = None  # that is being written
 
     def __enter__(self) -> Self:
         return self
@@ -105,9 +102,8 @@ class SceneWriter:
             if error is not None and not self.num_done:
                 self._unfinished.unlink(missing_ok=True)
                 self._state.unlink(missing_ok=True)
-        failed = next(filter(None, (one.exception() for one in self._waiting)), None)
-        if failed is not None and error is None:
-            raise failed
+        if error is None:
+            self._wait()
 
     @property
     def range_path(self) -> Path:
@@ -115,21 +111,18 @@ class SceneWriter:
         return self.out / "range_m.npy"
 
     def put(self, range_m: Tensor, nfe: int = 0) -> None:
-        """Queue the next scenes; waits only while two batches are queued already.
+        """Write the next scenes beside the caller; waits for those before them.
 
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
             nfe: Network evaluations of each of them.
         """
-        while len(self._waiting) >= _MOST_WAITING:
-            self._waiting.popleft().result()
-        self._waiting.append(self._thread.submit(self._write, range_m.cpu(), nfe))
+        self._wait()
+        self._batch = self._thread.submit(self._write, range_m.cpu(), nfe)
 
     def close(self) -> None:
         """Wait until all scenes are written, and give ``range_m.npy`` its name."""
-        while self._waiting:
-            self._waiting.popleft().result()
-        self._thread.shutdown()
+        self._wait()
         self._file.close()
         assert self.num_done == self.num, "closed before all scenes were put"
         if "npz" in self._formats:
@@ -208,10 +201,7 @@ class SceneWriter:
         return file
 
     def _write(self, range_m: Tensor, nfe: int) -> None:
-        """Write one batch; none after one that failed, whose error the next call raises."""
-        if self._failed:
-            return
-        self._failed = True
+        """Write one batch."""
         for index, scene in enumerate(range_m, self.num_done):
             if scene.isnan().any():
                 raise ValueError(
@@ -231,7 +221,12 @@ class SceneWriter:
         evaluations = self.evaluations + nfe * len(range_m)
         self._save_state(num_done, evaluations)
         self.num_done, self.evaluations = num_done, evaluations
-        self._failed = False
+
+    def _wait(self) -> None:
+        """Wait for the batch that is being written; raises its error, once."""
+        batch, self._batch = self._batch, None
+        if batch is not None:
+            batch.result()
 
     def _save_state(self, num_done: int, evaluations: int) -> None:
         state = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
