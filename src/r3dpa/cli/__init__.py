@@ -86,7 +86,8 @@ def _run(args: list[str]) -> None:
         sys.stdout.write(f"{__version__}\n")
         return
     group = args[0] if args and args[0] in _GROUPS else ""
-    if args[bool(group) :][:1] in ([], ["-h"], ["--help"]):
+    rest = args[1:] if group else args
+    if not rest or rest[0] in ("-h", "--help"):
         sys.stdout.write(f"{_help(group)}\n")
         return
     name, words = _find(args)

@@ -99,16 +99,14 @@ def view(
     drawn = {scan.name: scan.points for scan in [*scans, *([beside] if beside else [])]}
     resolved = source.resolve()
     out = out or Path("view") / (resolved.name if resolved.is_dir() else resolved.stem)
-    pictures = {
-        "range_images.png": viz.range_strips(drawn, SphericalProjection(LidarSensor())),
-        "birds_eye.png": viz.birds_eye_sheet(drawn),
-    }
-    paths = [viz.save(figure, out / name) for name, figure in pictures.items()]
-    paths.append(write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view", beside))
-    lines = [f"{len(scans)} of {len(readers)} scans in {source}"]
-    if beside:
-        lines.append(beside.name)
-    return "\n".join([*lines, *map(str, paths), "open the .html file in a browser"])
+    strips = viz.range_strips(drawn, SphericalProjection(LidarSensor()))
+    paths = [
+        viz.save(strips, out / "range_images.png"),
+        viz.save(viz.birds_eye_sheet(drawn), out / "birds_eye.png"),
+        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view", beside),
+    ]
+    line = f"{len(scans)} of {len(readers)} scans in {source}"
+    return "\n".join([line, *map(str, paths), "open the .html file in a browser"])
 
 
 def _readers(source: Path) -> list[Callable[[], viz.PageScan]]:

@@ -179,7 +179,10 @@ def complete(
         empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
         masks.append(empty.expand_as(source.range_m))
     if not masks:
-        raise ValueError("nothing is missing: give --sector, --keep_every, ... or --mask")
+        raise ValueError(
+            "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
+            "--mask"
+        )
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))

@@ -206,7 +206,7 @@ def _with_preset(words: list[str]) -> list[str]:
         if name not in known:
             raise ValueError(f"there is no {folder} {name!r}; give one of {', '.join(known)}")
     data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *["trainer_demo"] * demo, f"data/{data}", f"experiment/{stage}"]
+    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", f"experiment/{stage}"]
     if demo and (conf / f"experiment/{stage}_demo.yaml").is_file():
         names.append(f"experiment/{stage}_demo")
     configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
