@@ -156,14 +156,13 @@ def test_cuda_equals_cpu():
     # libm and CUDA may round an angle on a pixel border differently.
     assert (cuda_range.cpu() != range_m).sum() <= 2
     assert (cuda_image.cpu() != image).sum() <= 6
-    means, _ = pool_cells(points.cuda(), values.cuda(), projection)
-    torch.testing.assert_close(
-        means.cpu(), pool_cells(points, values, projection)[0], atol=1e-3, rtol=0
-    )
-    assert torch.equal(pool_cells(points.cuda(), values.cuda(), projection)[0], means)
-    again = range_image(points.cuda(), projection, values.cuda())
-    assert torch.equal(again[0], cuda_range)
-    assert torch.equal(again[1], cuda_image)
+    expected, _ = pool_cells(points, values, projection)
+    means, again = (pool_cells(points.cuda(), values.cuda(), projection)[0] for _ in range(2))
+    torch.testing.assert_close(means.cpu(), expected, atol=1e-3, rtol=0)
+    assert torch.equal(again, means)
+    range_again, image_again = range_image(points.cuda(), projection, values.cuda())
+    assert torch.equal(range_again, cuda_range)
+    assert torch.equal(image_again, cuda_image)
     torch.testing.assert_close(
         unproject(cuda_range, projection).cpu(), unproject(cuda_range.cpu(), projection)
     )

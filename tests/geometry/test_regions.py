@@ -234,16 +234,13 @@ def test_shares_sum_to_one_and_turn_with_the_layout(starts, blend, turn):
     torch.testing.assert_close(turned, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("layout", "blend", "message"),
-    [
+def test_a_layout_that_cannot_be_used_is_refused():
+    for layout, blend, message in (
         ([(0, 0), (180, 0)], 0, r"two or more sources, numbered from 0; got \[0\]"),
         ([(0, 0), (180, 2)], 0, r"got \[0, 2\]"),
         ([(0, 0), (360, 1)], 0, "start at one azimuth"),
         ([(0, 0), (math.inf, 1)], 0, "finite"),
         ([(0, 0), (180, 1)], -1, "blend must be 0 to 360 degrees, got -1"),
-    ],
-)
-def test_a_layout_that_cannot_be_used_is_refused(layout, blend, message):
-    with pytest.raises(ValueError, match=message):
-        sector_weights(layout, (2, 8), blend)
+    ):
+        with pytest.raises(ValueError, match=message):
+            sector_weights(layout, (2, 8), blend)

@@ -36,9 +36,9 @@ class Release:
     build: Any
     official_name: Any
     load: Any
-    entry: str  # of the file, that holds the weights
     removed: str  # weight that a broken file lacks
     cut: str  # weight that a broken file holds without its last row
+    entry: str = "state_dict"  # of the file, that holds the weights
 
     def weights(self):
         torch.manual_seed(0)
@@ -52,7 +52,6 @@ RELEASES = {
         lambda: RangeViT(SENSOR, 4, **VIT, skip_channels=6, trained_size=TRAINED),
         renamed(rangevit._NAMES),
         lambda path: RangeViT.from_checkpoint(path, SENSOR, num_heads=3, trained_size=TRAINED),
-        "state_dict",
         "rangevit.encoder.blocks.1.norm2.bias",
         "rangevit.encoder.blocks.0.mlp.fc1.bias",
     ),
@@ -60,7 +59,6 @@ RELEASES = {
         lambda: LIPLoc(picture_side=32, patch_side=8, **VIT),
         lambda key: liploc._ENCODER + renamed(liploc._NAMES)(key),
         lambda path: LIPLoc.from_checkpoint(path, num_heads=3),
-        "state_dict",
         "encoder_lidar.model.blocks.1.norm2.bias",
         "encoder_lidar.model.blocks.0.mlp.fc1.bias",
     ),
@@ -68,7 +66,6 @@ RELEASES = {
         lambda: MinkowskiNet(WIDTHS),
         minkowski.official_name,
         MinkowskiNet.from_checkpoint,
-        "state_dict",
         "stem.1.bias",
         "stem.1.weight",
     ),
@@ -76,7 +73,6 @@ RELEASES = {
         lambda: SPVCNN(WIDTHS),
         minkowski.official_name,
         SPVCNN.from_checkpoint,
-        "state_dict",
         "point_transforms.0.0.bias",
         "stem.1.weight",
     ),
@@ -84,9 +80,9 @@ RELEASES = {
         lambda: WaffleIron(width=4, depth=3, head_dim=5),
         lambda key: "module." + point_features.official_name(key),
         ScaLR.from_checkpoint,
-        "model_point",
         "module.waffleiron.spatial_mix.1.scale.weight",
         "module.embed.final.bias",
+        "model_point",
     ),
 }
 
