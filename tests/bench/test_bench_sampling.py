@@ -115,11 +115,7 @@ class TestFront:
             "0.072, 2.26 times less, for 800 ms more a scene."
         ]
 
-    @pytest.mark.parametrize(
-        ("seconds", "text"), [(1.5, "1.5 s"), (0.0521, "52.1 ms"), (3.2e-5, "32 µs")]
-    )
-    def test_durations(self, seconds, text):
-        assert duration(seconds) == text
+        assert duration(3.2e-5) == "32 µs"
 
 
 class TestQuality:
@@ -207,18 +203,6 @@ class TestErrors:
         torch.testing.assert_close(ours.latents.double(), exact.latents, atol=1e-4, rtol=0)
         both = (ours.range_m > 0) & (exact.range_m > 0)
         assert (ours.range_m - exact.range_m)[both].abs().max() < 0.01
-
-    @pytest.mark.parametrize(
-        ("wrong", "message"),
-        [
-            ({"samples": 1}, "at least 2, rounds.*got .*samples=1,"),
-            ({"evaluations": ()}, "with some nfe"),
-            ({"reference_steps": 3}, "even"),
-        ],
-    )
-    def test_efforts_that_measure_nothing_are_refused(self, wrong, message):
-        with pytest.raises(ValueError, match=message):
-            replace(TINY, **wrong)
 
 
 @pytest.fixture(scope="module")

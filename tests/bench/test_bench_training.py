@@ -95,8 +95,6 @@ def test_the_table_quotes_the_file(figures):
         assert cells[8] == f"{stage['peak_host_bytes'] / 2**30:.2f}"
         assert cells[12] == f"{stage['flop'] / 1e9:.4g}"
     assert f"torch {torch.__version__}" in table
-    assert content["settings"]["batch_size"] == 2
-    assert content["machine"]["cpu"]
 
 
 @pytest.mark.slow
@@ -110,11 +108,6 @@ def test_quick_measures_the_small_networks_in_a_process_of_their_own(small_conf,
 def test_a_missing_experiment_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"experiment/joint\.yaml.*conf"):
         training(tmp_path, ("joint",))
-
-
-def test_no_steps_are_refused():
-    with pytest.raises(ValueError, match="at least 1, got 1 and 0"):
-        StepSettings(steps=0)
 
 
 def killed(*args):

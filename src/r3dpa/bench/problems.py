@@ -6,7 +6,6 @@ Letters: N scenes or samples, D dimensions, B batch, K Gaussians.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal, NamedTuple
@@ -22,6 +21,8 @@ from r3dpa.generation import SamplerConfig, SceneGenerator, scene_noise
 
 Precision = Literal["fp32", "bf16"]
 _SEED = 0
+#: Convolutions in float32, as matrix products are by default.
+_EXACT_PRODUCTS = partial(torch.backends.cudnn.flags, enabled=True, allow_tf32=False)
 
 
 @dataclass(frozen=True)
@@ -73,13 +74,7 @@ def toy_mixture(seed: int = 0) -> GaussianMixture:
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to sample.
-
-    Args:
-        sampler: ODE solver, steps and shift.
-        precision: Of the networks.
-        batch: Scenes computed together.
-    """
+    """One way to sample: ODE solver, steps and shift, precision, scenes computed together."""
 
     sampler: SamplerConfig
     precision: Precision = "fp32"
@@ -112,10 +107,7 @@ class Solved(NamedTuple):
 class MixtureProblem:
     """A mixture of Gaussians with its exact velocity; float64, whatever the precision of a setting.
 
-    Args:
-        mixture: Data.
-        num: Samples that are solved together: one generator draws all noise.
-        batch: Samples that are timed together.
+    ``num`` samples are solved together, since one generator draws all noise, and ``batch`` timed.
     """
 
     def __init__(self, mixture: GaussianMixture, num: int, batch: int = 256) -> None:
@@ -147,41 +139,28 @@ class MixtureProblem:
 
 
 class ModelProblem:
-    """The velocity network and the decoder of a checkpoint.
-
-    Args:
-        checkpoint: Of stage joint or flow_matching.
-        device: Where it is computed.
-        batch: Scenes that are solved together where nothing is timed.
-    """
+    """Networks of a checkpoint; where nothing is timed ``batch`` scenes are solved together."""
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
-        self.batch, self._path = batch, checkpoint.interpolant
-        self._plain = SceneGenerator.from_checkpoint(checkpoint, SamplerConfig(), device=device)
+        self.batch = batch
+        self._read = partial(
+            SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device
+        )
+        self._plain = self._read()
         self.device = self._plain.device
 
     def _generator(self, setting: Setting) -> SceneGenerator:
         """Generator of its own that shares the plain networks with others."""
-        if setting.precision == "fp32":
-            return self._plain.with_sampler(setting.sampler)
-        return self._rounded.with_sampler(setting.sampler)
+        plain = setting.precision == "fp32"
+        return (self._plain if plain else self._rounded).with_sampler(setting.sampler)
 
     @cached_property
     def _rounded(self) -> SceneGenerator:
-        plain = self._plain
-        return SceneGenerator(
-            plain.vae,
-            plain.sit,
-            plain.latent_norm,
-            plain.geometry,
-            SamplerConfig(),
-            self._path,
-            "bf16",
-        )
+        return self._read(precision="bf16")
 
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Scenes of these indices as the generator draws them."""
-        with _exact_products():
+        with _EXACT_PRODUCTS():
             found = self._generator(setting).generate(indices, _SEED)
         return Solved(found.latents.cpu(), found.range_m.cpu())
 
@@ -194,7 +173,7 @@ class ModelProblem:
         def velocity(x: Tensor, moment: Tensor) -> Tensor:
             return sit.velocity(x.float(), moment.float()).double()
 
-        with _exact_products():
+        with _EXACT_PRODUCTS():
             found = heun(velocity, noise.double(), ode_times(steps))
             image = generator.vae.decode(generator.latent_norm.denormalise(found.float()))
         geometry = generator.geometry
@@ -219,8 +198,3 @@ class ModelProblem:
 
 
 Problem = MixtureProblem | ModelProblem
-
-
-def _exact_products() -> AbstractContextManager[None]:
-    """Convolutions in float32, as matrix products are by default."""
-    return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)

@@ -272,40 +272,37 @@ def _record(found: Finding) -> dict[str, Any]:
         },
         "front": [row.label for row in front],
         "sentences": sentences(front),
-        "timing": {
-            "a_a": asdict(found.timing.repeat),
-            "sound": found.timing.sound,
-        },
+        "timing": {"a_a": asdict(found.timing.repeat), "sound": found.timing.sound},
         "flop": {"evaluation": found.flop[0], "rest": found.flop[1]},
     }
 
 
 def _picture(name: str, found: Finding) -> Figure:
     """Error against time."""
+
+    def points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
+        return [
+            viz.ParetoPoint(
+                row.label,
+                row.way.name,
+                row.seconds,
+                row.error,
+                row.interval,
+                filled=row.way.precision == "bf16",
+            )
+            for row in rows
+            if row.error > 0
+        ]
+
     front = front_of(found.rows, found.timing.tolerance)
     bf16 = [row for row in found.rows if row.way.precision == "bf16" and row.precision_error]
     return viz.pareto_figure(
         f"What accuracy costs in time: {_TITLES[name]}",
         "RMSE of the latents from the converged solution",
-        _points(found.rows),
-        _points(front),
+        points(found.rows),
+        points(front),
         {"bf16 against fp32": bf16[0].precision_error or 0.0} if bf16 else {},
     )
-
-
-def _points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
-    return [
-        viz.ParetoPoint(
-            row.label,
-            row.way.name,
-            row.seconds,
-            row.error,
-            row.interval,
-            filled=row.way.precision == "bf16",
-        )
-        for row in rows
-        if row.error > 0
-    ]
 
 
 #: Column of the table, key of the row, factor and format.

@@ -53,13 +53,6 @@ class StepSettings:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     quick: bool = False
 
-    def __post_init__(self) -> None:
-        """Checks the counts."""
-        if self.batch_size < 1 or self.steps < 1:
-            raise ValueError(
-                f"batch_size and steps must be at least 1, got {self.batch_size} and {self.steps}"
-            )
-
 
 @dataclass(frozen=True)
 class StageCost:
@@ -104,17 +97,9 @@ def training(
 ) -> str:
     """Trains each stage for a few steps on simulated scans; returns a table of its cost.
 
-    Each stage runs in a fresh process, so that no peak contains what another stage left behind.
-
-    Args:
-        conf: Folder of the configurations; stage ``joint`` is ``<conf>/experiment/joint.yaml``.
-        stages: Experiments to measure.
-        settings: Size, number, precision and device of the steps.
-        out: JSON file for the same figures, without rounding.
-
-    Raises:
-        ValueError: If there is no such experiment.
-        RuntimeError: If the process of a stage was killed, as happens when memory runs out.
+    Each stage runs in a fresh process, so that no peak contains what another stage left behind;
+    ``RuntimeError`` if it was killed, as happens when memory runs out. Stage ``joint`` is
+    ``<conf>/experiment/joint.yaml``, and the JSON file ``out`` gets the figures without rounding.
     """
     settings = replace(settings, device=cast(Any, usable_device(settings.device)))
     files = {stage: _experiments(conf, stage, settings.quick) for stage in stages}

@@ -21,8 +21,8 @@ __all__ = ["ablate", "sampling", "training"]
 def training(
     *,
     stages: tuple[str, ...] = ("vae_alignment", "joint", "flow_matching"),
-    batch_size: int = 1,
-    steps: int = 2,
+    batch_size: PositiveInt = 1,
+    steps: PositiveInt = 2,
     precision: Literal["32-true", "bf16-mixed"] = "32-true",
     device: Literal["auto", "cpu", "cuda"] = "auto",
     out: Path | None = None,
@@ -52,11 +52,11 @@ def sampling(
     out: Path,
     ckpt: Path | None = None,
     quick: bool = False,
-    scenes: int | None = None,
-    batch_size: int | None = None,
-    rounds: int | None = None,
-    nfe: list[int] | None = None,
-    reference_steps: int | None = None,
+    scenes: PositiveInt | None = None,
+    batch_size: PositiveInt | None = None,
+    rounds: PositiveInt | None = None,
+    nfe: list[PositiveInt] | None = None,
+    reference_steps: PositiveInt | None = None,
     device: str = "auto",
 ) -> Any:
     """Measure accuracy against time for an exact velocity and a trained model; draw both.
@@ -82,7 +82,7 @@ def sampling(
     effort = {
         "samples": scenes,
         "reference_steps": reference_steps,
-        "evaluations": None if nfe is None else tuple(sorted(set(nfe))),
+        "evaluations": tuple(sorted(set(nfe))) if nfe else None,
         "rounds": rounds,
         "batch": batch_size,
     }
