@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import lightning as L
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.image_datamodule import (
@@ -25,17 +25,7 @@ from r3dpa.modules.checks import check_latents, check_trainer, image_datamodule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
-
-
-class ImageTeacher(Protocol):
-    """Frozen network whose features of images, of width ``dim``, a SiT is aligned with."""
-
-    dim: int
-    trained: bool
-
-    def __call__(self, image: Tensor, grid_size: tuple[int, int]) -> Tensor:
-        """Features ``(B, N, F)`` of grid cells, row-major, of images ``(B, 3, S, S)``."""
-        ...
+from r3dpa.nn.backbones import DINOv2
 
 
 class RGBPretraining(L.LightningModule):
@@ -52,8 +42,7 @@ class RGBPretraining(L.LightningModule):
     Args:
         vae: Image autoencoder; its weights come from ``init_from`` and stay fixed.
         sit: Flow transformer.
-        teacher: Frozen image network to align with, such as
-            :class:`r3dpa.nn.backbones.DINOv2`; None aligns with nothing.
+        teacher: Frozen image network to align with; None aligns with nothing.
         init_from: Trained image VAE: checkpoint of stage ``image_vae``, or the
             ``diffusion_pytorch_model.safetensors`` of a VAE of Stable Diffusion.
         weights: Loss weights; those of the velocity and of ``sit_alignment`` count. The latter must
@@ -76,7 +65,7 @@ class RGBPretraining(L.LightningModule):
         self,
         vae: ImageVAE,
         sit: SiT,
-        teacher: nn.Module | None = None,
+        teacher: DINOv2 | None = None,
         init_from: str | None = None,
         weights: LossWeights = LossWeights(sit_alignment=0.0),
         optimizer: OptimizerConfig = OptimizerConfig(),
@@ -92,13 +81,12 @@ class RGBPretraining(L.LightningModule):
         if (teacher is None) != (weights.sit_alignment == 0):
             raise ValueError(
                 "teacher and weights.sit_alignment go together: give a teacher and a weight above "
-                f"0, or neither; got teacher {type(teacher).__name__} and weight "
-                f"{weights.sit_alignment}"
+                f"0, or neither; got {type(teacher).__name__} and {weights.sit_alignment}"
             )
-        if teacher is not None and cast(ImageTeacher, teacher).dim != sit.feature_dim:
+        if teacher is not None and teacher.dim != sit.feature_dim:
             raise ValueError(
                 f"sit.feature_dim is {sit.feature_dim}, but the teacher's features have width "
-                f"{cast(ImageTeacher, teacher).dim}; set the former to the latter"
+                f"{teacher.dim}; set the former to the latter"
             )
         self.vae, self.sit = vae, sit
         self.weights, self.optimizer_config = weights, optimizer
@@ -123,7 +111,7 @@ class RGBPretraining(L.LightningModule):
         check_trainer(self.trainer)
         size = self._datamodule.image_size
         check_latents(self.vae, self.sit, (size, size))
-        if stage == "fit" and not all(cast(ImageTeacher, one).trained for one in self._teacher):
+        if stage == "fit" and not all(one.trained for one in self._teacher):
             raise ValueError(
                 "the teacher has random weights: give model.init_args.teacher.init_args.weights "
                 "the file of a trained one, such as dinov2_vitb14_pretrain.pth, or train without "

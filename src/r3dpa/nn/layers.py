@@ -291,15 +291,11 @@ class SyncedBatchNorm2d(nn.BatchNorm2d):
             result = (centred * scale.view(-1, 1, 1) + self.bias.view(-1, 1, 1)).to(image.dtype)
         else:
             result = F.batch_norm(image, *moved, self.weight, self.bias, True, momentum, self.eps)
-        self._take_statistics(*moved)
-        return result
-
-    @torch.no_grad()
-    def _take_statistics(self, mean: Tensor, variance: Tensor) -> None:
-        usable = mean.isfinite().all() & variance.isfinite().all()
-        self.running_mean.copy_(torch.where(usable, mean, self.running_mean))
-        self.running_var.copy_(torch.where(usable, variance, self.running_var))
+        usable = torch.stack(moved).isfinite().all()
+        for running, value in zip((self.running_mean, self.running_var), moved, strict=True):
+            running.copy_(torch.where(usable, value, running))
         self.num_batches_tracked += usable
+        return result
 
 
 def num_processes() -> int:

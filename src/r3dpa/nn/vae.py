@@ -235,9 +235,11 @@ class _Decoder(nn.Module):
         self.conv_in = CircularConv2d(in_channels, last, (3, 3))
         self.mid = _Middle(last)
         upsample = partial(Upsample, legacy=legacy)
+        # Kernels extend over columns only, unless the rows are upsampled afterwards.
+        columns_only = [stride is None or stride[0] == 1 for *_, stride in levels]
         self.up = nn.ModuleList(
-            _Level(level, num_blocks, _up_kernel(level[3]), "upsample", upsample)
-            for level in levels
+            _Level(level, num_blocks, (1, 4) if flat else (3, 3), "upsample", upsample)
+            for level, flat in zip(levels, columns_only, strict=True)
         )
         self.norm_out = GroupNorm(first)
         self.conv_out = WideCircularConv2d(first, out_channels, (1, 4))
@@ -247,11 +249,6 @@ class _Decoder(nn.Module):
         for level in reversed(self.up):
             hidden = level(hidden)
         return self.conv_out(F.silu(self.norm_out(hidden)))
-
-
-def _up_kernel(stride: Size | None) -> Size:
-    """Kernels extend over columns only, unless the rows are upsampled afterwards."""
-    return (1, 4) if stride is None or stride[0] == 1 else (3, 3)
 
 
 class _Level(nn.Module):

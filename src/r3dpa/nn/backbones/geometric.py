@@ -59,7 +59,7 @@ class GeometricFeatures(nn.Module):
     Attributes:
         name: ``"geometric"``.
         num_headings: Rotations by multiples of this part of a turn leave the features unchanged.
-        mirror_invariant: Swapping left and right leaves the features unchanged.
+        mirror_invariant: So does swapping left and right.
         settings: Everything that determines the features, see :class:`r3dpa.data.Extractor`.
     """
 

@@ -1,8 +1,5 @@
 """MinkowskiNet and SPVCNN: U-Nets of sparse convolutions, and their official checkpoints.
 
-SPVCNN has a branch of single points beside the voxels; the dropout that the official network has
-in training is left out.
-
 Source: Choy, Gwak and Savarese, "4D Spatio-Temporal ConvNets" (CVPR 2019), in the form of Tang et
 al., "Searching Efficient 3D Architectures with Sparse Point-Voxel Convolution" (ECCV 2020); same
 numbers as the networks of FSVD and FPVD in valeoai/R3DPA (``tests/parity``).
@@ -14,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -23,7 +21,7 @@ from torch.nn import functional
 
 from r3dpa.nn.backbones.official import load_strictly, read_released
 from r3dpa.nn.backbones.sparse import KernelMap, SparseConv, Voxels, kernel_offsets, voxel_keys
-from r3dpa.nn.layers import at_least_float32
+from r3dpa.nn.layers import at_least_float32, named_layers
 
 #: Widths of the stem, the four encoder stages and the four decoder stages at channel rate 1.
 WIDTHS = (32, 32, 64, 128, 256, 256, 128, 96, 96)
@@ -242,21 +240,8 @@ def corners(points: Points, voxels: Voxels) -> tuple[Tensor, Tensor]:
     return torch.where(occupied, rows, len(voxels)), weights
 
 
-class PointTransform(nn.Module):
-    """Linear layer, batch norm and ReLU on single points."""
-
-    def __init__(self, in_channels: int, out_channels: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(in_channels, out_channels)
-        self.norm = nn.BatchNorm1d(out_channels)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """``(P, in_channels)`` to ``(P, out_channels)``."""
-        return functional.relu(self.norm(self.linear(features)), inplace=True)
-
-
 class SPVCNN(MinkowskiNet):
-    """Features of points: the U-Net with a point branch between its parts.
+    """Features of points: the U-Net with a point branch between its parts, without dropout.
 
     As in the official code, coordinates are multiplied and divided by the voxel size in float32,
     which moves them by up to 2e-4 of a voxel below 4000 voxels.
@@ -278,7 +263,12 @@ class SPVCNN(MinkowskiNet):
         super().__init__(widths, in_channels, num_classes)
         self.voxel_m = voxel_m
         stops = [self.widths[index] for index in (0, 4, 6, 8)]
-        self.points = nn.ModuleList(map(PointTransform, stops[:-1], stops[1:]))
+        self.points = nn.ModuleList(
+            named_layers(
+                linear=nn.Linear(before, after), norm=nn.BatchNorm1d(after), relu=nn.ReLU(True)
+            )
+            for before, after in pairwise(stops)
+        )
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
         """Features ``(P, F)`` before the head, in the order of the input.
