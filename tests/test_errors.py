@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from r3dpa.cli import main
 
@@ -130,6 +131,22 @@ class TestCheckpoints:
         message = refused("joint", option, path)
         assert str(path) in message
         assert "damaged" in message
+
+    @pytest.mark.parametrize("command", ["fit", "predict"])
+    def test_a_url_or_a_setting_makes_none_run_code(self, command, smoke_args, tmp_path):
+        class Evil:
+            def __reduce__(self):
+                return (tmp_path / "ran").touch, ()
+
+        torch.save({"state_dict": {}, "evil": Evil()}, tmp_path / "evil.ckpt")
+        for path in (f"file://{tmp_path}/evil.ckpt", "http://127.0.0.1:9/evil.ckpt"):
+            words = smoke_args("joint", tmp_path / "run", "--ckpt_path", path)
+            with pytest.raises(FileNotFoundError, match=r"evil\.ckpt"):
+                main([command, *words[1:], "--weights_only=false"])
+        words = smoke_args("joint", tmp_path / "run", "--weights_only=false")
+        with pytest.raises(ValueError, match="would run code of the checkpoint: leave it out"):
+            main([command, *words[1:]])
+        assert not (tmp_path / "ran").exists()
 
     @pytest.mark.parametrize(
         ("stage", "option"),

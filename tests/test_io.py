@@ -70,3 +70,13 @@ def test_a_lock_ends_with_its_block_whatever_was_forked_within(tmp_path):
         pass
     child.kill()
     child.join()
+
+
+def test_a_lock_that_is_a_link_leaves_the_file_it_leads_to(tmp_path):
+    target, lock = tmp_path / "mine.txt", tmp_path / "run" / ".fit.lock"
+    target.write_text("mine")
+    lock.parent.mkdir()
+    lock.symlink_to(target)
+    with pytest.raises(OSError, match=r"symbolic links.*\.fit\.lock"), only_writer(lock, "trains"):
+        pass
+    assert target.read_text() == "mine"

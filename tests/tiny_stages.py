@@ -205,9 +205,9 @@ def guarded(stage, bad=(), fault=infinite_image, numbers=None, **kwargs):
         def own_number(self):
             return (numbers or range(99))[batch_number(self)]
 
-        def draw_path(self, num_scans, number=None, stream=0):
+        def draw_path(self, num_scans, number=None):
             number = self.own_number() if number is None else number
-            return super().draw_path(num_scans, number, stream)
+            return super().draw_path(num_scans, number)
 
         def training_step(self, batch, batch_idx):
             if self.own_number() in bad:

@@ -70,6 +70,11 @@ def _fsync(path: Path) -> None:
         os.close(descriptor)
 
 
+def no_follow(path: str, flags: int) -> int:
+    """``opener`` for :func:`open`: a symbolic link is an ``OSError``, not the file it leads to."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
 def delete_unfinished(folder: Path) -> None:
     """Remove temporary files of killed writers below a folder."""
     for path in list(folder.rglob(".*.partial.*")):
@@ -86,7 +91,8 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
     held: AbstractContextManager[Any]
     try:
         held = FileLock(lock).acquire(blocking=False)
-        lock.write_text(f"{os.getpid()} on {platform.node()}")
+        with open(lock, "w", opener=no_follow) as file:
+            file.write(f"{os.getpid()} on {platform.node()}")
     except Timeout as error:
         if not wait:
             raise ValueError(

@@ -32,7 +32,8 @@ class Shuffled(NamedData):
 
     def val_dataloader(self):
         mask = torch.ones_like(self.batches[0]["range_image"], dtype=torch.bool)
-        return DataLoader([self.batches[0] | {"valid_mask": mask}], batch_size=None)
+        more = {"valid_mask": mask, "index": torch.arange(2)}
+        return DataLoader([self.batches[0] | more], batch_size=None)
 
     def train_dataloader(self):
         return training_loader(self.scans, 2, collate_fn=default_collate)
@@ -94,3 +95,13 @@ def test_a_resumed_run_is_exact_also_at_the_end_of_an_epoch(
     for before, after in zip(*(state.values() for state in states), strict=True):
         for key, value in before.items():
             assert torch.equal(after[key], value), key
+
+
+def test_last_is_the_newest_in_a_folder_that_was_moved(tmp_path):
+    """Lightning would write last-v1.ckpt beside the stale last.ckpt."""
+    fit(tmp_path / "run", 2)
+    (tmp_path / "run").rename(tmp_path / "moved")
+    for steps in (3, 4):
+        _, last = fit(tmp_path / "moved", steps, tmp_path / "moved" / "last.ckpt")
+        assert last["global_step"] == steps
+    assert not list((tmp_path / "moved").glob("last-*"))

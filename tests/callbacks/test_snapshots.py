@@ -54,9 +54,10 @@ def module(kind=FlowMatching, **more):
     return made
 
 
-def trainer(folder, step=0, max_steps=64, rank=0):
+def trainer(folder, step=0, max_steps=64, rank=0, resumed=False):
     return SimpleNamespace(
         default_root_dir=folder,
+        ckpt_path=str(folder / "checkpoints" / "last.ckpt") if resumed else None,
         global_step=step,
         max_steps=max_steps,
         is_global_zero=rank == 0,
@@ -152,8 +153,15 @@ def test_an_existing_snapshot_stays_as_it_is(tmp_path):
     before = path.read_bytes()
     with torch.no_grad():
         made.ema.sit.pos_embed.add_(1)
-    run(EMASnapshots(steps=[1]), made, tmp_path, [1, 1])
+    run(EMASnapshots(steps=[1]), made, tmp_path, [1, 1], resumed=True)
     assert path.read_bytes() == before
+
+
+def test_snapshots_of_an_earlier_run_are_refused(tmp_path):
+    """They would be taken for weak models of the new one."""
+    run(EMASnapshots(steps=[1]), module(), tmp_path, [1])
+    with pytest.raises(ValueError, match=r"holds snapshots of an earlier run: delete them"):
+        run(EMASnapshots(steps=[1]), module(), tmp_path, [1])
 
 
 def test_a_killed_writer_does_not_stop_the_next(tmp_path):
@@ -162,7 +170,7 @@ def test_a_killed_writer_does_not_stop_the_next(tmp_path):
     run(EMASnapshots(steps=[1]), made, tmp_path, [1])
     path = tmp_path / "snapshots" / "step_0000001.safetensors"
     path.unlink()
-    assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == [path.name]
+    assert run(EMASnapshots(steps=[1]), made, tmp_path, [1], resumed=True) == [path.name]
     read_checkpoint(path)
 
 

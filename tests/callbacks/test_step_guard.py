@@ -168,6 +168,13 @@ def checked(norms, loss=1.0, buffer=1.0, scaler=None, guard=None):
     return guard, module.step_skipped, kept.tolist()
 
 
+@pytest.mark.parametrize(("norms", "idle"), [([0.0, 0.0], True), ([0.0, 1.0], False)])
+def test_a_step_without_any_gradient_is_noticed(norms, idle, recwarn):
+    _, skipped, _ = checked(norms)
+    assert not skipped
+    assert any("gradients of a step are 0" in str(one.message) for one in recwarn) == idle
+
+
 @pytest.mark.parametrize(("value", "after"), [(torch.inf, 1.0), (1e38, 1e38)])
 def test_statistics_that_overflow_are_put_back_though_the_gradients_are_finite(value, after):
     _, skipped, kept = checked([1.0, 1.0], buffer=value)

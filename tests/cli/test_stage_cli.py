@@ -91,6 +91,8 @@ def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):
     arguments[arguments.index("--trainer.logger=false")] = "--trainer.logger=WandbLogger"
     arguments += ["--trainer.logger.offline=true", "--trainer.logger.save_dir=x"]
     main(["fit", *arguments])
+    run = wandb.run
+    assert (run.name, run.group, run.job_type) == ("group/run", "group", "LoggingModel")
     wandb.finish()
     main(["validate", *arguments, "--ckpt_path", "last"])
     wandb.finish()

@@ -176,8 +176,7 @@ def test_fewer_images_than_processes_are_refused(folder):
     module = ImageDataModule(ImageFolder(str(folder)), image_size=8, batch_size=2, val_every=4)
     module.setup("fit")
     module.trainer = SimpleNamespace(world_size=2, global_rank=0, limit_train_batches=1.0)
-    with pytest.raises(ValueError, match="1 held-out images are fewer than the 2 processes"):
-        module.val_dataloader()
+    assert [len(batch["image"]) for batch in module.val_dataloader()] == [1]  # both get it
     with pytest.raises(
         ValueError, match=r"3 training images do not fill .* 2 images .*more images"
     ):

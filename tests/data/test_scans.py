@@ -1,5 +1,6 @@
 import json
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -129,6 +130,17 @@ def test_round_trips(tmp_path, width):
     assert np.array_equal(archive["one"], points)
     assert np.array_equal(archive["two"], points[:1])
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.npz", "a.ply", "new"]
+
+
+def test_a_small_archive_of_much_memory_is_refused(tmp_path):
+    """The directory says 2 GiB."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", b"\0" * 2**20)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(struct.pack("<I", 2**20), struct.pack("<I", 2**31)))
+    with pytest.raises(ScanError, match="far larger than the file"):
+        read_npz(path)
 
 
 def test_ply_of_other_programs(tmp_path):

@@ -127,6 +127,20 @@ def test_shards_are_merged_and_nothing_is_written_twice(halves):
     assert (halves.folder / "shard_00002.rows").stat().st_size == 64
 
 
+@pytest.mark.parametrize("name", ["shard_00000.rows", "shard_00000.jsonl"])
+def test_a_link_in_a_foreign_folder_is_not_followed(name, halves, tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    halves.folder.mkdir()
+    (halves.folder / name).symlink_to(tmp_path / "mine")
+    if name.endswith(".jsonl"):
+        with pytest.raises(StoreError, match="symbolic links"):
+            fill(halves, (0, 3))
+    else:  # the next shard is taken
+        fill(halves, (0, 3))
+        assert (halves.folder / "shard_00001.rows").stat().st_size == 3 * 64
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
 def test_writers_never_share_a_shard(halves):
     with halves.writer() as first, halves.writer(1) as second, halves.writer() as third:
         for start in (0, 3):

@@ -163,6 +163,22 @@ def test_prdc_against_loops(monkeypatch, offset):
         precision_recall(real, generated[:5])
 
 
+def test_prdc_with_one_far_outlier():
+    """Only the ball of the outlier knows that it is there."""
+    real, generated = draw(400, 8), draw(300, 8, seed=1)
+    before = precision_recall(real, generated)
+    real[0], generated[0] = -1e6, 1e6
+    assert precision_recall(real, generated) == pytest.approx(before, abs=0.02)
+
+
+@pytest.mark.parametrize("function", [squared_mmd, precision_recall])
+def test_values_whose_powers_overflow_are_refused(function):
+    x = draw(30, 3)
+    x[4] = 1e60
+    with pytest.raises(ValueError, match=r"1 of 30 rows .* beyond 1e\+50, the first is row 4"):
+        function(x, x)
+
+
 # Bird's-eye view
 
 GRID = BEVGrid(4.0, 1.0)

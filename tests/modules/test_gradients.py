@@ -170,6 +170,13 @@ class TestClipping:
                 expected = expected * limit / before[network]
                 torch.testing.assert_close(gradient, expected, atol=1e-7, rtol=1e-4)
 
+    @pytest.mark.parametrize("limit", [0, -1.0])
+    def test_no_limit_above_0_means_no_clipping(self, limit):
+        """As in Lightning; a factor of 0 would train nothing, one below 0 ascend."""
+        module = train(stage_module("joint"), gradient_clip_val=limit)
+        for name, gradient in module.grads[0].items():
+            assert torch.equal(module.clipped[0][name], gradient), name
+
     def test_clipping_by_value_is_refused(self):
         with pytest.raises(ValueError, match=r"by norm per network; .*got 'value'"):
             train(stage_module("joint"), gradient_clip_val=1.0, gradient_clip_algorithm="value")
@@ -248,6 +255,12 @@ class TestNonFiniteGradients:
 def test_precisions_without_float32_weights_are_refused(precision):
     with pytest.raises(ValueError, match=rf"precision {precision} is not supported.*bf16-mixed"):
         train(stage_module("joint"), precision=precision)
+
+
+def test_reloaded_loaders_are_refused():
+    """Their order after a resume would be another one."""
+    with pytest.raises(ValueError, match="reload_dataloaders_every_n_epochs would break the order"):
+        train(stage_module("joint"), reload_dataloaders_every_n_epochs=1)
 
 
 def test_another_average_of_the_weights_is_refused():

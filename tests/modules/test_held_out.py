@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import os
+import socket
+
 import lightning as L
 import pytest
 import torch
+import torch.multiprocessing as mp
 from tiny_stages import QUIET, TinyData, stage_module
 from torch.utils.data import DataLoader
+
+from r3dpa.data.loaders import LoaderModule
+from r3dpa.modules import steps
 
 pytestmark = [
     *QUIET,
@@ -31,6 +39,7 @@ class HeldOut(TinyData):
         both["valid_mask"] = torch.zeros_like(both["range_image"], dtype=torch.bool)
         for scan, num_returns in enumerate((128, 10, 1, 0)):
             both["valid_mask"][scan].flatten()[:num_returns] = True
+        both["index"] = torch.arange(4)
         self.whole = both
         self.scans = [{key: value[i] for key, value in both.items()} for i in range(4)]
 
@@ -52,14 +61,14 @@ def test_the_error_in_metres_is_the_mean_over_pixels(batch_size, tmp_path):
 
 
 def test_the_average_is_evaluated_where_there_is_one(tmp_path):
-    """By hand, with the draws of the first validation batch."""
+    """By hand, with the draws of the scans."""
     module, data = stage_module("joint"), HeldOut(4)
     with torch.no_grad():
         for weight in module.ema.parameters():
             weight.mul_(1.5)
     trainer = L.Trainer(accelerator="cpu", logger=False, default_root_dir=tmp_path, **SILENT)
     (logged,) = trainer.validate(module, datamodule=data, verbose=False)
-    draws = module.draw_path(4, 0, stream=1)
+    draws = steps.draw_held_out(module, torch.arange(4), (4, 4, 8), module.seed)
     losses = {}
     for name, networks in (("average", module.ema), ("last", module)):
         with torch.no_grad():
@@ -71,3 +80,68 @@ def test_the_average_is_evaluated_where_there_is_one(tmp_path):
         losses[name] = (velocity - (draws.noise - latents)).square().mean().item()
     assert logged["val/denoising"] == pytest.approx(losses["average"], rel=1e-4)
     assert losses["last"] != pytest.approx(losses["average"], rel=1e-2)
+
+
+class Dealt(LoaderModule):
+    """The first scans of two sets of four, dealt out to the processes."""
+
+    geometry = TinyData.geometry
+
+    def __init__(self, num_scans):
+        super().__init__(batch_size=2, num_workers=0, seed=0)
+        scans = [*HeldOut(4).scans, *reversed(HeldOut(4).scans)][:num_scans]
+        self.scans = [scan | {"index": index} for index, scan in enumerate(scans)]
+
+    def val_dataloader(self):
+        return self.loader(self.scans, train=False)
+
+    test_dataloader = val_dataloader
+
+
+def evaluate(rank, num_processes, port, counts, folder):
+    """Losses of ``validate`` and ``test``, in a process as Lightning's launchers start it."""
+    if num_processes > 1:
+        os.environ |= {"LOCAL_RANK": str(rank), "NODE_RANK": "0", "GROUP_RANK": "0"}
+        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    found = {}
+    for count in counts:
+        module = stage_module("joint")
+        settings = SILENT | {"strategy": "ddp" if num_processes > 1 else "auto"}
+        trainer = L.Trainer(
+            accelerator="cpu",
+            devices=num_processes,
+            logger=False,
+            default_root_dir=folder,
+            **settings,
+        )
+        (validated,) = trainer.validate(module, datamodule=Dealt(count), verbose=False)
+        (tested,) = trainer.test(module, datamodule=Dealt(count), verbose=False)
+        found[count] = validated | tested
+    (folder / f"{num_processes}_{rank}.json").write_text(json.dumps(found))
+
+
+def assert_equal_on(num_processes, counts, folder):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    evaluate(0, 1, 0, counts, folder)
+    mp.spawn(evaluate, (num_processes, port, counts, folder), nprocs=num_processes)
+    alone = json.loads((folder / "1_0.json").read_text())
+    for rank in range(num_processes):
+        shared = json.loads((folder / f"{num_processes}_{rank}.json").read_text())
+        for count in map(str, counts):
+            assert len(alone[count]) == 8
+            assert shared[count] == pytest.approx(alone[count], rel=1e-6, abs=1e-6), count
+
+
+@pytest.mark.ddp
+def test_losses_do_not_depend_on_the_number_of_processes(tmp_path):
+    """Three scans on two processes: one of them gets a scan twice."""
+    assert_equal_on(2, [1, 3], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.ddp
+@pytest.mark.parametrize("num_processes", [2, 3])
+def test_losses_of_any_number_of_scans(num_processes, tmp_path):
+    assert_equal_on(num_processes, range(1, 8), tmp_path)

@@ -49,7 +49,7 @@ class Recording(JointAlignment):
     def load_previous_stage(self):
         """Keeps the recorded average, which differs from the weights."""
 
-    def draw_path(self, num_scans, number=None, stream=0):
+    def draw_path(self, num_scans, number=None):
         self.steps.append({})
         values = f"in/step{batch_number(self)}"
         return PathDraws(

@@ -132,10 +132,13 @@ def test_repeating_a_request_does_nothing_and_an_unfinished_one_is_completed(tmp
     folder = points_folder(tmp_path, "0003")
     for number, (kind, suffix) in enumerate(KINDS.items()):
         (folder / kind / f"{number:010d}{suffix}").unlink()
+    (folder / "data" / "0000000004.bin").write_bytes(b"")
+    labels = folder / "labels" / "0000000005.label"
+    labels.write_bytes(labels.read_bytes()[:-4])
     for path in (folder / "timestamps.txt", *tmp_path.rglob("velodyne_to_world.txt")):
         path.unlink()
     report = simulate(tmp_path, 6, drives=["0003"], workers=2, **SMALL)
-    assert report.num_written == 4
+    assert report.num_written == 6
     assert files_of(tmp_path) == whole
 
 

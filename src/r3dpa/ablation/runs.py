@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import json
 import os
+import signal
 import sys
 import time
 from collections import Counter
@@ -15,7 +17,7 @@ from typing import NamedTuple
 import yaml
 
 from r3dpa.ablation.plan import Plan
-from r3dpa.io import only_writer
+from r3dpa.io import no_follow, only_writer
 from r3dpa.metrics.results import save_text
 
 _CSV_LOGGER = {
@@ -106,13 +108,14 @@ async def _run(job: Job, cores: int) -> str | None:
         job.makes.unlink(missing_ok=True)
     job.place.parent.mkdir(parents=True, exist_ok=True)
     log_path = job.place.with_suffix(".log")
-    with log_path.open("ab") as log:
+    with open(log_path, "ab", opener=no_follow) as log:
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "r3dpa", *job.words),
             stdout=log,
             stderr=log,
             env={"OMP_NUM_THREADS": str(cores)} | os.environ,
             process_group=0,  # Ctrl-C reaches it once, by way of this process
+            preexec_fn=_end_with_parent,
         )
         try:
             status = await process.wait()
@@ -126,6 +129,11 @@ async def _run(job: Job, cores: int) -> str | None:
         return "\n      ".join([f"{why}; {log_path} ends with", *lines])
     save_text(job.place.with_suffix(".done"), job.content)
     return None
+
+
+def _end_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _jobs(plan: Plan) -> list[Job]:

@@ -134,6 +134,15 @@ class RunCheckpoint(ModelCheckpoint):
         )
         raise SystemExit(128 + number)  # as a shell reports it
 
+    def _save_last_checkpoint(self, trainer: L.Trainer, monitor_candidates: Any) -> None:
+        """Replaces ``last.ckpt`` in a run folder that was moved or copied, too.
+
+        Lightning takes the file there for that of another run and writes ``last-v1.ckpt``.
+        """
+        last = self.format_checkpoint_name(monitor_candidates, self.CHECKPOINT_NAME_LAST)
+        self.last_model_path = last
+        super()._save_last_checkpoint(trainer, monitor_candidates)
+
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Saves unless the last step is saved already, or this is a ``fast_dev_run``."""
         if cast(Any, trainer).fast_dev_run:

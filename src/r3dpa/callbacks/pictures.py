@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import lightning as L
 import torch
 from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.utilities import rank_zero_warn
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from r3dpa import viz
 from r3dpa.data import write_bin
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import points_of
+from r3dpa.io import first_line
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
 
@@ -59,9 +61,13 @@ class PictureLogger(L.Callback):
         self.seed = seed
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draws after a validation run, but not after the sanity check."""
-        if not trainer.sanity_checking:
+        """Draws after a validation run, but not after the sanity check; a failure is a warning."""
+        if trainer.sanity_checking:
+            return
+        try:
             self._draw(trainer, pl_module, "val")
+        except (OSError, RuntimeError, ValueError) as error:  # training is worth more than pictures
+            rank_zero_warn(f"no pictures at step {trainer.global_step}: {first_line(error)}")
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draws after a test run."""

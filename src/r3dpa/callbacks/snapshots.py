@@ -57,6 +57,13 @@ class EMASnapshots(L.Callback):
         _sit_config(pl_module)
         if cast(Any, trainer).fast_dev_run:
             return
+        folder = Path(trainer.default_root_dir).resolve()
+        resumed = folder in Path(trainer.ckpt_path or "").resolve().parents
+        if not resumed and any((folder / self.folder).glob("step_*")):
+            raise ValueError(
+                f"{folder / self.folder} holds snapshots of an earlier run: delete them, or give "
+                "another --run_dir"
+            )
         if self.steps is not None:
             self._due = self.steps
         elif trainer.max_steps > 0:

@@ -7,6 +7,7 @@ from typing import Any
 import lightning as L
 import torch
 import torch.distributed as dist
+from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from r3dpa.callbacks.bad_batches import listed, report_skipped
@@ -62,7 +63,9 @@ class StepGuard(L.Callback):
         """Skips the step if it is not finite; stops after ``max_skipped_steps`` in a row."""
         pl_module.grad_norms = gradient_norms(pl_module, optimizer)
         norms = torch.stack(list(pl_module.grad_norms.values()))
-        own_bad, losses_bad, gradients_bad, buffers_bad = self._faults(norms)
+        own_bad, losses_bad, gradients_bad, buffers_bad, idle = self._faults(norms)
+        if idle:
+            rank_zero_warn("all gradients of a step are 0: check the weights of the losses")
         skip = pl_module.step_skipped = losses_bad or gradients_bad or buffers_bad
         self.skipped += skip
         # Filled on the device: a copy from the host would make it wait.
@@ -85,29 +88,29 @@ class StepGuard(L.Callback):
         if own_bad or not losses_bad:
             report_skipped(pl_module, batches, found, self.saved_batches)
         if self.in_a_row >= self.max_skipped_steps:
-            folder = f"{trainer.default_root_dir}/bad_batches"
             raise RuntimeError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last one "
                 f"at step {trainer.global_step} (gradient norms: {listed(found)}). Look at the "
-                f"named samples, or at a file of {folder} with `r3dpa replay`; if they are sound, "
-                "lower the learning rate, or train in bf16 or fp32 instead of fp16"
+                f"named samples, with `r3dpa replay` in {trainer.default_root_dir}/bad_batches; if "
+                "they are sound, lower the learning rate, or leave fp16 for bf16 or fp32"
             )
 
     def _faults(self, norms: Tensor) -> list[bool]:
-        """Not finite: losses of this process; losses, norms and buffers of any process."""
+        """Not finite: own losses, any process's losses, norms, buffers; whether norms are all 0."""
         losses = [values["loss"].to(norms) for _, _, values in self._batches if values]
         own = ~torch.stack([norms.new_zeros(()), *losses]).isfinite().all()
         moved = [b for b, _ in self._kept if b.numel() and b.is_floating_point()]
         sizes = torch._foreach_norm(moved, torch.inf) if moved else ()
         finite = torch.stack([norms.new_zeros(()), *sizes]).isfinite().all()
-        flags = torch.stack([own, ~norms.isfinite().all(), ~finite]).int()
-        flags = torch.cat([flags, flags.new_full((1,), self.stop)])
+        flags = torch.stack([own, ~norms.isfinite().all(), ~finite, torch.zeros_like(own)]).int()
+        flags[3] = self.stop
         if dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1:
             dist.all_reduce(flags, dist.ReduceOp.MAX)  # one process skips: all skip
         # One number, for each read makes the host wait for the device.
-        code = int(own + 2 * flags[0] + 4 * flags[1] + 8 * flags[2] + 16 * flags[3])
-        self.stop = code >> 4
-        return [bool(code & 1 << bit) for bit in range(4)]
+        bits = (own, *flags[:3], ~norms.any())
+        code = int(sum(bit.int() << place for place, bit in enumerate(bits)) + (flags[3] << 5))
+        self.stop = code >> 5
+        return [bool(code & 1 << bit) for bit in range(5)]
 
     def state_dict(self) -> dict[str, int]:
         """The two counts."""

@@ -123,13 +123,15 @@ class StageCLI(LightningCLI):
         )
 
     def _parse_ckpt_path(self) -> None:
-        """Checks the file; Lightning would take class and settings of the model from it."""
+        """Checks the local file, without which Lightning would run what a URL says."""
         config = self.config[self.config.subcommand]
         if config.get("ckpt_path") == "last":
             config.ckpt_path = _newest(Path(config.run_dir))
-        path = config.get("ckpt_path")
-        if path and Path(path).is_file():
-            read_checkpoint(path)
+        if config.get("ckpt_path"):
+            read_checkpoint(config.ckpt_path)
+        if config.get("weights_only") is False:
+            raise ValueError("weights_only: false would run code of the checkpoint: leave it out")
+        config.weights_only = True
 
     def _run_subcommand(self, subcommand: str) -> None:
         """Runs the command, unless another process does the same in ``run_dir``."""
@@ -175,13 +177,24 @@ class StageCLI(LightningCLI):
             arguments: Any = getattr(logger, "init_args", {})
             if "save_dir" in arguments:
                 arguments.save_dir = config.run_dir
-            if "save_dir" in arguments and logger.class_path.endswith(".WandbLogger"):
-                note = run_dir / "wandb_id.txt"
-                if self.subcommand == "fit" and not note.exists():
-                    note.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
-                if arguments.get("id") is None and note.exists():
-                    arguments.id = note.read_text(encoding="utf-8")
-                arguments.name = arguments.get("name") or "/".join(run_dir.parts[-2:])
+                if logger.class_path.endswith(".WandbLogger"):
+                    self._name_wandb_run(arguments, run_dir)
+
+    def _name_wandb_run(self, init_args: Any, run_dir: Path) -> None:
+        """Fills what the configuration leaves open; `test` and a resumed `fit` join the run."""
+        model, note = self.config[self.subcommand].get("model"), run_dir / "wandb_id.txt"
+        if self.subcommand == "fit" and not note.exists():
+            with atomic_path(note) as temporary:
+                temporary.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
+        names = {
+            "name": "/".join(run_dir.parts[-2:]),
+            "group": run_dir.resolve().parent.name,
+            "job_type": model.class_path.rpartition(".")[2] if model else None,
+            "id": note.read_text(encoding="utf-8") if note.exists() else None,
+        }
+        for key, value in names.items():
+            if init_args.get(key) is None:
+                init_args[key] = value
 
 
 def _newest(run_dir: Path) -> str | None:

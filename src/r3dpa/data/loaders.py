@@ -8,7 +8,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 from lightning.pytorch import LightningDataModule
-from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 T = TypeVar("T")
@@ -162,7 +161,7 @@ class LoaderModule(LightningDataModule):
     def loader(
         self, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
     ) -> DataLoader[Any]:
-        """Loader as :func:`training_loader`, or of all samples in order, none twice."""
+        """Loader as :func:`training_loader`, or of all samples in order."""
         trainer = self.trainer
         replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
         if train:
@@ -177,17 +176,11 @@ class LoaderModule(LightningDataModule):
                 kind=kind,
                 **options,
             )
-        num_samples = len(cast(Sized, dataset))
-        if num_samples < replicas:
-            raise ValueError(
-                f"{num_samples} {kind} are fewer than the {replicas} processes, each of which "
-                f"needs one: use more {kind} or fewer devices."
-            )
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            # Lightning's default sampler pads the last batch with some samples again.
-            sampler=UnrepeatedDistributedSampler(dataset, replicas, rank, shuffle=False),
+            # Some samples come twice, so that all processes have as many batches.
+            sampler=DistributedSampler(dataset, replicas, rank, shuffle=False),
             num_workers=self.num_workers,
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.num_workers > 0,

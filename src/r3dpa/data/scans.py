@@ -270,8 +270,9 @@ def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                     continue
                 if reason := refuse_name(info.filename):
                     raise ValueError(f"its name {reason}")
-                if info.compress_size > path.stat().st_size:  # before so much memory is asked for
-                    raise ValueError("it is larger than the file")
+                size = path.stat().st_size  # before so much memory is asked for
+                if info.compress_size > size or info.file_size > max(2**30, 100 * size):
+                    raise ValueError("it is far larger than the file")
                 yield info.filename.removesuffix(".npy"), _array(archive.read(info))
     except ARCHIVE_ERRORS as error:
         raise ScanError(f"{where}: is damaged or no .npz file of numbers ({error})") from error

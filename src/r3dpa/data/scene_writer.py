@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +20,7 @@ from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.data.store import append
 from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
-from r3dpa.io import atomic_path, delete_unfinished, only_writer
+from r3dpa.io import atomic_path, delete_unfinished, no_follow, only_writer
 
 SCENE_FORMATS = ("bin", "ply", "npz")
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
@@ -123,6 +124,7 @@ class SceneWriter:
     def close(self) -> None:
         """Wait until all scenes are written, and give ``range_m.npy`` its name."""
         self._wait()
+        os.fsync(self._file)
         self._file.close()
         assert self.num_done == self.num, "closed before all scenes were put"
         if "npz" in self._formats:
@@ -194,7 +196,8 @@ class SceneWriter:
                 f"{self._unfinished} is gone or cut short, but {self._state} tells of "
                 f"{self.num_done} scenes: give --overwrite true to start anew"
             )
-        file = self._unfinished.open("r+b" if self.num_done else "wb", buffering=0)
+        mode = "r+b" if self.num_done else "wb"
+        file = FileIO(self._unfinished, mode, opener=no_follow)
         file.write(header.getvalue())
         file.truncate(end)
         file.seek(end)

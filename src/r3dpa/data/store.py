@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.io import atomic_path, refuse_name
+from r3dpa.io import atomic_path, no_follow, refuse_name
 
 ItemKey = tuple[str, int, int]
 """Name, size in bytes and time of change (ns) of the file that a row is made from."""
@@ -239,7 +239,7 @@ class StoreWriter:
             rows = self._store.folder / f"shard_{shard:05d}.rows"
             with suppress(FileExistsError):
                 file = rows.open("xb", buffering=0)
-                self._files = file, rows.with_suffix(".jsonl").open("ab", buffering=0)
+                self._files = file, FileIO(rows.with_suffix(".jsonl"), "ab", opener=no_follow)
         assert self._files is not None
         return self._files
 

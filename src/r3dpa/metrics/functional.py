@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 _SMALLEST_SHARE, _NUM_SIZES = 4, 8  # fd_infinity starts from a quarter of the samples
+_LARGEST = 1e50  # the sixth power of it, in squared_mmd, is finite
 _BLOCK = 1024  # rows of a distance matrix held at once
 
 
@@ -27,14 +28,15 @@ def checked_features(features: Tensor, name: str = "features", at_least: int = 1
         raise ValueError(f"{name}: expected (N, F), got {tuple(features.shape)}; one row a sample")
     if len(features) < at_least:
         raise ValueError(f"{name}: {len(features)} samples, at least {at_least} are needed")
-    broken = ~torch.isfinite(features).all(dim=1)
+    features = features.double()
+    broken = ~(features.abs() <= _LARGEST).all(dim=1)
     if broken.any():
         first = int(broken.nonzero()[0])
         raise ValueError(
-            f"{name}: {int(broken.sum())} of {len(features)} rows hold NaN or infinity, the first "
-            f"is row {first}; check the scan it was extracted from"
+            f"{name}: {int(broken.sum())} of {len(features)} rows hold NaN or values "
+            f"beyond {_LARGEST:g}, the first is row {first}; check the scan it was extracted from"
         )
-    return features.double()
+    return features
 
 
 def checked_pair(real: Tensor, generated: Tensor, at_least: int = 1) -> tuple[Tensor, Tensor]:
@@ -290,10 +292,8 @@ def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dic
     real, generated = checked_pair(real, generated, num_neighbors + 1)
     centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances
     real, generated = real - centre, generated - centre
-    norms = torch.cat([real, generated]).square().sum(dim=1)
-    edge = 1e-12 * norms.max()  # as near to the edge as rounding is on it
-    real_radius = _kth_neighbor(real, num_neighbors) - edge
-    generated_radius = _kth_neighbor(generated, num_neighbors) - edge
+    real_radius = _radius(real, num_neighbors)
+    generated_radius = _radius(generated, num_neighbors)
 
     counts = []
     recalled = torch.zeros(len(real), dtype=torch.bool, device=real.device)
@@ -319,10 +319,11 @@ def _squared_distances(x: Tensor, y: Tensor) -> Iterator[tuple[slice, Tensor]]:
         yield rows, x[rows].square().sum(dim=1, keepdim=True) + norms - 2 * x[rows] @ y.T
 
 
-def _kth_neighbor(x: Tensor, k: int) -> Tensor:
-    """Squared distance ``(N,)`` to the k-th neighbour, the sample itself not counted."""
+def _radius(x: Tensor, k: int) -> Tensor:
+    """Squared radius ``(N,)`` of the balls, to the k-th other sample, less what rounding adds."""
     radii = []
     for rows, squared in _squared_distances(x, x):
         squared[:, rows].fill_diagonal_(torch.inf)
         radii.append(squared.kthvalue(k, dim=1).values)
-    return torch.cat(radii)
+    radius = torch.cat(radii)
+    return radius - 1e-12 * (radius + x.square().sum(dim=1))

@@ -117,6 +117,7 @@ class GenerativeModule(L.LightningModule):
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.geometry: ScanGeometry | None = None
         self.augmentation: Augmentation | None = None
+        self.held_out = steps.HeldOutMeans()
         self.loaded_step = 0
         self.feature_source: str | None = None
         self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
@@ -206,14 +207,10 @@ class GenerativeModule(L.LightningModule):
         """Whether a training batch must hold feature grids."""
         return self.weights.vae_alignment != 0 or self.weights.sit_alignment != 0
 
-    def draw_path(
-        self, num_scans: int, batch_number: int | None = None, stream: int = 0
-    ) -> PathDraws:
+    def draw_path(self, num_scans: int, batch_number: int | None = None) -> PathDraws:
         """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
         shape = (self.vae.latent_channels, *self.sit.input_size)
-        return steps.draw_path(
-            self, num_scans, shape, self.seed, batch_number, self.time_sampling, stream
-        )
+        return steps.draw_path(self, num_scans, shape, self.seed, batch_number, self.time_sampling)
 
     def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
         """Sum of weighted losses, logged as ``train/loss``; see :func:`steps.weigh_and_log`."""
@@ -262,7 +259,8 @@ class GenerativeModule(L.LightningModule):
         normalised = self.latent_norm.normalise(latents)
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
         projected = self.sit.project_features(noisy, draws.time)
-        return {"vae_alignment": self.weights.vae_alignment * self.align(projected, features)}
+        alignment = self.align(projected, features).mean()
+        return {"vae_alignment": self.weights.vae_alignment * alignment}
 
     def flow_losses(
         self, normalised: Tensor, features: Tensor | None, draws: PathDraws
@@ -281,18 +279,17 @@ class GenerativeModule(L.LightningModule):
             error = losses.flow_matching_loss(velocity, target).mean()
             parts["denoising"] = weights.denoising * error
         if projected is not None:
-            parts["sit_alignment"] = weights.sit_alignment * self.align(projected, features)
+            parts["sit_alignment"] = weights.sit_alignment * self.align(projected, features).mean()
         return parts
 
     def align(self, projected: Tensor, features: Tensor | None) -> Tensor:
-        """L_align of projected tokens and feature grids, both ``(B, N, D)``."""
+        """L_align ``(B,)`` of projected tokens and feature grids, both ``(B, N, D)``."""
         if features is None:
             raise ValueError(
                 f"stage {self.stage} aligns with 3D features, but the batch holds no feature_grid"
             )
-        return losses.alignment_loss(
-            projected, features, skip_empty_cells=self.weights.skip_empty_cells
-        ).mean()
+        skip = self.weights.skip_empty_cells
+        return losses.alignment_loss(projected, features, skip_empty_cells=skip)
 
     # Optimisation
 
@@ -322,34 +319,27 @@ class GenerativeModule(L.LightningModule):
         """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
         return self.vae.decode(self.vae.encode(image).mean)
 
-    def evaluate(self, batch: LidarBatch, batch_idx: int, prefix: str) -> None:
-        """Logs the losses on held-out scans, and the reconstruction error in metres.
+    def evaluate(self, batch: LidarBatch) -> None:
+        """Adds held-out scans to the means: the losses, and the reconstruction error in metres.
 
         The error is the mean over all pixels with a return, the losses are means over the scans.
         The SiT is the averaged one where the stage has an average.
         """
         image, mask = batch["range_image"], batch["valid_mask"]
         codec = self.scan_geometry.codec
-        draws = self.draw_path(len(image), batch_idx, stream=1)
+        shape = (self.vae.latent_channels, *self.sit.input_size)
+        draws = steps.draw_held_out(self, batch["index"], shape, self.seed, self.time_sampling)
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
-        norm = self.weights.reconstruction_norm
-        values = {"reconstruction": losses.reconstruction_loss(reconstruction, image, norm)}
+        values = {}
         if self.trains_velocity or self.needs_features():
-            values |= self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
-        self.log_dict(
-            {f"{prefix}/{name}": value for name, value in values.items()},
-            batch_size=len(image),
-            sync_dist=True,
-        )
-        # Weighted by pixels: the mean must not depend on how scans were put into batches.
-        num_returns = int(mask.sum())
-        self.log(
-            f"{prefix}/range_error_m",
-            error_m[mask].sum() / max(1, num_returns),
-            batch_size=num_returns,
-            sync_dist=True,
+            values = self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
+        self.held_out.update(
+            batch["index"],
+            reconstruction=steps.each_reconstruction_loss(reconstruction, image, self.weights),
+            range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),
+            **values,
         )
 
     def _evaluate_flow(
@@ -364,18 +354,21 @@ class GenerativeModule(L.LightningModule):
         values = {}
         if velocity is not None:
             target = self.interpolant.target(latents, draws.noise, draws.time)
-            values["denoising"] = losses.flow_matching_loss(velocity, target).mean()
+            values["denoising"] = losses.flow_matching_loss(velocity, target)
         if projected is not None:
             values["alignment"] = self.align(projected, features)
         return values
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Evaluates a batch of the validation split under ``val/``."""
-        self.evaluate(batch, batch_idx, "val")
+        self.evaluate(batch)
 
     def test_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Evaluates a batch of the test split under ``test/``."""
-        self.evaluate(batch, batch_idx, "test")
+        self.evaluate(batch)
+
+    on_validation_epoch_end = steps.log_validation
+    on_test_epoch_end = steps.log_test
 
     def predict_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""

@@ -21,6 +21,11 @@ def check_trainer(trainer: Any) -> None:
             f"trainer.precision {trainer.precision} is not supported, as weights, averages and "
             f"latent statistics are float32: give one of {', '.join(_PRECISIONS)}"
         )
+    if trainer.reload_dataloaders_every_n_epochs:
+        raise ValueError(
+            "trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
+            "leave it out; the loaders shuffle each epoch anew"
+        )
     if any(isinstance(callback, StochasticWeightAveraging) for callback in trainer.callbacks):
         raise ValueError(
             "StochasticWeightAveraging is not supported: leave the callback out; stages that train "

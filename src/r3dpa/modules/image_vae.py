@@ -42,6 +42,7 @@ class ImageVAETraining(L.LightningModule):
         with steps.networks_as_settings():
             self.save_hyperparameters()
         self.vae = vae
+        self.held_out = steps.HeldOutMeans()
         self.weights, self.optimizer_config, self.seed = weights, optimizer, seed
 
     def setup(self, stage: str) -> None:
@@ -70,20 +71,22 @@ class ImageVAETraining(L.LightningModule):
 
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Evaluates held-out images under ``val/``."""
-        self._evaluate(batch, "val")
+        self._evaluate(batch)
 
     def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Evaluates held-out images under ``test/``."""
-        self._evaluate(batch, "test")
+        self._evaluate(batch)
 
-    def _evaluate(self, batch: ImageBatch, prefix: str) -> None:
-        """Logs the reconstruction error of the posterior mean, and the KL."""
+    on_validation_epoch_end = steps.log_validation
+    on_test_epoch_end = steps.log_test
+
+    def _evaluate(self, batch: ImageBatch) -> None:
+        """The reconstruction error of the posterior mean, and the KL."""
         image = batch["image"]
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
-        error = reconstruction_loss(reconstruction, image, self.weights.reconstruction_norm)
-        values = {f"{prefix}/reconstruction": error, f"{prefix}/kl": posterior.kl().mean()}
-        self.log_dict(values, batch_size=len(image), sync_dist=True)
+        error = steps.each_reconstruction_loss(reconstruction, image, self.weights)
+        self.held_out.update(batch["index"], reconstruction=error, kl=posterior.kl())
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW of the VAE."""

@@ -99,6 +99,7 @@ class RGBPretraining(L.LightningModule):
         # In a tuple, so that checkpoints do not hold weights that never change.
         self._teacher = () if teacher is None else (teacher.eval().requires_grad_(False),)
         self.init_from, self.latents_dir = init_from, latents_dir
+        self.held_out = steps.HeldOutMeans()
         self.step_skipped = False  # set by StepGuard
         self._resumed = False
 
@@ -164,19 +165,15 @@ class RGBPretraining(L.LightningModule):
         draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(self.sit, normalised, draws, self._features(batch))
-        losses = {"denoising": weights.denoising * denoising}
+        losses = {"denoising": weights.denoising * denoising.mean()}
         if alignment is not None:
-            losses["sit_alignment"] = weights.sit_alignment * alignment
+            losses["sit_alignment"] = weights.sit_alignment * alignment.mean()
         return steps.weigh_and_log(self, losses, weights)
 
-    def draw_path(
-        self, num_images: int, batch_number: int | None = None, stream: int = 0
-    ) -> steps.PathDraws:
+    def draw_path(self, num_images: int, batch_number: int | None = None) -> steps.PathDraws:
         """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
         shape = (self.vae.latent_channels, *self.sit.input_size)
-        return steps.draw_path(
-            self, num_images, shape, self.seed, batch_number, self.time_sampling, stream
-        )
+        return steps.draw_path(self, num_images, shape, self.seed, batch_number, self.time_sampling)
 
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:
@@ -189,35 +186,37 @@ class RGBPretraining(L.LightningModule):
     def _losses(
         self, sit: SiT, normalised: Tensor, draws: steps.PathDraws, features: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """L_denoise and, with features, L_align."""
+        """L_denoise ``(B,)`` and, with features, L_align ``(B,)``."""
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
         velocity, projected = steps.predict(sit, noisy, draws.time, True, features is not None)
         target = self.interpolant.target(normalised, draws.noise, draws.time)
-        denoising = flow_matching_loss(cast(Tensor, velocity), target).mean()
+        denoising = flow_matching_loss(cast(Tensor, velocity), target)
         if projected is None or features is None:
             return denoising, None
         skip = self.weights.skip_empty_cells
-        return denoising, alignment_loss(projected, features, skip_empty_cells=skip).mean()
+        return denoising, alignment_loss(projected, features, skip_empty_cells=skip)
 
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Evaluates held-out images under ``val/``."""
-        self._evaluate(batch, batch_idx, "val")
+        self._evaluate(batch)
 
     def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Evaluates held-out images under ``test/``."""
-        self._evaluate(batch, batch_idx, "test")
+        self._evaluate(batch)
 
-    def _evaluate(self, batch: ImageBatch, batch_idx: int, prefix: str) -> None:
-        """Logs the losses of the averaged SiT."""
+    on_validation_epoch_end = steps.log_validation
+    on_test_epoch_end = steps.log_test
+
+    def _evaluate(self, batch: ImageBatch) -> None:
+        """The losses of the averaged SiT."""
         sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
-        draws = self.draw_path(len(posterior.mean), batch_idx, stream=1)
+        shape = (self.vae.latent_channels, *self.sit.input_size)
+        draws = steps.draw_held_out(self, batch["index"], shape, self.seed, self.time_sampling)
         normalised = norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
-        values = {f"{prefix}/denoising": denoising}
-        if alignment is not None:
-            values[f"{prefix}/alignment"] = alignment
-        self.log_dict(values, batch_size=len(batch["image"]), sync_dist=True)
+        values = {"denoising": denoising} | ({} if alignment is None else {"alignment": alignment})
+        self.held_out.update(batch["index"], **values)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW of the SiT."""

@@ -12,10 +12,13 @@ import lightning as L
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa import __version__
 from r3dpa.flow import sample_time
 from r3dpa.io import source_commit
+from r3dpa.losses import reconstruction_loss
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.nn import VelocityNetwork
 
@@ -38,34 +41,104 @@ def draw_path(
     seed: int,
     number: int | None = None,
     time_sampling: TimeSampling = "uniform",
-    stream: int = 0,
 ) -> PathDraws:
     """Posterior noise, times and path noise for this process's part of a global batch.
 
-    They are a function of ``(seed, stream, batch, sample)``, whatever the number of processes.
+    They are a function of ``(seed, batch, sample)``, whatever the number of processes.
 
     Args:
         module: Attached to a trainer, on its device.
         num_samples: Samples B of the batch on this process.
         latent_shape: ``(C, h, w)``.
         seed: Key of the draws.
-        number: Number of the batch since the start of training or of the split; None is that of
-            the training batch at hand.
+        number: Number of the batch since the start of training; None is that of the batch at hand.
         time_sampling: Density of the times.
-        stream: Separates training (0) from evaluation draws.
     """
     world, rank = module.trainer.world_size, module.trainer.global_rank
     number = batch_number(module) if number is None else number
-    key = np.random.SeedSequence([seed, stream, number]).generate_state(1)
-    generator = torch.Generator(module.device).manual_seed(int(key[0]))
-    total = num_samples * world
+    drawn = _draw(module, [seed, 0, number], num_samples * world, latent_shape, time_sampling)
+    return PathDraws(*(values[rank::world] for values in drawn))
+
+
+def draw_held_out(
+    module: L.LightningModule,
+    index: Tensor,
+    latent_shape: tuple[int, int, int],
+    seed: int,
+    time_sampling: TimeSampling = "uniform",
+) -> PathDraws:
+    """Draws for held-out scans, a function of ``(seed, index)``; arguments of :func:`draw_path`."""
+    each = [_draw(module, [seed, 1, i], 1, latent_shape, time_sampling) for i in index.tolist()]
+    return PathDraws(*map(torch.cat, zip(*each, strict=True)))
+
+
+def _draw(
+    module: L.LightningModule,
+    key: list[int],
+    total: int,
+    latent_shape: tuple[int, int, int],
+    time_sampling: TimeSampling,
+) -> PathDraws:
+    state = np.random.SeedSequence(key).generate_state(1)
+    generator = torch.Generator(module.device).manual_seed(int(state[0]))
     shape = (total, *latent_shape)
-    drawn = PathDraws(
+    return PathDraws(
         torch.randn(shape, generator=generator, device=module.device),
         sample_time(total, time_sampling, generator=generator),
         torch.randn(shape, generator=generator, device=module.device),
     )
-    return PathDraws(*(values[rank::world] for values in drawn))
+
+
+class HeldOutMeans(Metric):
+    """Means over held-out scans, each counted once, whatever the batches and processes.
+
+    Loaders of several processes repeat scans to give all of them the same number of batches.
+    """
+
+    full_state_update = False
+    index: list[Tensor]
+    values: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: tuple[str, ...] = ()
+        self.add_state("index", [], dist_reduce_fx="cat")
+        self.add_state("values", [], dist_reduce_fx="cat")
+
+    def update(self, index: Tensor, **sums: Tensor | tuple[Tensor, Tensor]) -> None:
+        """Adds scans by their index ``(B,)``: a value ``(B,)`` each, or its sum and its weight."""
+        pairs = [s if isinstance(s, tuple) else (s, torch.ones_like(s)) for s in sums.values()]
+        self.names = tuple(sums)
+        self.index.append(index)
+        self.values.append(torch.stack([torch.stack(pair, dim=1).float() for pair in pairs], dim=1))
+
+    def compute(self) -> dict[str, float]:
+        """Means by name; 0 where all weights are 0."""
+        index, order = dim_zero_cat(self.index).cpu().sort(stable=True)
+        once = order[index.diff(prepend=index[:1] - 1) != 0]
+        total, weight = dim_zero_cat(self.values).cpu()[once].double().sum(dim=0).unbind(dim=1)
+        return dict(zip(self.names, (total / weight.clamp(min=1)).tolist(), strict=True))
+
+
+def log_validation(module: Any) -> None:
+    """Logs the means over the validation scans as ``val/<name>``."""
+    _log_means(module, "val")
+
+
+def log_test(module: Any) -> None:
+    """Logs the means over the test scans as ``test/<name>``."""
+    _log_means(module, "test")
+
+
+def _log_means(module: Any, prefix: str) -> None:
+    module.log_dict({f"{prefix}/{name}": v for name, v in module.held_out.compute().items()})
+    module.held_out.reset()
+
+
+def each_reconstruction_loss(reconstruction: Tensor, image: Tensor, weights: LossWeights) -> Tensor:
+    """Reconstruction loss ``(B,)`` of each image."""
+    pairs = zip(reconstruction.split(1), image.split(1), strict=True)
+    return torch.stack([reconstruction_loss(*p, weights.reconstruction_norm) for p in pairs])
 
 
 def batch_number(module: L.LightningModule) -> int:
@@ -196,7 +269,8 @@ def clip_per_network(
         )
     norms = module.__dict__.pop("grad_norms", None) or gradient_norms(module, optimizer)
     module.log_dict({f"grad_norm/{name}": norm for name, norm in norms.items()})
-    limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
+    limit = float(gradient_clip_val or 0)
+    limit = limit if limit > 0 else float("inf")  # 0 and below: no clipping, as in Lightning
     for group in optimizer.param_groups:
         nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
 

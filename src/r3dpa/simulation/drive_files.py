@@ -51,10 +51,19 @@ class DriveFiles:
         return self.root / "data_3d_raw" / drive_name(self.drive) / "velodyne_points"
 
     def missing(self, count: int) -> list[int]:
-        """Numbers below ``count`` of the scans that lack any of their files."""
-        folders = (self.points_folder / kind for kind in _SUFFIXES)
-        stems = ({path.stem for path in folder.glob("[!.]*")} for folder in folders)
-        complete = set.intersection(*stems)
+        """Numbers below ``count`` of the scans that lack a file, or whose points lack a label."""
+        sizes = {
+            kind: {p.stem: p.stat().st_size for p in (self.points_folder / kind).glob("[!.]*")}
+            for kind in _SUFFIXES
+        }
+        complete = {
+            stem
+            for stem, size in sizes["data"].items()
+            if size > 0
+            and sizes["labels"].get(stem) == size // 4
+            and sizes["origins"].get(stem) == size // 16
+            and sizes["sim"].get(stem)
+        }
         return [number for number in range(count) if _stem(number) not in complete]
 
     def write_scan(self, number: int, scan: SimulatedScan) -> None:

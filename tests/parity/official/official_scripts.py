@@ -304,9 +304,7 @@ class _GivenDraws(JointAlignment):
     def setup(self, stage: str) -> None:
         """Needs no scans: the batch is given."""
 
-    def draw_path(
-        self, num_scans: int, batch_number: int | None = None, stream: int = 0
-    ) -> PathDraws:
+    def draw_path(self, num_scans: int, batch_number: int | None = None) -> PathDraws:
         return self.draws
 
 
