@@ -34,18 +34,6 @@ class TestCompare:
         assert found.over_first("b").value == pytest.approx(9 / 5)
         assert found.repeat.value == pytest.approx(5 / 5)
 
-    def test_kept_rounds_are_not_run_again(self):
-        calls = []
-        kept = {1: [1.0, 2.0, 1.0]}
-
-        def keep(number, run):
-            return kept[number] if number in kept else run()
-
-        cases = {"a": lambda: calls.append(1) or 3.0, "b": case([6.0])}
-        found = compare(cases, 2, keep)
-        assert len(calls) == 2 * 2  # warm-up and the second round
-        assert found.seconds["b"] == [2, 6]
-
     def test_a_case_that_differs_from_itself_is_not_sound(self):
         """Its two runs of a round take 1 s and 2 s; every second round goes backwards."""
         slower = case([1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 2.0, 1.0])

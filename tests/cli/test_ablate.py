@@ -276,16 +276,6 @@ def recorded(name, out):
     return Plan(out, stored["scale"], stored["about"], [], (0, 1, 2), [table]), stored
 
 
-def printed_cells(path):
-    """Numbers and intervals of a table in Markdown, without marks, by row."""
-    found = {}
-    for line in path.read_text().splitlines():
-        cells = [re.sub(r"<[^>]*>|[*_=]", "", cell).strip() for cell in line.split("|")[1:-1]]
-        if cells and re.fullmatch(r"-|\d.*", cells[1]):
-            found[cells[0]] = [cell for cell in cells[1:] if cell != "-"]
-    return {name: cells for name, cells in found.items() if cells}
-
-
 @pytest.mark.parametrize("name", ["table_2", "table_3", "table_4"])
 def test_recorded_tables_are_computed_again(name, tmp_path):
     """From the numbers of each seed: means, intervals, paired differences and what they say."""
@@ -295,8 +285,6 @@ def test_recorded_tables_are_computed_again(name, tmp_path):
     for key in ("caption", "scale", "about", "rows", "orders"):
         assert found[key] == stored[key], key
     old, new = (folder / f"{name}.md" for folder in (RECORDED, tmp_path))
-    assert printed_cells(new) == printed_cells(old)
-    assert len(printed_cells(new)) == 2 * len(stored["rows"]) + 1
     lines = [line for line in old.read_text().splitlines() if "Paper: " in line or "Scale" in line]
     assert [line for line in lines if line not in new.read_text()] == []
     means = []
@@ -419,9 +407,6 @@ def test_files_and_text_of_a_table(command, tmp_path, processes, capsys):
         assert "Paper: row 2_b better than row 1_a. Here: JSD unclear, +0 % [-14, +14]" in text
         assert "row 1_a (published)" in text.replace("\\_", "_")
     assert r"\bottomrule" in (out / "table_x.tex").read_text()
-    with (out / "table_x.csv").open(newline="") as file:
-        values = {line["label"]: (line["value"], line["low"]) for line in csv.DictReader(file)}
-    assert values == {"row 1_a": ("1.0", "0.9"), "row 2_b": ("1.0", "0.9")}
     stored = json.loads((out / "table_x.json").read_text())
     assert [row["values"] for row in stored["rows"]] == [{"0": {"JSD": 1.0}}] * 2
     assert list(stored["curves"].values()) == [{"train/loss": [[0, 1], [2.0, 1.0]]}] * 3
