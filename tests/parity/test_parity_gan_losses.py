@@ -109,10 +109,8 @@ def test_gan_losses_outputs(case, compare):
     """Gradients and weighted terms lie below 1e-5: the tolerance follows their size."""
     results = logits(case) | before_start(case)
     results |= training_step(case, "train") | training_step(case, "eval")
-    compare(
-        case,
-        results,
-        tolerance=lambda _, expected: {
-            "atol": min(1e-5, 1e-4 * float(expected.abs().max()) + 1e-12)
-        },
-    )
+
+    def tolerance(_, expected):
+        return {"atol": min(1e-5, 1e-4 * float(expected.abs().max()) + 1e-12)}
+
+    compare(case, results, tolerance=tolerance)

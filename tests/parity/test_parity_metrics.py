@@ -13,8 +13,6 @@ from r3dpa.metrics.functional_bev import (
     minimum_matching,
 )
 
-pytestmark = pytest.mark.parametrize("name", ["metrics"])
-
 
 @pytest.fixture(scope="module")
 def case(load_case):
@@ -36,7 +34,7 @@ def gaussian(case, name, side):
     return case[f"in/frechet_{name}_mu{side}"], case[f"in/frechet_{name}_sigma{side}"]
 
 
-def test_frechet(name, case, close):
+def test_frechet(case, close):
     """The official root of a singular product is known to 1e-3 only (parity/README.md)."""
     features = frechet_distance_of(case["in/frechet_feats_x"], case["in/frechet_feats_y"])
     close(features, case["out/frechet_feats"], atol=0, rtol=1e-6)
@@ -52,7 +50,7 @@ def test_frechet(name, case, close):
 
 
 @pytest.mark.parametrize("which", ["ref", "smp"])
-def test_histogram(name, case, which):
+def test_histogram(case, which):
     grid = grid_of(case)
     assert list(grid.shape) == case["out/bev_shape"].tolist()
     counts = grid.histogram(clouds(case, which))
@@ -63,7 +61,7 @@ def test_histogram(name, case, which):
 
 
 @pytest.mark.parametrize(("suffix", "cell_m"), [("", None), ("_voxel0.5", 0.5)])
-def test_histogram_distances(name, case, close, suffix, cell_m):
+def test_histogram_distances(case, close, suffix, cell_m):
     grid = grid_of(case, cell_m)
     result = histogram_distance(*(grid.histogram(clouds(case, which)) for which in ("ref", "smp")))
     close(result.jsd_distance, case[f"out/jsd{suffix}"])
@@ -72,7 +70,7 @@ def test_histogram_distances(name, case, close, suffix, cell_m):
         close(result.jsd_divergence, case[f"out/jsd{suffix}_squared_is_divergence"])
 
 
-def test_occupied_cells(name, case):
+def test_occupied_cells(case):
     """Indices of the cells, which the official code stores divided by the number of cells."""
     grid = grid_of(case)
     for key in case.keys("out/voxelized_"):
@@ -83,7 +81,7 @@ def test_occupied_cells(name, case):
         assert torch.equal(scaled.float(), case[key])
 
 
-def test_matching(name, case, close):
+def test_matching(case, close):
     grid = grid_of(case)
     references, samples = ([grid.cells(c) for c in clouds(case, w)] for w in ("ref", "smp"))
     pairs = [
@@ -95,5 +93,5 @@ def test_matching(name, case, close):
     close(matching.squared_normalised.mean().item(), case["out/mmd"], atol=0, rtol=1e-5)
 
 
-def test_chamfer_of_points(name, case, close):
+def test_chamfer_of_points(case, close):
     close(chamfer_squared(case["in/cd3_x"], case["in/cd3_y"]), case["out/cd3"], atol=0, rtol=1e-5)

@@ -180,12 +180,8 @@ def test_from_checkpoint(case, name, tmp_path, close):
 @pytest.mark.parametrize("kind", ["voxel", "voxel_dense"])
 def test_metrics_voxels(metrics, kind):
     low, high = metrics.config["DATASET_CONFIG"]["depth_range"]
-    coordinates, features = voxelize(
-        metrics[f"in/{kind}_points"],
-        metrics.config["VOXEL_SIZE"],
-        range_min_m=low,
-        range_max_m=high,
-    )
+    points, voxel_m = metrics[f"in/{kind}_points"], metrics.config["VOXEL_SIZE"]
+    coordinates, features = voxelize(points, voxel_m, range_min_m=low, range_max_m=high)
     assert coordinates.tolist() == metrics[f"out/{kind}_coords"].tolist()
     assert torch.equal(features, metrics[f"out/{kind}_feats"])
 
@@ -194,10 +190,7 @@ def test_metrics_pooling(metrics, close):
     coordinates = torch.cat([metrics["in/agg_coords"], metrics["in/agg_batch"][:, None]], dim=1)
     expected = metrics["out/agg_depth"]
     voxel_m = metrics.config["VOXEL_SIZE"]
-    close(
-        pool_voxels(metrics["in/agg_logits"], coordinates, len(expected), voxel_m),
-        expected,
-    )
+    close(pool_voxels(metrics["in/agg_logits"], coordinates, len(expected), voxel_m), expected)
 
 
 @pytest.mark.parametrize("rate", ["0.5", "1.0"])
