@@ -37,21 +37,19 @@ def path_of(kind: type) -> str:
 
 def _network_class(class_path: str) -> type[nn.Module]:
     """The class of a network, looked up inside ``r3dpa.nn`` only."""
-    refusal = (
+    module_path, _, name = str(class_path).rpartition(".")
+    if f"{module_path}.".startswith(_ALLOWED_PACKAGE):
+        try:
+            found = getattr(importlib.import_module(module_path), name)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"class {class_path!r} does not exist here ({error})") from None
+        is_network = isinstance(found, type) and issubclass(found, nn.Module)
+        if is_network and found.__module__.startswith(_ALLOWED_PACKAGE):
+            return found
+    raise ValueError(
         f"class {class_path!r} is not allowed: a checkpoint may only name networks defined in "
         "r3dpa.nn. Edit the class_path if the class was moved; otherwise do not trust the file"
     )
-    module_path, _, name = str(class_path).rpartition(".")
-    if not f"{module_path}.".startswith(_ALLOWED_PACKAGE):
-        raise ValueError(refusal)
-    try:
-        found = getattr(importlib.import_module(module_path), name)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise ValueError(f"class {class_path!r} does not exist in this version ({error})") from None
-    is_network = isinstance(found, type) and issubclass(found, nn.Module)
-    if not is_network or not found.__module__.startswith(_ALLOWED_PACKAGE):
-        raise ValueError(refusal)
-    return found
 
 
 def shapes_of(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -203,14 +201,10 @@ class Checkpoint:
 
 
 def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: str) -> None:
-    """Copies the weights of a checkpoint into networks, all of them or none.
-
-    A key names the network in the checkpoint: ``{"sit": average}`` starts an average from ``sit``.
-    ``stage`` appears in errors.
+    """Copies the weights of a checkpoint into the networks of those names, all of them or none.
 
     Raises:
-        ValueError: If a network is absent or does not fit; lists everything that does not fit, and
-            no network is changed.
+        ValueError: Listing for ``stage`` what is absent or does not fit; nothing is changed then.
     """
     problems: list[str] = []
     for name, network in networks.items():

@@ -163,29 +163,26 @@ def read_snapshot(
     weights: Literal["ema", "last"] = "ema",
     allow: bool = False,
 ) -> WeakModel:
-    """Reads a weak model that may guide a given one; any checkpoint with an average will do.
+    """Reads a weak model that may guide a given one.
 
     If both models have one VAE, which stage ``flow_matching`` freezes, normalisations that drifted
-    apart are converted, up to :data:`NORM_TOLERANCE`. With another VAE, as after a snapshot of
-    stage ``joint``, no conversion exists: the normalised latents of both are equated, which removes
-    the drift of mean and scale only, and is refused unless allowed.
+    apart are converted, up to ``NORM_TOLERANCE``. With another VAE, as after a snapshot of stage
+    ``joint``, the normalised latents of both are equated, which is refused unless allowed.
 
     Args:
-        path: File of :class:`r3dpa.callbacks.EMASnapshots`, or another checkpoint.
+        path: File of :class:`r3dpa.callbacks.EMASnapshots`, or any checkpoint with an average.
         strong: Checkpoint of the model to be guided.
         weights: Whose latent statistics it uses, those of the average or of the last step.
         allow: Warn of latents that differ instead of refusing them.
 
     Raises:
-        ValueError: If the file has no average or no fitted statistics, or another latent size, path
-            or VAE, or statistics further apart than the tolerance.
+        ValueError: If the file has no average or fitted statistics, or does not fit ``strong``.
     """
     weak = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(weak.networks):
         raise ValueError(
             f"{path} is of stage {weak.stage} and holds no averaged SiT with its statistics, "
-            f"only {', '.join(weak.networks)}; give a file of a run's snapshots, or a "
-            "checkpoint of stage joint or flow_matching"
+            f"only {', '.join(weak.networks)}; give a file of a run's snapshots"
         )
     sit_name, norm_name = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
     size, strong_size = _latent_size(weak, "ema"), _latent_size(strong, sit_name)
@@ -203,22 +200,18 @@ def read_snapshot(
     scale = ratios.log().mean().exp()
     spread = (ratios / scale - 1).abs().max().item()
     shift = ((strong_norm.running_mean - norm.running_mean).double() / deviation).float()
-    problem, vae = None, _vae_note(weak)
+    reason, vae = "", _vae_note(weak)
     if vae is None or vae != _vae_note(strong):
-        problem = "its latents are those of another VAE, as within stage joint"
+        reason = "its latents are those of another VAE, as within stage joint"
         scale, shift = torch.ones(()), torch.zeros_like(shift)
     elif spread > NORM_TOLERANCE:
-        problem = (
-            f"the scales of its latents differ by {spread:.1%} between channels, more than "
-            f"{NORM_TOLERANCE:.0%}"
-        )
-    if problem is not None:
-        problem = f"{path} cannot guide {strong.path} exactly: {problem}"
+        limit = f"{NORM_TOLERANCE:.0%}"
+        reason = f"the scales of its latents differ by {spread:.1%} between channels, over {limit}"
+    if reason:
+        problem = f"{path} cannot guide {strong.path} exactly: {reason}"
         if not allow:
-            raise ValueError(
-                f"{problem}. Give a snapshot of a run of stage flow_matching on this VAE, or allow "
-                "the approximation"
-            )
+            remedy = "Give a snapshot of stage flow_matching on this VAE, or allow other latents"
+            raise ValueError(f"{problem}. {remedy}")
         warnings.warn(f"{problem}; allowed: an approximation", stacklevel=2)
     sit = weak.network("ema").build()
     assert isinstance(sit, VelocityNetwork)  # _latent_size
