@@ -1,11 +1,9 @@
 """Realism of scans: 36 distances to real scans, each beside the distance between real drives.
 
-The floor is the median distance between two drives of the reference. The distance of the scans is
-the median over pairs of one drive of the scans and one of the reference: pooled sets are closer to
-each other than single drives are, and a single pair may be unusually near or far. A ratio of 1
-means that the scans are no farther from a real drive than another real drive is. Drives of fewer
-scans than those of the reference have noisier histograms and come out farther away, never nearer.
-The distance between the pooled sets is shown as well; it has no floor.
+The floor is the median distance between two drives of the reference, and the distance of the scans
+the median over pairs of one drive of the scans and one of the reference, as pooled sets are closer
+to each other. A ratio of 1 means that the scans are no farther from a real drive than another real
+drive is. Drives of few scans have noisier histograms and come out farther away, never nearer.
 
 Source: JSD and W1 of histograms as in LiDARGen (ECCV 2022) and LiDM (CVPR 2024), but the divergence
 itself in nats, not its root.
@@ -290,16 +288,14 @@ def realism_table(
         real, ratio = whole_b[name], math.nan
         lacks = {"A": own.lacks, "B": real.lacks}
         reason = "; ".join(f"{side}: {why}" for side, why in lacks.items() if why)
-        if reason:
-            pass
-        elif math.isnan(distance):
-            reason = "no bin holds enough returns in a drive of A and in one of B"
+        if math.isnan(distance):
+            reason = reason or "no bin holds enough returns in a drive of A and in one of B"
         elif math.isnan(floor):
-            reason = "no two drives of B can be compared, so there is no floor"
-        elif floor == 0:
-            ratio = 0.0 if distance == 0 else math.inf
-        else:
+            reason = reason or "no two drives of B can be compared, so there is no floor"
+        if not reason and floor:
             ratio = distance / floor
+        elif not reason:
+            ratio = math.inf if distance else 0.0
         values = float(own.summary), float(real.summary)
         pooled = float(own.distance(own.values, real.values))
         largest = _known(np.max, floors)

@@ -152,8 +152,15 @@ class ReferenceStatistics:
         saved, whole = self.num_done, True  # never saved in the middle of a batch
         try:
             for batch, features in with_features(usable_scenes(scenes, self.protocol), spaces):
+                expected = self.names[self.num_done : self.num_done + len(batch)]
+                if tuple(scene.name for scene in batch) != expected:
+                    raise ValueError(f"{batch[0].name}: not the next scan; give all, in order")
                 whole = False
-                self._add(batch, features)
+                for index, part in enumerate(self.halves):
+                    own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
+                    of_half = {name: values[own] for name, values in features.items()}
+                    update_with(part, [batch[i] for i in own], of_half, real=True)
+                self.num_done += len(batch)
                 whole = True
                 if partial is not None and self.num_done - saved >= every:
                     self.save(partial)
@@ -162,16 +169,6 @@ class ReferenceStatistics:
             if whole and partial is not None and self.num_done:
                 self.save(partial)
             raise
-
-    def _add(self, batch: Sequence[EvaluationScene], features: dict[str, Tensor]) -> None:
-        expected = self.names[self.num_done : self.num_done + len(batch)]
-        if tuple(scene.name for scene in batch) != expected:
-            raise ValueError(f"{batch[0].name}: not the next scan; give all, in announced order")
-        for index, part in enumerate(self.halves):
-            own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
-            of_half = {name: values[own] for name, values in features.items()}
-            update_with(part, [batch[i] for i in own], of_half, real=True)
-        self.num_done += len(batch)
 
     def _states(self) -> Iterator[tuple[str, SceneMetric, str, Tensor]]:
         """Key in the file, metric, name and value of each state; a feature space has one set."""
