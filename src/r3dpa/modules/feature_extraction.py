@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -117,25 +117,14 @@ class MissingScans(LightningDataModule):
     def predict_dataloader(self) -> DataLoader[Any]:
         """The share of this process, in order."""
         assert self.trainer is not None
-        dataset = PointDataset(self.scans, self.sensor, self.extractor.prepare)
+        own = self.scans[self.trainer.global_rank :: self.trainer.world_size]
+        dataset = PointDataset(own, self.sensor, self.extractor.prepare)
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            sampler=_Share(dataset, self.trainer.world_size, self.trainer.global_rank),
+            # Of one process, so that Lightning does not divide the share once more.
+            sampler=DistributedSampler(dataset, num_replicas=1, rank=0, shuffle=False),
             num_workers=self.num_workers,
             collate_fn=list,
             generator=torch.Generator(),  # the default would draw from the global random state
         )
-
-
-class _Share(DistributedSampler[int]):
-    """Each ``num_replicas``-th scan, none twice; unlike Lightning's own it may be empty."""
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._share())
-
-    def __len__(self) -> int:
-        return len(self._share())
-
-    def _share(self) -> range:
-        return range(self.rank, len(cast(PointDataset, self.dataset)), self.num_replicas)

@@ -22,7 +22,7 @@ _SCANS_TO_QUANTISE = 16
 
 
 class PointPretraining(LightningModule):
-    """WaffleIron trained to tell the geometry of whole scans from parts of them.
+    """WaffleIron trained to predict the geometry of whole scans from parts of them.
 
     Blocks of rays are hidden; the hidden points are known by their cells alone. From the token of
     every point, hidden or not, a linear layer predicts in which of ``num_bins`` quantiles each

@@ -259,10 +259,8 @@ def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
         }
         grid = ScanGrid(**settings)
         network = WaffleIron(about["width"], about["depth"], grid.cells)
-        prefix = "network."
-        network.load_state_dict(
-            {key.removeprefix(prefix): state[key] for key in state if key.startswith(prefix)}
-        )
+        own = [key for key in state if key.startswith("network.")]
+        network.load_state_dict({key.removeprefix("network."): state[key] for key in own})
     except (*UNPICKLING_ERRORS, SafetensorError) as error:
         raise ValueError(
             f"{path} holds no weights of waffleiron-s ({first_line(error)}): give the "
@@ -290,10 +288,9 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
         raise ValueError(f"there is no feature source {name!r}; there are {', '.join(SOURCES)}.")
     if name == "scalr":
         if ckpt is None:
-            others = ", ".join(source for source in SOURCES if source != name)
             raise ValueError(
                 "feature source scalr needs ckpt, the released ckpt_last.pth; without it, choose "
-                f"one of {others}."
+                f"one of {', '.join(SOURCES[1:])}."
             )
         scalr = ScaLR.from_checkpoint(ckpt)
         if scalr.dim != dim:

@@ -75,15 +75,14 @@ class WaffleIron(nn.Module):
     def _planes(self, batch: PointCloudBatch, visible: Tensor | None = None) -> list[Plane]:
         num_scans, num_points = len(batch.num_points), len(batch.features)
         scan = torch.repeat_interleave(batch.num_points, output_size=num_points)
-        weight = None if visible is None else visible.to(batch.features.dtype)
+        weight = None if visible is None else visible.to(batch.features.dtype)[:, None]
         planes = []
         for cells, (rows, columns) in zip(batch.cells, self.plane_sizes, strict=True):
             own = cells + scan * (rows * columns)
             count = batch.features.new_zeros(num_scans * rows * columns)
-            count.index_add_(0, own, count.new_ones(num_points) if weight is None else weight)
+            count.index_add_(0, own, count.new_ones(num_points) if weight is None else weight[:, 0])
             share = (count + _COUNT_EPS).reciprocal()[:, None]
-            column = None if weight is None else weight[:, None]
-            planes.append(Plane(own, share, (num_scans, rows, columns), column))
+            planes.append(Plane(own, share, (num_scans, rows, columns), weight))
         return planes
 
 
