@@ -123,16 +123,6 @@ def test_check_names_every_bad_scan(tmp_path, capsys):
     assert "NaN or infinite" in second
 
 
-def test_check_names_missing_folders(tmp_path, capsys):
-    (tmp_path / "data_3d_raw" / "2013_05_28_drive_0000_sync").mkdir(parents=True)
-    status, lines = check(tmp_path, capsys)
-    assert status == 1
-    missing = [line for line in lines if line.startswith("missing: ")]
-    assert len(missing) == 9
-    assert missing[0].endswith("drive_0000_sync/velodyne_points/data")
-    assert missing[1].endswith("drive_0002_sync")
-
-
 class TestObjects:
     def test_writes_a_library_and_says_what_it_holds(self, simulated, tiny_file, tmp_path):
         out = tmp_path / "objects.safetensors"

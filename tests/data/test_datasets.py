@@ -5,8 +5,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from r3dpa import geometry
-from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset, find_scans
+from r3dpa.data import Augmentation, FeatureGrids, LidarDataset, find_scans
 from r3dpa.data.augmentation import View
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
@@ -67,16 +66,6 @@ def test_scan_in_no_ring_order_is_named(tmp_path, make_scans):
         LidarDataset(scans, rings, RangeCodec())[0]
 
 
-def test_points_are_projected_once_per_item(tmp_path, make_scans, projection, monkeypatch):
-    """Ranges are computed by the projection alone."""
-    calls, original = [], geometry.projection.range_of
-    monkeypatch.setattr(
-        geometry.projection, "range_of", lambda points: calls.append(1) or original(points)
-    )
-    LidarDataset(find_scans(make_scans(tmp_path / "s", 1)), projection, RangeCodec())[0]
-    assert len(calls) == 1
-
-
 def test_a_scan_out_of_range_is_named(tmp_path, projection):
     scans = write(tmp_path, [[0, 0, 0.5, 1], [90, 0, 0, 1]])
     with pytest.raises(ScanError, match=r"000000\.bin: has no point within .* 1\.\.56 m"):
@@ -102,23 +91,6 @@ def test_posteriors_turn_with_the_scan(scans, projection, posteriors):
     seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample)
     assert torch.equal(seen["posterior_moments"], posteriors[1][1].roll(6, -1))
     assert (seen["index"], seen["name"]) == (1, scans[1].name)
-
-
-def data(folder, **kwargs):
-    """Loaded like in a fit."""
-    sensor = LidarSensor(beams=8, columns=32)
-    module = LidarDataModule(
-        str(folder), sensor=sensor, grid_size=(2, 8), batch_size=2, val_every=None, **kwargs
-    )
-    module.prepare_data()
-    module.setup("fit")
-    return module
-
-
-def test_the_data_module_refuses_latents_that_do_not_follow(tmp_path, posteriors):
-    module = data(tmp_path / "scans", augmentation=Augmentation(flip=True))
-    with pytest.raises(ValueError, match="mirroring"):
-        module.use_posteriors(posteriors[0])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import threading
-import weakref
 
 import numpy as np
 import pytest
@@ -216,21 +215,6 @@ def test_writing_goes_on_beside_drawing(tmp_path, monkeypatch):
         second.join(10)
         open_writer.close()
         assert open_writer.num_done == 2
-
-
-def test_40_scenes_are_never_in_memory_together(tmp_path):
-    batches, most = weakref.WeakSet(), 0
-    with writer(tmp_path, 40, formats=("bin", "npz")) as open_writer:
-        for first in range(0, 40, 2):
-            batch = scenes(2, seed=first)
-            batches.add(batch)
-            open_writer.put(batch)
-            del batch
-            most = max(most, len(batches))
-        open_writer.close()
-        open_writer.finish({})
-    assert most <= 3  # two and the one that is being handed over
-    assert len(np.load(tmp_path / "range_m.npy", mmap_mode="r")) == 40
 
 
 def test_files_of_somebody_else_are_never_removed(tmp_path):

@@ -113,7 +113,6 @@ class LidarDataModule(LoaderModule):
         self.train_set: LidarDataset | None = None
         self.val_set: LidarDataset | None = None
         self.all_set: LidarDataset | None = None
-        self._posteriors: CachedTensors | None = None
 
     @property
     def feature_dim(self) -> int:
@@ -166,7 +165,6 @@ class LidarDataModule(LoaderModule):
 
     def setup(self, stage: str) -> None:
         """Index the scans and open the store of feature grids, but to ``"predict"``."""
-        self._posteriors = None  # of another fit, maybe with another VAE
         train, val, self.projection = self._scans_and_projection()
         scans, grids = sorted(train + val), None
         if self.features_dir is not None and stage != "predict":
@@ -178,23 +176,17 @@ class LidarDataModule(LoaderModule):
         )
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
-        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE: :class:`LatentBatch`.
-
-        Raises:
-            ValueError: If they do not follow the augmentation.
-        """
-        self.augmentation.check_latents(posteriors.store.shape[-1], self.grid_size[1])
-        self._posteriors = posteriors
+        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE: :class:`LatentBatch`."""
+        images = ready(self.train_set)
+        self.train_set = LidarDataset(
+            images.scans, images.projection, images.codec, images.grids, posteriors
+        )
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
         dataset = ready(self.train_set)
         if not len(dataset):
             raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
-        if self._posteriors is not None:
-            dataset = LidarDataset(
-                dataset.scans, dataset.projection, dataset.codec, dataset.grids, self._posteriors
-            )
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self.loader(dataset, train=False)
         if not self.augmentation.active:
