@@ -187,7 +187,6 @@ def test_grids_of_a_single_file_need_a_folder(tmp_path, data, sensor, scaled_poi
     ("options", "message"),
     [
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
-        ({"projection": "cubic"}, "'spherical' or 'rings', got 'cubic'"),
         ({"val_every": 1}, "val_every must be at least 2"),
         ({"seed": -1}, "seed must be at least 0"),
     ],

@@ -97,8 +97,6 @@ class LidarDataModule(LoaderModule):
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
-        if projection not in ("spherical", "rings"):
-            raise ValueError(f"projection must be 'spherical' or 'rings', got {projection!r}.")
         at_least(2, val_every=val_every)
         at_least(1, limit=limit)
         self.scans, self.sensor, self.codec = scans, sensor, codec
