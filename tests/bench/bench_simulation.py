@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from statistics import median
-
 import pytest
 
 from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
@@ -25,21 +23,7 @@ WEATHERS = {
 def bench_scan(benchmark, weather):
     seed, drive, number = STREET
     scene, sensor = Street(seed, drive, WEATHERS[weather]).scene(number), hdl64e()
-    scans = []
-
-    def run():
-        scans.append(simulate_scan(scene, sensor, (seed, "effects", drive, number)))
-
-    benchmark(run)
-    parts = {name: [scan.parts_ms[name] for scan in scans] for name in scans[0].parts_ms}
-    for effect in scans[0].effects:
-        if effect.status == "ran":
-            parts[effect.name] = [
-                next(e.ms for e in scan.effects if e.name == effect.name) for scan in scans
-            ]
-    idle = [sum(e.ms for e in scan.effects if e.status == "not_called") for scan in scans]
-    benchmark.extra_info |= {f"{name} ms": round(median(ms), 2) for name, ms in parts.items()}
-    benchmark.extra_info["effects not called ms"] = round(median(idle), 3)
+    benchmark(simulate_scan, scene, sensor, (seed, "effects", drive, number))
 
 
 def bench_scene(benchmark):

@@ -65,7 +65,6 @@ def test_every_effect_is_accounted_for(street_scan):
         assert status[name] == "not_called"
     assert all(record.reason for record in street_scan.effects)
     assert all(record.rays > 0 or record.status != "ran" for record in street_scan.effects)
-    assert set(street_scan.parts_ms) == {"rays", "cast", "points"}
 
 
 def test_parallax_changes_the_inclination_of_the_highest_beam_with_range():
@@ -133,8 +132,8 @@ def test_switches():
     np.testing.assert_array_equal(off.points, clear.points)
     record = {record.name: record for record in off.effects}["fog"]
     assert (record.status, record.rays) == ("off", 0)
-    forced = simulate_scan(replace(scene, weather=DRY), hdl64e(90), (0,), {"fog": "on"})
-    np.testing.assert_array_equal(forced.points, clear.points)
+    on = simulate_scan(scene, hdl64e(90), (0,), {"fog": "on"})
+    assert on.points.tobytes() == simulate_scan(scene, hdl64e(90), (0,)).points.tobytes()
 
 
 def test_intensity_rises_with_the_root_of_the_reflectivity_and_weak_returns_have_none():
@@ -190,6 +189,6 @@ def test_a_simulator_gives_the_scans_of_its_drive():
     key = (3, "effects", 5, 7)
     expected = simulate_scan(scene, hdl64e(32), key, {"range_noise": False})
     assert scan.points.tobytes() == expected.points.tobytes()
-    assert (scan.scene, list(scan.parts_ms)) == (scene, ["rays", "cast", "points"])
+    assert scan.scene == scene
     assert Simulator(sensor="vls128").sensor.num_beams == 128
     assert doctest.testmod(scan_module).failed == 0

@@ -92,7 +92,7 @@ def test_files_of_a_scan_say_what_was_simulated(tmp_path):
         found = summary["effects"][record.name]
         assert (found["status"], found["rays"]) == (record.status, record.rays)
     manifest = json.loads((tmp_path / "simulation.json").read_text())
-    assert manifest["effects"] == {"range_noise": "off", "rolling_shutter": "on"}
+    assert manifest["effects"] == {"range_noise": "off"}
     assert manifest["weather"]["rain_mm_h"] == 4.0
     table = np.loadtxt(tmp_path / "data_poses" / drive_name("0003") / "velodyne_to_world.txt")
     assert table[:, 0].tolist() == [0, 1, 2]
@@ -165,7 +165,6 @@ def test_another_request_is_refused_with_both_values(tmp_path):
         ({"sensor": hdl64e(40)}, r"\(sensor\.shots 32 there, 40 now\)"),
         ({"sensor": hdl32e()}, r"sensor\.lasers\.inclination_rad 64 values there"),
         ({"effects": {}}, r"\(effects\.range_noise 'off' there, None now\)"),
-        ({"effects": {"range_noise": "on"}}, r"\(effects\.range_noise 'off' there, 'on' now\)"),
         ({"weather": Weather()}, r"\(weather None there, {'visibility_m': None, "),
     ):
         with pytest.raises(ValueError, match=message):

@@ -47,7 +47,7 @@ def simulate(
         sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
             reads, for an HDL-64E.
         return_mode: Strongest return of each shot, or the two strongest.
-        effects: ``auto``, ``on`` or ``off`` by effect, such as ``--effects.fog off``; default: an
+        effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: an
             effect runs where the scene calls for it.
         weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: random.
     """

@@ -119,7 +119,7 @@ def simulate(
             drives. With drives of both splits, a fifth of the scans (at least one, if there are
             two or more) is for validation.
         sensor: Instrument, or an argument of ``load_sensor``.
-        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
+        effects: ``off`` or ``auto`` by effect; those not named are ``auto``.
         weather: Of all scans; drawn for each stretch of street if None.
 
     Returns:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,8 +16,6 @@ from r3dpa.simulation.scene import Scene, Weather
 from r3dpa.simulation.sensor import SpinningLidar, load_sensor
 from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Echoes, Effect, Origin, Sweep
-
-Switch = Literal["auto", "on", "off"]
 
 # Smallest distance of two echoes of one shot, metres.
 _SECOND_RETURN_M = 1.0
@@ -36,7 +32,6 @@ class EffectRecord:
     status: Literal["ran", "not_called", "off"]
     reason: str
     rays: int  # selected by the effect
-    ms: float  # milliseconds, with its condition
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,6 @@ class SimulatedScan:
             points that show no surface.
         origins: ``(P,)`` uint8, the ``Origin`` of each point.
         effects: One record for each effect, in the order of ``EFFECTS``.
-        parts_ms: Time of the other parts, milliseconds.
         scene: Solids, pose and motion of the sensor, weather.
     """
 
@@ -59,7 +53,6 @@ class SimulatedScan:
     labels: NDArray[np.uint32]
     origins: NDArray[np.uint8]
     effects: tuple[EffectRecord, ...]
-    parts_ms: dict[str, float]
     scene: Scene
 
 
@@ -68,22 +61,18 @@ def effect_name(effect: Effect) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", type(effect).__name__).lower()
 
 
-def check_switches(switches: Mapping[str, str | bool]) -> dict[str, Switch]:
-    """The switches that are not ``auto``, by effect name, sorted.
+def check_switches(switches: Mapping[str, str | bool]) -> dict[str, str]:
+    """The effects that are switched ``off``, sorted by name; ``on`` is the same as ``auto``.
 
     True and False, the YAML values of a bare ``on`` and ``off``, are accepted as well.
     """
     names = [effect_name(effect) for effect in EFFECTS]
-    words: dict[str | bool, Switch] = {True: "on", False: "off", "on": "on", "off": "off"}
-    checked = {}
-    for name, switch in sorted(switches.items()):
+    for name, switch in switches.items():
         if name not in names:
             raise ValueError(f"there is no effect {name!r}; there are {', '.join(names)}")
-        if switch in words:
-            checked[name] = words[switch]
-        elif switch != "auto":
+        if switch not in ("auto", "on", "off", True, False):
             raise ValueError(f"effect {name} must be auto, on or off, got {switch!r}")
-    return checked
+    return {name: "off" for name in sorted(switches) if switches[name] in ("off", False)}
 
 
 def simulate_scan(
@@ -99,20 +88,14 @@ def simulate_scan(
         sensor: Instrument; its mount height is not used, the pose holds the height.
         key: Seed of the random draws, see ``generator_for``; the name of each effect is added, so
             that effects do not change the draws of each other.
-        switches: ``off`` omits an effect; ``on`` runs it even if the scene does not call for it,
-            which changes nothing; by default ``auto``.
+        switches: ``off`` omits an effect; the others run if scene or sensor call for them.
     """
-    checked = check_switches(switches or {})
-    parts_ms: dict[str, float] = {}
-    with _timed(parts_ms, "rays"):
-        sweep = Sweep(scene, sensor)
-    records = [_run(effect, sweep, key, checked) for effect in RAY_EFFECTS]
-    with _timed(parts_ms, "cast"):
-        sweep.cast()
-    records += [_run(effect, sweep, key, checked) for effect in ECHO_EFFECTS]
-    with _timed(parts_ms, "points"):
-        points, labels, origins = _points(sweep)
-    return SimulatedScan(points, labels, origins, tuple(records), parts_ms, scene)
+    off = check_switches(switches or {})
+    sweep = Sweep(scene, sensor)
+    records = [_run(effect, sweep, key, off) for effect in RAY_EFFECTS]
+    sweep.cast()
+    records += [_run(effect, sweep, key, off) for effect in ECHO_EFFECTS]
+    return SimulatedScan(*_points(sweep), tuple(records), scene)
 
 
 class Simulator:
@@ -125,7 +108,7 @@ class Simulator:
         drive: Number of the drive; each leads through a street of its own.
         weather: Weather of all scans; None draws another one every 100 scans.
         sensor: Instrument, or an argument of ``load_sensor``.
-        effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
+        effects: ``off`` or ``auto`` by effect; those not named are ``auto``.
 
     Raises:
         ValueError: If a value is out of range or an effect unknown.
@@ -159,31 +142,19 @@ class Simulator:
 
 
 def _run(
-    effect: Effect, sweep: Sweep, key: tuple[int | str, ...], switches: Mapping[str, Switch]
+    effect: Effect, sweep: Sweep, key: tuple[int | str, ...], off: Mapping[str, str]
 ) -> EffectRecord:
-    start = time.perf_counter()
     name = effect_name(effect)
-    switch = switches.get(name, "auto")
-    if switch == "off":
-        return EffectRecord(name, "off", "switched off", 0, 0.0)
+    if name in off:
+        return EffectRecord(name, "off", "switched off", 0)
     reason = effect.called_by(sweep.scene, sweep.sensor)
-    touched = 0
-    if reason is not None or switch == "on":
-        rays = effect.rays(sweep)
-        touched = sweep.num_rays if isinstance(rays, slice) else len(rays)
-        if touched:
-            effect.apply(sweep, rays, Draws(sweep.num_rays, *key, name))
-    ms = 1000 * (time.perf_counter() - start)
-    if reason is None and switch == "auto":
-        return EffectRecord(name, "not_called", "nothing in the scene calls for it", 0, ms)
-    return EffectRecord(name, "ran", reason or "switched on", touched, ms)
-
-
-@contextmanager
-def _timed(parts_ms: dict[str, float], part: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    parts_ms[part] = 1000 * (time.perf_counter() - start)
+    if reason is None:
+        return EffectRecord(name, "not_called", "nothing in the scene calls for it", 0)
+    rays = effect.rays(sweep)
+    num_rays = sweep.num_rays if isinstance(rays, slice) else len(rays)
+    if num_rays:
+        effect.apply(sweep, rays, Draws(sweep.num_rays, *key, name))
+    return EffectRecord(name, "ran", reason, num_rays)
 
 
 def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:

@@ -263,11 +263,7 @@ class Sweep:
 
 
 class Effect(ABC):
-    """One physical effect: the condition under which it runs, its rays, and the change to them.
-
-    ``apply`` depends on the scene and the sensor only: an effect that is switched on in a scene
-    that does not call for it changes no bit of the scan.
-    """
+    """One physical effect: the condition under which it runs, its rays, and the change to them."""
 
     @abstractmethod
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:

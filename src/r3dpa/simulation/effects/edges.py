@@ -88,9 +88,8 @@ class MixedPixels(Effect):
     def rays(self, sweep: Sweep) -> RayIndex:
         """Rays whose rim reaches over an edge, and rays beside a thin solid."""
         chosen = np.zeros(sweep.num_rays, dtype=bool)
-        if sweep.sensor.divergence_rad and sweep.scene.primitives:
-            chosen[_at_edges(sweep)] = True
-            chosen[_beside_thin_solids(sweep)[0]] = True
+        chosen[_at_edges(sweep)] = True
+        chosen[_beside_thin_solids(sweep)[0]] = True
         index = np.flatnonzero(chosen)
         origin, surface = sweep.first.origin[index], sweep.first.surface[index]
         straight = (origin == Origin.SURFACE) | (origin == Origin.FOLIAGE)
@@ -99,8 +98,6 @@ class MixedPixels(Effect):
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Replace the echoes of each footprint by its peaks."""
         chosen = np.arange(sweep.num_rays)[rays]
-        if not len(chosen):
-            return
         targets = _targets_of(sweep, chosen)
         met, rim_m = _nearest(targets, len(chosen))
         axis_m = sweep.first.range_m[chosen]

@@ -55,7 +55,7 @@ class SunGlare(Effect):
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Rays within 10 degrees of a visible sun."""
-        if not _shines(sweep.scene.weather) or _is_hidden(sweep):
+        if _is_hidden(sweep):
             return np.empty(0, dtype=np.int64)
         return np.flatnonzero(
             _sun_direction(sweep.scene) @ sweep.direction > math.cos(math.radians(_SUN_REACH_DEG))

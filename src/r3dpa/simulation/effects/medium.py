@@ -29,7 +29,6 @@ from r3dpa.simulation.sweep import Effect, Origin, Sweep
 # Backscatter over extinction of clouds of water droplets, see Fog.
 _BACKSCATTER = 0.046 / math.log(20)
 _FOG_STEP_M = 0.05
-_NO_RAYS = np.empty(0, dtype=np.int64)
 _FAST_M_S = 10.0
 _PLUME_S, _PLUME_MAX_M, _PLUME_HEIGHT_M = 0.6, 12.0, 1.8
 # Undersides of vehicles lie about this much above the road.
@@ -62,11 +61,6 @@ def steps_before_target(sweep: Sweep, edges: NDArray[np.float64]) -> Floats:
     return steps.clip(0, len(edges) - 1)
 
 
-def all_rays(called: bool) -> RayIndex:
-    """Index of all rays, or of none."""
-    return slice(None) if called else _NO_RAYS
-
-
 class Fog(Effect):
     """Fog attenuates every echo and adds a soft echo of its own.
 
@@ -90,9 +84,6 @@ class Fog(Effect):
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         visibility_m = scene.weather.visibility_m
         return f"visibility of {visibility_m:g} m" if math.isfinite(visibility_m) else None
-
-    def rays(self, sweep: Sweep) -> RayIndex:
-        return all_rays(math.isfinite(sweep.scene.weather.visibility_m))
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Attenuate the echoes and add the soft ones."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from r3dpa.simulation.draws import Draws, RayIndex
 from r3dpa.simulation.effects.instrument import MAX_SPREADS
 from r3dpa.simulation.effects.medium import (
-    all_rays,
     attenuate,
     overlap_by_square,
     range_edges,
@@ -66,9 +65,6 @@ class _Hydrometeors(Effect):
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         rate = getattr(scene.weather, self.field)
         return f"{rate:g} mm/h of {self.origin.name.lower()}" if rate > 0 else None
-
-    def rays(self, sweep: Sweep) -> RayIndex:
-        return all_rays(getattr(sweep.scene.weather, self.field) > 0)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         """Attenuate the echoes and add the strongest drop or flake of each ray."""
