@@ -26,12 +26,8 @@ def wall(x, y, half_size, **changes):
 def room(distance_m=20.0):
     """Walls ahead, behind, left and right, their faces at the same distance."""
     d, thick = distance_m + 0.5, 0.5
-    return (
-        wall(d, 0, (thick, 60, 9)),
-        wall(-d, 0, (thick, 60, 9)),
-        wall(0, d, (60, thick, 9)),
-        wall(0, -d, (60, thick, 9)),
-    )
+    across = [wall(x, 0, (thick, 60, 9)) for x in (d, -d)]
+    return (*across, *(wall(0, y, (60, thick, 9)) for y in (d, -d)))
 
 
 def swept(scene, *effects):
@@ -44,7 +40,7 @@ def azimuth_of(sweep):
 
 
 def horizontal_range(sweep, beam=LEVEL):
-    slope = np.cos(np.radians(0)) * sweep.sensor.rays.direction[2, beam, 0]
+    slope = sweep.sensor.rays.direction[2, beam, 0]
     return sweep.grid(sweep.first.range_m)[beam] * np.sqrt(1 - slope**2)
 
 
@@ -95,12 +91,9 @@ def test_an_actor_that_crosses_is_sheared():
 
     first, last = ends(still)
     assert last - first == pytest.approx(2 * np.arctan(6 / 9), abs=0.01)
-    # Driving forward, the truck's front is met earlier in the turn than its rear: both when the
-    # head looks there, that is at azimuth / (2 pi) * 0.1 s.
-    time_of = {edge: edge / (2 * np.pi) * 0.1 for edge in (first, last)}
-    for edge, was in zip(ends(moving), (first, last), strict=True):
-        corner = 6 if was == first else -6
-        expected = np.arctan2(9, corner + 10 * time_of[was])
+    # Each end of the truck is met when the head looks there, at azimuth / (2 pi) * 0.1 s.
+    for edge, was, corner in zip(ends(moving), (first, last), (6, -6), strict=True):
+        expected = np.arctan2(9, corner + 10 * was / (2 * np.pi) * 0.1)
         assert edge == pytest.approx(expected, abs=0.012)
     # Driving away, its face is sheared: the end seen later is farther by v * (time between).
     sweep = swept(Scene((away,)), MovingActors())

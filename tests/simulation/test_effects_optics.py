@@ -59,7 +59,7 @@ def pane_transmittance(cosine):
     return sum((1 - surface) ** 2 * surface ** (2 * n) for n in range(60))
 
 
-def test_power_behind_a_pane():
+def test_power_behind_a_pane_and_dirt_of_one_before_nothing():
     plain, sweep = swept(WALL), swept(WALL, PANE, effects=[Glass()])
     rays = with_origin(sweep, Origin.GLASS)
     rays = rays[sweep.first.surface[rays] == 0]
@@ -71,8 +71,6 @@ def test_power_behind_a_pane():
     assert cosine.max() > 0.9999
     assert ratio[cosine.argmax()] == pytest.approx(0.843, abs=5e-4)
 
-
-def test_a_pane_before_nothing_shows_its_dirt():
     plain, sweep = swept(PANE), swept(PANE, effects=[Glass()])
     upward = np.flatnonzero((plain.first.surface == 0) & (plain.direction[2] > 0))
     assert len(upward) > 100

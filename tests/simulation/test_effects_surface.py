@@ -51,14 +51,6 @@ def test_rough_surfaces_return_more_at_grazing_incidence():
     )
 
 
-def test_no_surface_gives_no_power():
-    sweep = swept(Scene(), SENSOR, after=[DiffuseReflection()])
-    nothing = np.isinf(sweep.first.range_m)
-    assert nothing.any()
-    assert (sweep.first.power[nothing] == 0).all()
-    assert (sweep.first.power[~nothing] > 0).all()
-
-
 @pytest.mark.parametrize("smooth", [False, True])
 def test_last_ground_return(smooth):
     """Asphalt of 10 %, 1.73 m below the shot's start, vanishes at 50.0 m.

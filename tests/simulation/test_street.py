@@ -29,6 +29,12 @@ def many_scenes():
     }
 
 
+def turned(points, angle_rad):
+    """Points (..., 3) turned about the vertical axis."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return points @ [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]
+
+
 def top_at(primitive, x_m, y_m):
     """Height of the top plane of a box at a place."""
     x, y = x_m - primitive.centre[0], y_m - primitive.centre[1]
@@ -63,8 +69,7 @@ def test_motion_agrees_with_the_poses(drive):
     along = np.diff([course.position(scan) for scan in range(500)])
     moves = along > 0
     assert (along >= 0).all()
-    assert along[moves].min() >= 1.0
-    assert along[moves].max() <= 1.4
+    assert (along[moves].min() >= 1.0) & (along[moves].max() <= 1.4)
     for scan in range(0, 300, 3):
         scene, after = street.scene(scan), street.scene(scan + 1)
         step = np.subtract((after.pose.x_m, after.pose.y_m), (scene.pose.x_m, scene.pose.y_m))
@@ -101,13 +106,11 @@ def test_the_sensor_is_at_mount_height_above_the_road_and_tilts_with_it():
 
 def test_neighbouring_ground_boxes_meet_without_a_step():
     def top_of(block, x, y):
-        roads = (
-            p
-            for p in street_module._block(0, drive, block).primitives
-            if p.semantic == Semantic.ROAD
-        )
-        under = (p for p in roads if inside(p, [[x, y, top_at(p, x, y) - p.half_size[2]]])[0])
-        return top_at(next(under), x, y)
+        for p in street_module._block(0, drive, block).primitives:
+            top_m = top_at(p, x, y)
+            if p.semantic == Semantic.ROAD and inside(p, [[x, y, top_m - p.half_size[2]]])[0]:
+                return top_m
+        raise AssertionError("no road")
 
     steps = []
     for drive in range(2):
@@ -132,16 +135,13 @@ def test_nothing_stands_in_the_lane_of_the_recording_car():
         at = course.ego_lateral_m + across.ravel()
         up = height.ravel() + [course.surface_m(lateral) for lateral in at]
         for block in range(12, 60):
-            section, primitives = (
-                course.section_of(block),
-                street_module._block(0, drive, block).primitives,
-            )
+            section = course.section_of(block)
             tunnel = [
                 np.add(section.at((block + ahead) * BLOCK_M, lateral), (0, 0, above))
                 for ahead in np.arange(0, 1, 1 / 16)
                 for lateral, above in zip(at, up, strict=True)
             ]
-            for p in primitives:
+            for p in street_module._block(0, drive, block).primitives:
                 if p.semantic not in GROUND:
                     assert not inside(p, tunnel).any(), (drive, block, p)
 
@@ -149,8 +149,7 @@ def test_nothing_stands_in_the_lane_of_the_recording_car():
 def test_traffic_keeps_clear_of_the_recording_car():
     for key, scene in many_scenes().items():
         body = np.array([[x, y, 0] for x in (-2, -1, 0, 1, 2) for y in (-0.9, 0.9)])
-        cosine, sine = np.cos(scene.pose.heading_rad), np.sin(scene.pose.heading_rad)
-        points = body @ [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]
+        points = turned(body, scene.pose.heading_rad)
         points += (scene.pose.x_m, scene.pose.y_m, scene.pose.z_m - 1.0)
         for p in scene.primitives:
             if any(p.velocity_m_s):
@@ -164,10 +163,7 @@ def test_no_car_stands_in_a_building():
         bodies = [p for p in scene.primitives if p.semantic in (Semantic.CAR, Semantic.TRUCK)]
         points = []
         for p in bodies:
-            x, y, _ = (corners * p.half_size).T
-            cosine, sine = np.cos(p.yaw_rad), np.sin(p.yaw_rad)
-            turned = np.stack([cosine * x - sine * y, sine * x + cosine * y, 0 * x], axis=1)
-            points += [*(turned + p.centre), p.centre]
+            points += [*(turned(corners * p.half_size, p.yaw_rad) + p.centre), p.centre]
         for wall in scene.primitives:
             if wall.semantic == Semantic.BUILDING and wall.material != Material.GLASS:
                 assert not inside(wall, points).any(), (key, wall)
@@ -180,20 +176,17 @@ def test_actors_move_as_their_velocity_says():
     for drive in (0, 3):
         street = Street(0, drive, DRY)
         for scan in range(20, 100, 16):
-            here, after = (
-                {
-                    (p.instance, p.semantic, p.half_size, p.centre[2] > 1): p
-                    for p in scene.primitives
-                }
-                for scene in (street.scene(scan), street.scene(scan + 1))
-            )
-            for key, p in here.items():
-                q = after.get(key)
-                if q is None or not any(p.velocity_m_s) or p.yaw_rad != q.yaw_rad:
-                    continue
-                moved = np.subtract(q.centre[:2], p.centre[:2])
-                np.testing.assert_allclose(moved, 0.1 * np.array(p.velocity_m_s), atol=0.03)
-                compared += 1
+            parts = {}
+            for after in (0, 1):
+                for p in street.scene(scan + after).primitives:
+                    key = (p.instance, p.semantic, p.half_size, p.centre[2] > 1, p.yaw_rad)
+                    parts.setdefault(key, {})[after] = p
+            for pair in parts.values():
+                if len(pair) == 2 and any(pair[0].velocity_m_s):
+                    moved = np.subtract(pair[1].centre[:2], pair[0].centre[:2])
+                    expected = 0.1 * np.array(pair[0].velocity_m_s)
+                    np.testing.assert_allclose(moved, expected, atol=0.03)
+                    compared += 1
     assert compared > 100
 
 
@@ -213,18 +206,14 @@ def test_an_object_has_one_instance_number():
 
 
 def test_every_class_and_material_occurs():
-    semantics, materials, shapes = set(), set(), set()
+    solids = []
     for scene in many_scenes().values():
-        for p in (*scene.primitives, *scene.ego_body):
-            semantics.add(p.semantic)
-            materials.add(p.material)
-            shapes.add(p.shape)
-        assert scene.ground_m < min(
-            p.centre[2] + p.half_size[2] for p in scene.primitives if p.semantic in GROUND
-        )
-    assert semantics == set(Semantic) - {Semantic.UNLABELED}
-    assert materials == set(Material)
-    assert shapes == set(Shape)
+        solids += [*scene.primitives, *scene.ego_body]
+        tops = (p.centre[2] + p.half_size[2] for p in scene.primitives if p.semantic in GROUND)
+        assert scene.ground_m < min(tops)
+    assert {p.semantic for p in solids} == set(Semantic) - {Semantic.UNLABELED}
+    assert {p.material for p in solids} == set(Material)
+    assert {p.shape for p in solids} == set(Shape)
 
 
 def test_shares_and_ranges_of_the_weather():
