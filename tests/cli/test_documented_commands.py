@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from r3dpa.cli import COMMANDS, OWN_PARSER, _find, main
-from r3dpa.cli.features import _parser, _with_data_class
+from r3dpa.cli.features import features_parser, with_data_class
 from r3dpa.cli.parser import load, parse
 
 TOP = Path(__file__).resolve().parents[2]
@@ -56,12 +56,12 @@ def documented():
             yield pytest.param(words, id=f"{name}-{number}-{words[0]}")
 
 
-@pytest.mark.parametrize("words", documented())
+@pytest.mark.parametrize("words", list(documented()))
 def test_command_is_accepted(words, monkeypatch, capsys):
     monkeypatch.chdir(TOP)
     name, rest = _find(words)
     if name == "data features":
-        _parser().parse_args(_with_data_class(rest))
+        features_parser(name).parse_args(with_data_class(rest))
     elif COMMANDS[name].target in OWN_PARSER:
         for place, word in enumerate(words):
             if word == "--config" and not Path(words[place + 1]).is_file():

@@ -1,9 +1,4 @@
-"""The ``r3dpa`` command: one table of commands, each a function in a file of this package.
-
-jsonargparse reads the function: its arguments are the options, its docstring is the help, and what
-it returns is printed. A file is imported only when its command runs, so that ``r3dpa --help``
-answers at once.
-"""
+"""The ``r3dpa`` command: one table of commands, whose files are imported when they run."""
 
 from __future__ import annotations
 
@@ -15,10 +10,11 @@ __all__ = ["COMMANDS", "main"]
 
 
 class Command(NamedTuple):
-    """Function ``file:name`` below ``r3dpa.cli``, and summary for the help.
+    """Function ``file:name`` below ``r3dpa.cli``, or of another area, and summary for the help.
 
-    A ``resumable`` command continues its work when it is repeated after an interrupt. The functions
-    of :data:`OWN_PARSER` take the words of the command line.
+    jsonargparse reads the function: its arguments are the options, its docstring is the help, and
+    what it returns is printed. Those of :data:`OWN_PARSER` take the words of the command line. A
+    ``resumable`` command continues its work when it is repeated after an interrupt.
     """
 
     target: str
@@ -31,7 +27,7 @@ COMMANDS = {
     "validate": Command("stages:run", "evaluate on the validation split"),
     "test": Command("stages:run", "sample scenes and compare them with real scans"),
     "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
-    "data simulate": Command("data:simulate", "write simulated scans", resumable=True),
+    "data simulate": Command("r3dpa.simulation:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
     "data features": Command("features:features", "write feature grids of scans", resumable=True),

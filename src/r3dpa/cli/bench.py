@@ -15,8 +15,6 @@ from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.options import check_file, check_folder
 
-__all__ = ["ablate", "sampling", "training"]
-
 
 def training(
     *,

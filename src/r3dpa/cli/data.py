@@ -4,58 +4,10 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 from r3dpa.cli.options import check_file, check_folder, check_least
-
-if TYPE_CHECKING:  # read by jsonargparse for the options of the weather
-    from r3dpa.simulation import Weather
-MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
-if MYPY:
-    from collections.abc import Callable
-
-    from r3dpa import viz
-
-__all__ = ["check", "objects", "simulate", "view"]
-
-
-def simulate(
-    *,
-    out: Path,
-    scans: int = 100,
-    seed: int = 0,
-    workers: int = 1,
-    drives: list[str] | None = None,
-    sensor: str = "hdl64e",
-    return_mode: Literal["strongest", "dual"] = "strongest",
-    effects: dict[str, str | bool] | None = None,
-    weather: Weather | None = None,
-) -> Any:
-    """Write simulated scans in the KITTI-360 layout.
-
-    The same command completes an interrupted run. Prints what each effect did, as
-    ``report.json`` and, for each scan, ``sim/*.json`` keep it.
-
-    Args:
-        out: Root of the data set to write.
-        scans: Number of scans over all drives.
-        seed: Seed of streets and instrument.
-        workers: Processes; the bytes written do not depend on it.
-        drives: Four-digit drives to fill, such as ``0000 0003``; default: all official ones.
-        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
-            reads, for an HDL-64E.
-        return_mode: Strongest return of each shot, or the two strongest.
-        effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: an
-            effect runs where the scene calls for it.
-        weather: Weather of all scans, such as ``--weather.rain_mm_h 10``; default: random.
-    """
-    from r3dpa.simulation import load_sensor
-    from r3dpa.simulation import simulate as write
-
-    lidar = load_sensor(sensor, return_mode=return_mode)
-    return write(out, scans, seed, workers, drives, lidar, effects, weather)
 
 
 def check(path: Path) -> None:
@@ -84,17 +36,17 @@ def view(
         reference: Scan to show beside the others, such as a real one beside simulated ones.
     """
     from r3dpa import viz
-    from r3dpa.cli.scene_files import write_page
+    from r3dpa.cli.scene_files import page_scans, write_page
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
 
     check_least(1, num=num)
     check_folder(out)
-    readers = _readers(source)
+    readers = page_scans(source)
     scans = [read() for read in evenly(readers, num)]
     beside = None
     if reference is not None:
-        first = _readers(reference)[0]()
+        first = page_scans(reference)[0]()
         beside = replace(first, name=f"reference: {first.name}")  # unlike every other name
     drawn = {scan.name: scan.points for scan in [*scans, *([beside] if beside else [])]}
     resolved = source.resolve()
@@ -107,24 +59,6 @@ def view(
     ]
     line = f"{len(scans)} of {len(readers)} scans in {source}"
     return "\n".join([line, *map(str, paths), "open the .html file in a browser"])
-
-
-def _readers(source: Path) -> list[Callable[[], viz.PageScan]]:
-    """Readers of the scans of a folder or file, in order."""
-    from r3dpa import viz
-    from r3dpa.cli.scene_files import read_clouds
-    from r3dpa.data.scans import find_scans, read_beside
-
-    def read(name: str, path: Path) -> viz.PageScan:
-        (points,) = read_clouds(path).values()
-        if path.suffix == ".ply":
-            return viz.PageScan(name, points)
-        return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
-
-    if source.suffix == ".npz" and source.is_file():
-        clouds = read_clouds(source).items()
-        return [partial(viz.PageScan, f"{source.stem}/{name}", points) for name, points in clouds]
-    return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 
 
 def objects(

@@ -8,8 +8,6 @@ from typing import Any
 
 from r3dpa.cli.options import EditOptions
 
-__all__ = ["complete", "inpaint", "interpolate", "mix", "vary"]
-
 
 def inpaint(
     *,

@@ -1,7 +1,4 @@
-"""Work shared by the edits: read checkpoint, scans and features, run the edit, write the results.
-
-Letters: B scenes, H beams, W columns, N tokens, F feature width, P points.
-"""
+"""Work shared by the edits: read checkpoint and scans, run the edit, write the results."""
 
 from __future__ import annotations
 
@@ -34,8 +31,6 @@ from r3dpa.geometry.gaps import check_view, filled, range_error_m
 from r3dpa.geometry.regions import check_mask
 from r3dpa.io import atomic_path, usable_device
 from r3dpa.nn.backbones import feature_source
-
-__all__ = ["EditSession", "ScanView", "held_out_errors"]
 
 _SHOWN = 8  # results on the sheet and the page
 
@@ -130,32 +125,20 @@ class EditSession:
     ) -> str:
         """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
-        Args:
-            command: Name of the edit.
-            arguments: Its own options, for the metadata.
-            scans: The scans by name.
-            run: The edit.
-            parts: Part ``(H, W)`` of the range image that each pixel belongs to.
-            part_names: Names of the parts.
-            guided: Whether features guide it.
-            measure: Errors of results ``(B, H, W)`` by method, where the scan was held out.
+        ``arguments`` are its own options, for the metadata; ``parts`` ``(H, W)`` says to which of
+        the named parts each pixel belongs; ``measure`` gives errors of results ``(B, H, W)`` by
+        method, where the scan was held out.
         """
         options, settings = self.options, asdict(self.settings)
         if not guided:
             del settings["strength"], settings["window"]
         own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
-        request = provenance(self.checkpoint, options.ckpt, self.geometry) | own
+        request = own | provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {
             "command": command,
             "scans": {name: scan.path for name, scan in scans.items()},
             "guided": guided,
-            "weights": options.weights,
-            "num": self.num,
-            "seed": options.seed,
             "settings": settings,
-            "device": self.device,
-            "batch_size": options.batch_size,
-            "formats": options.formats,
         }
         request = json.loads(json.dumps(request, default=str))  # paths as text
         with SceneWriter(

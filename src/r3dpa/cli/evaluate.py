@@ -10,12 +10,6 @@ from typing import Any, Literal
 
 from r3dpa.cli.options import check_file, check_folder, check_least
 
-MYPY = False  # true for mypy; jsonargparse would run a TYPE_CHECKING block, and import torch
-if MYPY:
-    from r3dpa.metrics.scene import EvaluationScene
-
-__all__ = ["evaluate", "realism", "reference"]
-
 
 def reference(
     *,

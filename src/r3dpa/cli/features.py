@@ -36,8 +36,8 @@ def features(args: list[str]) -> None:
             used; the message names it.
     """
     ignore_harmless_warnings()
-    parser = _parser()
-    config = parser.parse_args(_with_data_class(args[1:]))
+    parser = features_parser("r3dpa data features")
+    config = parser.parse_args(with_data_class(args[1:]))
     if config.extractor or config.ckpt:
         config.data.init_args.extractor = feature_source(config.extractor or "scalr", config.ckpt)
     if config.out:
@@ -106,8 +106,8 @@ def read_data(source: Path) -> LidarDataModule:
     Raises:
         ValueError: If the path is neither.
     """
-    parser = _data_parser()
-    config = parser.parse_args(_with_data_class(["--data", str(source)]))
+    parser = features_parser("r3dpa data reference")
+    config = parser.parse_args(with_data_class(["--data", str(source)]))
     config.data.init_args.extractor = config.data.init_args.features_dir = None
     module: LidarDataModule = parser.instantiate(config).data
     if source.is_file():
@@ -115,7 +115,7 @@ def read_data(source: Path) -> LidarDataModule:
     return module
 
 
-def _with_data_class(words: Sequence[str]) -> list[str]:
+def with_data_class(words: Sequence[str]) -> list[str]:
     """The words with a folder or YAML file after ``--data`` as class path or ``--config``."""
     found: list[str] = []
     rest = iter(words)
@@ -139,20 +139,16 @@ def _with_data_class(words: Sequence[str]) -> list[str]:
     return found
 
 
-def _data_parser(**about: Any) -> StageParser:
-    parser = StageParser(**about)
-    parser.add_argument("--config", action="config", help="YAML, the same as after --data")
-    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
-    return parser
-
-
-def _parser() -> StageParser:
-    parser = _data_parser(
-        prog="r3dpa data features",
+def features_parser(prog: str) -> StageParser:
+    """Parser of the command, and of ``--data`` for another ``prog``."""
+    parser = StageParser(
+        prog=prog,
         description="Write the feature grids of all scans of --data: a folder of scans, in the "
         "KITTI-360 layout or any other, or a data YAML. The same command completes an interrupted "
         "run. Several devices and nodes share the work.",
     )
+    parser.add_argument("--config", action="config", help="YAML, the same as after --data")
+    parser.add_lightning_class_args(LidarDataModule, "data", subclass_mode=True)
     sources = f"one of {', '.join(SOURCES)}; default: that of the data, or scalr if --ckpt is given"
     parser.add_argument("--extractor", type=str | None, help=sources)
     parser.add_argument("--ckpt", type=Path | None, help="weights of the extractor")

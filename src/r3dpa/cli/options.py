@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-__all__ = ["EditOptions", "SceneOptions", "check_file", "check_folder", "check_least"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:

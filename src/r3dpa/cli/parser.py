@@ -9,11 +9,9 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from inspect import cleandoc
 from types import UnionType
-from typing import Any, NoReturn, Union, get_args, get_origin
+from typing import Any, NoReturn, Union, cast, get_args, get_origin
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
-
-__all__ = ["OneLineErrors", "load", "parse", "run_function"]
 
 # jsonargparse denies os.system and its like already when a YAML file names them.
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
@@ -85,17 +83,17 @@ def _with_lists(parser: Parser, words: Sequence[str]) -> list[str]:
 
 def _item_types(kind: Any) -> set[Any]:
     """Types of the items of a list or tuple, also of an optional one; empty for other types."""
-    if get_origin(kind) in (list, tuple):
+    if get_origin(kind) in (list, tuple, Sequence):
         return set(get_args(kind))
     union = get_origin(kind) in (Union, UnionType)
     return set().union(*map(_item_types, get_args(kind))) if union else set()
 
 
 def load(target: str) -> Callable[..., Any]:
-    """The function of ``file:name`` below ``r3dpa.cli``."""
+    """The function of ``file:name`` below ``r3dpa.cli``, or of ``r3dpa.area:name``."""
     file, _, name = target.partition(":")
-    function: Callable[..., Any] = getattr(import_module(f"r3dpa.cli.{file}"), name)
-    return function
+    module = import_module(file if file.startswith("r3dpa.") else f"r3dpa.cli.{file}")
+    return cast(Callable[..., Any], getattr(module, name))
 
 
 def parse(
@@ -103,12 +101,13 @@ def parse(
 ) -> tuple[Parser, Namespace]:
     """Parser of a function and the values of a command line.
 
-    Keyword-only arguments are options, others may be positional.
+    Keyword-only arguments are options, and so are those of functions outside this package.
     """
+    positional = function.__module__.startswith("r3dpa.cli.")
     description = cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]
     parser = Parser(prog=prog, description=description)
     parser.add_argument("--config", action="config", help="YAML file with options")
-    parser.add_function_arguments(function, as_positional=True, as_group=False)
+    parser.add_function_arguments(function, as_positional=positional, as_group=False)
     return parser, parser.parse_args(_with_lists(parser, words))
 
 

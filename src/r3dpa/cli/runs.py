@@ -15,8 +15,6 @@ if MYPY:
     from r3dpa.checkpoints import Checkpoint
     from r3dpa.modules import GenerativeModule
 
-__all__ = ["convert", "replay", "report"]
-
 _AUTOCAST = {"bf16-mixed": "bfloat16", "16-mixed": "float16"}
 
 

@@ -7,8 +7,6 @@ from typing import Any, Literal
 
 from r3dpa.cli.options import SceneOptions, check_least
 
-__all__ = ["sample"]
-
 
 def sample(
     *,
@@ -102,16 +100,10 @@ def sample(
         compile=compile,
     )
     generator.prepare()
-    request = provenance(checkpoint, files.ckpt, generator.geometry)
+    request = provenance(checkpoint, files, num, device, generator.geometry)
     request |= {
-        "weights": files.weights,
-        "num": num,
-        "seed": files.seed,
         "precision": precision,
         "compile": compile,
-        "batch_size": files.batch_size,
-        "device": device,
-        "formats": list(files.formats),
         "sampler": asdict(sampler),
         "autoguidance": about_guide,
     }

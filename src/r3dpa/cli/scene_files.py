@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,13 @@ from tqdm import tqdm
 import r3dpa
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.data.scans import ScanError, read_npz, read_ply, read_scan
+from r3dpa.cli.options import SceneOptions
+from r3dpa.data.scans import ScanError, find_scans, read_beside, read_npz, read_ply, read_scan
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import atomic_path, source_commit
 from r3dpa.simulation import Origin, Semantic
-
-__all__ = [
-    *("draw_all", "draw_scene", "feature_source_of", "generate_all", "provenance"),
-    *("read_clouds", "write_page", "written"),
-]
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
 # that is not named here takes one of the palette.
@@ -83,15 +80,23 @@ def feature_source_of(checkpoint: Checkpoint) -> str:
     return checkpoint.feature_source
 
 
-def provenance(checkpoint: Checkpoint, path: Path, geometry: ScanGeometry) -> dict[str, Any]:
-    """Checkpoint, geometry and versions, as the metadata of scenes holds them."""
+def provenance(
+    checkpoint: Checkpoint, options: SceneOptions, num: int, device: str, geometry: ScanGeometry
+) -> dict[str, Any]:
+    """Checkpoint, request, geometry and versions, as the metadata of scenes holds them."""
     return {
-        "checkpoint": str(path),
-        "checkpoint_written": written(path),
+        "checkpoint": str(options.ckpt),
+        "checkpoint_written": written(options.ckpt),
         "stage": checkpoint.stage,
         "step": checkpoint.step,
         "feature_source": checkpoint.feature_source,
         "interpolant": checkpoint.interpolant,
+        "weights": options.weights,
+        "num": num,
+        "seed": options.seed,
+        "batch_size": options.batch_size,
+        "device": device,
+        "formats": list(options.formats),
         "geometry": geometry.to_dict(),
         "r3dpa": r3dpa.__version__,
         "commit": source_commit(),
@@ -150,6 +155,21 @@ def draw_all(out: Path, range_path: Path, pictures: int, geometry: ScanGeometry)
         return f"open {out / 'scenes.png'}"
     page = write_page(out / "scenes.html", scans, f"{out.resolve().name} - r3dpa sample")
     return f"open {out / 'scenes.png'} and {page}"
+
+
+def page_scans(source: Path) -> list[Callable[[], viz.PageScan]]:
+    """Readers of the scans of a folder or file, in order."""
+
+    def read(name: str, path: Path) -> viz.PageScan:
+        (points,) = read_clouds(path).values()
+        if path.suffix == ".ply":
+            return viz.PageScan(name, points)
+        return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
+
+    if source.suffix == ".npz" and source.is_file():
+        clouds = read_clouds(source).items()
+        return [partial(viz.PageScan, f"{source.stem}/{name}", points) for name, points in clouds]
+    return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 
 
 def write_page(

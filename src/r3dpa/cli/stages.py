@@ -22,8 +22,6 @@ from r3dpa.cli.parser import OneLineErrors
 from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
 from r3dpa.modules import GenerativeModule
 
-__all__ = ["StageCLI", "StageParser", "conf_folder", "ignore_harmless_warnings", "run"]
-
 # Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, and
 # a process may have no scan.
 _HARMLESS = (

@@ -22,9 +22,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from tqdm import tqdm
 
@@ -95,11 +95,12 @@ class SimulationReport:
 
 def simulate(
     out: Path,
-    scans: int,
+    scans: int = 100,
     seed: int = 0,
     workers: int = 1,
     drives: Sequence[str] | None = None,
     sensor: str | SpinningLidar = "hdl64e",
+    return_mode: Literal["strongest", "dual"] | None = None,
     effects: Mapping[str, str | bool] | None = None,
     weather: Weather | None = None,
 ) -> SimulationReport:
@@ -115,12 +116,15 @@ def simulate(
         scans: Scans of all drives together, 1 or more.
         seed: Seed of streets and instrument, 0 or greater.
         workers: Processes; more than one needs an importable main module, as ``spawn`` does.
-        drives: Four-digit drives to write; by default all official training and validation
-            drives. With drives of both splits, a fifth of the scans (at least one, if there are
-            two or more) is for validation.
-        sensor: Instrument, or an argument of ``load_sensor``.
-        effects: ``off`` or ``auto`` by effect; those not named are ``auto``.
-        weather: Of all scans; drawn for each stretch of street if None.
+        drives: Four-digit drives, such as ``0000 0003``; default: all of training and validation.
+            With drives of both splits, a fifth of the scans (at least one, if there are two or
+            more) is for validation.
+        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
+            reads, for an HDL-64E; in Python any instrument.
+        return_mode: Strongest return of each shot, or the two strongest; default: as the sensor.
+        effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
+        weather: Of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each stretch
+            of street.
 
     Returns:
         Contents of the data set by effect, also written to ``report.json``.
@@ -134,6 +138,8 @@ def simulate(
         raise ValueError(f"workers must be 1 or greater, got {workers}")
     if isinstance(sensor, str):
         sensor = load_sensor(sensor)
+    if return_mode is not None:
+        sensor = replace(sensor, return_mode=return_mode)
     names = (*TRAIN_DRIVES, *VAL_DRIVES) if drives is None else tuple(drives)
     counts = split_scans(scans, names)
     simulators = {drive: Simulator(seed, int(drive), weather, sensor, effects) for drive in counts}
