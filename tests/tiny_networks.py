@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
@@ -50,3 +51,16 @@ def tiny_checkpoint(path, geometry, spread=0.1, sit_args=None, **fields):
     }
     content = Checkpoint(Path("tiny"), "joint", networks, geometry=geometry.to_dict(), **fields)
     return save_checkpoint(content, path)
+
+
+def aligned_velocity(velocity, project_features):
+    """An aligned velocity of two functions that share no work."""
+
+    def evaluate(x, time):
+        def finish():
+            with torch.no_grad():
+                return velocity(x.detach(), time)
+
+        return SimpleNamespace(features=project_features(x, time), velocity=finish)
+
+    return evaluate

@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from r3dpa.bench.measure import compare, flop_of, timed
-from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
+from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn import LatentNorm, SiT
@@ -70,17 +70,11 @@ def bench_scene(benchmark, sit, precision, alone):
 class BenchGuidance:
     @pytest.fixture
     def ways(self, sit):
-        """Plain velocity, guided by features, and guided with features computed apart."""
+        """Plain velocity, and guided by features."""
         target = FeatureTarget(torch.randn(1, 512, sit.feature_dim))
-
-        def guided(aligned):
-            return FeatureGuidance(sit.velocity, aligned, target, scale=0.5, relative=True)
-
-        return {
-            "plain": sit.velocity,
-            "guided": guided(sit.aligned_pass),
-            "guided, features apart": guided(aligned_velocity(sit.velocity, sit.project_features)),
-        }
+        options = {"scale": 0.5, "relative": True}
+        guided = FeatureGuidance(sit.velocity, sit.aligned_pass, target, **options)
+        return {"plain": sit.velocity, "guided": guided}
 
     @pytest.mark.parametrize("way", ["plain", "guided"])
     def bench_velocity(self, benchmark, sit, ways, way, one_thread):

@@ -3,9 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 from einops import rearrange
+from tiny_networks import aligned_velocity
 
 from r3dpa.bench.measure import flop_of
-from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
+from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import euler, heun, ode_solver
 from r3dpa.flow.times import ode_times, sde_times

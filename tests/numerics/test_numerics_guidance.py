@@ -6,12 +6,12 @@ import weakref
 
 import pytest
 import torch
+from tiny_networks import aligned_velocity
 
 from r3dpa.bench.problems import GaussianMixture
 from r3dpa.flow import (
     FeatureGuidance,
     FeatureTarget,
-    aligned_velocity,
     euler,
     euler_maruyama,
     heun,

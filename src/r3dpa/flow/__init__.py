@@ -2,7 +2,7 @@
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
-from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget, aligned_velocity
+from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.interpolant import Interpolant, sample_time
 from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import (
@@ -29,7 +29,6 @@ __all__ = [
     "Velocity",
     "ab2",
     "ab3",
-    "aligned_velocity",
     "autoguided",
     "dpm_solver_pp_2m",
     "euler",

@@ -10,13 +10,9 @@ import math
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import check_interval, per_sample
-
-__all__ = ["autoguided", "renormalised"]
-
-_LINEAR = Interpolant("linear")
 
 
 def autoguided(
@@ -75,7 +71,7 @@ def autoguided(
 
 
 def renormalised(
-    weak: Velocity, scale: float, shift: Tensor, interpolant: Interpolant = _LINEAR
+    weak: Velocity, scale: float, shift: Tensor, interpolant: Interpolant = LINEAR
 ) -> Velocity:
     """Velocity of a model whose latents are ``scale * latents + shift``, for these latents.
 

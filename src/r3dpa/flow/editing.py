@@ -18,13 +18,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.solvers import AfterStep, Velocity, ode_solver
 from r3dpa.flow.times import batch_time, step_pairs
-
-__all__ = ["Trajectory", "invert", "kept", "pnp_flow_feature", "renoised", "spherical_mean"]
-
-_LINEAR = Interpolant("linear")
 
 
 class Trajectory(NamedTuple):
@@ -40,7 +36,7 @@ def invert(
     times: Tensor,
     solver: str = "midpoint",
     *,
-    interpolant: Interpolant = _LINEAR,
+    interpolant: Interpolant = LINEAR,
 ) -> Trajectory:
     """Carry data along the probability flow towards noise, on a sampling grid in reverse.
 
@@ -77,7 +73,7 @@ def renoised(
     trajectory: Trajectory,
     edit_mask: Tensor,
     noise: Tensor,
-    interpolant: Interpolant = _LINEAR,
+    interpolant: Interpolant = LINEAR,
 ) -> Tensor:
     """Start of an edit: fresh noise inside the mask, the inverted latents elsewhere.
 
@@ -215,8 +211,8 @@ def pnp_flow_feature(
         step = now**exponent
         x = x - step * feature_term(x, time).to(x.dtype)
         x = torch.where(edit_mask, x, x - step * (x - latents))
-        noisy = _LINEAR.interpolate(x, draw.to(x), time)
-        x = _LINEAR.denoise(velocity(noisy, time), noisy, time).to(x.dtype)
+        noisy = LINEAR.interpolate(x, draw.to(x), time)
+        x = LINEAR.denoise(velocity(noisy, time), noisy, time).to(x.dtype)
     return x
 
 

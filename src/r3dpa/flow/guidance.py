@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import NamedTuple, Protocol, Self
 
 import torch
@@ -17,15 +16,6 @@ from torch import Tensor
 from r3dpa.flow.sde import DriftChange
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import check_interval, per_sample
-
-__all__ = [
-    "AlignedEvaluation",
-    "AlignedVelocity",
-    "FeatureGuidance",
-    "FeatureTarget",
-    "GuidanceRecord",
-    "aligned_velocity",
-]
 
 _COSINE_EPS = 1e-6
 
@@ -43,23 +33,6 @@ class AlignedEvaluation(Protocol):
 
 
 AlignedVelocity = Callable[[Tensor, Tensor], AlignedEvaluation]
-
-
-def aligned_velocity(velocity: Velocity, project_features: Velocity) -> AlignedVelocity:
-    """An aligned velocity of two functions that share no work, such as an autoguided velocity.
-
-    A network's own ``aligned_pass`` does not evaluate its first blocks twice. ``project_features``
-    is ``(x (B, ...), time (B,)) -> (B, N, F)``, differentiable in ``x``.
-    """
-
-    def evaluate(x: Tensor, time: Tensor) -> AlignedEvaluation:
-        def finish() -> Tensor:
-            with torch.no_grad():
-                return velocity(x.detach(), time)
-
-        return SimpleNamespace(features=project_features(x, time), velocity=finish)
-
-    return evaluate
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +135,7 @@ class FeatureGuidance:
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` without guidance.
         aligned: The same with projected features, see :class:`AlignedEvaluation`: the
-            ``aligned_pass`` of a network, or :func:`aligned_velocity`.
+            ``aligned_pass`` of a network.
         target: What to reach.
         scale: Strength, 0 or above.
         relative: Measure the strength in velocities rather than in gradients.

@@ -16,8 +16,6 @@ from torch import Tensor
 
 from r3dpa.flow.times import per_sample
 
-__all__ = ["Interpolant", "PathCoefficients", "sample_time"]
-
 
 class PathCoefficients(NamedTuple):
     """Coefficients of ``x_t = alpha data + sigma noise`` and their time derivatives.
@@ -110,6 +108,9 @@ class Interpolant:
             return (2 - time) * velocity + x
         u_cot_u = torch.cos(math.pi / 2 * time) / torch.sinc(time / 2)
         return (1 + (4 / math.pi**2) * u_cot_u) * velocity + time * x
+
+
+LINEAR = Interpolant("linear")
 
 
 def sample_time(

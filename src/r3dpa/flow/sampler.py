@@ -16,18 +16,7 @@ from r3dpa.flow.sde import euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, Velocity, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
-__all__ = ["Quality", "SamplerConfig", "Solver"]
-
-Solver = Literal[
-    "euler",
-    "heun",
-    "midpoint",
-    "ab2",
-    "ab3",
-    "dpmpp_2m",
-    "unipc",
-    "euler_maruyama",
-]
+Solver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "euler_maruyama"]
 Quality = Literal["draft", "good", "best"]
 
 

@@ -9,15 +9,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.solvers import Velocity
 from r3dpa.flow.times import batch_time, step_pairs
 
-__all__ = ["DriftChange", "euler_maruyama"]
-
 DriftChange = Callable[[Tensor, Tensor, Tensor], Tensor]
-
-_LINEAR = Interpolant("linear")
 
 
 @torch.no_grad()
@@ -28,7 +24,7 @@ def euler_maruyama(
     noise: torch.Generator | Iterable[Tensor],
     *,
     eta: float = 1.0,
-    interpolant: Interpolant = _LINEAR,
+    interpolant: Interpolant = LINEAR,
     last: Literal["denoise", "mean"] = "denoise",
     change_drift: DriftChange | None = None,
 ) -> Tensor:

@@ -26,32 +26,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.times import batch_time, step_pairs
-
-__all__ = [
-    "ODE_SOLVERS",
-    "AfterStep",
-    "OdeSolver",
-    "Velocity",
-    "ab2",
-    "ab3",
-    "dpm_solver_pp_2m",
-    "euler",
-    "evaluations",
-    "heun",
-    "midpoint",
-    "ode_solver",
-    "steps_for",
-    "unchanged",
-    "unipc",
-]
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 OdeSolver = Callable[[Velocity, Tensor, Tensor], Tensor]
 AfterStep = Callable[[Tensor, float, int], Tensor]
-
-_LINEAR = Interpolant("linear")
 
 
 def unchanged(x: Tensor, time: float, index: int) -> Tensor:
@@ -135,7 +115,7 @@ def dpm_solver_pp_2m(
     x: Tensor,
     times: Tensor,
     *,
-    interpolant: Interpolant = _LINEAR,
+    interpolant: Interpolant = LINEAR,
     after_step: AfterStep = unchanged,
 ) -> Tensor:
     """DPM-Solver++(2M) on the path of ``interpolant``; order 2, one evaluation per step.
@@ -167,7 +147,7 @@ def unipc(
     x: Tensor,
     times: Tensor,
     *,
-    interpolant: Interpolant = _LINEAR,
+    interpolant: Interpolant = LINEAR,
     after_step: AfterStep = unchanged,
 ) -> Tensor:
     """UniPC-2 with ``B_2(h)`` on the path of ``interpolant``; one evaluation per step.
@@ -195,7 +175,7 @@ ODE_SOLVERS: dict[str, Callable[..., Tensor]] = {
 
 
 def ode_solver(
-    name: str, interpolant: Interpolant = _LINEAR, after_step: AfterStep = unchanged
+    name: str, interpolant: Interpolant = LINEAR, after_step: AfterStep = unchanged
 ) -> OdeSolver:
     """The solver of that name, for velocities of that path.
 

@@ -7,8 +7,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-__all__ = ["batch_time", "check_interval", "ode_times", "per_sample", "sde_times", "step_pairs"]
-
 
 def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0, shift: float = 1.0) -> Tensor:
     """Times ``(num_steps + 1,)`` of an ODE solver, equidistant in the unshifted time u.
