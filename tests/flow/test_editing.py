@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from velocities import still
 
 from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
 from r3dpa.flow.interpolant import Interpolant
@@ -17,14 +18,6 @@ def edit_mask():
     mask = torch.zeros(2, 1, 4, 6, dtype=torch.bool)
     mask[:, :, :, 2:4] = True
     return mask
-
-
-def no_feature(x, time):
-    return torch.zeros_like(x)
-
-
-def still(x, time):
-    return torch.zeros_like(x)
 
 
 def silence(num):
@@ -186,8 +179,6 @@ def test_steps_by_hand():
 
 def test_edit_that_cannot_run_is_refused():
     with pytest.raises(ValueError, match=r"\(2, 1, 4, 6\); got torch.float32"):
-        pnp_flow_feature(
-            still, no_feature, latents(), edit_mask().float(), ode_times(2), silence(3)
-        )
+        pnp_flow_feature(still, still, latents(), edit_mask().float(), ode_times(2), silence(3))
     with pytest.raises(ValueError, match="3 times, 2 draws"):
-        pnp_flow_feature(still, no_feature, latents(), edit_mask(), ode_times(2), silence(2))
+        pnp_flow_feature(still, still, latents(), edit_mask(), ode_times(2), silence(2))

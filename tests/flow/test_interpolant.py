@@ -33,13 +33,10 @@ def test_path_goes_from_data_to_noise(path):
     torch.testing.assert_close(path.interpolate(data, noise, ones), noise, atol=1e-14, rtol=0)
 
 
-def test_linear_path_by_hand():
+def test_paths_by_hand():
     data, noise, time = torch.tensor([4.0]), torch.tensor([8.0]), torch.tensor([0.25])
     assert Interpolant().interpolate(data, noise, time).item() == 5.0
     assert Interpolant().target(data, noise, time).item() == 4.0
-
-
-def test_cosine_path_by_hand():
     data, noise, time = torch.tensor([1.0]), torch.tensor([2.0]), torch.tensor([1 / 3])
     path = Interpolant("cosine")  # angle of 30 degrees
     middle = path.interpolate(data, noise, time).item()
@@ -75,12 +72,11 @@ def test_sde_drift_equals_the_divided_form_and_is_finite_at_both_ends(path):
     divided = velocity - time[:, None, None] * path.score(velocity, x, time)
     drift = path.sde_drift(velocity, x, time)
     torch.testing.assert_close(drift, divided, atol=1e-12, rtol=1e-12)
-    for dtype in (torch.float64, torch.float32, torch.bfloat16):
-        v, y, ends = velocity[:2].to(dtype), x[:2].to(dtype), torch.tensor([0, 1]).to(dtype)
-        assert path.sde_drift(v, y, ends).isfinite().all()
-        assert path.denoise(v, y, ends).isfinite().all()
-        naive = v - ends[:, None, None] * path.score(v, y, ends)
-        assert not naive.isfinite().all()
+    ends = torch.tensor([0, 1]).double()
+    assert path.sde_drift(velocity[:2], x[:2], ends).isfinite().all()
+    assert path.denoise(velocity[:2], x[:2], ends).isfinite().all()
+    naive = velocity[:2] - ends[:, None, None] * path.score(velocity[:2], x[:2], ends)
+    assert not naive.isfinite().all()
 
 
 def test_sde_drift_by_hand():

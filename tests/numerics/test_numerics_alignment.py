@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -31,28 +33,23 @@ def test_gradient_at_zero_is_bounded_and_empty_cells_have_none(dtype):
     assert gradient.isfinite().all()
     assert gradient.float().norm(dim=-1).max() <= 1e6 / 4 * 1.01  # 1 / eps, in a mean of 4
     grid[:, 1:] = 0
+    tokens = torch.randn(2, 4, 768, generator=torch.Generator().manual_seed(1)).to(dtype)
     for skip in (False, True):
-        tokens = torch.randn(2, 4, 768, generator=torch.Generator().manual_seed(1)).to(dtype)
-        gradient = gradient_of(
-            lambda x, y, skip=skip: alignment_loss(x, y, skip_empty_cells=skip), tokens, grid
-        )
+        loss = partial(alignment_loss, skip_empty_cells=skip)
+        gradient = gradient_of(loss, tokens, grid)
         assert (gradient[:, 1:] == 0).all()
         assert (gradient[:, 0] != 0).any()
-        both = gradient_of(
-            lambda x, y, skip=skip: alignment_loss(x, y, skip_empty_cells=skip), projected, 0 * grid
-        )
-        assert (both == 0).all()
+        assert (gradient_of(loss, projected, 0 * grid) == 0).all()
     wrong = gradient_of(normalised_loss, projected, grid).float().norm(dim=-1).max()
     assert wrong > 1e11
 
 
-@pytest.mark.parametrize("dtype", [torch.float16])
 @pytest.mark.numerics("vectors of length zero")
-def test_loss_of_float16_zeros_is_zero(dtype):
+def test_loss_of_float16_zeros_is_zero():
     """Inference only, a gradient of 1 / eps is beyond float16."""
-    zeros = torch.zeros(2, 4, 768, dtype=dtype)
+    zeros = torch.zeros(2, 4, 768, dtype=torch.float16)
     assert (alignment_loss(zeros, torch.ones_like(zeros)) == 0).all()
-    eps = torch.tensor(1e-12, dtype=dtype)
+    eps = torch.tensor(1e-12, dtype=torch.float16)
     assert (zeros / zeros.norm(dim=-1, keepdim=True).clamp_min(eps.item())).isnan().all()
 
 
@@ -74,8 +71,7 @@ def test_cosine_is_exact_to_float32(dtype):
     wide = F.cosine_similarity(projected.to(half).double(), grid.to(half).double(), dim=-1)
     error = (cosines.double() - wide).abs().max()
     assert error > 1e-4
-    above = ((a * a).sum(dim=-1) > 1).float().mean()
-    assert above > 0
+    assert ((a * a).sum(dim=-1) > 1).any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *HALF])
@@ -101,10 +97,7 @@ def test_large_and_small_features_have_the_cosine_of_their_directions(dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.numerics("collapse of the gradients")
 def test_a_zeroed_network_has_no_gradient(dtype):
-    """All weights are zero: the loss is 0, finite, and no layer before the last learns anything.
-
-    The logged ``grad_norm/<network>`` shows it.
-    """
+    """The loss is 0, and no layer before the last learns anything."""
     network = nn.Sequential(nn.Linear(6, 16), nn.SiLU(), nn.Linear(16, 16), nn.Linear(16, 8))
     grid = torch.randn(2, 4, 8, generator=torch.Generator().manual_seed(0))
     tokens = torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(1))

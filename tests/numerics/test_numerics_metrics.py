@@ -45,11 +45,9 @@ def test_the_distance_of_few_samples_is_real_and_not_negative(dtype):
     assert math.isfinite(distance)
     assert distance == pytest.approx(frechet_distance_of(b, a), rel=1e-12)
     assert 0 <= frechet_distance_of(a, a) < 1e-8
-    covariances = (x.covariance() @ y.covariance()).float()
-    as_if_symmetric = torch.linalg.eigvalsh(covariances)
+    as_if_symmetric = torch.linalg.eigvalsh((x.covariance() @ y.covariance()).float())
     assert as_if_symmetric.min() < -1e-3
-    roots = as_if_symmetric.sqrt().sum()
-    assert roots.isnan()
+    assert as_if_symmetric.sqrt().sum().isnan()
 
 
 @pytest.mark.numerics("root of a singular covariance product")
@@ -72,8 +70,7 @@ def test_flat_and_empty_covariances():
 
     check()
     line = torch.outer(*2 * [torch.arange(1.0, 6.0)])
-    broken = torch.linalg.eigvalsh(line).sqrt()
-    assert broken.isnan().any()
+    assert torch.linalg.eigvalsh(line).sqrt().isnan().any()
 
 
 @pytest.mark.numerics("Frechet distance of few samples")
@@ -100,9 +97,8 @@ def test_fewer_samples_than_features_are_refused():
         metric.compute()
     with pytest.raises(ValueError, match="at least 68 are needed; polynomial_mmd has no bias"):
         fd_infinity(a, b, generator())
-    few = frechet_distance_of(a, b)
     many = frechet_distance_of(drawn(0, 4000, 16), drawn(1, 4000, 16))
-    assert few > 30 * many
+    assert frechet_distance_of(a, b) > 30 * many
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -178,20 +174,17 @@ def test_a_difference_within_the_intervals_is_a_tie():
         return histogram_distance(real.sum(0), scenes.sum(0)).jsd_distance
 
     resampling = Resampling(num_resamples=1000)
-    rows = [
-        MetricResult(
-            "JSD",
-            distance(scenes),
-            resampling.interval(lambda drawn, scenes=scenes: distance(scenes[drawn]), 60),
-        )
-        for scenes in models
-    ]
-    assert rows[0].ties_with(rows[1])
+
+    def row_of(scenes):
+        interval = resampling.interval(lambda drawn: distance(scenes[drawn]), 60)
+        return MetricResult("JSD", distance(scenes), interval)
+
+    one, other = map(row_of, models)
+    assert one.ties_with(other)
     floor = distance(clouds(3))
-    values = [row.value for row in rows]
-    assert all(abs(value - floor) < 0.1 * floor for value in values)
-    assert values[0] != values[1]
-    assert min(values) > 0.05
+    assert [one.value, other.value] == pytest.approx([floor, floor], rel=0.1)
+    assert one.value != other.value
+    assert min(one.value, other.value) > 0.05
 
 
 GRID = BEVGrid(8.0, 0.25)
@@ -211,8 +204,7 @@ def test_an_empty_cloud_is_refused_by_name_wherever_it_stands(place):
     reference = drawn(5, 30, 3)
     means = [torch.cdist(cloud, reference).square().mean().item() for cloud in clouds]
     orders = min(means), min(reversed(means))
-    wrong = math.isnan(torch.tensor(means).min())
-    assert wrong
+    assert torch.tensor(means).min().isnan()
     assert place == 1 or any(map(math.isnan, orders))
 
 
@@ -276,8 +268,7 @@ def test_a_broken_feature_is_named_by_its_row(value, dtype):
             compare(good, broken)
         with pytest.raises(ValueError, match=f"real features: {message}"):
             compare(broken, good)
-    mean = broken.double().mean(0)
-    assert not mean[2].isfinite()
+    assert not broken.double().mean(0)[2].isfinite()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

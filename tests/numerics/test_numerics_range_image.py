@@ -30,12 +30,15 @@ DTYPES = [torch.float32, torch.bfloat16]
 exhaustive = settings(derandomize=True, max_examples=25, deadline=None)
 
 
+def vae_of(**options):
+    torch.manual_seed(0)
+    sizes = {"num_res_blocks": 1, "attention_levels": (2,)}
+    return VAE(1, 4, 32, (1, 1, 2, 2), **sizes, **options).requires_grad_(False)
+
+
 @pytest.fixture(scope="module")
 def vae():
-    torch.manual_seed(0)
-    return VAE(1, 4, 32, (1, 1, 2, 2), num_res_blocks=1, attention_levels=(2,)).requires_grad_(
-        False
-    )
+    return vae_of()
 
 
 def autocast(dtype):
@@ -52,10 +55,8 @@ def test_nominal_beams_leave_rows_of_equal_pitch_empty():
     inclinations = torch.cat([upper, lower]).double() - 0.01
     azimuth = (torch.arange(2083).double() + 0.5) * (2 * math.pi / 2083)
     up = inclinations.deg2rad()[:, None]
-    directions = torch.stack(
-        [up.cos() * azimuth.cos(), up.cos() * azimuth.sin(), up.sin().expand(64, 2083)], dim=-1
-    )
-    points = (20 * directions).reshape(-1, 3).float()  # ring after ring, as a file
+    xyz = up.cos() * azimuth.cos(), up.cos() * azimuth.sin(), up.sin().expand(64, 2083)
+    points = (20 * torch.stack(xyz, dim=-1)).reshape(-1, 3).float()  # ring after ring, as a file
 
     sensor = LidarSensor()
     hit = range_image(points, SphericalProjection(sensor))[0] > 0
@@ -141,10 +142,7 @@ def test_rotated_latents_decode_to_a_rotated_image(dtype, vae):
             still, turned = (network.decode(latents.roll(k, -1)).float() for k in (0, 3))
         return ((turned - still.roll(24, -1)).norm() / still.norm()).item()
 
-    legacy = VAE(
-        1, 4, 32, (1, 1, 2, 2), num_res_blocks=1, attention_levels=(2,), legacy_upsample=True
-    ).requires_grad_(False)
-    legacy.load_state_dict(vae.state_dict())
+    legacy = vae_of(legacy_upsample=True)
     # In bfloat16 sums of another order may round to another number, layer after layer.
     assert error(vae) < (1e-5 if dtype == torch.float32 else 3e-2)
     assert error(legacy) > 0.1
@@ -164,9 +162,6 @@ def test_a_half_empty_grid_has_the_loss_of_its_full_half(dtype):
     assert (alignment_loss(projected, 0 * half, skip_empty_cells=True) == 0).all()
     diluted = alignment_loss(projected, half) / full_half
     torch.testing.assert_close(diluted, torch.full((3,), 0.5))
-
-
-# Properties.
 
 
 @st.composite

@@ -132,23 +132,15 @@ def test_sde_starts_and_ends_with_finite_numbers(path, dtype):
     x = torch.randn(4, 16, generator=generator)
     velocity = torch.randn(4, 16, generator=generator).to(dtype)
     for last in ("denoise", "mean"):
-        result = euler_maruyama(
-            lambda x, time: velocity,
-            x.to(dtype),
-            sde_times(4),
-            generator,
-            interpolant=interpolant,
-            last=last,
-        )
-        assert result.isfinite().all()
+        options = {"interpolant": interpolant, "last": last}
+        args = lambda x, time: velocity, x.to(dtype), sde_times(4), generator
+        assert euler_maruyama(*args, **options).isfinite().all()
     ends = torch.tensor([0.0, 0.0, 1.0, 1.0])
     assert interpolant.sde_drift(velocity, x, ends).isfinite().all()
     divided = velocity - ends[:, None] * interpolant.score(velocity, x, ends)
     assert not divided[:2].isfinite().any()
     assert divided[2:].isfinite().all()
 
-
-# Properties.
 
 unit_interval = st.floats(0, 1, width=32)
 

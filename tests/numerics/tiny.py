@@ -26,6 +26,7 @@ def batch_of(seed, size=2):
         "range_image": drawn(seed, size, 1, 8, 16).tanh(),
         "valid_mask": torch.ones(size, 1, 8, 16, dtype=torch.bool),
         "feature_grid": drawn(seed + 1, size, 8, FEATURE_DIM),
+        "index": torch.arange(size),
     }
 
 
@@ -53,42 +54,35 @@ class TinyData(LidarDataModule):
         return DataLoader(self.batches, batch_size=None)
 
     def val_dataloader(self):
-        return DataLoader(self.batches, batch_size=None)
+        return self.train_dataloader()
 
     def state_dict(self):
         return {}
 
 
 def vae():
-    return VAE(
-        latent_channels=LATENT_CHANNELS,
-        channels=32,
-        channel_multipliers=(1, 1),
-        strides=((2, 2),),
-        num_res_blocks=1,
-    )
+    sizes = {"channels": 32, "channel_multipliers": (1, 1), "strides": ((2, 2),)}
+    return VAE(latent_channels=LATENT_CHANNELS, num_res_blocks=1, **sizes)
+
+
+def vae_losses(made, image):
+    """Reconstruction of an image, and the losses of the VAE."""
+    posterior = made.vae.encode(image)
+    reconstruction = made.vae.decode(posterior.mean)
+    return reconstruction, made.vae_losses(image, posterior, reconstruction)
 
 
 def module(stage="joint", **kwargs):
     """A training module of ``STAGES``, without a stage before it."""
     torch.manual_seed(0)
-    sit = SiT(
-        input_size=(4, 8),
-        in_channels=LATENT_CHANNELS,
-        hidden_size=8,
-        depth=2,
-        num_heads=2,
-        alignment_depth=1,
-        feature_dim=FEATURE_DIM,
-        projector_dim=8,
-    )
+    sizes = {"in_channels": LATENT_CHANNELS, "hidden_size": 8, "depth": 2, "num_heads": 2}
+    head = {"alignment_depth": 1, "feature_dim": FEATURE_DIM, "projector_dim": 8}
+    sit = SiT(input_size=(4, 8), **sizes, **head)
     for parameter in sit.parameters():  # a fresh one has zero gates: no gradient would pass
         nn.init.normal_(parameter, std=0.3)
     discriminator = PatchDiscriminator(channels=4, num_layers=1)
-    norm = LatentNorm(LATENT_CHANNELS)
-    made = STAGES[stage](
-        vae=vae(), sit=sit, discriminator=discriminator, latent_norm=norm, **kwargs
-    )
+    networks = {"vae": vae(), "sit": sit, "discriminator": discriminator}
+    made = STAGES[stage](**networks, latent_norm=LatentNorm(LATENT_CHANNELS), **kwargs)
     made.load_previous_stage = lambda: None
     return made
 
