@@ -68,6 +68,12 @@ class TestHelp:
         (["edit", "vari"], "unknown command 'edit vari': give one of"),
         (["sample", "--ckpt", "a", "--out", "b", "--stepz", "3"], "--stepz"),
         (["sample", "--ckpt", "a"], "out"),
+        (
+            ["sample", "--ckpt", "a", "--out", "b", "--num", "0"],
+            "--num: Not of type PositiveInt: 0",
+        ),
+        (["sample", "--ckpt", "a", "--out", "b", "--seed", "-1"], "--seed: "),
+        (["reference", "--data", "a", "--out", "b", "--limit", "0"], "--limit: Not of type Pos"),
         (["features", "--dat", "x"], "dat"),
     ],
 )

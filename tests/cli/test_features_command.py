@@ -146,14 +146,8 @@ class TestForms:
     [
         (["--data", "no/folder"], "--data no/folder: is no folder of scans and no data YAML"),
         (["--data", "{scans}"], "there is no extractor: give --extractor, one of scalr, "),
-        (["--data", "{scans}", "--extractor", "scaler"], "no feature source 'scaler'; there are "),
-        (["--data", "{scans}", "--extractor", "scalr"], "scalr needs ckpt"),
         (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
         (["--data", "{yaml}", "--grid_sizes", "[[3, 8]]"], "grid.*3"),
-        (
-            ["--data", "{yaml}", "--data.init_args.batch_size", "0"],
-            "batch_size must be at least 1, got 0",
-        ),
         (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
     ],
 )

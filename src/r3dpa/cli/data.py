@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from r3dpa.cli.options import check_file, check_folder, check_least
+from jsonargparse.typing import PositiveInt
+
+from r3dpa.cli.options import check_file, check_folder
 
 
 def check(path: Path) -> None:
@@ -25,7 +27,7 @@ def check(path: Path) -> None:
 
 
 def view(
-    source: Path, *, out: Path | None = None, num: int = 8, reference: Path | None = None
+    source: Path, *, out: Path | None = None, num: PositiveInt = 8, reference: Path | None = None
 ) -> str:
     """Draw scans as range images, from above, and as a page with point clouds to turn.
 
@@ -40,7 +42,6 @@ def view(
     from r3dpa.data.scans import evenly
     from r3dpa.geometry import LidarSensor, SphericalProjection
 
-    check_least(1, num=num)
     check_folder(out)
     readers = page_scans(source)
     scans = [read() for read in evenly(readers, num)]
@@ -67,7 +68,7 @@ def objects(
     ckpt: Path,
     out: Path,
     features_ckpt: Path | None = None,
-    limit: int = 200,
+    limit: PositiveInt = 200,
     device: str = "auto",
 ) -> str:
     """Write the mean feature of each class of labelled scans, for ``r3dpa edit inpaint``.
@@ -96,7 +97,6 @@ def objects(
     check_file(out)
     if out.suffix != ".safetensors":
         raise ValueError(f"the library is a .safetensors file, got {out}")
-    check_least(1, limit=limit)
     source = feature_source_of(read_checkpoint(ckpt))
     generator = SceneGenerator.from_checkpoint(ckpt, device="cpu")
     projection, sit = generator.geometry.projection, generator.sit

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from jsonargparse.typing import PositiveInt
+
 from r3dpa.cli.options import EditOptions
 
 
@@ -21,7 +23,7 @@ def inpaint(
     window: tuple[float, float] | None = None,
     start: float = 1.0,
     dilation: int = 0,
-    num: int = 8,
+    num: PositiveInt = 8,
     **options: Any,
 ) -> str:
     """Generate a part of a scan anew, as an object if one is named.
@@ -85,7 +87,7 @@ def mix(
     features_ckpt: Path | None = None,
     strength: float = 0.5,
     window: tuple[float, float] = (0.0, 1.0),
-    num: int = 8,
+    num: PositiveInt = 8,
     **options: Any,
 ) -> str:
     """Generate scenes that follow one scan on one side and another scan on the other.
@@ -128,7 +130,7 @@ def complete(
     other_sensor: tuple[int, float, float] | None = None,
     mask: Path | None = None,
     start: float = 0.3,
-    num: int = 8,
+    num: PositiveInt = 8,
     **options: Any,
 ) -> str:
     """Fill a missing sector, dropped beams, or any pixels of a scan.
@@ -196,7 +198,7 @@ def complete(
     )
 
 
-def vary(*, scan: Path, start: float = 0.5, num: int = 8, **options: Any) -> str:
+def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any) -> str:
     """Generate scenes similar to a scan: part of the way to noise and back.
 
     Args:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.options import EditOptions, check_least
+from r3dpa.cli.options import EditOptions
 from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
@@ -53,7 +53,6 @@ class EditSession:
         strength: float | None = None,
         window: tuple[float, float] | None = None,
     ) -> None:
-        check_least(1, num=num)
         self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
         self.settings = EditSettings(options.solver, options.steps, options.shift, strength, window)

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.options import check_file, check_folder, check_least
+from jsonargparse.typing import PositiveInt
+
+from r3dpa.cli.options import check_file, check_folder
 
 
 def reference(
@@ -18,7 +20,7 @@ def reference(
     spaces: tuple[str, ...] = ("fwid", "fgeo"),
     ckpt: dict[str, Path] | None = None,
     split: Literal["train", "val", "all"] = "all",
-    limit: int | None = None,
+    limit: PositiveInt | None = None,
     protocol: Literal["default", "published"] = "default",
     device: str = "auto",
 ) -> str:
@@ -50,13 +52,12 @@ def reference(
     check_file(out)
     if out.exists():
         raise ValueError(f"{out} exists: delete it, or give another --out")
-    check_least(2, limit=limit)
     module = read_data(data)
     train, val = module.limited_split()
     scans = {"train": train, "val": val, "all": sorted(train + val)}[split]
-    if len(scans) < 2:
-        raise ValueError(f"{data}: the split {split} has {len(scans)} scans; at least 2 are needed")
     scans = evenly(scans, limit)
+    if len(scans) < 2:
+        raise ValueError(f"{data}: {len(scans)} scans of the split {split}; at least 2 are needed")
     setting = PROTOCOLS[protocol].with_sensor(module.sensor)
     found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}

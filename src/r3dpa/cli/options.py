@@ -1,10 +1,12 @@
-"""Options that ``r3dpa sample`` and the edits share, and checks of options before the work."""
+"""Options that ``r3dpa sample`` and the edits share, and checks before the work."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,17 +27,15 @@ class SceneOptions:
 
     ckpt: Path
     out: Path
-    seed: int = 0
-    batch_size: int = 8
+    seed: NonNegativeInt = 0
+    batch_size: PositiveInt = 8
     device: str = "auto"
     weights: Literal["ema", "last"] = "ema"
     formats: tuple[str, ...] = ("bin",)
-    pictures: int = 16
+    pictures: NonNegativeInt = 16
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        check_least(1, batch_size=self.batch_size)
-        check_least(0, seed=self.seed, pictures=self.pictures)
         check_folder(self.out)
 
 
@@ -52,13 +52,6 @@ class EditOptions(SceneOptions):
     solver: Literal["midpoint", "heun", "euler", "ab2", "ab3", "dpmpp_2m", "unipc"] = "midpoint"
     steps: int = 32
     shift: float = 1.0
-
-
-def check_least(least: int, **values: int | None) -> None:
-    """Refuses a number below ``least``; None is none."""
-    for name, value in values.items():
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}")
 
 
 def check_folder(out: Path | None) -> None:

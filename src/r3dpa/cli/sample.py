@@ -5,18 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from r3dpa.cli.options import SceneOptions, check_least
+from jsonargparse.typing import PositiveInt
+
+from r3dpa.cli.options import SceneOptions
 
 
 def sample(
     *,
-    num: int = 16,
+    num: PositiveInt = 16,
     quality: Literal["draft", "good", "best"] | None = None,
     solver: Literal[
         "euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "euler_maruyama"
     ]
     | None = None,
-    steps: int | None = None,
+    steps: PositiveInt | None = None,
     shift: float | None = None,
     eta: float | None = None,
     sde_last: Literal["denoise", "mean"] | None = None,
@@ -70,7 +72,6 @@ def sample(
         raise ValueError(
             "--guidance_scale, --guidance_interval and --allow_other_latents need --autoguidance"
         )
-    check_least(1, num=num)
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
