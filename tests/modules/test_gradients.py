@@ -10,7 +10,7 @@ from torch import nn
 
 from r3dpa.callbacks import StepGuard
 from r3dpa.modules import LossWeights
-from r3dpa.modules.base import frozen
+from r3dpa.modules.steps import frozen
 
 pytestmark = QUIET
 ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}

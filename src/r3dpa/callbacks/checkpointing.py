@@ -17,8 +17,6 @@ from lightning.pytorch.utilities import rank_zero_info
 from r3dpa.callbacks.step_guard import StepGuard
 from r3dpa.io import atomic_path
 
-__all__ = ["AtomicCheckpointIO", "RunCheckpoint"]
-
 
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints beside their place, then renames them: a partial file is never visible.
@@ -31,8 +29,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
     ) -> None:
         """Writes a checkpoint; an OSError names the file and the reason."""
-        if storage_options is not None:
-            raise TypeError(f"{type(self).__name__} supports no storage_options")
         # A file object: torch's own errors do not name the reason.
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)

@@ -20,8 +20,6 @@ from r3dpa.io import first_line
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import EMA
 
-__all__ = ["PictureLogger", "ReconstructionWriter"]
-
 
 class ReconstructionWriter(L.Callback):
     """Writes what ``r3dpa predict`` reconstructs, as ``<run_dir>/reconstructions/<scan>.bin``."""

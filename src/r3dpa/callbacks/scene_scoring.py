@@ -12,7 +12,6 @@ from typing import Any, Literal
 import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
@@ -38,8 +37,6 @@ from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
 from r3dpa.viz.evaluation import save_figures
-
-__all__ = ["SceneScorer"]
 
 _SAMPLER = SamplerConfig()
 
@@ -142,11 +139,10 @@ class SceneScorer(L.Callback):
         statistics, spaces, scans = self._job
         self._job = None
         folder = Path(trainer.default_root_dir) / "evaluation"
-        self._sample(trainer, pl_module, folder)
+        nfe = self._sample(trainer, pl_module, folder)
         trainer.strategy.barrier("SceneScorer")
         if not trainer.is_global_zero:
             return
-        made_with = self._made_with(trainer, pl_module, folder)
         if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
             path = folder / "reference.safetensors"
             sensor = statistics.protocol.sensor
@@ -163,7 +159,7 @@ class SceneScorer(L.Callback):
                 spaces,
                 label=folder.absolute().parent.name,
                 source=str(trainer.ckpt_path),
-                made_with=made_with,
+                made_with=self._made_with(trainer, pl_module, nfe),
                 allow_few=True,  # checked before; scenes left out later are listed
                 skip_bad=self.skip_bad,
             )
@@ -186,31 +182,23 @@ class SceneScorer(L.Callback):
         except ValueError as error:
             raise ValueError(f"scorer.reference: {error}") from error
 
-    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> None:
-        """Writes the batches of this process."""
+    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> int:
+        """Writes the batches of this process; network evaluations per scene, 0 without any."""
         assert module.ema is not None
         generator = averaged_generator(module, module.ema, self.sampler, self.precision)
         starts = range(0, self.num_scenes, self.batch_size)
         own = starts[trainer.global_rank :: trainer.world_size]
-        quiet = None if trainer.is_global_zero else True
+        quiet, nfe = None if trainer.is_global_zero else True, 0
         for first in tqdm(own, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
-            part = {"range_m": scenes.range_m.cpu().contiguous(), "nfe": torch.tensor(scenes.nfe)}
+            nfe = scenes.nfe
             with atomic_path(_part(folder, first)) as temporary:
-                save_file(part, temporary)
+                save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
+        return nfe
 
-    def _made_with(
-        self, trainer: L.Trainer, module: GenerativeModule, folder: Path
-    ) -> dict[str, Any]:
-        """Sampler, checkpoint and seed of the scenes, and their mean NFE."""
-        total = 0
-        for first in range(0, self.num_scenes, self.batch_size):
-            with safe_open(_part(folder, first), framework="pt") as file:
-                num = file.get_slice("range_m").get_shape()[0]
-                total += num * int(file.get_tensor("nfe"))
-        nfe = total / self.num_scenes  # whole but for a solver that chooses its steps
-        nfe = int(nfe) if nfe.is_integer() else nfe
+    def _made_with(self, trainer: L.Trainer, module: GenerativeModule, nfe: int) -> dict[str, Any]:
+        """Sampler, checkpoint and seed of the scenes."""
         return {
             "solver": self.sampler.solver,
             "steps": self.sampler.steps,

@@ -12,15 +12,13 @@ from lightning.pytorch.utilities import rank_zero_info
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, vae_fingerprint
 from r3dpa.modules import GenerativeModule
 
-__all__ = ["EMASnapshots"]
-
 _NORM_ARGS = ("channels", "eps", "momentum", "legacy_inverse", "replace_non_finite")
 
 
 class EMASnapshots(L.Callback):
     """Keeps the averaged SiT at a few early steps, as weak models for autoguidance.
 
-    Each step makes ``<run_dir>/<folder>/step_<step>.safetensors`` with its ``.yaml``: average,
+    Each step makes ``<run_dir>/snapshots/step_<step>.safetensors`` with its ``.yaml``: average,
     latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
     file that exists is never replaced. A stage without average keeps none.
 
@@ -29,14 +27,12 @@ class EMASnapshots(L.Callback):
     Args:
         fractions: Steps as parts of ``trainer.max_steps``, each in (0, 1].
         steps: Optimiser steps, at least 1; where given, ``fractions`` do not count.
-        folder: Below the folder of the run.
     """
 
     def __init__(
         self,
         fractions: Sequence[float] = (1 / 32, 1 / 16, 1 / 8),
         steps: Sequence[int] | None = None,
-        folder: str = "snapshots",
     ) -> None:
         if not all(0 < fraction <= 1 for fraction in fractions):
             raise ValueError(f"snapshot fractions must be in (0, 1], got {list(fractions)}")
@@ -44,7 +40,6 @@ class EMASnapshots(L.Callback):
             raise ValueError(f"snapshot steps must be at least 1, got {list(steps)}")
         self.fractions = tuple(fractions)
         self.steps = None if steps is None else frozenset(steps)
-        self.folder = folder
         self._due: frozenset[int] = frozenset()
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -57,11 +52,12 @@ class EMASnapshots(L.Callback):
         _sit_config(pl_module)
         if cast(Any, trainer).fast_dev_run:
             return
-        folder = Path(trainer.default_root_dir).resolve()
-        resumed = folder in Path(trainer.ckpt_path or "").resolve().parents
-        if not resumed and any((folder / self.folder).glob("step_*")):
+        run_dir = Path(trainer.default_root_dir).resolve()
+        folder = run_dir / "snapshots"
+        resumed = run_dir in Path(trainer.ckpt_path or "").resolve().parents
+        if not resumed and any(folder.glob("step_*")):
             raise ValueError(
-                f"{folder / self.folder} holds snapshots of an earlier run: delete them, or give "
+                f"{folder} holds snapshots of an earlier run: delete them, or give "
                 "another --run_dir"
             )
         if self.steps is not None:
@@ -82,7 +78,7 @@ class EMASnapshots(L.Callback):
             return
         assert isinstance(pl_module, GenerativeModule)
         step = trainer.global_step
-        path = Path(trainer.default_root_dir) / self.folder / f"step_{step:07d}.safetensors"
+        path = Path(trainer.default_root_dir) / "snapshots" / f"step_{step:07d}.safetensors"
         if not path.exists():  # with accumulated gradients, several batches end at one step
             # A description without weights may be left of a run that was killed: overwrite.
             save_checkpoint(_checkpoint(pl_module, path, step), path, overwrite=True)

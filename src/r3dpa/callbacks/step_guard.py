@@ -13,8 +13,6 @@ from torch import Tensor
 from r3dpa.callbacks.bad_batches import listed, report_skipped
 from r3dpa.modules.steps import batch_number, gradient_norms
 
-__all__ = ["StepGuard"]
-
 
 class StepGuard(L.Callback):
     """Skips a step with a loss, gradient norm or buffer that is not finite, on any process.

@@ -22,15 +22,13 @@ from r3dpa.modules import steps
 from r3dpa.modules.checks import (
     check_features,
     check_geometry,
-    check_sizes,
+    check_latents,
     check_trainer,
     geometry_of,
 )
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
 from r3dpa.modules.steps import PathDraws, frozen
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
-
-__all__ = ["GenerativeModule", "PathDraws", "frozen"]
 
 
 class GenerativeModule(L.LightningModule):
@@ -129,20 +127,16 @@ class GenerativeModule(L.LightningModule):
 
     def configure_model(self) -> None:
         """Arranges the memory of the networks, and compiles them for a fit."""
-        self.arrange_networks()
+        format_ = torch.channels_last if self.channels_last else torch.contiguous_format
+        for network in (self.vae, self.discriminator):
+            if network is not None:
+                cast(Any, network).to(memory_format=format_)  # not in torch's own stubs
         if self.compiles and self.trainer.state.fn == "fit":
             # In place and part by part: names in checkpoints stay, and equal blocks share a graph.
             parts = [self.vae.encoder, self.vae.decoder, self.discriminator]
             for part in [*parts, *self.sit.compiled_parts]:
                 if part is not None:
                     part.compile(dynamic=False)
-
-    def arrange_networks(self) -> None:
-        """Puts the kernels of VAE and discriminator into the memory format of ``channels_last``."""
-        format_ = torch.channels_last if self.channels_last else torch.contiguous_format
-        for network in (self.vae, self.discriminator):
-            if network is not None:
-                cast(Any, network).to(memory_format=format_)  # not in torch's own stubs
 
     def setup(self, stage: str) -> None:
         """Checks trainer and data against the networks.
@@ -155,7 +149,8 @@ class GenerativeModule(L.LightningModule):
         geometry = geometry_of(datamodule, self)
         self.geometry = geometry
         self.augmentation = getattr(datamodule, "augmentation", None)
-        check_sizes(self.vae, self.sit, geometry)
+        sensor = geometry.projection.sensor
+        check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
         if stage != "predict":
             self.feature_source = getattr(datamodule, "feature_source", None)
             if self.needs_features():
@@ -212,9 +207,7 @@ class GenerativeModule(L.LightningModule):
         shape = (self.vae.latent_channels, *self.sit.input_size)
         return steps.draw_path(self, num_scans, shape, self.seed, batch_number, self.time_sampling)
 
-    def weigh_and_log(self, parts: dict[str, Tensor]) -> Tensor:
-        """Sum of weighted losses, logged as ``train/loss``; see :func:`steps.weigh_and_log`."""
-        return steps.weigh_and_log(self, parts, self.weights)
+    weigh_and_log = steps.weigh_and_log
 
     def vae_losses(
         self, image: Tensor, posterior: Posterior, reconstruction: Tensor
@@ -319,7 +312,7 @@ class GenerativeModule(L.LightningModule):
         """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
         return self.vae.decode(self.vae.encode(image).mean)
 
-    def evaluate(self, batch: LidarBatch) -> None:
+    def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Adds held-out scans to the means: the losses, and the reconstruction error in metres.
 
         The error is the mean over all pixels with a return, the losses are means over the scans.
@@ -359,16 +352,8 @@ class GenerativeModule(L.LightningModule):
             values["alignment"] = self.align(projected, features)
         return values
 
-    def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Evaluates a batch of the validation split under ``val/``."""
-        self.evaluate(batch)
-
-    def test_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Evaluates a batch of the test split under ``test/``."""
-        self.evaluate(batch)
-
-    on_validation_epoch_end = steps.log_validation
-    on_test_epoch_end = steps.log_test
+    test_step = validation_step
+    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
 
     def predict_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""

@@ -45,11 +45,6 @@ def geometry_of(datamodule: object, module: object) -> ScanGeometry:
     return geometry
 
 
-def check_sizes(vae: VAE, sit: VelocityNetwork, geometry: ScanGeometry) -> None:
-    """Refuses a velocity network of other latents than those of the range images."""
-    check_latents(vae, sit, (geometry.projection.sensor.beams, geometry.projection.sensor.columns))
-
-
 def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:
     """Refuses a velocity network of other latents than those of the images."""
     if sit.in_channels != vae.latent_channels:

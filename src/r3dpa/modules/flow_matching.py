@@ -17,8 +17,6 @@ from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
-__all__ = ["FlowMatching"]
-
 
 class FlowMatching(GenerativeModule):
     """FM baseline: the SiT by L_denoise (+ lambda2 L_align) on a frozen, trained VAE.

@@ -67,26 +67,18 @@ class ImageVAETraining(L.LightningModule):
             "reconstruction": weights.reconstruction * error,
             "kl": weights.kl * posterior.kl().mean(),
         }
-        return steps.weigh_and_log(self, losses, weights)
+        return steps.weigh_and_log(self, losses)
 
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
-        """Evaluates held-out images under ``val/``."""
-        self._evaluate(batch)
-
-    def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
-        """Evaluates held-out images under ``test/``."""
-        self._evaluate(batch)
-
-    on_validation_epoch_end = steps.log_validation
-    on_test_epoch_end = steps.log_test
-
-    def _evaluate(self, batch: ImageBatch) -> None:
-        """The reconstruction error of the posterior mean, and the KL."""
+        """Held-out images: the reconstruction error of the posterior mean, and the KL."""
         image = batch["image"]
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error = steps.each_reconstruction_loss(reconstruction, image, self.weights)
         self.held_out.update(batch["index"], reconstruction=error, kl=posterior.kl())
+
+    test_step = validation_step
+    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW of the VAE."""

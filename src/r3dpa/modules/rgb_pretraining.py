@@ -168,7 +168,7 @@ class RGBPretraining(L.LightningModule):
         losses = {"denoising": weights.denoising * denoising.mean()}
         if alignment is not None:
             losses["sit_alignment"] = weights.sit_alignment * alignment.mean()
-        return steps.weigh_and_log(self, losses, weights)
+        return steps.weigh_and_log(self, losses)
 
     def draw_path(self, num_images: int, batch_number: int | None = None) -> steps.PathDraws:
         """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
@@ -197,18 +197,7 @@ class RGBPretraining(L.LightningModule):
         return denoising, alignment_loss(projected, features, skip_empty_cells=skip)
 
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
-        """Evaluates held-out images under ``val/``."""
-        self._evaluate(batch)
-
-    def test_step(self, batch: ImageBatch, batch_idx: int) -> None:
-        """Evaluates held-out images under ``test/``."""
-        self._evaluate(batch)
-
-    on_validation_epoch_end = steps.log_validation
-    on_test_epoch_end = steps.log_test
-
-    def _evaluate(self, batch: ImageBatch) -> None:
-        """The losses of the averaged SiT."""
+        """Held-out images: the losses of the averaged SiT."""
         sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
         shape = (self.vae.latent_channels, *self.sit.input_size)
@@ -217,6 +206,9 @@ class RGBPretraining(L.LightningModule):
         denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
         values = {"denoising": denoising} | ({} if alignment is None else {"alignment": alignment})
         self.held_out.update(batch["index"], **values)
+
+    test_step = validation_step
+    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW of the SiT."""

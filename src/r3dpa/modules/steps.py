@@ -120,18 +120,10 @@ class HeldOutMeans(Metric):
         return dict(zip(self.names, (total / weight.clamp(min=1)).tolist(), strict=True))
 
 
-def log_validation(module: Any) -> None:
-    """Logs the means over the validation scans as ``val/<name>``."""
-    _log_means(module, "val")
-
-
-def log_test(module: Any) -> None:
-    """Logs the means over the test scans as ``test/<name>``."""
-    _log_means(module, "test")
-
-
-def _log_means(module: Any, prefix: str) -> None:
-    module.log_dict({f"{prefix}/{name}": v for name, v in module.held_out.compute().items()})
+def log_held_out(module: Any) -> None:
+    """Logs the means over the held-out scans as ``val/<name>`` or ``test/<name>``."""
+    split = "test" if module.trainer.testing else "val"
+    module.log_dict({f"{split}/{name}": mean for name, mean in module.held_out.compute().items()})
     module.held_out.reset()
 
 
@@ -182,18 +174,16 @@ def zero_loss(network: nn.Module) -> Tensor:
     return torch.stack(empty).sum()
 
 
-def weigh_and_log(
-    module: L.LightningModule, parts: Mapping[str, Tensor], weights: LossWeights
-) -> Tensor:
+def weigh_and_log(module: Any, parts: Mapping[str, Tensor]) -> Tensor:
     """Sum of weighted losses; logs it as ``train/loss``, and each loss without its weight.
 
     The logged values are kept in ``module.logged_losses``; losses of weight 0 are not logged.
     """
     total = torch.stack(list(parts.values())).sum()
-    factors = {name: getattr(weights, name) for name in parts}
+    factors = {name: getattr(module.weights, name) for name in parts}
     values = {n: value.detach() / factors[n] for n, value in parts.items() if factors[n] != 0}
     values["loss"] = total.detach()
-    module.logged_losses = values  # type: ignore[assignment]
+    module.logged_losses = values
     module.log_dict({f"train/{name}": value for name, value in values.items()})
     return total
 
