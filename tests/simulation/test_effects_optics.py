@@ -12,7 +12,7 @@ from r3dpa.simulation.effects import (
     PolishedMetal,
     WetGround,
 )
-from r3dpa.simulation.effects.optics import fresnel_reflectance
+from r3dpa.simulation.effects.surface import fresnel_reflectance
 from r3dpa.simulation.scene import Material, Pose, Puddle, Scene, Semantic, Weather
 from r3dpa.simulation.sensor import hdl64e
 from r3dpa.simulation.sweep import Origin

@@ -2,7 +2,6 @@
 
 from r3dpa.simulation.drive_files import drive_name
 from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate
-from r3dpa.simulation.effects import EFFECTS
 from r3dpa.simulation.scan import SimulatedScan, Simulator, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
@@ -17,13 +16,11 @@ from r3dpa.simulation.scene import (
 )
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, hdl64e, load_sensor
 from r3dpa.simulation.street import Street
-from r3dpa.simulation.sweep import Effect, Origin, Sweep
+from r3dpa.simulation.sweep import Origin, Sweep
 
 __all__ = [
-    "EFFECTS",
     "TRAIN_DRIVES",
     "VAL_DRIVES",
-    "Effect",
     "EgoMotion",
     "Lasers",
     "Material",

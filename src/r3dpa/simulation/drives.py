@@ -39,12 +39,11 @@ VAL_DRIVES = ("0000", "0002")
 VAL_SHARE = 0.2
 
 _MANIFEST = "simulation.json"
-_REPORT = "report.json"
-_LOCK = ".lock"
 # Raised whenever the same request gives other scans than before.
 _SIMULATOR_VERSION = 2
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
+_Task = tuple[DriveFiles, Simulator, list[int]]  # numbers of the scans of one drive
 
 
 class EffectTotal(NamedTuple):
@@ -69,11 +68,8 @@ class SimulationReport:
     def to_dict(self) -> dict[str, Any]:
         """What does not depend on the call, as plain values."""
         effects = {name: total._asdict() for name, total in self.effects.items()}
-        return {
-            "scans_per_drive": self.scans_per_drive,
-            "num_empty": self.num_empty,
-            "effects": effects,
-        }
+        about = {"scans_per_drive": self.scans_per_drive, "num_empty": self.num_empty}
+        return about | {"effects": effects}
 
     def __str__(self) -> str:
         heads = ["effect", "ran", "not called", "off", "rays/scan"]
@@ -158,15 +154,15 @@ def simulate(
     if read_only and not any(drive.missing(count) for drive, count in files.items()):
         return make_report([one for drive in files for one in drive.summaries(files[drive])], 0)
     out.mkdir(parents=True, exist_ok=True)
-    with only_writer(out / _LOCK, f"simulates into {out}", wait=True):
+    with only_writer(out / ".lock", f"simulates into {out}", wait=True):
         _check_folder(out, request)  # again: another process may have written meanwhile
         write(out / _MANIFEST, to_json(request))
         tasks = []
         for drive, count in files.items():
             missing, simulator = drive.missing(count), simulators[drive.drive]
             for start in range(0, len(missing), _SCANS_PER_TASK):
-                tasks.append(_Task(drive, simulator, missing[start : start + _SCANS_PER_TASK]))
-        num_missing = sum(len(task.numbers) for task in tasks)
+                tasks.append((drive, simulator, missing[start : start + _SCANS_PER_TASK]))
+        num_missing = sum(len(numbers) for *_, numbers in tasks)
         complete = scans - num_missing
         # disable=None: no bar without a terminal.
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
@@ -217,14 +213,6 @@ def expected_scans(root: Path) -> dict[str, int] | None:
 def _share(scans: int, drives: list[str]) -> dict[str, int]:
     counts = (len(range(place, scans, len(drives))) for place in range(len(drives)))
     return {drive: count for drive, count in zip(drives, counts, strict=True) if count}
-
-
-class _Task(NamedTuple):
-    """Scans of one drive, written by one worker."""
-
-    files: DriveFiles
-    simulator: Simulator
-    numbers: list[int]
 
 
 def _check_folder(out: Path, request: dict[str, Any]) -> None:
@@ -314,9 +302,10 @@ def _end_with_parent() -> None:
 
 def _run(task: _Task) -> int:
     """Simulate and write the scans of a task; their number."""
-    for number in task.numbers:
-        task.files.write_scan(number, task.simulator.scan(number))
-    return len(task.numbers)
+    files, simulator, numbers = task
+    for number in numbers:
+        files.write_scan(number, simulator.scan(number))
+    return len(numbers)
 
 
 def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
@@ -331,7 +320,7 @@ def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> Sim
     for path in out.glob(".*.partial.json"):
         path.unlink(missing_ok=True)
     report = make_report(summaries, num_written)
-    write(out / _REPORT, to_json(report.to_dict()))
+    write(out / "report.json", to_json(report.to_dict()))
     return report
 
 

@@ -170,7 +170,9 @@ def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDAr
         parts.append((points, labels, np.full(len(seen), Origin.SECOND_RETURN, dtype=np.uint8)))
         beams.append(seen // sweep.shape[1])
     points, labels, origins = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    order = _storage_order(points, np.concatenate(beams))
+    # By beam, then by azimuth in [0, 2 pi), so that a beam ends where azimuth falls.
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) % np.float32(2 * np.pi)
+    order = np.argsort(7.0 * np.concatenate(beams) + azimuth, kind="stable")
     return points[order], labels[order], origins[order]
 
 
@@ -203,9 +205,3 @@ def calibrated_intensity(
     weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
     return np.round((np.sqrt(power * range_m**2) * ramp.clip(max=1)).clip(0, 0.99), 2)
-
-
-def _storage_order(points: NDArray[np.float32], beams: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order by beam, then by azimuth in [0, 2 pi), so that a beam ends where azimuth falls."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0]) % np.float32(2 * np.pi)
-    return np.argsort(7.0 * beams + azimuth, kind="stable")

@@ -91,13 +91,14 @@ class Street:
             primitives += builder.primitives
             details += builder.details
         pose = _pose(course, scan, sensor_height_m)
+        speed_m_s = course.speed_m_s(scan) * course.section(s).stretch(course.ego_lateral_m)
         here = (pose.x_m, pose.y_m)
         primitives += [p for p in details if math.dist(p.centre[:2], here) < _DETAIL_M]
         around = range(own - _BLOCKS_BEHIND, own + _BLOCKS_AHEAD + 2)
         return Scene(
             tuple(primitives),
             pose,
-            _motion(course, scan),
+            EgoMotion(speed_m_s, course.speed_m_s(scan) * course.smooth(s)[1]),
             weather,
             tuple(puddles) if weather.water_film_mm > 0 else (),
             recording_car(),
@@ -153,12 +154,6 @@ def _pose(course: Course, scan: int, sensor_height_m: float) -> Pose:
         # Uphill to the left means: the right side is down.
         course.mount_roll_rad + math.atan(cross) + rocking[1],
     )
-
-
-def _motion(course: Course, scan: int) -> EgoMotion:
-    s, along_m_s = course.position(scan), course.speed_m_s(scan)
-    speed_m_s = along_m_s * course.section(s).stretch(course.ego_lateral_m)
-    return EgoMotion(speed_m_s, along_m_s * course.smooth(s)[1])
 
 
 class _Stream(NamedTuple):

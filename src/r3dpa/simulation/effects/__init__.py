@@ -5,27 +5,29 @@ whether it runs, selects its rays, and changes nothing else.
 """
 
 from r3dpa.simulation.effects.edges import MixedPixels
-from r3dpa.simulation.effects.glare import Blooming, SunGlare
 from r3dpa.simulation.effects.instrument import (
+    Blooming,
     DetectionLimit,
     DualReturn,
     LaserCalibration,
     RangeNoise,
     SoftRaydrop,
+    SunGlare,
 )
-from r3dpa.simulation.effects.medium import Fog, Spray
+from r3dpa.simulation.effects.medium import Fog, Rain, Snow, Spray
 from r3dpa.simulation.effects.motion import (
     EgoOcclusion,
     FoliageOcclusion,
     MovingActors,
     RollingShutter,
 )
-from r3dpa.simulation.effects.optics import Glass, PolishedMetal, WetGround
-from r3dpa.simulation.effects.precipitation import Rain, Snow
 from r3dpa.simulation.effects.surface import (
     DiffuseReflection,
+    Glass,
+    PolishedMetal,
     RetroReflection,
     SurfaceTexture,
+    WetGround,
     surface_power,
 )
 from r3dpa.simulation.sweep import Effect

@@ -96,7 +96,6 @@ class MixedPixels(Effect):
         return index[straight & (surface != EGO_BODY)]
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Replace the echoes of each footprint by its peaks."""
         chosen = np.arange(sweep.num_rays)[rays]
         targets = _targets_of(sweep, chosen)
         met, rim_m = _nearest(targets, len(chosen))

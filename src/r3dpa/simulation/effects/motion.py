@@ -37,7 +37,6 @@ class RollingShutter(Effect):
         return f"ego moves at {motion.speed_m_s:.1f} m/s, {turn_deg:.1f} deg/s"
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Turn and shift the rays in the frame of the sensor, then level them."""
         motion, pose = sweep.scene.motion, sweep.scene.pose
         angle = np.float32(motion.yaw_rate_rad_s) * sweep.time_s
         # sinc(x) = sin(pi x) / (pi x) stands for sin(w t / 2) / (w t / 2): no division by w.
@@ -60,11 +59,7 @@ class RollingShutter(Effect):
 class MovingActors(Effect):
     """Position of moving solids at the time of each shot.
 
-    ::
-
-        position(t) = position(0) + velocity * t
-
-    so that an object crossing at v is sheared by ``v * (its width in azimuth) / (2 pi) * 0.1 s``.
+    An object crossing at v is sheared by ``v * (its width in azimuth) / (2 pi) * 0.1 s``.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
@@ -78,7 +73,6 @@ class MovingActors(Effect):
         )
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Set the firing time of these rays for the ray cast."""
         sweep.actor_time_s = np.zeros_like(sweep.time_s)
         sweep.actor_time_s[rays] = sweep.time_s[rays]
 
@@ -104,17 +98,11 @@ class FoliageOcclusion(Effect):
         return sweep.all_near(subset(sweep.solids, sweep.solids.extinction > 0), sweep.actor_time_s)
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Draw the optical depth of each ray for the ray cast."""
         sweep.optical_depth = draws.exponential(slice(None))
 
 
 class EgoOcclusion(Effect):
-    """Occlusion by the roof of the recording car; the mask is the same in every scan.
-
-    ::
-
-        range -> min(range, range to the car)
-    """
+    """Occlusion by the roof of the recording car; the mask is the same in every scan."""
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
         return f"{len(scene.ego_body)} parts of the recording car" if scene.ego_body else None
@@ -123,7 +111,6 @@ class EgoOcclusion(Effect):
         return _ego_mask(sweep.scene.ego_body, sweep.sensor).rays
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
-        """Replace farther hits by the surface of the car."""
         mask = _ego_mask(sweep.scene.ego_body, sweep.sensor)
         nearer = mask.range_m < sweep.first.range_m[mask.rays]
         hit = mask.rays[nearer]
