@@ -9,6 +9,8 @@ import math
 import re
 import shutil
 import signal
+import subprocess
+import threading
 from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace
@@ -529,6 +531,41 @@ def test_a_stopped_ablation_stops_what_it_started(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         asyncio.run(stopped())
     assert sleeping[0].returncode == -signal.SIGTERM
+
+
+def test_a_table_refuses_numbers_of_another_step(command, tmp_path, processes):
+    """As of a stale checkpoint in a folder that was moved."""
+
+    def of_step(words):
+        without_training(words)
+        if words[0] == "test":
+            folder = Path(words[words.index("--run_dir") + 1]) / "evaluation"
+            about = {"extra": {"step": 2 if stepped else 3}}
+            stepped.append(folder)
+            Evaluation("x", evaluation(JSD=1.0).rows, about).save(folder / "evaluation.json")
+
+    stepped = []
+    processes.run = of_step
+    main([*command, "--jobs", "1"])
+    stored = json.loads((tmp_path / "out" / "table_x.json").read_text())
+    assert [len(row["values"]) for row in stored["rows"]] == [1, 0]
+    assert (
+        "evaluation.json is of step 2, not the last"
+        in (tmp_path / "out" / "table_x.md").read_text()
+    )
+
+
+def test_a_killed_ablation_leaves_no_process():
+    """Linux signals a child when the thread that has started it ends."""
+    started = []
+
+    def start():
+        started.append(subprocess.Popen(["sleep", "60"], preexec_fn=runner._end_with_parent))
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert started[0].wait(5) == -signal.SIGTERM
 
 
 @pytest.mark.slow

@@ -82,8 +82,13 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
             path = chain[-1].evaluation
             if f"test of {chain[-1].name}" in failed or not path.is_file():
                 lost.append(f"{row.label}, seed {seed}: no result")
+                continue
+            found = Evaluation.load(path)
+            step = found.about["extra"].get("step")
+            if step is not None and step != chain[-1].config["trainer"]["max_steps"]:
+                lost.append(f"{row.label}, seed {seed}: {path} is of step {step}, not the last")
             else:
-                results[row.key][seed] = Evaluation.load(path)
+                results[row.key][seed] = found
         if results[row.key]:
             means.append(mean_of_seeds(row.label, list(results[row.key].values())))
     file = plan.out / table.name
