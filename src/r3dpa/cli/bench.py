@@ -13,7 +13,7 @@ from typing import Any, Literal
 import yaml
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.options import check_file, check_folder
+from r3dpa.cli.parser import check_file, check_folder
 
 
 def training(

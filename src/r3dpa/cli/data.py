@@ -9,7 +9,7 @@ from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.options import check_file, check_folder
+from r3dpa.cli.parser import check_file, check_folder
 
 
 def check(path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.options import EditOptions
+from r3dpa.cli.parser import EditOptions
 
 
 def inpaint(

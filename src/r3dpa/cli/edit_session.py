@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from r3dpa import viz
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.options import EditOptions
+from r3dpa.cli.parser import EditOptions
 from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask

@@ -7,17 +7,14 @@ from typing import Any, Literal
 
 from jsonargparse.typing import PositiveInt
 
-from r3dpa.cli.options import SceneOptions
+from r3dpa.cli.parser import ODESolver, SceneOptions
 
 
 def sample(
     *,
     num: PositiveInt = 16,
     quality: Literal["draft", "good", "best"] | None = None,
-    solver: Literal[
-        "euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "euler_maruyama"
-    ]
-    | None = None,
+    solver: Literal[ODESolver, "euler_maruyama"] | None = None,
     steps: PositiveInt | None = None,
     shift: float | None = None,
     eta: float | None = None,

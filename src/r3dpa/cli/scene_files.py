@@ -20,7 +20,7 @@ from tqdm import tqdm
 import r3dpa
 from r3dpa import viz
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.cli.options import SceneOptions
+from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import ScanError, find_scans, read_beside, read_npz, read_ply, read_scan
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
