@@ -56,29 +56,25 @@ def _mount(*words):
         pytest.skip(f"this user may not mount a disk in memory: {getattr(error, 'stderr', error)}")
 
 
-@pytest.fixture(scope="session")
-def scans_folder(tmp_path_factory):
-    """Eight small scans in a folder."""
-    folder = tmp_path_factory.mktemp("faults") / "scans"
-    folder.mkdir()
-    write_scans(folder)
-    return folder
-
-
 def write_scans(folder):
+    folder.mkdir()
     generator = np.random.default_rng(0)
     points = generator.uniform(2, 20, (8, 200, 4)).astype(np.float32)
     for index, scan in enumerate(points):
         (folder / f"{index:06d}.bin").write_bytes(scan.tobytes())
+    return folder
+
+
+@pytest.fixture(scope="session")
+def scans_folder(tmp_path_factory):
+    """Eight small scans in a folder."""
+    return write_scans(tmp_path_factory.mktemp("faults") / "scans")
 
 
 @pytest.fixture
 def own_scans(tmp_path):
     """The same scans, to be damaged."""
-    folder = tmp_path / "scans"
-    folder.mkdir()
-    write_scans(folder)
-    return folder
+    return write_scans(tmp_path / "scans")
 
 
 @pytest.fixture(scope="session")

@@ -141,10 +141,7 @@ def pause(folder: Path) -> None:
 
 
 def assert_whole(folder: Path) -> int:
-    """Opens each file that looks whole, that is, has no hidden name; returns how many there are.
-
-    Rows of a store count where the journal names them.
-    """
+    """Opens each file that looks whole, that is, has no hidden name; returns how many there are."""
     num_files = 0
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not path.name.startswith(".") and path.name != "filler":

@@ -35,10 +35,10 @@ class PointsThemselves(nn.Module):
 
 
 READERS = {
-    "fit --ckpt_path": lambda ckpt, out, scans: fit_words(scans, out, "--ckpt_path", ckpt),
-    "fit --model.init_args.init_from": lambda ckpt, out, scans: fit_words(
-        scans, out, "--model.init_args.init_from", ckpt
-    ),
+    **{
+        f"fit {key}": lambda ckpt, out, scans, key=key: fit_words(scans, out, key, ckpt)
+        for key in ("--ckpt_path", "--model.init_args.init_from")
+    },
     "sample": lambda ckpt, out, scans: ["sample", "--ckpt", ckpt, "--out", out],
 }
 
@@ -47,14 +47,11 @@ READERS = {
 def test_a_checkpoint_cut_short(reader, scans_folder, tmp_path):
     ckpt = tmp_path / "last.ckpt"
     torch.save({"state_dict": {"weight": torch.zeros(1000)}}, ckpt)
-    size = ckpt.stat().st_size
     words = READERS[reader](ckpt, tmp_path / "out", scans_folder)
-    for kept in (size - 1, 0):
+    for kept in (ckpt.stat().st_size - 1, 0):
         os.truncate(ckpt, kept)
-        with pytest.raises(ValueError, match="cannot read") as caught:
+        with pytest.raises(ValueError, match=f"cannot read {ckpt}: .*damaged"):
             main([str(word) for word in words])
-        assert str(ckpt) in str(caught.value)
-        assert "damaged" in str(caught.value)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != ckpt]
 
 

@@ -40,6 +40,19 @@ def step_of(path):
 
 
 @pytest.fixture
+def faulty(ended, scans_folder, tmp_path):
+    """``faulty(*faults)``: a run with faults; its folder, exit status, and what the user saw."""
+
+    def run(*faults, more=()):
+        run_dir = tmp_path / "run"
+        result = run_dir, *ended(fit_words(scans_folder, run_dir, *more), *faults)
+        assert_whole(run_dir)
+        return result
+
+    return run
+
+
+@pytest.fixture
 def goes_on(ended, scans_folder, undisturbed):
     """``goes_on(run_dir)``: the same command, with ``--ckpt_path last``, ends as if undisturbed."""
 
@@ -54,96 +67,73 @@ def goes_on(ended, scans_folder, undisturbed):
 
 
 class TestStopped:
-    def test_between_two_batches_of_a_step(self, scans_folder, tmp_path, ended, goes_on):
-        """In the first of the two batches of step 3: it waits for the second."""
-        words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At(STEP, TERMINATE, call=5))
-        assert status == 143
-        says = "stopped by SIGTERM after step 3: the same command goes on with --ckpt_path "
-        assert f"{says}{last(tmp_path / 'run')}\n" in seen
+    @pytest.mark.parametrize(
+        ("target", "fault", "call", "step"),
+        [
+            (STEP, TERMINATE, 5, 3),  # in the first of the two batches of step 3
+            (STEP, INTERRUPT, 3, 2),
+            pytest.param("torch.save", TERMINATE, 1, 2, marks=pytest.mark.slow),
+        ],
+    )
+    def test_at_the_end_of_a_step(self, target, fault, call, step, faulty, goes_on):
+        run_dir, status, seen = faulty(At(target, fault, call))
+        number, name = (143, "SIGTERM") if fault is TERMINATE else (130, "SIGINT")
+        assert status == number, seen
+        says = f"stopped by {name} after step {step}: the same command goes on with --ckpt_path "
+        assert f"{says}{last(run_dir)}\n" in seen
         assert "Traceback" not in seen
-        assert step_of(last(tmp_path / "run")) == 3
-        assert_whole(tmp_path / "run")
-        goes_on(tmp_path / "run")
-
-    def test_ctrl_c_saves_too(self, scans_folder, tmp_path, ended):
-        words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At(STEP, INTERRUPT, call=3))
-        assert status == 130, seen
-        assert "stopped by SIGINT after step 2: the same command goes on" in seen
-        assert "Traceback" not in seen
-        assert step_of(last(tmp_path / "run")) == 2
+        assert step_of(last(run_dir)) == step
+        goes_on(run_dir)
 
     @pytest.mark.slow
-    def test_a_second_ctrl_c_ends_at_once(self, scans_folder, tmp_path, ended):
-        words = fit_words(scans_folder, tmp_path / "run")
-        twice = (
-            At(STEP, INTERRUPT, call=3),
-            At(STEP, INTERRUPT, call=3),
-        )
-        status, seen = ended(words, *twice)
+    def test_a_second_ctrl_c_ends_at_once(self, faulty):
+        _, status, seen = faulty(*2 * [At(STEP, INTERRUPT, call=3)])
         assert status == 1, seen  # that of Lightning
         assert "stopped by" not in seen
 
     @pytest.mark.slow
-    def test_while_a_checkpoint_is_written(self, scans_folder, tmp_path, ended, goes_on):
-        words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At("torch.save", TERMINATE))
-        assert status == 143, seen
-        assert "stopped by SIGTERM after step 2" in seen
-        assert step_of(last(tmp_path / "run")) == 2
-        goes_on(tmp_path / "run")
-
-    @pytest.mark.slow
-    def test_in_a_validation(self, scans_folder, tmp_path, ended, goes_on):
+    def test_in_a_validation(self, scans_folder, tmp_path, ended, faulty):
         """It ends after the next batch, not after minutes; the rest is validated on resuming."""
         more = ["--trainer.limit_val_batches=4", "--trainer.val_check_interval=6"]
         more += ["--data.init_args.val_every=2", "--data.init_args.batch_size=1"]
         calm = tmp_path / "calm"
         assert ended(fit_words(scans_folder, calm, *more))[0] == 0
-        words = fit_words(scans_folder, tmp_path / "run", *more)
         validation = "r3dpa.modules.VAEAlignment.validation_step"
-        status, seen = ended(words, At(validation, TERMINATE, call=2))
+        run_dir, status, seen = faulty(At(validation, TERMINATE, call=2), more=more)
         assert status == 143, seen
-        assert step_of(last(tmp_path / "run")) == 3
-        status, seen = ended([*words, "--ckpt_path", "last"])
+        assert step_of(last(run_dir)) == 3
+        status, seen = ended(fit_words(scans_folder, run_dir, *more, "--ckpt_path", "last"))
         assert status == 0, seen
-        assert_same_training(tmp_path / "run", calm)
+        assert_same_training(run_dir, calm)
 
 
 @pytest.mark.slow
 class TestKilled:
     @pytest.mark.parametrize("call", [1, 6])
-    def test_between_checkpoints(self, call, scans_folder, tmp_path, ended, goes_on):
+    def test_between_checkpoints(self, call, faulty, goes_on):
         """Before the first one, too: ``last`` then means from the start."""
-        words = fit_words(scans_folder, tmp_path / "run")
-        status, _ = ended(words, At(STEP, partial(signal.raise_signal, signal.SIGKILL), call=call))
+        run_dir, status, _ = faulty(At(STEP, partial(signal.raise_signal, signal.SIGKILL), call))
         assert status == -signal.SIGKILL
-        assert_whole(tmp_path / "run")
-        assert last(tmp_path / "run").exists() == (call > 1)
-        goes_on(tmp_path / "run")
+        assert last(run_dir).exists() == (call > 1)
+        goes_on(run_dir)
 
     @pytest.mark.parametrize("save", [1, 4])
-    def test_with_half_a_checkpoint_written(self, save, scans_folder, tmp_path, ended, goes_on):
+    def test_with_half_a_checkpoint_written(self, save, faulty, goes_on):
         """Each saving writes two files, ``step=...`` and ``last``."""
-        words = fit_words(scans_folder, tmp_path / "run")
-        status, seen = ended(words, At("torch.save", partial(limit_files, 100_000), call=save))
+        run_dir, status, seen = faulty(At("torch.save", partial(limit_files, 100_000), save))
         assert status == -signal.SIGXFSZ, seen
-        (half,) = (tmp_path / "run").rglob(".*.partial.ckpt")
+        (half,) = run_dir.rglob(".*.partial.ckpt")
         assert half.stat().st_size == 100_000
-        assert_whole(tmp_path / "run")
         if save == 4:
-            assert step_of(last(tmp_path / "run")) == 2
-        goes_on(tmp_path / "run")
+            assert step_of(last(run_dir)) == 2
+        goes_on(run_dir)
 
-    def test_worker(self, scans_folder, tmp_path, ended, goes_on):
-        words = fit_words(scans_folder, tmp_path / "run")
-        words += ["--data.init_args.num_workers=1"]
-        status, seen = ended(words, At(STEP, kill_worker, call=6))
+    def test_worker(self, faulty, goes_on):
+        more = ["--data.init_args.num_workers=1"]
+        run_dir, status, seen = faulty(At(STEP, kill_worker, call=6), more=more)
         assert status == 1
         assert "DataLoader worker" in seen
-        assert_whole(tmp_path / "run")
-        goes_on(tmp_path / "run")
+        goes_on(run_dir)
 
 
 @pytest.mark.slow
@@ -191,9 +181,8 @@ def test_scans_lost_between_index_and_read(kept, says, own_scans, tmp_path, ende
     saved = tmp_path / "saved"
     shutil.copytree(own_scans, saved)
     words = fit_words(own_scans, tmp_path / "run")
-    status, seen = ended(
-        words, *(At(STEP, partial(cut, path, kept), call=5) for path in own_scans.iterdir())
-    )
+    lost = (At(STEP, partial(cut, path, kept), call=5) for path in own_scans.iterdir())
+    status, seen = ended(words, *lost)
     assert status == 1
     assert f"{own_scans}/0" in seen.splitlines()[-1]
     assert says in seen.splitlines()[-1]

@@ -32,19 +32,12 @@ SENSOR = {"class_path": "r3dpa.geometry.LidarSensor", "init_args": {"beams": 16,
 
 @dataclass(frozen=True)
 class Job:
-    """A command that writes.
+    """A command that writes."""
 
-    Args:
-        words: All but ``--out``.
-        inside: Function that is called for each piece of the work.
-        num_bytes: It is killed when it writes more to a file.
-        is_file: It writes one file, not a folder.
-    """
-
-    words: list
-    inside: At
-    num_bytes: int = 5000
-    is_file: bool = False
+    words: list  # all but ``--out``
+    inside: At  # function that is called for each piece of the work
+    num_bytes: int = 5000  # it is killed when it writes more to a file
+    is_file: bool = False  # it writes one file, not a folder
 
     def command(self, out, *more):
         return [*self.words, "--out", out, *more]
@@ -92,10 +85,11 @@ def contents(out):
     """Bytes of all files of which they are promised; of a store those of each scan's row."""
     if out.is_file():
         return out.read_bytes()
-    files = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
-    kept = {n: p for n, p in files.items() if n.name not in _NOT_PROMISED and n.name[0] != "."}
     found = {}
-    for name, path in kept.items():
+    for path in out.rglob("*"):
+        name = path.relative_to(out)
+        if not path.is_file() or name.name in _NOT_PROMISED or name.name[0] == ".":
+            continue
         if name.suffix == ".jsonl":
             found |= {f"{name.parent}/{scan}": row for scan, row in rows_of(path).items()}
         elif name.suffix != ".rows":
@@ -140,15 +134,14 @@ def out_of(jobs, tmp_path):
     return lambda name, root=tmp_path: root / ("out.safetensors" if jobs[name].is_file else "out")
 
 
-NAMES = ("simulate", "features", "sample", "reference")
+each_job = pytest.mark.parametrize("name", ["simulate", "features", "sample", "reference"])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_job
 def test_sigterm(name, jobs, ended, out_of, goes_on):
     out = out_of(name)
-    status, seen = ended(
-        jobs[name].command(out), at(jobs[name], partial(signal.raise_signal, signal.SIGTERM))
-    )
+    stop = at(jobs[name], partial(signal.raise_signal, signal.SIGTERM))
+    status, seen = ended(jobs[name].command(out), stop)
     assert status == 130
     assert seen.endswith(f"r3dpa {name}: stopped; the same command continues\n")
     assert "Traceback" not in seen
@@ -157,17 +150,13 @@ def test_sigterm(name, jobs, ended, out_of, goes_on):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@each_job
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGXFSZ])
-def test_killed_between_two_writes_or_in_the_midst_of_one(
-    number, name, jobs, ended, out_of, goes_on
-):
+def test_killed_between_two_writes_or_in_one(number, name, jobs, ended, out_of, goes_on):
     out, job = out_of(name), jobs[name]
-    fault = (
-        at(job, partial(signal.raise_signal, number))
-        if number == signal.SIGKILL
-        else partial(limit_files, job.num_bytes)
-    )
+    fault = partial(limit_files, job.num_bytes)
+    if number == signal.SIGKILL:
+        fault = at(job, partial(signal.raise_signal, number))
     status, seen = ended(job.command(out), fault)
     assert status == -number, seen
     assert not out.is_file()
@@ -176,7 +165,7 @@ def test_killed_between_two_writes_or_in_the_midst_of_one(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@each_job
 def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on):
     disk = small_disk(32_000_000)
     out, job = out_of(name, disk), jobs[name]
@@ -191,7 +180,7 @@ def test_full_disk(name, jobs, ended, out_of, small_disk, goes_on):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@each_job
 def test_read_only(name, jobs, ended, out_of, small_disk, make_read_only):
     disk = small_disk(1_000_000)
     make_read_only(disk)
@@ -201,7 +190,7 @@ def test_read_only(name, jobs, ended, out_of, small_disk, make_read_only):
     line = seen.splitlines()[-1]
     assert line.startswith(f"r3dpa {name}: ")
     assert "Read-only file system" in line
-    assert str(out.name) in line
+    assert out.name in line
     assert "Traceback" not in seen
 
 

@@ -17,7 +17,7 @@ from r3dpa.simulation.scene import (
     Shape,
     Weather,
 )
-from r3dpa.simulation.sensor import Lasers, hdl32e, hdl64e, vls128
+from r3dpa.simulation.sensor import hdl32e, hdl64e, vls128
 
 # Usual values of an instrument twice or more, and odd ones.
 INSTRUMENT = {
@@ -68,20 +68,10 @@ def random_case(seed):
         sensor = replace(sensor, **dict.fromkeys(NOISE, 0.0))
     sensor = replace(sensor, **{name: dice.among(*values) for name, values in table.items()})
     num = sensor.num_beams
-    if dice.chance(0.1):
-        sensor = replace(sensor, lasers=_few_lasers(dice))
-    elif dice.chance(0.3):
+    if dice.chance(0.3):
         exact = replace(sensor.lasers, range_bias_m=(0.0,) * num, intensity_gain=(1.0,) * num)
         sensor = replace(sensor, lasers=exact)
     return _scene(dice), sensor
-
-
-def _few_lasers(dice):
-    num = int(dice.generator.integers(1, 9))
-    limits = ((-7.0, 7.0), (-0.2, 0.3), (-0.2, 0.2), (-0.1, 0.1), (0.2, 5.0))
-    falling = np.sort(dice.generator.uniform(-1.0, 0.6, num))[::-1]
-    columns = (falling, *(dice.generator.uniform(*pair, num) for pair in limits))
-    return Lasers(*(tuple(column.tolist()) for column in columns))
 
 
 def _scene(dice):

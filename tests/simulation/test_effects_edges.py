@@ -33,12 +33,16 @@ def swept(scene, sensor=SENSOR, before=(), after=PATH):
     return sweeps.swept(scene, sensor, before=before, after=after)
 
 
-def state(sweep):
-    arrays = [sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.min_power]
-    arrays += [sweep.start, sweep.direction]
-    return [array.copy() for echoes in sweep.echoes() for array in echoes.columns()] + [
-        array.copy() for array in arrays
-    ]
+def assert_same_state(plain, sweep):
+    """All echoes and all arrays of the rays."""
+
+    def arrays_of(sweep):
+        arrays = [sweep.cos_incidence, sweep.reflectivity, sweep.material, sweep.min_power]
+        echoes = [array for echoes in sweep.echoes() for array in echoes.columns()]
+        return [*echoes, *arrays, sweep.start, sweep.direction]
+
+    for before, after in zip(arrays_of(plain), arrays_of(sweep), strict=True):
+        np.testing.assert_array_equal(before, after)
 
 
 def beside_ray(near_m, far_m, offset):
@@ -216,8 +220,7 @@ def test_tiles_of_ground_do_not_mix():
         for number in range(-8, 9)
     )
     plain, sweep = swept(Scene(tiles), after=PATH[:1]), swept(Scene(tiles))
-    for before, after in zip(state(plain), state(sweep), strict=True):
-        np.testing.assert_array_equal(before, after)
+    assert_same_state(plain, sweep)
 
 
 def test_leaves_fill_the_beam():
@@ -229,8 +232,7 @@ def test_leaves_fill_the_beam():
     foliage = (FoliageOcclusion(),)
     plain, sweep = swept(scene, before=foliage, after=PATH[:1]), swept(scene, before=foliage)
     assert (plain.first.origin == Origin.FOLIAGE).sum() > 100
-    for before, after in zip(state(plain), state(sweep), strict=True):
-        np.testing.assert_array_equal(before, after)
+    assert_same_state(plain, sweep)
     # A pole before the crown takes its share of the leaves behind it.
     before_it = pole((8.0, 0.0, 2.0), 0.1, 3.0, reflectivity=0.3)
     both = swept(Scene((crown, before_it)), before=foliage, after=PATH[:1])

@@ -137,22 +137,21 @@ def test_called_by_a_low_sun_in_a_clear_sky():
     """The highest beam of an HDL-64E rises by 1.96 degrees or little more, the glare 10 more."""
     highest = math.degrees(COARSE.lasers.inclination_rad[0])
     assert highest == pytest.approx(2, abs=1)
-    for elevation_deg in (0.0, 45.0):
-        high = Scene(weather=replace(LOW, sun_elevation_deg=elevation_deg))
-        assert SunGlare().called_by(high, COARSE) is None
-    for elevation_deg, called in ((0.5, True), (highest + 9.9, True), (highest + 10.1, False)):
-        weather = replace(LOW, sun_elevation_deg=elevation_deg)
-        assert bool(SunGlare().called_by(Scene(weather=weather), COARSE)) is called
-        assert bool(len(glared(Scene(weather=weather))[1])) is called
-    for covered in ("visibility_m", "rain_mm_h", "snow_mm_h"):
-        scene = Scene(weather=replace(LOW, **{covered: 1.0}))
-        assert SunGlare().called_by(scene, COARSE) is None
-    assert SunGlare().called_by(Scene(weather=replace(LOW, clear_sky=False)), COARSE) is None
-    # A sensor that leans towards the sun sees it higher.
-    leaning = Scene(pose=Pose(roll_rad=0.1), weather=replace(LOW, sun_elevation_deg=highest + 14))
-    assert SunGlare().called_by(leaning, COARSE)
-    assert len(glared(leaning)[1])
-    assert not len(glared(replace(leaning, pose=Pose(roll_rad=-0.1)))[1])
+    leaning = Pose(roll_rad=0.1)  # towards the sun: it sees the sun higher
+    for elevation_deg, pose, called in (
+        (0.5, Pose(), True),
+        (highest + 9.9, Pose(), True),
+        (highest + 10.1, Pose(), False),
+        (highest + 14, leaning, True),
+        (highest + 14, Pose(roll_rad=-0.1), False),
+    ):
+        scene = Scene(pose=pose, weather=replace(LOW, sun_elevation_deg=elevation_deg))
+        assert bool(len(glared(scene)[1])) is called
+        if called or pose == Pose():
+            assert bool(SunGlare().called_by(scene, COARSE)) is called
+    covered = [{name: 1.0} for name in ("visibility_m", "rain_mm_h", "snow_mm_h")]
+    for change in (*covered, {"clear_sky": False}, {"sun_elevation_deg": 0.0}):
+        assert SunGlare().called_by(Scene(weather=replace(LOW, **change)), COARSE) is None
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 60.0])

@@ -62,17 +62,6 @@ def test_echoes_of_the_air_lie_before_the_target(effect, weather):
     assert (after.first.surface[air] == NO_SURFACE).all()
 
 
-def test_transmission_of_fog():
-    """exp(-2 ln(20) / 50 * 30) = 20^-1.2 = 0.0275, without soft echoes in its way."""
-    sensor = replace(SENSOR, pulse_s=0.0)
-    before = surfaces(Scene((WALL,)), sensor)
-    after = applied(Fog(), Scene((WALL,), weather=Weather(visibility_m=50)), sensor)
-    hit = np.flatnonzero(np.abs(before.first.range_m - 30) < 0.1)
-    ratio = after.first.power[hit] / before.first.power[hit]
-    assert len(hit) > 10
-    np.testing.assert_allclose(ratio, 0.0275, rtol=0.015)
-
-
 @pytest.mark.parametrize(
     ("visibility_m", "last_m"), [(50, 17.9), (100, 24.7), (200, 31.7), (math.inf, 50.0)]
 )

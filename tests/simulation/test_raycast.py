@@ -14,18 +14,12 @@ from r3dpa.simulation.solids import GROUND, NO_SURFACE, Windows, level, solids_o
 REACH_M = 120.0
 
 
-def rays_towards(*directions, origin=(0.0, 0.0, 0.0)):
-    """One beam; the shots must be given by growing azimuth and fill the turn evenly."""
-    direction = np.array(directions, dtype=float).T
-    direction /= np.linalg.norm(direction, axis=0)
-    start = np.broadcast_to(np.array(origin)[:, None], direction.shape)
-    return Rays(start[:, None].astype(np.float32), direction[:, None].astype(np.float32))
-
-
-# Eight shots, 45 degrees apart, slightly downwards or upwards.
 def compass(z):
+    """One beam of eight shots, 45 degrees apart, slightly downwards or upwards."""
     angles = np.arange(8) * np.pi / 4
-    return rays_towards(*[(np.cos(a), np.sin(a), z) for a in angles])
+    direction = np.stack([np.cos(angles), np.sin(angles), np.full(8, z)])[:, None]
+    direction /= np.linalg.norm(direction, axis=0)
+    return Rays(np.zeros((3, 1, 8), np.float32), direction.astype(np.float32))
 
 
 def solid(shape, centre, half_size, yaw_rad=0.0):
@@ -56,7 +50,9 @@ def test_ground_range_and_incidence():
     np.testing.assert_allclose(hits.range_m, 10 * np.sqrt(1.04), rtol=1e-6)
     np.testing.assert_allclose(hits.cos_incidence, 0.2 / np.sqrt(1.04), rtol=1e-6)
     assert (hits.surface == GROUND).all()
-    lower = Hits(Scene(pose=Pose(z_m=2.0), ground_m=-1.0), compass(-0.2))
+    # A solid around the sensor is not seen from inside.
+    around = solid(Shape.ELLIPSOID, (0, 0, 2), (3, 3, 3))
+    lower = Hits(Scene((around,), Pose(z_m=2.0), ground_m=-1.0), compass(-0.2))
     np.testing.assert_allclose(lower.range_m, 15 * np.sqrt(1.04), rtol=1e-6)
 
 
@@ -98,34 +94,23 @@ def test_a_slope_rises_away_from_the_sensor_and_its_walls_stay_upright():
     slope = replace(solid(Shape.BOX, (20, 0, 0), (10, 5, 0.5)), grade=(0.1, 0.0))
     hits = Hits(Scene((slope,), Pose(z_m=2.0), ground_m=-9), compass(-0.05))
     # Its top is z = -1.5 + 0.1 (x - 20); the ray z = -0.05 x meets it at x = 3.5 / 0.15.
-    x = 3.5 / 0.15
-    assert hits.range_m[0, 0] == pytest.approx(x * np.sqrt(1 + 0.05**2), rel=1e-5)
-    np.testing.assert_allclose(
-        hits.normal[:, 0, 0], np.array([-0.1, 0, 1]) / np.sqrt(1.01), atol=1e-5
-    )
+    assert hits.range_m[0, 0] == pytest.approx(3.5 / 0.15 * np.sqrt(1 + 0.05**2), rel=1e-5)
+    upward = np.array([-0.1, 0, 1]) / np.sqrt(1.01)
+    np.testing.assert_allclose(hits.normal[:, 0, 0], upward, atol=1e-5)
     steep = replace(slope, centre=(20, 0, 3), half_size=(10, 5, 3))
     front = Hits(Scene((steep,), Pose(z_m=2.0), ground_m=-9), compass(0.0))
     assert front.range_m[0, 0] == pytest.approx(10)
     np.testing.assert_allclose(front.normal[:, 0, 0], [-1, 0, 0], atol=1e-6)
 
 
-def test_a_solid_around_the_sensor_is_not_seen_from_inside():
-    around = solid(Shape.ELLIPSOID, (0, 0, 2), (3, 3, 3))
-    hits = Hits(Scene((around,), Pose(z_m=2.0)), compass(-0.2))
-    assert (hits.surface == GROUND).all()
-
-
 def test_a_moving_solid_is_met_where_it_is_at_that_time():
     car = replace(solid(Shape.BOX, (10, 0, 2), (1, 2, 1)), velocity_m_s=(20.0, 0.0))
-    scene = Scene((car,), Pose(z_m=2.0, heading_rad=0.3))
-    ray = compass(0.0)
-    late = np.full((1, 8), 0.05, dtype=np.float32)
-    ahead = Pose(z_m=2.0)
-    here, there = (Hits(Scene((car,), ahead), ray, actor_time_s=t) for t in (0 * late, late))
+    late, scene = np.full((1, 8), 0.05, dtype=np.float32), Scene((car,), Pose(z_m=2.0))
+    here, there = (Hits(scene, compass(0.0), actor_time_s=t) for t in (0 * late, late))
     assert here.range_m[0, 0] == pytest.approx(9)
     assert there.range_m[0, 0] == pytest.approx(10)
     # The velocity is given in the world frame and turns with the heading.
-    turned = solids_of(scene.primitives, scene.pose, scene.ground_m).velocity[0]
+    turned = solids_of((car,), Pose(z_m=2.0, heading_rad=0.3), 0.0).velocity[0]
     np.testing.assert_allclose(turned, [20 * np.cos(0.3), -20 * np.sin(0.3)], rtol=1e-6)
 
 
@@ -209,10 +194,8 @@ def test_windows_never_cut_a_solid(monkeypatch, seed, moving):
     if moving:  # the sensor moves by up to 1 m and turns by up to 2 degrees
         shift = np.stack([20 * sensor.time_s, 2 * sensor.time_s, 0 * sensor.time_s])
         turn = 0.7 * sensor.time_s
-        x, y, z = rays.direction
-        direction = np.stack(
-            [np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, z]
-        )
+        (x, y, z), cosine, sine = rays.direction, np.cos(turn), np.sin(turn)
+        direction = np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
         rays, motion = Rays(rays.origin + shift, direction), {"actor_time_s": sensor.time_s}
     windowed = Hits(scene, rays, **motion)
 
@@ -233,11 +216,9 @@ def test_single_rays_see_what_the_turn_sees():
     sensor = hdl64e(shots=90)
     turn = Hits(scene, sensor.rays, actor_time_s=sensor.time_s)
     origin, direction = (level(a, scene.pose).reshape(3, -1) for a in sensor.rays)
-    none = np.full(origin.shape[1], NO_SURFACE)
-    reach = np.full(origin.shape[1], REACH_M)
-    range_m, surface = cast_single(
-        turn.solids, origin, direction, sensor.time_s.reshape(-1), reach, none, none
-    )
+    none, reach = (np.full(origin.shape[1], value) for value in (NO_SURFACE, REACH_M))
+    rays = origin, direction, sensor.time_s.reshape(-1)
+    range_m, surface = cast_single(turn.solids, *rays, reach, none, none)
     np.testing.assert_array_equal(surface, turn.surface.reshape(-1))
     seen = np.isfinite(range_m)
     np.testing.assert_allclose(range_m[seen], turn.range_m.reshape(-1)[seen], rtol=1e-6)
@@ -251,11 +232,10 @@ def test_single_rays_leave_out_and_look_inside():
     ahead = np.array([[1], [0], [0]], dtype=np.float32)
     time_s, reach = np.zeros(1, dtype=np.float32), np.array([100.0])
 
-    def one(excluded, hollow):
-        found = cast_single(
-            solids, start, ahead, time_s, reach, np.array([excluded]), np.array([hollow])
-        )
-        return found[0][0], found[1][0]
+    def one(*excluded_and_hollow):
+        surfaces = (np.array([surface]) for surface in excluded_and_hollow)
+        range_m, found = cast_single(solids, start, ahead, time_s, reach, *surfaces)
+        return range_m[0], found[0]
 
     # The front of the house is 0.03 m away, its back wall 8 m behind that.
     assert one(1, NO_SURFACE) == (pytest.approx(0.03, abs=1e-5), 0)

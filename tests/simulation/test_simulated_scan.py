@@ -66,20 +66,6 @@ def test_every_effect_is_accounted_for(street_scan):
     assert all(record.rays > 0 or record.status != "ran" for record in street_scan.effects)
 
 
-def test_points_lie_on_the_surface_whatever_the_pose():
-    """Points on the ground, brought to the world by the pose, have height 0."""
-    pose = Pose(3.0, -2.0, 1.73, 0.7, 0.03, -0.02)
-    points = simulate_scan(Scene((), pose), hdl64e(90), (0,), EXACT).points
-    assert len(points) > 1000
-    x, y, z = points[:, :3].astype(float).T
-    y, z = (
-        np.cos(pose.roll_rad) * y - np.sin(pose.roll_rad) * z,
-        np.sin(pose.roll_rad) * y + np.cos(pose.roll_rad) * z,
-    )
-    z = np.cos(pose.pitch_rad) * z - np.sin(pose.pitch_rad) * x
-    np.testing.assert_allclose(z + pose.z_m, 0, atol=1e-4)
-
-
 def test_labels_name_the_object_and_points_in_the_air_have_none():
     car = Primitive(Shape.BOX, (8, 0, 1), (2, 1, 0.8), Semantic.CAR, 0.5, 0.0, 1234)
     scanned = simulate_scan(Scene((car,)), hdl64e(360), (0,), EXACT)

@@ -195,10 +195,8 @@ def test_files_of_a_killed_run_are_deleted_and_those_of_others_are_not(tmp_path)
     folder, poses = points_folder(tmp_path, "0003"), tmp_path / "data_poses" / drive_name("0003")
     for path in (
         folder / "data" / ".0000000001.1a2b3c4d.partial.bin",
-        folder / "sim" / ".0000000001.1a2b3c4d.partial.json",
         poses / ".velodyne_to_world.1a2b3c4d.partial.txt",
         tmp_path / ".simulation.1a2b3c4d.partial.json",
-        tmp_path / ".report.1a2b3c4d.partial.json",
     ):
         path.write_bytes(b"half")
     grid = tmp_path / "feature_grids" / ".index.1a2b3c4d.partial.json"
