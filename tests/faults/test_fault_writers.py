@@ -10,16 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import pytest
-from fault_commands import (
-    At,
-    Command,
-    assert_whole,
-    fill,
-    kill_worker,
-    limit_files,
-    pause,
-    rows_of,
-)
+from fault_commands import At, Command, assert_whole, fill, kill_worker, limit_files, pause, rows_of
 from tiny_networks import tiny_checkpoint
 
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -48,9 +39,8 @@ def jobs(scans_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("jobs")
     lasers = folder / "lasers.yaml"
     lasers.write_text("lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]")
-    data = {"class_path": "r3dpa.data.LidarDataModule"}
-    data["init_args"] = {"scans": str(scans_folder), "sensor": SENSOR, "grid_size": [2, 8]}
-    data["init_args"]["batch_size"] = 1
+    data = {"scans": str(scans_folder), "sensor": SENSOR, "grid_size": [2, 8], "batch_size": 1}
+    data = {"class_path": "r3dpa.data.LidarDataModule", "init_args": data}
     (folder / "data.yaml").write_text(json.dumps({"data": data}))
     extractor = ["--extractor", "geometric", "--trainer.accelerator", "cpu"]
     sampler = ["--steps", 2, "--pictures", 0, "--device", "cpu", "--formats", "bin,ply,npz"]

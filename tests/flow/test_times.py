@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from r3dpa.flow.times import batch_time, ode_times, sde_times, step_pairs
+from r3dpa.flow.times import ode_times, sde_times, step_pairs
 
 
 def test_time_grids_by_hand():
@@ -58,14 +58,3 @@ def test_no_shift_is_linspace_to_the_bit(start, stop):
 def test_impossible_times_are_refused(grid, message):
     with pytest.raises(ValueError, match=message):
         grid()
-
-
-def test_batch_time_is_at_least_float32():
-    for dtype, expected in [
-        (torch.bfloat16, torch.float32),
-        (torch.float32, torch.float32),
-        (torch.float64, torch.float64),
-    ]:
-        time = batch_time(0.25, torch.zeros(3, 2, dtype=dtype))
-        assert time.tolist() == [0.25] * 3
-        assert time.dtype == expected

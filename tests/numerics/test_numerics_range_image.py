@@ -118,18 +118,20 @@ def test_scans_of_few_points_pass_through_images_grids_and_networks(dtype, vae):
 @pytest.mark.numerics("damaged scan file")
 def test_a_damaged_scan_is_refused_by_name(damage, tmp_path):
     points = np.ones((4, 4), np.float32)
-    points[2, 1] = np.nan if damage == "nan" else 1
     path = tmp_path / "0000000007.bin"
-    path.write_bytes(points.tobytes()[: 56 if damage == "cut" else None])
-    message = {"cut": "has 56 bytes, not a multiple of 16", "nan": "values in 1 of 4 points"}
-    with pytest.raises(ScanError, match=rf"0000000007\.bin.*{message[damage]}"):
-        read_scan(path)
     if damage == "cut":
+        path.write_bytes(points.tobytes()[:56])
+        says = "has 56 bytes, not a multiple of 16"
         with pytest.raises(ValueError, match="reshape") as error:
             np.fromfile(path, np.float32).reshape(-1, 4)
         assert path.name not in str(error.value)
     else:
-        assert np.isnan(np.fromfile(path, np.float32).reshape(-1, 4).mean())
+        points[2, 1] = np.nan
+        path.write_bytes(points.tobytes())
+        says = "values in 1 of 4 points"
+        assert np.isnan(np.fromfile(path, np.float32).mean())
+    with pytest.raises(ScanError, match=rf"0000000007\.bin.*{says}"):
+        read_scan(path)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -193,22 +195,3 @@ def test_an_image_comes_back_from_its_points(sensor, seed):
     row, column = projection.pixel_of(whole)
     assert torch.equal(row, torch.arange(sensor.beams)[:, None].expand_as(row))
     assert torch.equal(column, torch.arange(sensor.columns).expand_as(column))
-
-
-@pytest.mark.numerics
-@exhaustive
-@given(sensor=sensors(), point=st.lists(st.floats(width=32), min_size=3, max_size=3))
-def test_any_float32_point_has_a_pixel_and_at_most_one_return(sensor, point):
-    """NaN, infinities, denormals and signed zeros among them."""
-    points = torch.tensor([point])
-    projection = SphericalProjection(sensor)
-    row, column = projection.pixel_of(points)
-    assert 0 <= row.item() < sensor.beams
-    assert 0 <= column.item() < sensor.columns
-    range_m, image = range_image(points, projection, points)
-    assert (range_m > 0).sum() <= 1
-    assert not image.isnan().any()
-    exact = math.hypot(*point)
-    inside = sensor.range_min_m * (1 + 1e-6) < exact < sensor.range_max_m * (1 - 1e-6)
-    if inside:
-        assert range_m[row, column].item() == pytest.approx(exact, rel=1e-7)

@@ -122,29 +122,6 @@ def test_steps_below_the_edge_change_nothing():
         np.testing.assert_array_equal(plain.grid(before)[:, columns], sweep.grid(after)[:, columns])
 
 
-@pytest.mark.parametrize("divergence_rad", [0.0, 2e-3])
-def test_hit_rate_of_thin_poles(divergence_rad):
-    """(w + sqrt(2/3) * footprint) / pitch of each beam, over 50 poles 40 m away and 64 beams."""
-    width_m, distance_m = 0.03, 40.0
-    bearings = np.linspace(0, 2 * np.pi, 50, endpoint=False) + generator_for(1).random(50) / 20
-    feet = ((distance_m * np.cos(angle), distance_m * np.sin(angle), 0.0) for angle in bearings)
-    poles = tuple(pole(foot, width_m / 2, 40.0, reflectivity=0.3) for foot in feet)
-    sensor = replace(SENSOR, divergence_rad=divergence_rad)
-    sweep = swept(Scene(poles, Pose(z_m=0.0), ground_m=-1000), sensor)
-    hits = (sweep.first.surface >= 0) & (sweep.first.power > 0)
-    footprint = divergence_rad * distance_m / np.cos(sensor.lasers.inclination_rad)
-    pitch = 2 * np.pi * distance_m / sensor.shots
-    expected = ((width_m + np.sqrt(2 / 3) * footprint) / pitch).mean()
-    # 4 standard errors of 3200 trials.
-    rate = hits.sum() / (len(poles) * sensor.num_beams)
-    assert rate == pytest.approx(expected, abs=4 * np.sqrt(0.25 / 3200))
-    shares = sweep.first.power[hits] * sweep.first.range_m[hits] ** 2
-    assert shares.max() <= 0.3 * 1.0001
-    if divergence_rad:
-        # The mean share of all shots is the share of the pole in a pitch.
-        assert (shares / 0.3).sum() / (50 * 64) < 1.05 * width_m / pitch
-
-
 def crowd(seed):
     generator = generator_for("edges", seed)
     solids = []

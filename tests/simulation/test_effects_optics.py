@@ -137,10 +137,8 @@ def test_glass_mirrors_at_grazing_incidence():
     assert face.sum() > 20
     np.testing.assert_allclose(x[face], 40, rtol=1e-5)
     rays = rays[face]
-    incidence = sweep.cos_incidence[rays]
-    reflectance = 1 - pane_transmittance(incidence)
-    facing = sweep.direction[0, rays]
-    expected = reflectance**2 * 0.8 * facing / sweep.first.range_m[rays] ** 2
+    reflectance = 1 - pane_transmittance(sweep.cos_incidence[rays])
+    expected = reflectance**2 * 0.8 * sweep.direction[0, rays] / sweep.first.range_m[rays] ** 2
     np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=2e-3)
 
 
@@ -202,8 +200,7 @@ def test_image_in_a_puddle(heading_rad, pitch_rad):
     assert ((z < -1.73) & (z > -1.73 - 4)).all()
     legs = image(dry, rays)
     assert (np.hypot(legs[0] - 10, legs[1] - 1) < 2.001).all()
-    down = np.abs(sweep.direction[2, rays])
-    reflectance = fresnel_reflectance(down, 1.33)
+    reflectance = fresnel_reflectance(np.abs(sweep.direction[2, rays]), 1.33)
     expected = reflectance**2 * 0.5 * sweep.direction[0, rays] / sweep.first.range_m[rays] ** 2
     np.testing.assert_allclose(sweep.first.power[rays], expected, rtol=1e-3)
 

@@ -66,11 +66,9 @@ def test_last_ground_return(smooth):
     # A pitch of the sensor sweeps its beams over the ground in steps far below their pitch.
     for pitch in np.linspace(0, 0.006, 13):
         pose = Pose(pitch_rad=pitch)
-        scene = (
-            Scene((floor,), pose, ground_m=-3)
-            if smooth
-            else Scene((), pose, ground_reflectivity=0.1)
-        )
+        scene = Scene((), pose, ground_reflectivity=0.1)
+        if smooth:
+            scene = Scene((floor,), pose, ground_m=-3)
         sweep = swept(scene, sensor, after=[DiffuseReflection(), DetectionLimit()])
         farthest = max(farthest, sweep.first.range_m[np.isfinite(sweep.first.range_m)].max())
     expected = (0.1 * 1.73 / 1.38e-6) ** (1 / 3) if smooth else 50.0
