@@ -48,7 +48,8 @@ def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys)
 
 
 def test_a_stage_of_range_images_needs_batches_of_them(smoke_args, tmp_path):
-    arguments = smoke_args("vae_alignment", tmp_path, "--data", f"{BORING}.BoringDataModule")
+    more = ["--data", f"{BORING}.BoringDataModule", "--trainer.logger=false"]
+    arguments = smoke_args("vae_alignment", tmp_path, *more)
     with pytest.raises(
         ValueError,
         match=r"data\.class_path: VAEAlignment needs a data module that gives .*LidarBatch.*, "
