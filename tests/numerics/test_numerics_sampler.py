@@ -130,8 +130,8 @@ def test_sde_starts_and_ends_with_finite_numbers(path, dtype):
     velocity = torch.randn(4, 16, generator=generator).to(dtype)
     for last in ("denoise", "mean"):
         options = {"interpolant": interpolant, "last": last}
-        args = lambda x, time: velocity, x.to(dtype), sde_times(4), generator
-        assert euler_maruyama(*args, **options).isfinite().all()
+        steps = x.to(dtype), sde_times(4), generator
+        assert euler_maruyama(lambda x, time: velocity, *steps, **options).isfinite().all()
     ends = torch.tensor([0.0, 0.0, 1.0, 1.0])
     assert interpolant.sde_drift(velocity, x, ends).isfinite().all()
     divided = velocity - ends[:, None] * interpolant.score(velocity, x, ends)

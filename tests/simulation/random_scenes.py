@@ -85,7 +85,7 @@ def _scene(dice):
     materials = [m for m in Material if dice.chance(0.3)] or [Material.CONCRETE]
     moving, leafy = dice.chance(0.4), dice.chance(0.3)
     count = 0 if dice.chance(0.05) else int(dice.generator.integers(1, 26))
-    near = (
+    puddles = (
         Puddle(x_m + dice.even(-12, 12), y_m + dice.even(-12, 12), dice.even(0.01, 8))
         for _ in range(dice.among(0, 0, 1, 4))
     )
@@ -106,7 +106,7 @@ def _scene(dice):
             dice.among(0.0, 0.0, 0.0, 1e-6, dice.even(-1.5, 1.5)),
         ),
         _weather(dice),
-        tuple(near),
+        tuple(puddles),
         tuple(body),
         ground_m,
         dice.among(0.15, 1.0, 1e-3, dice.even(0.05, 0.6)),

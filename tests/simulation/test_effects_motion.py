@@ -39,9 +39,9 @@ def azimuth_of(sweep):
     return np.arctan2(direction[1], direction[0])
 
 
-def horizontal_range(sweep, beam=LEVEL):
-    slope = sweep.sensor.rays.direction[2, beam, 0]
-    return sweep.grid(sweep.first.range_m)[beam] * np.sqrt(1 - slope**2)
+def horizontal_range(sweep):
+    slope = sweep.sensor.rays.direction[2, LEVEL, 0]
+    return sweep.grid(sweep.first.range_m)[LEVEL] * np.sqrt(1 - slope**2)
 
 
 def test_rolling_shutter_at_50_km_h_steps_by_139_cm_behind_the_car():

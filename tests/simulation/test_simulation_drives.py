@@ -302,14 +302,10 @@ def test_a_damaged_manifest_is_named(tmp_path, text):
 @pytest.mark.parametrize("scans", [1, 2, 3, 10, 100, 1001])
 def test_split(scans):
     counts = split_scans(scans, (*TRAIN_DRIVES, *VAL_DRIVES))
-    train = [counts.get(drive, 0) for drive in TRAIN_DRIVES]
-    val = [counts.get(drive, 0) for drive in VAL_DRIVES]
-    assert sum(train) + sum(val) == scans
-    assert max(train) - min(train) <= 1
-    assert max(val) - min(val) <= 1
-    assert sum(train) >= 1
-    if scans >= 2:
-        assert sum(val) == max(1, round(0.2 * scans))
+    train, val = ([counts.get(d, 0) for d in group] for group in (TRAIN_DRIVES, VAL_DRIVES))
+    assert sum(val) == (max(1, round(0.2 * scans)) if scans >= 2 else 0)
+    assert sum(train) == scans - sum(val) >= 1
+    assert max(max(group) - min(group) for group in (train, val)) <= 1
     assert all(counts.values())
 
 
