@@ -68,7 +68,7 @@ def test_the_average_is_evaluated_where_there_is_one(tmp_path):
             weight.mul_(1.5)
     trainer = L.Trainer(accelerator="cpu", logger=False, default_root_dir=tmp_path, **SILENT)
     (logged,) = trainer.validate(module, datamodule=data, verbose=False)
-    draws = steps.draw_held_out(module, torch.arange(4), (4, 4, 8), module.seed)
+    draws = steps.draw_held_out(module, torch.arange(4))
     losses = {}
     for name, networks in (("average", module.ema), ("last", module)):
         with torch.no_grad():

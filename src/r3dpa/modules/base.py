@@ -102,6 +102,7 @@ class GenerativeModule(L.LightningModule):
         self.weights = weights
         self.optimizer_config = optimizer
         self.interpolant = Interpolant(path)
+        self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.time_sampling = time_sampling
         self.init_from = init_from
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
@@ -202,11 +203,7 @@ class GenerativeModule(L.LightningModule):
         """Whether a training batch must hold feature grids."""
         return self.weights.vae_alignment != 0 or self.weights.sit_alignment != 0
 
-    def draw_path(self, num_scans: int, batch_number: int | None = None) -> PathDraws:
-        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
-        shape = (self.vae.latent_channels, *self.sit.input_size)
-        return steps.draw_path(self, num_scans, shape, self.seed, batch_number, self.time_sampling)
-
+    draw_path = steps.draw_path
     weigh_and_log = steps.weigh_and_log
 
     def vae_losses(
@@ -320,8 +317,7 @@ class GenerativeModule(L.LightningModule):
         """
         image, mask = batch["range_image"], batch["valid_mask"]
         codec = self.scan_geometry.codec
-        shape = (self.vae.latent_channels, *self.sit.input_size)
-        draws = steps.draw_held_out(self, batch["index"], shape, self.seed, self.time_sampling)
+        draws = steps.draw_held_out(self, batch["index"])
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()

@@ -30,6 +30,7 @@ class ImageVAETraining(L.LightningModule):
     """
 
     stage = "image_vae"
+    time_sampling = "uniform"
 
     def __init__(
         self,
@@ -48,19 +49,14 @@ class ImageVAETraining(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Checks trainer and data against the VAE."""
         check_trainer(self.trainer)
-        image_datamodule(self, self.vae)
-
-    def draw_path(self, num_images: int) -> steps.PathDraws:
-        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
         size = image_datamodule(self, self.vae).image_size
-        shape = (self.vae.latent_channels, *self.vae.latent_size((size, size)))
-        return steps.draw_path(self, num_images, shape, self.seed)
+        self.latent_shape = (self.vae.latent_channels, *self.vae.latent_size((size, size)))
 
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, 3, S, S)``."""
         image, weights = batch["image"], self.weights
         posterior = self.vae.encode(image)
-        latents = posterior.sample(self.draw_path(len(image)).posterior_noise)
+        latents = posterior.sample(steps.draw_path(self, len(image)).posterior_noise)
         reconstruction = self.vae.decode(latents)
         error = reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
         losses = {

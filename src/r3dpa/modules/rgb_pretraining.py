@@ -91,6 +91,7 @@ class RGBPretraining(L.LightningModule):
         self.vae, self.sit = vae, sit
         self.weights, self.optimizer_config = weights, optimizer
         self.time_sampling, self.seed = time_sampling, seed
+        self.latent_shape = (vae.latent_channels, *sit.input_size)
         self.interpolant = Interpolant("linear")
         self.latent_norm = LatentNorm(vae.latent_channels)
         self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -162,18 +163,13 @@ class RGBPretraining(L.LightningModule):
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
         posterior, weights = Posterior(batch["posterior_moments"]), self.weights
-        draws = self.draw_path(len(posterior.mean))
+        draws = steps.draw_path(self, len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(self.sit, normalised, draws, self._features(batch))
         losses = {"denoising": weights.denoising * denoising.mean()}
         if alignment is not None:
             losses["sit_alignment"] = weights.sit_alignment * alignment.mean()
         return steps.weigh_and_log(self, losses)
-
-    def draw_path(self, num_images: int, batch_number: int | None = None) -> steps.PathDraws:
-        """Random numbers of a step, see :func:`r3dpa.modules.steps.draw_path`."""
-        shape = (self.vae.latent_channels, *self.sit.input_size)
-        return steps.draw_path(self, num_images, shape, self.seed, batch_number, self.time_sampling)
 
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:
@@ -200,8 +196,7 @@ class RGBPretraining(L.LightningModule):
         """Held-out images: the losses of the averaged SiT."""
         sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
-        shape = (self.vae.latent_channels, *self.sit.input_size)
-        draws = steps.draw_held_out(self, batch["index"], shape, self.seed, self.time_sampling)
+        draws = steps.draw_held_out(self, batch["index"])
         normalised = norm.normalise(posterior.sample(draws.posterior_noise))
         denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
         values = {"denoising": denoising} | ({} if alignment is None else {"alignment": alignment})

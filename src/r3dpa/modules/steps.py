@@ -19,7 +19,7 @@ from r3dpa import __version__
 from r3dpa.flow import sample_time
 from r3dpa.io import source_commit
 from r3dpa.losses import reconstruction_loss
-from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
+from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.nn import VelocityNetwork
 
 
@@ -34,57 +34,36 @@ class PathDraws(NamedTuple):
     noise: Tensor
 
 
-def draw_path(
-    module: L.LightningModule,
-    num_samples: int,
-    latent_shape: tuple[int, int, int],
-    seed: int,
-    number: int | None = None,
-    time_sampling: TimeSampling = "uniform",
-) -> PathDraws:
+def draw_path(module: Any, num_samples: int, number: int | None = None) -> PathDraws:
     """Posterior noise, times and path noise for this process's part of a global batch.
 
     They are a function of ``(seed, batch, sample)``, whatever the number of processes.
 
     Args:
-        module: Attached to a trainer, on its device.
+        module: Attached to a trainer, on its device; has ``seed``, ``latent_shape`` ``(C, h, w)``
+            and ``time_sampling``.
         num_samples: Samples B of the batch on this process.
-        latent_shape: ``(C, h, w)``.
-        seed: Key of the draws.
         number: Number of the batch since the start of training; None is that of the batch at hand.
-        time_sampling: Density of the times.
     """
     world, rank = module.trainer.world_size, module.trainer.global_rank
     number = batch_number(module) if number is None else number
-    drawn = _draw(module, [seed, 0, number], num_samples * world, latent_shape, time_sampling)
+    drawn = _draw(module, [module.seed, 0, number], num_samples * world)
     return PathDraws(*(values[rank::world] for values in drawn))
 
 
-def draw_held_out(
-    module: L.LightningModule,
-    index: Tensor,
-    latent_shape: tuple[int, int, int],
-    seed: int,
-    time_sampling: TimeSampling = "uniform",
-) -> PathDraws:
-    """Draws for held-out scans, a function of ``(seed, index)``; arguments of :func:`draw_path`."""
-    each = [_draw(module, [seed, 1, i], 1, latent_shape, time_sampling) for i in index.tolist()]
+def draw_held_out(module: Any, index: Tensor) -> PathDraws:
+    """Draws for held-out scans ``(B,)``, a function of ``(seed, index)``."""
+    each = [_draw(module, [module.seed, 1, number], 1) for number in index.tolist()]
     return PathDraws(*map(torch.cat, zip(*each, strict=True)))
 
 
-def _draw(
-    module: L.LightningModule,
-    key: list[int],
-    total: int,
-    latent_shape: tuple[int, int, int],
-    time_sampling: TimeSampling,
-) -> PathDraws:
+def _draw(module: Any, key: list[int], total: int) -> PathDraws:
     state = np.random.SeedSequence(key).generate_state(1)
     generator = torch.Generator(module.device).manual_seed(int(state[0]))
-    shape = (total, *latent_shape)
+    shape = (total, *module.latent_shape)
     return PathDraws(
         torch.randn(shape, generator=generator, device=module.device),
-        sample_time(total, time_sampling, generator=generator),
+        sample_time(total, module.time_sampling, generator=generator),
         torch.randn(shape, generator=generator, device=module.device),
     )
 
