@@ -185,9 +185,11 @@ def test_missing_grid_names_the_scan_and_the_command(made, projection, make_scan
         FeatureGrids(root / "none", find_scans(folder), projection, GRID)
 
 
-def test_replaced_scan_is_noticed_and_made_again(made, projection, scaled_points):
+@pytest.mark.parametrize("lost_bytes", [16, 0])
+def test_replaced_scan_is_noticed_and_made_again(lost_bytes, made, projection, scaled_points):
     scans, root = made
-    scans[1].path.write_bytes(scans[3].path.read_bytes()[:-16])
+    points = read_scan(scans[1].path)[:, [1, 0, 2, 3]]  # with 0 by another one of its size
+    scans[1].path.write_bytes(points.tobytes()[: points.nbytes - lost_bytes])
     with pytest.raises(StoreError, match=re.escape(str(scans[1].path)) + ".*replaced"):
         FeatureGrids(root, scans, projection, GRID).read(scans[1])
     assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1
