@@ -1,0 +1,62 @@
+"""Stage 2: VAE and SiT trained together, both aligned with 3D features (REPA-E)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from r3dpa.data.datasets import LidarBatch
+from r3dpa.modules.base import GenerativeModule
+from r3dpa.modules.steps import frozen
+from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
+
+
+class JointAlignment(GenerativeModule):
+    """Joint training: the VAE by L_AE + lambda1 L_align, the SiT by L_denoise + lambda2 L_align.
+
+    Both see the same latents, times and noise. The alignment loss reaches the VAE through a frozen
+    SiT with running latent statistics; the SiT sees detached latents, normalised with batch
+    statistics.
+
+    Source: R3DPA (ICRA 2026), section "End-to-end training"; REPA-E.
+
+    Args:
+        vae: Range-image autoencoder.
+        sit: Velocity network, :class:`r3dpa.nn.SiT` or :class:`r3dpa.nn.UNet`.
+        discriminator: Patch discriminator.
+        **kwargs: See :class:`GenerativeModule`; without ``init_from`` training starts from scratch.
+    """
+
+    stage = "joint"
+    default_init = ("vae", "discriminator", "sit", "latent_norm")
+
+    def __init__(
+        self, vae: VAE, sit: VelocityNetwork, discriminator: PatchDiscriminator, **kwargs: Any
+    ) -> None:
+        super().__init__(vae, sit, discriminator, **kwargs)
+        self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
+
+    def trainable(self) -> dict[str, nn.Module]:
+        """All three networks."""
+        return {
+            "vae": self.vae,
+            "discriminator": self.get_submodule("discriminator"),
+            "sit": self.sit,
+        }
+
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """One step on range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+        image, features = batch["range_image"], batch.get("feature_grid")
+        draws = self.draw_path(len(image))
+        posterior = self.vae.encode(image)
+        latents = posterior.sample(draws.posterior_noise)
+        reconstruction = self.vae.decode(latents)
+
+        losses = self.vae_losses(image, posterior, reconstruction)
+        with frozen(self.sit):
+            losses |= self.vae_alignment_losses(latents, features, draws)
+        losses |= self.discriminator_losses(image, reconstruction)
+        normalised = self.latent_norm.update(latents.detach())
+        losses |= self.flow_losses(normalised, features, draws)
+        return self.weigh_and_log(losses)
