@@ -32,7 +32,7 @@ _FIT_EPS = 0.1  # of the gradient's length: less would make steps of the roundin
 
 @dataclass(frozen=True)
 class EditSettings:
-    """How latents are carried to noise and back.
+    """Settings of the inversion of latents to noise and back.
 
     Args:
         solver: A key of :data:`r3dpa.flow.ODE_SOLVERS`. Midpoint steps have by far the smallest

@@ -217,7 +217,7 @@ class SceneGenerator:
 
     @property
     def device(self) -> torch.device:
-        """Where the networks are."""
+        """Device of the networks."""
         return next(self.sit.parameters()).device
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:

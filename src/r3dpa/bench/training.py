@@ -41,7 +41,7 @@ STAGES = ("vae_alignment", "joint", "flow_matching")
 
 @dataclass(frozen=True)
 class StepSettings:
-    """How the measured steps are run; ``quick`` takes the networks of the demo.
+    """Settings of the measured steps; ``quick`` takes the networks of the demo.
 
     The first of ``steps`` pays for warm-up and runs before the optimiser has moments: the peak of a
     long run takes two.

@@ -247,7 +247,7 @@ class FeatureGuidance:
 
     @property
     def num_dropped(self) -> int:
-        """How often a sample went unguided because its gradient was not finite."""
+        """Number of times that a sample went unguided because its gradient was not finite."""
         return int(self._num_dropped)
 
     def _add_to_drift(self, drift: Tensor, x: Tensor, time: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ Quality = Literal["draft", "good", "best"]
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """How noise becomes latents.
+    """Solver, steps and schedule that turn noise into latents.
 
     Args:
         solver: ``euler_maruyama`` solves the SDE, the others the ODE.

@@ -112,8 +112,8 @@ def evaluate(
             rows += metric.results(resampling)
 
     extra = dict(made_with or {})
-    told = ("solver", "steps", "seed", "precision", "feature_source")
-    about = {key: extra.pop(key, None) for key in told}
+    keys = ("solver", "steps", "seed", "precision", "feature_source")
+    about = {key: extra.pop(key, None) for key in keys}
     if more:
         extra["scenes"] = f"only the first {len(names)} were used, as many as the protocol counts"
     elif len(names) < protocol.num_samples:

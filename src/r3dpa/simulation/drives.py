@@ -66,7 +66,7 @@ class SimulationReport:
     num_written: int  # by this call; the others existed before
 
     def to_dict(self) -> dict[str, Any]:
-        """What does not depend on the call, as plain values."""
+        """Content that depends on the request alone, as plain values."""
         effects = {name: total._asdict() for name, total in self.effects.items()}
         about = {"scans_per_drive": self.scans_per_drive, "num_empty": self.num_empty}
         return about | {"effects": effects}

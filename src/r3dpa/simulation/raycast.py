@@ -125,7 +125,7 @@ def cast_single(
 def surface_distance(
     solids: Solids, index: NDArray[np.integer], origin: Floats, direction: Floats
 ) -> tuple[Floats, Floats]:
-    """Where each ray ``(3, M)`` enters and leaves its own solid ``index`` (M,); NaN for a miss."""
+    """Ranges where rays ``(3, M)`` enter and leave their own solids ``index`` (M,); NaN: a miss."""
     enter = np.full(len(index), np.nan, dtype=np.float32)
     leave = enter.copy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -325,7 +325,7 @@ def _crossing(
 
 
 def _slab(position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
-    """Where ``position + t velocity`` enters and leaves [-1, 1]."""
+    """Values of ``t`` at which ``position + t velocity`` enters and leaves [-1, 1]."""
     # Not 0, because a ray along the slab would give inf - inf.
     inverse = np.reciprocal(velocity + np.float32(1e-30))
     middle = position * inverse

@@ -144,7 +144,7 @@ def pieces(index: int, windows: Windows, num_shots: int) -> list[tuple[slice, sl
 
 
 class _Fan(NamedTuple):
-    """How far the rays of a turn leave their nominal azimuth and inclination."""
+    """Deviations of the rays of a turn from their nominal azimuth and inclination."""
 
     num_shots: int
     least_deviation: float  # of the azimuth from shot * 2 pi / W, radians

@@ -328,7 +328,7 @@ def _beside_thin_solids(sweep: Sweep) -> tuple[Indices, Indices]:
 
 
 def _rim_ranges(sweep: Sweep, rays: Indices, surface: Surfaces) -> Floats:
-    """Where the points of the rims of rays ``(K,)`` meet their surfaces, ``(6, K)``."""
+    """Intersections of the rims of rays ``(K,)`` with their surfaces, ``(6, K)``."""
     radius = np.float32(sweep.sensor.divergence_rad / 2)
     six, surfaces = np.tile(rays, len(_RING_LEFT)), np.tile(surface, len(_RING_LEFT))
     left, up = (np.repeat(radius * side, len(rays)) for side in (_RING_LEFT, _RING_UP))
@@ -337,7 +337,7 @@ def _rim_ranges(sweep: Sweep, rays: Indices, surface: Surfaces) -> Floats:
 
 
 def _range_to(sweep: Sweep, rays: Indices, surface: Surfaces, direction: Floats) -> Floats:
-    """Where rays ``(M,)`` in other directions meet given surfaces; infinite where they miss."""
+    """Ranges where rays ``(M,)`` in other directions meet given surfaces; infinite for a miss."""
     start = sweep.start[:, rays]
     solid = np.flatnonzero(surface >= 0)
     index = surface[solid]
@@ -361,7 +361,7 @@ def _turned_aside(sweep: Sweep, rays: Indices, left: Floats, up: Floats) -> Floa
 
 
 def _seen_from(sweep: Sweep, rays: Indices, solid: Indices) -> tuple[Floats, Floats]:
-    """How far the centres of solids lie ahead of rays and to their left, seen from above."""
+    """Distances of the centres of solids ahead of rays and to their left, seen from above."""
     x, y = sweep.solids.centre[solid, :2].T - sweep.start[:2, rays]
     if sweep.actor_time_s is not None:
         velocity, time_s = sweep.solids.velocity[solid].T, sweep.actor_time_s[rays]
