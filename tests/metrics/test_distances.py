@@ -222,7 +222,7 @@ def test_few_samples(num_real, message):
     with pytest.raises(ValueError, match=rf"{message}.* for 6 features, at least 7"):
         metric.compute()
     row = metric.results(Resampling(num_resamples=0))[0]
-    assert "scenes for 6 features: tells mostly how few they are" in row.note
+    assert "scenes for 6 features: dominated by their small number" in row.note
 
 
 def test_no_copy_of_the_empty_histograms_is_kept():

@@ -266,7 +266,11 @@ def random_cells(grid, num_clouds, seed):
 def test_matching_equals_all_against_all(threads, monkeypatch):
     """Also without looking up the second direction of most pairs."""
     lookups, lookup = [], functional_bev._mean_lookup
-    counted = lambda table, cells: lookups.append(None) or lookup(table, cells)  # noqa: E731
+
+    def counted(table, cells):
+        lookups.append(None)
+        return lookup(table, cells)
+
     monkeypatch.setattr(functional_bev, "_mean_lookup", counted)
     grid = BEVGrid(cell_m=1.0)
     references, samples = list(random_cells(grid, 12, 0)), list(random_cells(grid, 15, 1))

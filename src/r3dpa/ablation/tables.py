@@ -33,8 +33,8 @@ class Order(NamedTuple):
     """Result for one order of the paper in one metric.
 
     ``claim`` (better, worse, alike) is by the paper's numbers in this metric if it printed both.
-    ``change`` and ``interval`` are those of :func:`relative_change`. ``holds`` (yes, no, unclear)
-    tells whether the interval lies inside or outside the claim; *alike* is a difference of at most
+    ``change`` and ``interval`` are those of :func:`relative_change`. ``holds`` is yes if the
+    interval lies inside the claim, no if outside, else unclear; *alike* is a difference of at most
     5 %.
     """
 
@@ -48,7 +48,7 @@ class Order(NamedTuple):
 
 
 def order_results(table: Table, results: Results, metrics: Mapping[str, bool]) -> list[Order]:
-    """Orders for which there are results; ``metrics`` tells which are better where lower."""
+    """Orders for which there are results; ``metrics`` is True where lower values are better."""
     printed = {row.key: row.published for row in table.rows}
     found = []
     for (claim, first, second), (metric, lower) in product(table.orders, metrics.items()):

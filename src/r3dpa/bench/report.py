@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 _LEVEL = 0.975  # one-sided: 95 % for both sides
 _RESAMPLES = 1000
 _MARGIN = 10  # the reference must be this many times more exact than what it judges
-_SMALL_ERROR = 0.01  # negligible error of latents (of unit variance) where no bf16 row tells one
+_SMALL_ERROR = 0.01  # negligible error of latents (of unit variance) without a measured bf16 row
 _LEVELS = {"draft": 10.0, "good": 4.0, "best": 1.0}  # largest error over the negligible one
 _AS_CHEAP = 1.1
 

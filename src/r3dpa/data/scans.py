@@ -270,7 +270,7 @@ def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                     continue
                 if reason := refuse_name(info.filename):
                     raise ValueError(f"its name {reason}")
-                size = path.stat().st_size  # before so much memory is asked for
+                size = path.stat().st_size  # checked before memory is allocated
                 if info.compress_size > size or info.file_size > max(2**30, 100 * size):
                     raise ValueError("it is far larger than the file")
                 yield info.filename.removesuffix(".npy"), _array(archive.read(info))

@@ -193,7 +193,7 @@ class SceneWriter:
         size = self._unfinished.stat().st_size if self._unfinished.exists() else 0
         if self.num_done and size < end:  # to extend it would make scenes of zeros
             raise ValueError(
-                f"{self._unfinished} is gone or cut short, but {self._state} tells of "
+                f"{self._unfinished} is gone or cut short, but {self._state} counts "
                 f"{self.num_done} scenes: give --overwrite true to start anew"
             )
         mode = "r+b" if self.num_done else "wb"

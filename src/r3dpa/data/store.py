@@ -53,16 +53,19 @@ class StoreError(DataError):
 
 
 class Cacheable(Protocol):
-    """Scan or image that a row is made of; ``name`` is unique, ``path`` stands in messages."""
+    """Scan or image that a row is made of."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str:
+        """Unique name."""
 
     @property
-    def path(self) -> Path: ...  # noqa: D102
+    def path(self) -> Path:
+        """File that error messages name."""
 
     @property
-    def cache_key(self) -> ItemKey: ...  # noqa: D102
+    def cache_key(self) -> ItemKey:
+        """Name, size in bytes and time of change of the file."""
 
 
 Item = TypeVar("Item", bound=Cacheable)

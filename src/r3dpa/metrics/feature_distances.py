@@ -128,7 +128,7 @@ class FrechetDistance(FeatureMetric):
             lambda drawn: self._distance(Moments.of(rows[drawn])).item(), len(rows)
         )
         fewest = min(self.count(side) or math.inf for side in SIDES)
-        few = f"{fewest} scenes for {width} features: tells mostly how few they are"
+        few = f"{fewest} scenes for {width} features: dominated by their small number"
         value = self._distance(self.moments("generated")).item()
         return [self._row(self.label, value, interval=ends, note=few * (fewest <= width))]
 

@@ -54,7 +54,7 @@ class Sweep(NamedTuple):
     def other_ring(self, step: int) -> tuple[Indices, Mask]:
         """Index ``(P,)`` of the return of nearest azimuth ``step`` rings lower.
 
-        The mask tells whether it lies within 1.5 shots and in that ring.
+        The mask is True where it lies within 1.5 shots and in that ring.
         """
         key = self.ring * 2 * math.pi + self.azimuth
         ascending = np.argsort(key, kind="stable")
