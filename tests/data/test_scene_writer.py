@@ -129,7 +129,7 @@ def test_lost_range_images_are_not_made_up(tmp_path, damage):
             file.truncate(images.stat().st_size - 4)
     before = files(tmp_path)
     with pytest.raises(
-        ValueError, match=r"\.npy is gone or cut short, but .* of 2 scenes.*--overwrite true"
+        ValueError, match=r"\.npy is gone or cut short, but .* counts 2 scenes.*--overwrite true"
     ):
         writer(tmp_path, 4)
     assert files(tmp_path) == before
