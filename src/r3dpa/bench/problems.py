@@ -6,8 +6,8 @@ Letters: N scenes or samples, D dimensions, B batch, K Gaussians.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -91,11 +91,6 @@ class Setting:
         """Network evaluations per scene."""
         return evaluations(self.sampler.solver, self.sampler.steps)
 
-    @property
-    def plain(self) -> Setting:
-        """The same solver in fp32."""
-        return replace(self, precision="fp32")
-
 
 class Solved(NamedTuple):
     """Latents ``(N, ...)`` and range images ``(N, H, W)``, none without a decoder; on the CPU."""
@@ -142,21 +137,13 @@ class ModelProblem:
     """Networks of a checkpoint; where nothing is timed ``batch`` scenes are solved together."""
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
+        read = partial(SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device)
         self.batch = batch
-        self._read = partial(
-            SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device
-        )
-        self._plain = self._read()
-        self.device = self._plain.device
+        self._generators = {"fp32": read(), "bf16": read(precision="bf16")}
+        self.device = self._generators["fp32"].device
 
     def _generator(self, setting: Setting) -> SceneGenerator:
-        """Generator of its own that shares the plain networks with others."""
-        plain = setting.precision == "fp32"
-        return (self._plain if plain else self._rounded).with_sampler(setting.sampler)
-
-    @cached_property
-    def _rounded(self) -> SceneGenerator:
-        return self._read(precision="bf16")
+        return self._generators[setting.precision].with_sampler(setting.sampler)
 
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Scenes of these indices as the generator draws them."""
@@ -167,11 +154,11 @@ class ModelProblem:
     @torch.inference_mode()
     def converged(self, steps: int, indices: range) -> Solved:
         """The same scenes by Heun's method: network in float32 without TF32, state in float64."""
-        generator, sit = self._plain, self._plain.sit
-        noise = next(scene_noise(sit, indices, _SEED)).to(self.device)
+        generator = self._generators["fp32"]
+        noise = next(scene_noise(generator.sit, indices, _SEED)).to(self.device)
 
-        def velocity(x: Tensor, moment: Tensor) -> Tensor:
-            return sit.velocity(x.float(), moment.float()).double()
+        def velocity(x: Tensor, time: Tensor) -> Tensor:
+            return generator.sit.velocity(x.float(), time.float()).double()
 
         with _EXACT_PRODUCTS():
             found = heun(velocity, noise.double(), ode_times(steps))

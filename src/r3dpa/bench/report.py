@@ -80,7 +80,7 @@ class Row:
     @property
     def precision_error(self) -> float | None:
         """RMSE from the same solver in fp32; None for that itself."""
-        return self.errors.precision if self.way != self.way.plain else None
+        return None if self.way.precision == "fp32" else self.errors.precision
 
     @property
     def converged(self) -> bool:

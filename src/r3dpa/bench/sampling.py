@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from r3dpa.bench.measure import Comparison, compare
+from r3dpa.bench.measure import compare
 from r3dpa.bench.problems import (
     MixtureProblem,
     ModelProblem,
@@ -27,7 +27,7 @@ from r3dpa.bench.problems import (
 )
 from r3dpa.bench.report import Errors, Finding, Row, write_report
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.flow.solvers import steps_for
+from r3dpa.flow.solvers import evaluations, steps_for
 from r3dpa.generation import SamplerConfig, Solver
 from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
@@ -80,11 +80,6 @@ class Work:
                 torch.save(value, temporary)
         return torch.load(path, weights_only=True)
 
-    def finish(self) -> None:
-        """Deletes the pieces."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder)
-
 
 def sampling(
     out: Path,
@@ -132,7 +127,8 @@ def sampling(
         "versions": versions(torch, np),
     }
     text = write_report(out, found, facts)
-    work.finish()
+    if work.folder is not None:
+        shutil.rmtree(work.folder)
     return text
 
 
@@ -150,7 +146,8 @@ def settings_of(effort: Effort, precisions: Sequence[Precision] = ()) -> list[Se
     fixed = replace(usual, sampler=SamplerConfig("ab2", _PRECISION_STEPS, shift=2.0))
     ways += [replace(fixed, precision=precision) for precision in precisions]
     ways += [replace(fixed, batch=1)] * bool(precisions)
-    return list(dict.fromkeys(ways))
+    samplers = [way.sampler for way in ways]
+    return sorted(dict.fromkeys(ways), key=lambda way: samplers.index(way.sampler))
 
 
 def run_problem(
@@ -158,19 +155,28 @@ def run_problem(
 ) -> Finding:
     """Error and time of each way to sample, with a progress bar of all network evaluations."""
     work, num, steps = work or Work(), effort.samples, effort.reference_steps
-    solving = sum(way.nfe for way in {*ways, *(way.plain for way in ways)})
+    solved = {(way.sampler, precision) for way in ways for precision in (way.precision, "fp32")}
+    solving = sum(evaluations(sampler.solver, sampler.steps) for sampler, _ in solved)
     timing = sum(way.nfe * way.batch for way in ways) * (effort.rounds + 1)
     total = num * (3 * steps - 2 + solving) + timing
     # Without a terminal there is no bar.
     with tqdm(total=total, unit="evaluation", unit_scale=True, desc="bench", disable=None) as bar:
         exact, self_error = reference(problem, steps, num, work, bar.update)
         errors = errors_of(problem, ways, exact, work, bar.update)
-        labels = _labels(ways, effort.batch)
-        measured = _timed(problem, dict(zip(labels, ways, strict=True)), effort, work, bar.update)
+
+        def case(way: Setting, run: Callable[[], float]) -> float:
+            seconds = run()
+            bar.update(way.nfe * way.batch)
+            return seconds
+
+        labelled = _labelled(ways, effort.batch)
+        cases = {name: partial(case, way, problem.case(way)) for name, way in labelled.items()}
+        # Complete rounds are kept.
+        measured = compare(cases, effort.rounds, lambda n, run: work.piece(f"round_{n}", run))
     each, rest = problem.flop()
     rows = [
         Row(label, way, error, measured.seconds[label], way.nfe * each + rest, self_error)
-        for label, way, error in zip(labels, ways, errors, strict=True)
+        for (label, way), error in zip(labelled.items(), errors, strict=True)
     ]
     return Finding(rows, steps, num, self_error, measured, (each, rest))
 
@@ -209,30 +215,27 @@ def reference(
 def errors_of(
     problem: Problem, ways: Sequence[Setting], exact: Solved, work: Work, advance: Advance
 ) -> list[Errors]:
-    """Errors of each setting; those that differ only in speed share their plain companion."""
-    found: dict[int, Errors] = {}
+    """Errors of each setting, and from the same sampler in fp32."""
 
-    def solve(way: Setting) -> Solved:
-        solve_way = partial(problem.solve, way)
-        return _solved(len(exact.latents), problem.batch, solve_way, way.nfe, advance)
+    @lru_cache(maxsize=2)  # settings of one sampler follow each other
+    def solve(sampler: SamplerConfig, precision: Precision) -> Solved:
+        way = Setting(sampler, precision)
+        return _solved(
+            len(exact.latents), problem.batch, partial(problem.solve, way), way.nfe, advance
+        )
 
-    for sampler in dict.fromkeys(way.sampler for way in ways):
-        companion: list[Solved] = []
+    def errors(way: Setting) -> tuple[Any, ...]:
+        solved, plain = solve(way.sampler, way.precision), solve(way.sampler, "fp32")
+        return (
+            _squared(solved.latents, exact.latents).tolist(),
+            _rmse(solved.latents, plain.latents),
+            *_range_errors(solved.range_m, exact.range_m),
+        )
 
-        def errors(way: Setting, companion: list[Solved] = companion) -> tuple[Any, ...]:
-            if not companion:
-                companion.append(solve(way.plain))
-            solved = companion[0] if way == way.plain else solve(way)
-            return (
-                _squared(solved.latents, exact.latents).tolist(),
-                _rmse(solved.latents, companion[0].latents),
-                *_range_errors(solved.range_m, exact.range_m),
-            )
-
-        for index, way in enumerate(ways):
-            if way.sampler == sampler:
-                found[index] = Errors(*work.piece(f"errors_{index}", partial(errors, way)))
-    return [found[index] for index in range(len(ways))]
+    return [
+        Errors(*work.piece(f"errors_{index}", partial(errors, way)))
+        for index, way in enumerate(ways)
+    ]
 
 
 def _squared(a: Tensor, b: Tensor) -> Tensor:
@@ -254,27 +257,13 @@ def _range_errors(a: Tensor | None, b: Tensor | None) -> tuple[float | None, flo
     return rmse, (both.sum() / torch.clamp(either.sum(), min=1)).item()
 
 
-def _timed(
-    problem: Problem, ways: Mapping[str, Setting], effort: Effort, work: Work, advance: Advance
-) -> Comparison:
-    """Times of all ways; complete rounds are kept."""
-
-    def case(way: Setting, run: Callable[[], float]) -> float:
-        seconds = run()
-        advance(way.nfe * way.batch)
-        return seconds
-
-    cases = {label: partial(case, way, problem.case(way)) for label, way in ways.items()}
-    return compare(cases, effort.rounds, lambda number, run: work.piece(f"round_{number}", run))
-
-
-def _labels(ways: Sequence[Setting], batch: int) -> list[str]:
-    """Name and NFE; precision and batch only where several rows share them."""
-    labels: list[str] = []
+def _labelled(ways: Sequence[Setting], batch: int) -> dict[str, Setting]:
+    """Settings by name and NFE; precision and batch only where several share them."""
+    found: dict[str, Setting] = {}
     for way in ways:
         label = f"{way.name} {way.nfe}"
-        if label in labels:
+        if label in found:
             label += f" {way.precision}"
             label += f" batch {way.batch}" if way.batch != batch else ""
-        labels.append(label)
-    return labels
+        found[label] = way
+    return found
