@@ -158,11 +158,6 @@ def test_what_does_not_fit_is_said_before_scenes_are_sampled(
         main(words(tmp_path, *given))
 
 
-def test_a_batch_without_scenes_is_refused():
-    with pytest.raises(ValueError, match=r"scorer\.batch_size must be at least 1, got 0"):
-        SceneScorer(batch_size=0)
-
-
 @pytest.fixture
 def emptied(monkeypatch):
     """``emptied(*indices)``: the generator makes these scenes without any return."""

@@ -126,8 +126,6 @@ class TestSafety:
     [
         ({"points": np.ones((3, 2))}, r"s: points must be \(P, 3\) or \(P, 4\), got \(3, 2\)"),
         ({"points": np.full((3, 3), np.nan)}, "s: has NaN or infinite values"),
-        ({"labels": np.ones(2, int)}, r"s: labels and origins .* 3 points, got \(2,\)"),
-        ({"origins": np.array([0, 1, 256])}, "from 0 to 255 .* from 0 to 256"),
     ],
 )
 def test_errors_say_which_scan_and_what_is_wrong(change, message):

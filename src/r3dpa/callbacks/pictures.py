@@ -27,15 +27,13 @@ class ReconstructionWriter(L.Callback):
     def on_predict_batch_end(
         self,
         trainer: L.Trainer,
-        pl_module: L.LightningModule,
+        pl_module: Any,
         outputs: Any,
         batch: Any,
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
         """Writes the points of each reconstructed range image, intensity 0."""
-        if not isinstance(pl_module, GenerativeModule):
-            raise TypeError(f"needs a GenerativeModule, got {type(pl_module).__name__}")
         folder = Path(trainer.default_root_dir) / "reconstructions"
         for name, range_m in zip(batch["name"], outputs.float().cpu(), strict=True):
             points = points_of(range_m, pl_module.scan_geometry.projection)
@@ -58,7 +56,7 @@ class PictureLogger(L.Callback):
         self.sampler = SamplerConfig(solver="euler", steps=steps)
         self.seed = seed
 
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Draws after a validation run, but not after the sanity check; a failure is a warning."""
         if trainer.sanity_checking:
             return
@@ -67,15 +65,13 @@ class PictureLogger(L.Callback):
         except (OSError, RuntimeError, ValueError) as error:  # training is worth more than pictures
             rank_zero_warn(f"no pictures at step {trainer.global_step}: {first_line(error)}")
 
-    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_test_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Draws after a test run."""
         self._draw(trainer, pl_module, "test")
 
-    def _draw(self, trainer: L.Trainer, module: L.LightningModule, split: str) -> None:
+    def _draw(self, trainer: L.Trainer, module: GenerativeModule, split: str) -> None:
         if not trainer.is_global_zero:
             return
-        if not isinstance(module, GenerativeModule):
-            raise TypeError(f"PictureLogger draws GenerativeModules, got {type(module).__name__}")
         pictures = {}
         val_set = getattr(cast(Any, trainer).datamodule, "val_set", None)
         if val_set:

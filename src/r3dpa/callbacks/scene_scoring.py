@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import lightning as L
 import torch
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_info
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
@@ -70,11 +71,11 @@ class SceneScorer(L.Callback):
 
     def __init__(
         self,
-        num_scenes: int = 256,
-        batch_size: int = 8,
+        num_scenes: NonNegativeInt = 256,
+        batch_size: PositiveInt = 8,
         sampler: SamplerConfig = _SAMPLER,
         precision: Literal["fp32", "bf16"] = "fp32",
-        seed: int = 0,
+        seed: NonNegativeInt = 0,
         reference: str | None = None,
         split: Literal["val", "all"] | None = None,
         spaces: list[str] | None = None,
@@ -83,13 +84,6 @@ class SceneScorer(L.Callback):
         allow_few: bool = False,
         skip_bad: bool = True,
     ) -> None:
-        for name, value, least in (
-            ("num_scenes", num_scenes, 0),
-            ("batch_size", batch_size, 1),
-            ("seed", seed, 0),
-        ):
-            if value < least:
-                raise ValueError(f"scorer.{name} must be at least {least}, got {value}")
         self.num_scenes, self.batch_size, self.seed = num_scenes, batch_size, seed
         self.sampler, self.precision = sampler, precision
         self.reference, self.split, self.protocol = reference, split, protocol

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import lightning as L
+from jsonargparse.typing import ClosedUnitInterval, PositiveInt
 from lightning.pytorch.utilities import rank_zero_info
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint, vae_fingerprint
@@ -25,19 +26,15 @@ class EMASnapshots(L.Callback):
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
     Args:
-        fractions: Steps as parts of ``trainer.max_steps``, each in (0, 1].
-        steps: Optimiser steps, at least 1; where given, ``fractions`` do not count.
+        fractions: Steps as parts of ``trainer.max_steps``.
+        steps: Optimiser steps; where given, ``fractions`` do not count.
     """
 
     def __init__(
         self,
-        fractions: Sequence[float] = (1 / 32, 1 / 16, 1 / 8),
-        steps: Sequence[int] | None = None,
+        fractions: Sequence[ClosedUnitInterval] = (1 / 32, 1 / 16, 1 / 8),
+        steps: Sequence[PositiveInt] | None = None,
     ) -> None:
-        if not all(0 < fraction <= 1 for fraction in fractions):
-            raise ValueError(f"snapshot fractions must be in (0, 1], got {list(fractions)}")
-        if steps is not None and not all(step >= 1 for step in steps):
-            raise ValueError(f"snapshot steps must be at least 1, got {list(steps)}")
         self.fractions = tuple(fractions)
         self.steps = None if steps is None else frozenset(steps)
         self._due: frozenset[int] = frozenset()

@@ -7,6 +7,7 @@ from typing import Any
 import lightning as L
 import torch
 import torch.distributed as dist
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
@@ -31,10 +32,9 @@ class StepGuard(L.Callback):
             processes, see :class:`r3dpa.callbacks.RunCheckpoint`.
     """
 
-    def __init__(self, max_skipped_steps: int = 10, saved_batches: int = 3) -> None:
-        if max_skipped_steps < 1 or saved_batches < 0:
-            limits = "max_skipped_steps must be at least 1 and saved_batches at least 0"
-            raise ValueError(f"{limits}, got {max_skipped_steps} and {saved_batches}")
+    def __init__(
+        self, max_skipped_steps: PositiveInt = 10, saved_batches: NonNegativeInt = 3
+    ) -> None:
         self.max_skipped_steps, self.saved_batches = max_skipped_steps, saved_batches
         self.skipped = self.in_a_row = self.stop = 0
         self._batches: list[tuple[int, Any, dict[str, Tensor]]] = []  # number, content, losses

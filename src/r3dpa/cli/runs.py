@@ -80,7 +80,7 @@ def replay(file: Path, ckpt: Path, device: str = "cpu") -> str:
     The losses are computed as in training, with the draws, loss weights and precision of the step:
     of the whole batch, where hooks look at the output of each layer and at its gradient, and of
     each scan alone. The loss scale of float16 and the other processes of a distributed run are not
-    repeated.
+    repeated: where all is finite, give another checkpoint or the file of another process.
 
     Args:
         file: Of ``<run_dir>/bad_batches``.
@@ -148,24 +148,14 @@ class _Observer:
             output.register_hook(lambda grad: None if _finite(grad) else note(name, None))
 
     def conclusion(self) -> list[str]:
-        """Number of layers at fault and the first of them, and where the fault starts."""
+        """Numbers of layers at fault, the first of them, and those that had finite inputs."""
         lines = [
             f"layers whose {kind} is not finite: {len(names)} of {len(self.called)}"
             + (f", the first {next(iter(names))}" if names else "")
             for kind, names in (("output", self.outputs), ("gradient", self.gradients))
         ]
-        if starts := [name for name, inputs_finite in self.outputs.items() if inputs_finite]:
-            end = f"layers that turned finite inputs into others: {', '.join(starts)}"
-        elif self.outputs:
-            end = "no layer turned finite inputs into others: it came with inputs or latents"
-        elif self.gradients:
-            end = "all outputs are finite: it starts in a loss or in a gradient"
-        else:
-            end = (
-                "everything is finite with these weights: give an earlier or later checkpoint, or "
-                "the file of another process"
-            )
-        return [*lines, end]
+        starts = ", ".join(name for name, inputs_finite in self.outputs.items() if inputs_finite)
+        return [*lines, f"layers that turned finite inputs into others: {starts or 'none'}"]
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:

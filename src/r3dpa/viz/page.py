@@ -90,8 +90,7 @@ def scan_page(
         sensor: Gives the limits of the range colours; the default sensor if None.
 
     Raises:
-        ValueError: If there is no scan, or one is empty, of another shape than above, not finite,
-            or has another number of labels or origins than of points.
+        ValueError: If there is no scan, or one is empty, of another shape than above or not finite.
     """
     if not scans:
         raise ValueError("scan_page got no scan; give at least one")
@@ -188,7 +187,7 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
     columns = ["x", "y", "z"]
     data = [column.tobytes() for column in np.diff(steps, axis=0, prepend=np.int16(0)).T]
     if scan.labels is not None:
-        labels = _checked(scan, scan.labels, 0xFFFFFFFF)
+        labels = scan.labels.astype(np.int64)
         columns += ["semantic", "instance"]
         data += [(labels & 0xFFFF).astype("<u2").tobytes(), (labels >> 16).astype("<u2").tobytes()]
     intensity_max = 1.0
@@ -199,20 +198,10 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
         data.append(np.rint(255 * share).astype(np.uint8).tobytes())
     if scan.origins is not None:
         columns.append("origin")
-        data.append(_checked(scan, scan.origins, 0xFF).astype(np.uint8).tobytes())
+        data.append(scan.origins.astype(np.uint8).tobytes())
     header = {"name": scan.name, "count": count, "step_m": step_m}
     header |= {"intensity_max": intensity_max, "columns": columns}
     return header, base64.b64encode(zlib.compress(b"".join(data), 9)).decode("ascii")
-
-
-def _checked(scan: PageScan, values: NDArray[np.integer], largest: int) -> NDArray[np.int64]:
-    """Labels or origins, one for each point and within 0 to ``largest``."""
-    if values.shape != (len(scan.points),) or values.min() < 0 or values.max() > largest:
-        raise ValueError(
-            f"{scan.name}: labels and origins must be a number from 0 to {largest} for each of "
-            f"{len(scan.points)} points, got {values.shape} from {values.min()} to {values.max()}"
-        )
-    return values.astype(np.int64)
 
 
 def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) -> dict[str, Any]:
