@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_stages import TinyData, stage_module
 
-from r3dpa.modules import flow_matching
+from r3dpa.modules import FlowMatching, flow_matching
 from r3dpa.modules.encoding import encoded_once
 
 
@@ -33,10 +33,11 @@ def encode(tmp_path):
     trainer = SimpleNamespace(
         datamodule=loaders, strategy=strategy, global_rank=0, world_size=1, num_devices=1
     )
-    module = SimpleNamespace(trainer=trainer, device=torch.device("cpu"))
+    module = SimpleNamespace(trainer=trainer, device=torch.device("cpu"), latent_shape=(4, 4, 8))
 
     def run(vae, settings, given):
-        cached = encoded_once(module, vae, tmp_path, settings, (8, 4, 8), given, Images, "image")
+        module.vae = vae
+        cached = encoded_once(module, tmp_path, settings, given, Images, "image")
         rows = list(tmp_path.glob("*/*.rows"))
         return torch.stack([cached.read(item) for item in given]), len(rows)
 
@@ -66,10 +67,11 @@ def test_posteriors_of_scans_depend_on_projection_and_codec(monkeypatch, tmp_pat
     monkeypatch.setattr(flow_matching, "encoded_once", lambda *args: found.append(args))
     module = stage_module("flow_matching", cache_latents=True)
     module.geometry = TinyData.geometry
-    data = SimpleNamespace(train_set=SimpleNamespace(scans=[]))
-    module._trainer = SimpleNamespace(datamodule=data, default_root_dir=tmp_path)
-    module._cached_posteriors()
-    ((_, vae, _, settings, *_),) = found
+    data = SimpleNamespace(train_set=SimpleNamespace(scans=[]), use_posteriors=lambda _: None)
+    module._trainer = SimpleNamespace(
+        datamodule=data, default_root_dir=tmp_path, fast_dev_run=False
+    )
+    FlowMatching.on_fit_start(module)
+    ((_, _, settings, *_),) = found
     geometry = TinyData.geometry.to_dict()
-    assert vae is module.vae
     assert settings == {"projection": geometry["projection"], "codec": geometry["codec"]}

@@ -13,6 +13,7 @@ from r3dpa.modules import LossWeights
 from r3dpa.modules.steps import frozen
 
 pytestmark = QUIET
+CLIP_BY_VALUE = {"gradient_clip_val": 1.0, "gradient_clip_algorithm": "value"}
 ENCODER, DECODER = {"vae.encoder", "vae.quant_conv"}, {"vae.decoder", "vae.post_quant_conv"}
 DISCRIMINATOR = {"discriminator.main"}
 ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
@@ -37,10 +38,7 @@ REACH = {
         "denoising": ALIGNED | REST,
         "sit_alignment": ALIGNED | PROJECTOR,
     },
-    "flow_matching": {
-        "denoising": ALIGNED | REST,
-        "sit_alignment": ALIGNED | PROJECTOR,
-    },
+    "flow_matching": {"denoising": ALIGNED | REST, "sit_alignment": ALIGNED | PROJECTOR},
 }
 
 
@@ -81,60 +79,24 @@ class TestReach:
         for name, gradient in once.reached[0]["vae_alignment"].items():
             torch.testing.assert_close(twice.reached[0]["vae_alignment"][name], 2 * gradient)
 
-    def test_losses_of_weight_zero_are_not_computed(self):
-        weights = LossWeights(adversarial=0.0, vae_alignment=0.0, sit_alignment=0.0)
-        module = train(stage_module("joint", weights=weights))
-        assert set(module.parts[0]) == {"reconstruction", "kl", "discriminator", "denoising"}
-        assert not any(name.startswith("sit.projector") for name in module.grads[0])
-
-    def test_adversarial_losses_wait_for_their_start(self):
-        """Before its start the discriminator takes part with factor 0, which moves nothing."""
-        module = train(
-            stage_module("joint", weights=LossWeights(adversarial_start=1)), TinyData([False] * 2)
-        )
-        first, second = module.parts
-        assert "adversarial" not in first
-        assert first["discriminator"] == 0
-        assert "adversarial" in second
-        assert second["discriminator"] > 0
-
 
 class TestFrozen:
-    def test_gradients_pass_through_but_do_not_stay(self):
-        layer, inputs = nn.Linear(3, 2), torch.randn(4, 3, requires_grad=True)
-        with frozen(layer):
-            output = layer(inputs)
-        output.sum().backward()
-        assert layer.weight.grad is None
-        torch.testing.assert_close(inputs.grad, layer.weight.detach().sum(0).expand(4, 3))
-
     def test_both_passes_of_a_network_keep_to_themselves(self):
         """A pass inside and one outside: the parameters get the gradient of the latter alone."""
-        layer, inputs = nn.Linear(3, 1), torch.ones(1, 3)
+        layer, inputs = nn.Linear(3, 1), torch.ones(1, 3, requires_grad=True)
         with frozen(layer):
             inside = layer(inputs)
         (5 * inside + layer(2 * inputs)).sum().backward()
         assert layer.weight.grad.tolist() == [[2.0, 2.0, 2.0]]
+        torch.testing.assert_close(inputs.grad, 7 * layer.weight.detach())
 
-    def test_permanently_frozen_parameters_stay_frozen(self):
-        layer = nn.Linear(3, 2)
-        layer.bias.requires_grad_(False)
-        with frozen(layer):
-            assert not layer.weight.requires_grad
-        assert layer.weight.requires_grad
-        assert not layer.bias.requires_grad
-
-    def test_an_exception_restores_the_parameters(self):
+    def test_an_exception_restores_all_but_permanently_frozen_parameters(self):
         layers = nn.Linear(3, 2), nn.Linear(2, 1)
         layers[1].bias.requires_grad_(False)
+        parameters = [p for layer in layers for p in layer.parameters()]
         with pytest.raises(RuntimeError, match="in between"), frozen(*layers):
             raise RuntimeError("in between")
-        assert [p.requires_grad for layer in layers for p in layer.parameters()] == [
-            True,
-            True,
-            True,
-            False,
-        ]
+        assert [p.requires_grad for p in parameters] == [True, True, True, False]
 
 
 def norms_by_network(grads):
@@ -149,8 +111,6 @@ class TestClipping:
     def test_each_network_is_clipped_by_its_own_norm(self):
         """A limit between the norms: what is below it stays bit for bit, the rest has its norm."""
         module = train(stage_module("joint"))
-        for name, gradient in module.grads[0].items():
-            assert torch.equal(module.clipped[0][name], gradient)  # no limit, no clipping
         before = norms_by_network(module.grads[0])
         low, *_, high = sorted(before.values())
         limit = (low * high) ** 0.5
@@ -170,16 +130,12 @@ class TestClipping:
                 expected = expected * limit / before[network]
                 torch.testing.assert_close(gradient, expected, atol=1e-7, rtol=1e-4)
 
-    @pytest.mark.parametrize("limit", [0, -1.0])
+    @pytest.mark.parametrize("limit", [None, 0, -1.0])
     def test_no_limit_above_0_means_no_clipping(self, limit):
         """As in Lightning; a factor of 0 would train nothing, one below 0 ascend."""
         module = train(stage_module("joint"), gradient_clip_val=limit)
         for name, gradient in module.grads[0].items():
             assert torch.equal(module.clipped[0][name], gradient), name
-
-    def test_clipping_by_value_is_refused(self):
-        with pytest.raises(ValueError, match=r"by norm per network; .*got 'value'"):
-            train(stage_module("joint"), gradient_clip_val=1.0, gradient_clip_algorithm="value")
 
 
 def trained_keys(weights):
@@ -193,13 +149,6 @@ def trained_keys(weights):
 
 @pytest.mark.numerics
 class TestNonFiniteGradients:
-    def test_a_clipped_non_finite_gradient_would_break_the_weights(self):
-        """The naive way: inf / inf is NaN in one element, and 0 in all others."""
-        weight = nn.Parameter(torch.ones(3))
-        weight.grad = torch.tensor([1.0, torch.inf, 2.0])
-        nn.utils.clip_grad_norm_([weight], 1.0)
-        assert weight.grad.isnan().tolist() == [False, True, False]
-
     def test_a_bad_step_changes_neither_weights_nor_moments_nor_averages(self):
         """Only VAE and SiT see the NaN, yet the discriminator keeps its weights too."""
         module = train(
@@ -218,13 +167,7 @@ class TestNonFiniteGradients:
         for before, after in zip(first_moments, second_moments, strict=True):
             for key, value in before.items():
                 assert torch.equal(after[key], value), key
-        for prefix in (
-            "vae.encoder",
-            "vae.decoder",
-            "discriminator",
-            "sit.blocks",
-            "ema.sit.blocks",
-        ):
+        for prefix in ("vae.encoder", "vae.decoder", "discriminator", "sit.b", "ema.sit.b"):
             weights = [key for key in trained_keys(first) if key.startswith(prefix)]
             assert not all(torch.equal(third[key], second[key]) for key in weights), prefix
         assert all(value.isfinite().all() for value in third.values() if value.is_floating_point())
@@ -245,24 +188,18 @@ class TestNonFiniteGradients:
         assert len(module.states) == 3
         assert all(value.isfinite().all() for value in module.state_dict().values())
 
-    def test_bad_steps_with_good_ones_between_do_not_add_up(self):
-        module = stage_module("joint")
-        train(module, TinyData([True, False] * 3), StepGuard(2))
-        assert len(module.states) == 6
 
-
-@pytest.mark.parametrize("precision", ["bf16-true", "16-true", "64-true"])
-def test_precisions_without_float32_weights_are_refused(precision):
-    with pytest.raises(ValueError, match=rf"precision {precision} is not supported.*bf16-mixed"):
-        train(stage_module("joint"), precision=precision)
-
-
-def test_reloaded_loaders_are_refused():
-    """Their order after a resume would be another one."""
-    with pytest.raises(ValueError, match="reload_dataloaders_every_n_epochs would break the order"):
-        train(stage_module("joint"), reload_dataloaders_every_n_epochs=1)
-
-
-def test_another_average_of_the_weights_is_refused():
-    with pytest.raises(ValueError, match=r"StochasticWeightAveraging is not supported.*ema_decay"):
-        train(stage_module("joint"), callbacks=[StochasticWeightAveraging(0.1)])
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"precision": "bf16-true"}, "precision bf16-true is not supported.*bf16-mixed"),
+        ({"precision": "16-true"}, "precision 16-true is not supported"),
+        ({"precision": "64-true"}, "precision 64-true is not supported"),
+        ({"reload_dataloaders_every_n_epochs": 1}, "would break the order of a resumed run"),
+        ({"callbacks": [StochasticWeightAveraging(0.1)]}, "is not supported.*model.ema_decay"),
+        (CLIP_BY_VALUE, "by norm per network; .*got 'value'"),
+    ],
+)
+def test_settings_that_the_stages_cannot_train_with(setting, message):
+    with pytest.raises(ValueError, match=message):
+        train(stage_module("joint"), **setting)

@@ -20,13 +20,13 @@ pytestmark = [
     *QUIET,
     pytest.mark.filterwarnings("ignore:The 'val_dataloader' does not have many workers"),
 ]
+SILENT = {f"enable_{part}": False for part in ("checkpointing", "progress_bar", "model_summary")}
+SILENT |= {"accelerator": "cpu", "logger": False}
 
 
-SILENT = {
-    "enable_checkpointing": False,
-    "enable_progress_bar": False,
-    "enable_model_summary": False,
-}
+def validated(module, data, folder):
+    trainer = L.Trainer(default_root_dir=folder, **SILENT)
+    return trainer.validate(module, datamodule=data, verbose=False)[0]
 
 
 class HeldOut(TinyData):
@@ -50,8 +50,7 @@ class HeldOut(TinyData):
 @pytest.mark.parametrize("batch_size", [1, 2, 3, 4])
 def test_the_error_in_metres_is_the_mean_over_pixels(batch_size, tmp_path):
     module, data = stage_module("vae_alignment"), HeldOut(batch_size)
-    trainer = L.Trainer(accelerator="cpu", logger=False, default_root_dir=tmp_path, **SILENT)
-    (logged,) = trainer.validate(module, datamodule=data, verbose=False)
+    logged = validated(module, data, tmp_path)
     image, mask = data.whole["range_image"], data.whole["valid_mask"]
     codec = module.scan_geometry.codec
     with torch.no_grad():
@@ -66,8 +65,7 @@ def test_the_average_is_evaluated_where_there_is_one(tmp_path):
     with torch.no_grad():
         for weight in module.ema.parameters():
             weight.mul_(1.5)
-    trainer = L.Trainer(accelerator="cpu", logger=False, default_root_dir=tmp_path, **SILENT)
-    (logged,) = trainer.validate(module, datamodule=data, verbose=False)
+    logged = validated(module, data, tmp_path)
     draws = steps.draw_held_out(module, torch.arange(4))
     losses = {}
     for name, networks in (("average", module.ema), ("last", module)):
@@ -107,41 +105,31 @@ def evaluate(rank, num_processes, port, counts, folder):
     for count in counts:
         module = stage_module("joint")
         settings = SILENT | {"strategy": "ddp" if num_processes > 1 else "auto"}
-        trainer = L.Trainer(
-            accelerator="cpu",
-            devices=num_processes,
-            logger=False,
-            default_root_dir=folder,
-            **settings,
-        )
-        (validated,) = trainer.validate(module, datamodule=Dealt(count), verbose=False)
+        trainer = L.Trainer(devices=num_processes, default_root_dir=folder, **settings)
+        (held_out,) = trainer.validate(module, datamodule=Dealt(count), verbose=False)
         (tested,) = trainer.test(module, datamodule=Dealt(count), verbose=False)
-        found[count] = validated | tested
+        found[count] = held_out | tested
     (folder / f"{num_processes}_{rank}.json").write_text(json.dumps(found))
 
 
-def assert_equal_on(num_processes, counts, folder):
+@pytest.mark.ddp
+@pytest.mark.parametrize(
+    ("num_processes", "counts"),
+    [
+        (2, [1, 3]),  # three scans on two processes: one of them gets a scan twice
+        pytest.param(2, range(1, 8), marks=pytest.mark.slow),
+        pytest.param(3, range(1, 8), marks=pytest.mark.slow),
+    ],
+)
+def test_losses_do_not_depend_on_the_number_of_processes(num_processes, counts, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    evaluate(0, 1, 0, counts, folder)
-    mp.spawn(evaluate, (num_processes, port, counts, folder), nprocs=num_processes)
-    alone = json.loads((folder / "1_0.json").read_text())
+    evaluate(0, 1, 0, counts, tmp_path)
+    mp.spawn(evaluate, (num_processes, port, counts, tmp_path), nprocs=num_processes)
+    alone = json.loads((tmp_path / "1_0.json").read_text())
     for rank in range(num_processes):
-        shared = json.loads((folder / f"{num_processes}_{rank}.json").read_text())
+        shared = json.loads((tmp_path / f"{num_processes}_{rank}.json").read_text())
         for count in map(str, counts):
             assert len(alone[count]) == 8
             assert shared[count] == pytest.approx(alone[count], rel=1e-6, abs=1e-6), count
-
-
-@pytest.mark.ddp
-def test_losses_do_not_depend_on_the_number_of_processes(tmp_path):
-    """Three scans on two processes: one of them gets a scan twice."""
-    assert_equal_on(2, [1, 3], tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.ddp
-@pytest.mark.parametrize("num_processes", [2, 3])
-def test_losses_of_any_number_of_scans(num_processes, tmp_path):
-    assert_equal_on(num_processes, range(1, 8), tmp_path)

@@ -71,15 +71,8 @@ def test_stage_trains_logs_and_draws(stage, smoke_args, vae_checkpoint, tmp_path
         assert kept
         for key in kept:
             assert torch.equal(before[key], content["state_dict"][key]), key
-
-
-def test_vae_alignment_freezes_the_blocks(smoke_args, vae_checkpoint):
-    content = torch.load(vae_checkpoint, weights_only=True)
-    (group,) = [g for g in content["optimizer_states"][0]["param_groups"] if g["name"] == "sit"]
-    sit = {k for k in content["state_dict"] if k.startswith("sit.")}
-    trained = {k for k in sit if "projector" in k or "x_embedder" in k}
-    assert len(group["params"]) == len(trained)
-    assert content["state_dict"]["latent_norm.num_batches_tracked"] == 3
+    elif stage == "vae_alignment":
+        assert content["state_dict"]["latent_norm.num_batches_tracked"] == 3
 
 
 def test_flow_matching_without_latent_statistics_is_refused(smoke_args, vae_checkpoint, tmp_path):

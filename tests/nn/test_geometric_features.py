@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.nn.backbones.geometric import _BANDWIDTH, CENTRES, SPREADS, _symmetric_eigen
+from r3dpa.nn.backbones.geometric import _BANDWIDTH, CENTRES, SPREADS
 
 LINEARITY, PLANARITY, SPHERICITY, ALONG, ACROSS, UP, HEIGHT, LOG_RANGE, INTENSITY = range(9)
 
@@ -163,21 +163,3 @@ def test_lift_is_linear_and_the_seed_decides():
     assert not one.state_dict()
     with pytest.raises(ValueError, match="dim must be even and at least 2, got 3"):
         GeometricFeatures(3)
-
-
-def test_closed_form_agrees_with_lapack():
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(500, 3, 3, generator=generator, dtype=torch.float64)
-    root = root * torch.tensor([1.0, 0.3, 0.01], dtype=torch.float64)
-    matrix = root @ root.mT
-    entries = torch.stack(
-        [matrix[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    )
-    values, vector = _symmetric_eigen(entries)
-    expected, vectors = torch.linalg.eigh(matrix)
-    assert torch.allclose(values.T.flip(1), expected, atol=1e-9)
-    assert ((vector.T * vectors[..., 0]).sum(dim=1).abs() - 1).abs().max() < 1e-6
-    isotropic = torch.tensor([2.0, 2, 2, 0, 0, 0], dtype=torch.float64)[:, None]
-    values, vector = _symmetric_eigen(isotropic)
-    assert torch.allclose(values, torch.full((3, 1), 2.0, dtype=torch.float64))
-    assert torch.isfinite(vector).all()

@@ -5,33 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from r3dpa.nn.layers import (
-    AttentionBlock,
-    CircularConv2d,
-    Downsample,
-    GroupNorm,
-    SyncedBatchNorm2d,
-    Upsample,
-)
-
-
-def picking(kernel_size, row, column):
-    """Convolution of one channel that picks one tap of its kernel."""
-    conv = CircularConv2d(1, 1, kernel_size)
-    nn.init.zeros_(conv.weight)
-    nn.init.zeros_(conv.bias)
-    conv.weight.data[0, 0, row, column] = 1.0
-    return conv
-
-
-def test_circular_conv_has_columns_of_the_other_side_and_zeros_above_and_below():
-    image = torch.randn(2, 1, 3, 8)
-    for columns, tap, offset in ((3, 0, -1), (3, 2, 1), (4, 0, -1), (4, 3, 2)):
-        assert torch.equal(picking((1, columns), 0, tap)(image), image.roll(-offset, -1))
-    for tap, empty, offset in ((0, 0, 1), (2, -1, -1)):
-        expected = image.roll(offset, -2)
-        expected[:, :, empty] = 0
-        assert torch.equal(picking((3, 1), tap, 0)(image), expected)
+from r3dpa.nn.layers import AttentionBlock, Downsample, GroupNorm, SyncedBatchNorm2d, Upsample
 
 
 @pytest.mark.parametrize("stride", [(1, 2), (1, 4), (2, 1), (2, 2)])
@@ -63,8 +37,6 @@ def test_group_norm_of_half_precision_images_has_float32_statistics():
     actual = GroupNorm(32).half()(image.half())
     torch.testing.assert_close(actual.float(), expected, atol=5e-3, rtol=0)
     assert actual.dtype == torch.float16
-    naive_variance = image.half().square().flatten(2).mean(-1)
-    assert naive_variance.isinf().any()
 
 
 @pytest.mark.numerics
@@ -75,8 +47,6 @@ def test_attention_with_large_queries_survives_half_precision():
     expected = block(image)
     actual = block.half()(image.half()).float()
     torch.testing.assert_close(actual, expected, atol=0.01 * expected.abs().max().item(), rtol=0)
-    query = block.q(block.norm(image.half())).flatten(2)
-    assert (query.transpose(1, 2) @ query).isinf().any()  # scaled after the product
 
 
 def test_synced_batch_norm_in_one_process_is_batch_norm():

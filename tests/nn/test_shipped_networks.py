@@ -1,4 +1,4 @@
-"""Sizes of the networks in conf/net, and parameter counts of the SiT sizes of the paper."""
+"""Sizes of the networks in conf/net."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import pytest
 import torch
 import yaml
 
-from r3dpa.nn import VAE, SiT
+from r3dpa.nn import VAE
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "xl": (1152, 28, 16)}
 LATENTS = {
     "vae_h2p4d8": (8, 16, 128),
     "vae_h1p4d4": (4, 16, 256),
@@ -41,21 +40,6 @@ def test_parameters_of_the_paper_configuration():
     with torch.device("meta"):
         assert count(vae) == count(VAE()) == 59_660_649
     assert (sit.in_channels, *sit.input_size) == LATENTS["vae_h2p4d8"]
-
-
-@pytest.mark.parametrize("patch", [1, 2, 4, 8])
-@pytest.mark.parametrize("size", SIZES)
-def test_sit_sizes(size, patch):
-    width, depth, num_heads = SIZES[size]
-    with torch.device("meta"):
-        sit = SiT(hidden_size=width, depth=depth, num_heads=num_heads, patch_size=patch)
-    values = 8 * patch**2  # of one token
-    block = 18 * width**2 + 15 * width  # qkv 3, output 1, MLP 4 + 4, modulation 6
-    embedders = values * width + width + 256 * width + width + width**2 + width + width
-    head = 2 * width**2 + 2 * width + width * values + values
-    projector = width * 2048 + 2048 + 2048**2 + 2048 + 2048 * 768 + 768
-    assert count(sit) == depth * block + embedders + head + projector
-    assert sit.grid_size == (16 // patch, 128 // patch)
 
 
 def test_unet_configs():

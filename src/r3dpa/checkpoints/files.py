@@ -22,13 +22,7 @@ from torch import Tensor
 
 from r3dpa import __version__
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
-from r3dpa.checkpoints.official import (
-    OURS,
-    from_official,
-    is_official,
-    statistics_of,
-    to_official,
-)
+from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
 from r3dpa.nn.image_vae import ImageVAE
 

@@ -249,37 +249,24 @@ class GenerativeModule(L.LightningModule):
         normalised = self.latent_norm.normalise(latents)
         noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
         projected = self.sit.project_features(noisy, draws.time)
-        alignment = self.align(projected, features).mean()
+        alignment = steps.align(self, projected, features).mean()
         return {"vae_alignment": self.weights.vae_alignment * alignment}
 
     def flow_losses(
         self, normalised: Tensor, features: Tensor | None, draws: PathDraws
     ) -> dict[str, Tensor]:
         """L_denoise + lambda2 L_align on normalised latents without gradient."""
-        weights = self.weights
-        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
-        velocity, projected = steps.predict(
-            self.sit, noisy, draws.time, weights.denoising != 0, weights.sit_alignment != 0
+        denoising, alignment = self.weights.denoising, self.weights.sit_alignment
+        errors = steps.flow_errors(
+            self, self.sit, normalised, features, draws, denoising != 0, alignment != 0
         )
-        parts = {}
-        if velocity is None:
-            parts["denoising"] = steps.zero_loss(self.sit)
+        if "denoising" in errors:
+            parts = {"denoising": denoising * errors["denoising"].mean()}
         else:
-            target = self.interpolant.target(normalised, draws.noise, draws.time)
-            error = losses.flow_matching_loss(velocity, target).mean()
-            parts["denoising"] = weights.denoising * error
-        if projected is not None:
-            parts["sit_alignment"] = weights.sit_alignment * self.align(projected, features).mean()
+            parts = {"denoising": steps.zero_loss(self.sit)}
+        if "alignment" in errors:
+            parts["sit_alignment"] = alignment * errors["alignment"].mean()
         return parts
-
-    def align(self, projected: Tensor, features: Tensor | None) -> Tensor:
-        """L_align ``(B,)`` of projected tokens and feature grids, both ``(B, N, D)``."""
-        if features is None:
-            raise ValueError(
-                f"stage {self.stage} aligns with 3D features, but the batch holds no feature_grid"
-            )
-        skip = self.weights.skip_empty_cells
-        return losses.alignment_loss(projected, features, skip_empty_cells=skip)
 
     # Optimisation
 
@@ -321,32 +308,18 @@ class GenerativeModule(L.LightningModule):
         posterior = self.vae.encode(image)
         reconstruction = self.vae.decode(posterior.mean)
         error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
-        values = {}
-        if self.trains_velocity or self.needs_features():
-            values = self._evaluate_flow(posterior, batch.get("feature_grid"), draws)
+        networks, features = self.ema or self, batch.get("feature_grid")
+        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        aligns = self.needs_features()
+        values = steps.flow_errors(
+            self, networks.sit, latents, features, draws, self.trains_velocity, aligns
+        )
         self.held_out.update(
             batch["index"],
             reconstruction=steps.each_reconstruction_loss(reconstruction, image, self.weights),
             range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),
             **values,
         )
-
-    def _evaluate_flow(
-        self, posterior: Posterior, features: Tensor | None, draws: PathDraws
-    ) -> dict[str, Tensor]:
-        networks = self if self.ema is None else self.ema
-        latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        noisy = self.interpolant.interpolate(latents, draws.noise, draws.time)
-        velocity, projected = steps.predict(
-            networks.sit, noisy, draws.time, self.trains_velocity, self.needs_features()
-        )
-        values = {}
-        if velocity is not None:
-            target = self.interpolant.target(latents, draws.noise, draws.time)
-            values["denoising"] = losses.flow_matching_loss(velocity, target)
-        if projected is not None:
-            values["alignment"] = self.align(projected, features)
-        return values
 
     test_step = validation_step
     on_validation_epoch_end = on_test_epoch_end = steps.log_held_out

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.checkpoints import weights_sha256
 from r3dpa.data.store import Cacheable, CachedTensors, tensor_cache
-from r3dpa.nn import VAE, ImageVAE
 
 Item = TypeVar("Item", bound=Cacheable)
 
 
 @torch.no_grad()
 def encoded_once(
-    module: L.LightningModule,
-    vae: VAE | ImageVAE,
+    module: Any,
     root: Path,
     settings: Mapping[str, Any],
-    shape: tuple[int, int, int],
     items: Sequence[Item],
     dataset_of: Callable[[Sequence[Item]], Dataset[Any]],
     image: str,
@@ -34,11 +30,9 @@ def encoded_once(
     They are computed in float32 whatever the precision of the steps.
 
     Args:
-        module: In training, on its device.
-        vae: Frozen autoencoder; its weights are part of the settings.
+        module: In training, on its device; has a frozen ``vae`` and ``latent_shape`` (C, h, w).
         root: Folder of caches.
-        settings: What else the moments depend on, as JSON values.
-        shape: ``(2C, h, w)``.
+        settings: What the moments depend on beside the weights of the VAE, as JSON values.
         items: Scans or images, the same in all processes, which share the work.
         dataset_of: Dataset of some items, whose samples hold their ``index`` and an image.
         image: Name of the image in a sample, ``(C', H, W)``.
@@ -46,10 +40,10 @@ def encoded_once(
     Raises:
         StoreError: If the cache cannot be written or is damaged, or moments are not finite.
     """
-    trainer = module.trainer
-    datamodule = cast(Any, trainer).datamodule
-    about = {**settings, "vae": weights_sha256(vae.state_dict())}
-    cache = tensor_cache(root, "posterior", about, shape)
+    trainer, datamodule = module.trainer, module.trainer.datamodule
+    channels, *size = module.latent_shape
+    about = {**settings, "vae": weights_sha256(module.vae.state_dict())}
+    cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
     missing = cache.missing(items)
     trainer.strategy.barrier("cached latents: all have looked")
     # Where each node has a disk of its own, its processes encode everything.
@@ -68,7 +62,7 @@ def encoded_once(
         keys = [item.cache_key for item in own]
         with cache.writer(trainer.global_rank) as writer:
             for batch in loader:
-                posterior = vae.encode(batch[image].to(module.device))
+                posterior = module.vae.encode(batch[image].to(module.device))
                 moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
                 writer.add([keys[index] for index in batch["index"]], moments)
     trainer.strategy.barrier("cached latents: all are written")

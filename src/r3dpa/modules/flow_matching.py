@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
-from r3dpa.data.scans import Scan
-from r3dpa.data.store import CachedTensors
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
@@ -91,27 +89,23 @@ class FlowMatching(GenerativeModule):
         A ``fast_dev_run`` encodes its few scans in each step.
         """
         super().on_fit_start()
-        if self.cache_latents and not cast(Any, self.trainer).fast_dev_run:
-            self._datamodule.use_posteriors(self._cached_posteriors())
-
-    @property
-    def _datamodule(self) -> LidarDataModule:
-        return cast(Any, self.trainer).datamodule
-
-    def _cached_posteriors(self) -> CachedTensors[Scan]:
-        """Posteriors of the training scans; the processes share the work."""
+        if not self.cache_latents or cast(Any, self.trainer).fast_dev_run:
+            return
         dataset = cast(LidarDataset, self._datamodule.train_set)
         geometry = self.scan_geometry.to_dict()
-        return encoded_once(
+        posteriors = encoded_once(
             self,
-            self.vae,
             Path(self.trainer.default_root_dir) / "latents",
             {"projection": geometry["projection"], "codec": geometry["codec"]},
-            (2 * self.vae.latent_channels, *self.sit.input_size),
             dataset.scans,
             lambda scans: LidarDataset(scans, dataset.projection, dataset.codec),
             "range_image",
         )
+        self._datamodule.use_posteriors(posteriors)
+
+    @property
+    def _datamodule(self) -> LidarDataModule:
+        return cast(Any, self.trainer).datamodule
 
     def trainable(self) -> dict[str, nn.Module]:
         """The SiT alone."""

@@ -10,16 +10,10 @@ import torch
 from torch import Tensor
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.data.image_datamodule import (
-    ImageBatch,
-    ImageDataModule,
-    ImageDataset,
-    latent_statistics,
-)
+from r3dpa.data.image_datamodule import ImageBatch, ImageDataModule, ImageDataset, latent_statistics
 from r3dpa.data.images import ImageEntry
 from r3dpa.data.store import CachedTensors
 from r3dpa.flow import Interpolant
-from r3dpa.losses import alignment_loss, flow_matching_loss
 from r3dpa.modules import steps
 from r3dpa.modules.checks import check_latents, check_trainer, image_datamodule
 from r3dpa.modules.encoding import encoded_once
@@ -151,10 +145,8 @@ class RGBPretraining(L.LightningModule):
             entries = entries[: batches * datamodule.batch_size * trainer.world_size]
         return encoded_once(
             self,
-            self.vae,
             Path(self.latents_dir or Path(trainer.default_root_dir) / "latents"),
             {"images": datamodule.settings},
-            (2 * self.vae.latent_channels, *self.sit.input_size),
             entries,
             lambda some: ImageDataset(datamodule.source, some, datamodule.image_size),
             "image",
@@ -165,10 +157,11 @@ class RGBPretraining(L.LightningModule):
         posterior, weights = Posterior(batch["posterior_moments"]), self.weights
         draws = steps.draw_path(self, len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        denoising, alignment = self._losses(self.sit, normalised, draws, self._features(batch))
-        losses = {"denoising": weights.denoising * denoising.mean()}
-        if alignment is not None:
-            losses["sit_alignment"] = weights.sit_alignment * alignment.mean()
+        aligns, features = bool(self._teacher), self._features(batch)
+        errors = steps.flow_errors(self, self.sit, normalised, features, draws, alignment=aligns)
+        losses = {"denoising": weights.denoising * errors["denoising"].mean()}
+        if aligns:
+            losses["sit_alignment"] = weights.sit_alignment * errors["alignment"].mean()
         return steps.weigh_and_log(self, losses)
 
     @torch.no_grad()
@@ -179,28 +172,15 @@ class RGBPretraining(L.LightningModule):
             return teacher.to(image.device)(image, self.sit.grid_size)
         return None
 
-    def _losses(
-        self, sit: SiT, normalised: Tensor, draws: steps.PathDraws, features: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """L_denoise ``(B,)`` and, with features, L_align ``(B,)``."""
-        noisy = self.interpolant.interpolate(normalised, draws.noise, draws.time)
-        velocity, projected = steps.predict(sit, noisy, draws.time, True, features is not None)
-        target = self.interpolant.target(normalised, draws.noise, draws.time)
-        denoising = flow_matching_loss(cast(Tensor, velocity), target)
-        if projected is None or features is None:
-            return denoising, None
-        skip = self.weights.skip_empty_cells
-        return denoising, alignment_loss(projected, features, skip_empty_cells=skip)
-
     def validation_step(self, batch: ImageBatch, batch_idx: int) -> None:
         """Held-out images: the losses of the averaged SiT."""
-        sit, norm = cast(SiT, self.ema.sit), self.ema.latent_norm
         posterior = self.vae.encode(batch["image"])
         draws = steps.draw_held_out(self, batch["index"])
-        normalised = norm.normalise(posterior.sample(draws.posterior_noise))
-        denoising, alignment = self._losses(sit, normalised, draws, self._features(batch))
-        values = {"denoising": denoising} | ({} if alignment is None else {"alignment": alignment})
-        self.held_out.update(batch["index"], **values)
+        normalised = self.ema.latent_norm.normalise(posterior.sample(draws.posterior_noise))
+        errors = steps.flow_errors(
+            self, self.ema.sit, normalised, self._features(batch), draws, True, bool(self._teacher)
+        )
+        self.held_out.update(batch["index"], **errors)
 
     test_step = validation_step
     on_validation_epoch_end = on_test_epoch_end = steps.log_held_out

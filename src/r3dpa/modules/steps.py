@@ -15,10 +15,9 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from r3dpa import __version__
+from r3dpa import __version__, losses
 from r3dpa.flow import sample_time
 from r3dpa.io import source_commit
-from r3dpa.losses import reconstruction_loss
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.nn import VelocityNetwork
 
@@ -109,7 +108,7 @@ def log_held_out(module: Any) -> None:
 def each_reconstruction_loss(reconstruction: Tensor, image: Tensor, weights: LossWeights) -> Tensor:
     """Reconstruction loss ``(B,)`` of each image."""
     pairs = zip(reconstruction.split(1), image.split(1), strict=True)
-    return torch.stack([reconstruction_loss(*p, weights.reconstruction_norm) for p in pairs])
+    return torch.stack([losses.reconstruction_loss(*p, weights.reconstruction_norm) for p in pairs])
 
 
 def batch_number(module: L.LightningModule) -> int:
@@ -187,11 +186,13 @@ def uses_fused(module: L.LightningModule) -> bool:
     return supported and module.trainer.precision != "16-mixed"
 
 
-def arrange_optimizer(optimizer: torch.optim.Optimizer, fused: bool) -> None:
-    """Moves a state of other settings to its device, in the memory format of the weights.
+def fit_optimizer(module: L.LightningModule) -> None:
+    """Moves the state of a resumed optimiser to its device, in the memory format of the weights.
 
     A fused optimiser walks through the memory of weights and moments alike, unchecked.
     """
+    optimizer = cast(torch.optim.Optimizer, module.optimizers(use_pl_optimizer=False))
+    fused = uses_fused(module)
     for group in optimizer.param_groups:
         group["fused"] = fused
     for parameter, state in optimizer.state.items():
@@ -199,12 +200,6 @@ def arrange_optimizer(optimizer: torch.optim.Optimizer, fused: bool) -> None:
         for name in ("exp_avg", "exp_avg_sq"):
             if state[name].stride() != parameter.stride():
                 state[name] = torch.empty_like(parameter).copy_(state[name])
-
-
-def fit_optimizer(module: L.LightningModule) -> None:
-    """Fits the state of a resumed optimiser to this run."""
-    optimizer = cast(torch.optim.Optimizer, module.optimizers(use_pl_optimizer=False))
-    arrange_optimizer(optimizer, uses_fused(module))
 
 
 def gradient_norms(
@@ -267,12 +262,37 @@ def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:
             group.update(asdict(module.optimizer_config))
 
 
-def predict(
-    sit: VelocityNetwork, noisy: Tensor, time: Tensor, velocity: bool, features: bool
-) -> tuple[Tensor | None, Tensor | None]:
-    """Velocity and projected features; an output that is not requested is None and not computed."""
-    if velocity and features:
-        return sit(noisy, time)
-    if velocity:
-        return sit.velocity(noisy, time), None
-    return None, sit.project_features(noisy, time) if features else None
+def flow_errors(
+    module: Any,
+    sit: VelocityNetwork,
+    latents: Tensor,
+    features: Tensor | None,
+    draws: PathDraws,
+    velocity: bool = True,
+    alignment: bool = True,
+) -> dict[str, Tensor]:
+    """L_denoise and L_align, each ``(B,)``, of normalised latents: those requested, by name."""
+    noisy, errors = module.interpolant.interpolate(latents, draws.noise, draws.time), {}
+    predicted, projected = None, None
+    if velocity and alignment:
+        predicted, projected = sit(noisy, draws.time)
+    elif velocity:
+        predicted = sit.velocity(noisy, draws.time)
+    elif alignment:
+        projected = sit.project_features(noisy, draws.time)
+    if predicted is not None:
+        target = module.interpolant.target(latents, draws.noise, draws.time)
+        errors["denoising"] = losses.flow_matching_loss(predicted, target)
+    if projected is not None:
+        errors["alignment"] = align(module, projected, features)
+    return errors
+
+
+def align(module: Any, projected: Tensor, features: Tensor | None) -> Tensor:
+    """L_align ``(B,)`` of projected tokens and feature grids, both ``(B, N, D)``."""
+    if features is None:
+        raise ValueError(
+            f"stage {module.stage} aligns with 3D features, but the batch holds no feature_grid"
+        )
+    skip = module.weights.skip_empty_cells
+    return losses.alignment_loss(projected, features, skip_empty_cells=skip)
