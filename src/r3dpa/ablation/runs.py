@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,15 +68,9 @@ def run_plan(plan: Plan, say: Callable[[str], None], jobs: int = 1) -> dict[str,
     todo = [job for job in every if not job.done]
     if len(todo) < len(every):
         say(f"{len(every) - len(todo)} of {len(every)} are done already")
-    return asyncio.run(_run_all(todo, say, jobs))
-
-
-async def _run_all(
-    todo: Sequence[Job], say: Callable[[str], None], at_a_time: int
-) -> dict[str, str]:
     failed: dict[str, str] = {}
     tasks: dict[str, asyncio.Task[None]] = {}
-    slots, cores = asyncio.Semaphore(at_a_time), max(1, (os.cpu_count() or 1) // at_a_time)
+    slots, cores = asyncio.Semaphore(jobs), max(1, (os.cpu_count() or 1) // jobs)
 
     async def finish(job: Job) -> None:
         await asyncio.gather(*(tasks[name] for name in job.needs if name in tasks))
@@ -93,9 +87,11 @@ async def _run_all(
             num = sum(task.done() for task in tasks.values()) + 1
             say(f"  = {job.name}: {time.monotonic() - began:.0f} s ({num} of {len(todo)})")
 
-    for job in todo:
-        tasks[job.name] = asyncio.create_task(finish(job))
-    await asyncio.gather(*tasks.values())
+    async def finish_all() -> None:
+        tasks.update((job.name, asyncio.create_task(finish(job))) for job in todo)
+        await asyncio.gather(*tasks.values())
+
+    asyncio.run(finish_all())
     return failed
 
 
@@ -144,11 +140,12 @@ def _jobs(plan: Plan) -> list[Job]:
     save_text(data, yaml.safe_dump({"data": on_scans[0]}))
     scans = json.dumps([on_scans[0], sizes], sort_keys=True)
     of_reference = f"{scans} {plan.reference}"
-    words = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]
-    jobs = [Job("features", words, out / "features", scans)]
-    words = ["reference", "--data", str(data), "--out", str(reference), *plan.reference]
-    place = out / "reference"
-    jobs.append(Job("reference", words, place, of_reference, ("features",), reference))
+    extract = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]
+    refer = ["reference", "--data", str(data), "--out", str(reference), *plan.reference]
+    jobs = [
+        Job("features", extract, out / "features", scans),
+        Job("reference", refer, out / "reference", of_reference, ("features",), reference),
+    ]
     tested = {chain[-1].name for chain in plan.chains}
     for stage in plan.stages:
         name, folder = stage.name, stage.folder
@@ -161,6 +158,8 @@ def _jobs(plan: Plan) -> list[Job]:
             test += ["--scorer.reference", str(reference), "--trainer.logger", "false"]
             test += ["--trainer.devices", "1"]
             content = json.dumps([of_reference, stage.config.get("scorer")], sort_keys=True)
-            needs, place = (name, "reference"), folder / "test"
-            jobs.append(Job(f"test of {name}", test, place, content, needs, stage.evaluation))
+            needs = (name, "reference")
+            jobs.append(
+                Job(f"test of {name}", test, folder / "test", content, needs, stage.evaluation)
+            )
     return jobs

@@ -111,7 +111,6 @@ class Row:
             "mask_iou": errors.mask_iou,
             "converged": self.converged,
             "seconds": self.seconds,
-            "seconds_interval": np.quantile(self.rounds, [0.25, 0.75]).tolist(),
             "flop": self.flop,
             "flop_s": self.flop / self.seconds,
             "rounds": self.rounds,

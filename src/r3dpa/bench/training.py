@@ -7,7 +7,6 @@ import logging
 import tempfile
 import time
 import warnings
-from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
@@ -21,7 +20,6 @@ import lightning as L
 import torch
 import yaml
 from lightning.pytorch.cli import LightningArgumentParser
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
@@ -58,14 +56,11 @@ class StepSettings:
 class StageCost:
     """Cost of training one stage.
 
-    ``num_parameters`` are in millions: VAE, SiT and SiT without projector (both with the position
-    embedding, as published counts have it), discriminator, and those that are trained.
     ``step_seconds`` hold losses, backward, clipping, optimiser and averages, not loading; ``flop``
     is of one step; ``peak_host_bytes`` of the whole process, ``peak_gpu_bytes`` of tensors.
     """
 
     stage: str
-    num_parameters: dict[str, float]
     step_seconds: list[float]
     loss: float
     peak_host_bytes: int
@@ -77,16 +72,17 @@ class StageCost:
         """Cells of the table."""
         first, *others = self.step_seconds
         gpu = self.peak_gpu_bytes
-        cells = {f"{name} M": f"{count:.2f}" for name, count in self.num_parameters.items()}
-        cells["first s"] = f"{first:.3g}"
-        cells["next s"] = f"{median(others):.3g}" if others else "-"
-        cells["host GiB"] = f"{self.peak_host_bytes / 2**30:.2f}"
-        cells["GPU GiB"] = "-" if gpu is None else f"{gpu / 2**30:.2f}"
-        cells["loss"] = f"{self.loss:.4g}"
-        cells["images/s"] = f"{self.images_per_second:.3g}"
-        cells["GFLOP/step"] = f"{self.flop / 1e9:.4g}"
-        cells["GFLOP/s"] = f"{self.flop / median(others or [first]) / 1e9:.4g}"
-        return {"stage": self.stage} | cells
+        return {
+            "stage": self.stage,
+            "first s": f"{first:.3g}",
+            "next s": f"{median(others):.3g}" if others else "-",
+            "host GiB": f"{self.peak_host_bytes / 2**30:.2f}",
+            "GPU GiB": "-" if gpu is None else f"{gpu / 2**30:.2f}",
+            "loss": f"{self.loss:.4g}",
+            "images/s": f"{self.images_per_second:.3g}",
+            "GFLOP/step": f"{self.flop / 1e9:.4g}",
+            "GFLOP/s": f"{self.flop / median(others or [first]) / 1e9:.4g}",
+        }
 
 
 def training(
@@ -179,7 +175,6 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
     trainer.fit(module, datamodule=_data(module, folder, stage, settings.batch_size))
     return StageCost(
         stage,
-        _num_parameters(module),
         meter.seconds,
         meter.loss,
         meter.peak_host_bytes,
@@ -265,20 +260,3 @@ class _StepMeter(L.Callback):
     def _now(trainer: L.Trainer) -> float:
         synchronise(trainer.strategy.root_device)
         return time.perf_counter()
-
-
-def _num_parameters(module: GenerativeModule) -> dict[str, float]:
-    sit, discriminator = module.sit, module.discriminator
-    trainable = [p for net in module.trainable().values() for p in net.parameters()]
-    whole = _millions((*sit.parameters(), *sit.buffers()))  # a fixed position embedding counts
-    return {
-        "VAE": _millions(module.vae.parameters()),
-        "SiT": whole,
-        "no proj.": whole - _millions(sit.projector.parameters()),
-        "discr.": 0.0 if discriminator is None else _millions(discriminator.parameters()),
-        "trained": _millions(p for p in trainable if p.requires_grad),
-    }
-
-
-def _millions(tensors: Iterable[Tensor]) -> float:
-    return sum(tensor.numel() for tensor in tensors) / 1e6
