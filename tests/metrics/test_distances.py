@@ -90,7 +90,7 @@ def expected(name):
     if name == "frechet":
         return {"X": frechet_distance_of(real, made)}
     if name == "inf":
-        return {"X inf": fd_infinity(real, made, generator).value}
+        return {"X inf": fd_infinity(real, made, generator)[0]}
     if name == "kid":
         return {"X KID": polynomial_mmd(real, made, generator, 100, 10)[0]}
     if name == "prdc":

@@ -52,10 +52,10 @@ def test_frechet(case, close):
 @pytest.mark.parametrize("which", ["ref", "smp"])
 def test_histogram(case, which):
     grid = grid_of(case)
-    assert list(grid.shape) == case["out/bev_shape"].tolist()
+    assert [grid.side] * 2 == case["out/bev_shape"].tolist()
     counts = grid.histogram(clouds(case, which))
     x, y = case[f"out/bev_hist_{which}_cells"].long()
-    expected = torch.zeros(grid.shape, dtype=torch.int64)
+    expected = torch.zeros(grid.side, grid.side, dtype=torch.int64)
     expected[x, y] = case[f"out/bev_hist_{which}_counts"].long()
     assert torch.equal(counts, expected)
 
@@ -76,8 +76,8 @@ def test_occupied_cells(case):
     for key in case.keys("out/voxelized_"):
         which = key.removeprefix("out/voxelized_")
         cells = grid.cells(case[f"in/{which}"])
-        indices = torch.stack([cells // grid.shape[1], cells % grid.shape[1]], dim=1)
-        scaled = indices / torch.tensor(grid.shape, dtype=torch.float64)
+        indices = torch.stack([cells // grid.side, cells % grid.side], dim=1)
+        scaled = indices.double() / grid.side
         assert torch.equal(scaled.float(), case[key])
 
 

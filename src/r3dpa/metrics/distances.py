@@ -46,6 +46,7 @@ class SceneMetric(Metric):
     """
 
     full_state_update = False
+    has_file = False  # whether the real side comes from the official statistics file
     real_count: Tensor
     generated_count: Tensor
 
@@ -86,7 +87,7 @@ class SceneMetric(Metric):
     @property
     def has_reference(self) -> bool:
         """Whether the real side is known."""
-        return self.count("real") > 0
+        return self.has_file or self.count("real") > 0
 
     def count(self, side: str) -> int:
         """Scenes seen."""
@@ -197,11 +198,6 @@ class _Histograms(SceneMetric):
             # One number in place of up to 256 MB of zeros that torchmetrics would keep for reset.
             self._defaults[name] = torch.zeros((), dtype=dtype).expand(shape)
 
-    @property
-    def has_reference(self) -> bool:
-        """Whether the histogram of the real scans is known."""
-        return bool(self.real_bins.any())
-
     def _groups(self, real: bool, num: int) -> tuple[Tensor, Tensor]:
         """Histograms ``(groups, bins)`` of a side, and the group ``(num,)`` of each new scene."""
         bins = self.real_bins[None] if real else self.generated_bins
@@ -237,7 +233,7 @@ class BEVHistogramDistance(_Histograms):
     """
 
     def __init__(self, grid: BEVGrid, num_groups: int = 1) -> None:
-        super().__init__(math.prod(grid.shape), num_groups, torch.int32)
+        super().__init__(grid.side**2, num_groups, torch.int32)
         self.grid = grid
 
     def update(self, clouds: Sequence[Tensor], real: bool) -> None:
@@ -285,12 +281,12 @@ class RangeHistogramDistance(_Histograms):
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """W1."""
-        groups = self.generated_bins.double()
-        return [self._resampled_row("W1 range", self._distance, resampling, groups, unit="m")]
+        real, groups = self.real_bins.double().cpu().numpy(), self.generated_bins.double()
 
-    def _distance(self, counted: Tensor) -> float:
-        real = self.real_bins.double().cpu().numpy()
-        return wasserstein_1(real, counted.double().cpu().numpy(), RANGE_BIN_M)
+        def distance(counted: Tensor) -> float:
+            return wasserstein_1(real, counted.double().cpu().numpy(), RANGE_BIN_M)
+
+        return [self._resampled_row("W1 range", distance, resampling, groups, unit="m")]
 
 
 class MinimumMatchingDistance(SceneMetric):
@@ -316,11 +312,6 @@ class MinimumMatchingDistance(SceneMetric):
         self.protocol = protocol
         self.reference_cells: list[Tensor] = []
         self._add_kept(torch.zeros(0, protocol.sensor.beams, protocol.sensor.columns))
-
-    @property
-    def has_reference(self) -> bool:
-        """Whether real scans or their cells are known."""
-        return bool(self.reference_cells) or super().has_reference
 
     def update(self, range_m: Tensor, real: bool, names: Sequence[str] | None = None) -> None:
         """Add range images ``(B, H, W)``; of the named ones those with the lowest hashes stay."""

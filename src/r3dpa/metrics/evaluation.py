@@ -347,7 +347,7 @@ def _figures(
     names: Sequence[str],
 ) -> dict[str, Any]:
     """Data of the figures; ``matching`` is of the real scans that are kept."""
-    protocol, ranges, match = reference.protocol, metrics["ranges"], metrics["matching"]
+    grid, ranges, match = reference.protocol.grid, metrics["ranges"], metrics["matching"]
     halves = [metrics_of(half) for half in reference.halves]
     cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
     (places, samples), (_, scans) = match.kept("generated"), match.kept("real")
@@ -364,12 +364,12 @@ def _figures(
         pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
     counted = [half["ranges"] for half in halves if half["ranges"].count("real")]
     return {
-        "cells": tuple(part.view(protocol.grid.shape).numpy() for part in cells),
-        "half_m": protocol.grid.half_m,
+        "cells": tuple(part.view(grid.side, grid.side).numpy() for part in cells),
+        "half_m": grid.half_m,
         "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
         "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
         "halves": torch.stack([half.real_bins for half in counted]).numpy(),
         "best": pairs[:_SHOWN_MATCHES],
         "worst": pairs[::-1][:_SHOWN_MATCHES],
-        "sensor": protocol.sensor,
+        "sensor": reference.protocol.sensor,
     }

@@ -105,11 +105,6 @@ class FrechetDistance(FeatureMetric):
 
     reference: tuple[Tensor, Tensor] | None = None
 
-    @property
-    def has_reference(self) -> bool:
-        """Whether real features or their moments are known."""
-        return self.reference is not None or super().has_reference
-
     def compute(self) -> dict[str, float]:
         """The distance; a ``ValueError`` for fewer than F + 1 samples, unlike in ``results``."""
         for side in SIDES:
@@ -254,9 +249,9 @@ def update_with(
 
 
 def with_features(
-    scenes: Iterable[EvaluationScene], spaces: Sequence[SceneFeatures], batch_size: int = _BATCH
+    scenes: Iterable[EvaluationScene], spaces: Sequence[SceneFeatures]
 ) -> Iterator[tuple[list[EvaluationScene], dict[str, Tensor]]]:
     """Batches of scenes with their features by space, for :func:`update_with`."""
     stream = iter(scenes)
-    while batch := list(islice(stream, batch_size)):
+    while batch := list(islice(stream, _BATCH)):
         yield batch, {space.name: space(batch) for space in spaces}

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -143,18 +143,13 @@ def frechet_distance_of(real: Tensor, generated: Tensor) -> float:
     ).item()
 
 
-class FDInfinity(NamedTuple):
-    """Fréchet distance for infinitely many samples: the intercept of a line over 1/N."""
-
-    value: float  # may be slightly negative
-    standard_error: float  # too low, since the subsets overlap
-
-
-def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> FDInfinity:
+def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> tuple[float, float]:
     """Fréchet distance of ``(N, F)`` and ``(M, F)`` features, extrapolated to infinitely many.
 
     The distance of N samples is too large by about c / N. A line is fitted over 1/N to subsets of
-    equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all of it.
+    equal sizes, spaced evenly in 1/N from a quarter of the smaller set up to all of it. Returns
+    its intercept, which may be slightly negative, and the standard error, which is too low as the
+    subsets overlap.
 
     Source: Chong and Forsyth, "Effectively unbiased FID and Inception score", CVPR 2020.
     """
@@ -181,11 +176,11 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
     value = y.mean() - slope * over.mean()
     noise = (y - value - slope * over).square().sum() / (_NUM_SIZES - 2)
     error = (noise * (1 / _NUM_SIZES + over.mean().square() / spread)).sqrt()
-    return FDInfinity(value.item(), error.item())
+    return value.item(), error.item()
 
 
-def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
-    """Unbiased squared maximum mean discrepancy under ``(x . y / F + 1) ** degree``.
+def squared_mmd(real: Tensor, generated: Tensor) -> Tensor:
+    """Unbiased squared maximum mean discrepancy under ``(x . y / F + 1) ** 3``.
 
     Takes ``(N, F)`` and ``(M, F)`` with at least 2 rows each, returns ``()`` float64, which may be
     negative: pairs of a sample with itself are left out.
@@ -195,7 +190,7 @@ def squared_mmd(real: Tensor, generated: Tensor, degree: int = 3) -> Tensor:
     x, y = checked_pair(real, generated, at_least=2)
 
     def kernel(a: Tensor, b: Tensor) -> Tensor:
-        return (a @ b.T / a.shape[1] + 1) ** degree
+        return (a @ b.T / a.shape[1] + 1) ** 3
 
     def within(a: Tensor) -> Tensor:
         values = kernel(a, a)

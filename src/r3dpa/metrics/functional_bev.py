@@ -37,13 +37,8 @@ class BEVGrid:
 
     @property
     def side(self) -> int:
-        """Cells along a side."""
+        """Cells along x, and along y."""
         return math.ceil(2 * self.half_m / self.cell_m)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Cells along x and y."""
-        return self.side, self.side
 
     def kept(self, points: Tensor, name: str = "cloud") -> Tensor:
         """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one.
@@ -73,11 +68,9 @@ class BEVGrid:
         return (indices[:, 0] * self.side + indices[:, 1]).unique()
 
     def histogram(self, clouds: Iterable[Tensor]) -> Tensor:
-        """Number of clouds that occupy each cell: ``shape`` int64."""
-        counts = torch.zeros(math.prod(self.shape), dtype=torch.int64)
-        for index, points in enumerate(clouds):
-            counts[self.cells(points, f"cloud {index}").cpu()] += 1
-        return counts.view(self.shape)
+        """Number of clouds that occupy each cell: ``(side, side)`` int64."""
+        cells = [self.cells(points, f"cloud {index}") for index, points in enumerate(clouds)]
+        return torch.cat(cells).bincount(minlength=self.side**2).view(self.side, self.side)
 
 
 def _checked_points(points: Tensor, name: str) -> Tensor:

@@ -104,8 +104,11 @@ class OfficialStatistics:
         if self.cells is not None:
             by_name["cells"].real_bins = self.cells
         by_name["matching"].reference_cells = list(self.clouds)
+        by_name["cells"].has_file = self.cells is not None
+        by_name["matching"].has_file = bool(self.clouds)
         for space in spaces:
-            by_name[f"{space.name}_frechet"].reference = self.of_space(space)
+            metric = by_name[f"{space.name}_frechet"]
+            metric.reference, metric.has_file = self.of_space(space), True
 
     @classmethod
     def load(cls, path: str | Path, split: OfficialSplit | None = None) -> OfficialStatistics:
@@ -129,7 +132,7 @@ class OfficialStatistics:
                     moments[key] = (mean, covariance.view(len(mean), len(mean)))
             cells = None
             if _HISTOGRAM in part:
-                cells = _numbers(part[_HISTOGRAM], 2).view(PUBLISHED.grid.shape).flatten()
+                cells = _numbers(part[_HISTOGRAM], 2).view([PUBLISHED.grid.side] * 2).flatten()
             parts = part[_CLOUDS]["points"] if _CLOUDS in part else []
             clouds = [_cells(cloud) for cloud in parts[: PUBLISHED.num_mmd_references]]
         except (*UNPICKLING_ERRORS, SystemError) as error:  # of NumPy, for a damaged type
@@ -188,7 +191,7 @@ def _numbers(values: np.ndarray, ndim: int) -> Tensor:
 
 def _cells(points: np.ndarray) -> Tensor:
     """Indices of occupied cells from their coordinates, which the file divides by the side."""
-    side = PUBLISHED.grid.shape[0]
+    side = PUBLISHED.grid.side
     scaled = _numbers(points, 2) * side
     cells = scaled.round()
     if ((cells < 0) | (cells >= side) | ((cells - scaled).abs() > 0.01)).any():
