@@ -20,6 +20,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -181,7 +182,7 @@ def _add_official(folder: Path, add: Callable[..., None]) -> None:
     np.save(official, content, allow_pickle=True)
     add("official .npy", official, lambda: OfficialStatistics.load(official))
     reference = folder / "reference.safetensors"
-    protocol = PROTOCOLS["default"].with_sensor(SENSOR)
+    protocol = replace(PROTOCOLS["default"], sensor=SENSOR)
     ReferenceStatistics(protocol, {}, ["a/0", "b/0"], {"data": "a"}).save(reference)
     add("reference .safetensors", reference, lambda: ReferenceStatistics.load(reference))
 

@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def test_members_of_archives(tmp_path):
 
 def test_names_in_a_reference(tmp_path):
     path = tmp_path / "a.safetensors"
-    protocol = PROTOCOLS["default"].with_sensor(LidarSensor(4, 16))
+    protocol = replace(PROTOCOLS["default"], sensor=LidarSensor(4, 16))
     ReferenceStatistics(protocol, {}, ["a/0", "b/0"], {}).save(path)
     with safe_open(path, framework="pt") as file:
         tensors, about = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118

@@ -7,9 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 import torch.distributed as dist
+from one_device import OneDevice
 from scipy.stats import wasserstein_distance
 
 from r3dpa.geometry import LidarSensor, points_of
+from r3dpa.metrics import functional
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     BEVHistogramDistance,
@@ -280,6 +282,27 @@ def test_metrics_of_a_space_share_one_state():
     assert found["x_kid"].real_moments is found["x_frechet"].real_moments
     assert found["x_shares"].count("real") == 7
     assert found["cells"].compute() == pytest.approx(expected("bev"))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "bev"])
+def test_updates_stay_on_the_device(monkeypatch, name):
+    """No update waits for a GPU or mixes devices, see ``one_device``.
+
+    Left out: the checks of values that come from outside, and the histogram of bird's eye view
+    cells, whose number of occupied cells is known only after a synchronisation.
+    """
+    monkeypatch.setattr(functional, "checked_features", lambda x, *_: x.double())
+    options = {"mmd": {"max_real": 1, "max_generated": 1}, "ranges": {"num_groups": 3}}
+    with torch.device("meta"):
+        metric = metric_of(name, **options.get(name, {}))
+    shape = (2, 8, 32) if name in ("mmd", "ranges") else (2, 4)
+    with OneDevice():
+        for real in [True] * 40 + [False] * 40:
+            metric.update(torch.zeros(shape, device="meta"), real=real)
+    for state in metric._defaults:
+        value = getattr(metric, state)
+        for part in value if isinstance(value, list) else [value]:
+            assert part.device.type == "meta", state
 
 
 @pytest.mark.gpu

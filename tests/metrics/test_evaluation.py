@@ -10,7 +10,7 @@ from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
 from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, precision_recall
-from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
+from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation, EvaluationTable
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
@@ -113,21 +113,7 @@ def test_values_are_those_of_the_metrics_one_by_one(reference):
     shares = precision_recall(toy(real), toy(made))
     assert {name: rows[f"TOY {name}"].value for name in shares} == shares
     assert (rows["JSD"].num_samples, rows["JSD"].num_references) == (30, 40)
-
-
-def test_ranges_move_by_what_they_moved():
-    """All returns 2 m farther away: W1 is 2 m, and so is the mean; no matter how many returns."""
-    names = [f"{drive}/{i}" for drive in "ab" for i in range(3)]
-    near = [EvaluationScene(name, None, torch.full((16, 64), 10.05)) for name in names]
-    far = [EvaluationScene(str(i), None, torch.full((16, 64), 12.05)) for i in range(4)]
-    rows = rows_of(far, reference_of(near), allow_few=True)
-    assert rows["W1 range"].value == pytest.approx(2.0)
-    assert rows["W1 range"].interval == pytest.approx((2.0, 2.0))
-    assert (rows["W1 range"].floor, rows["W1 range"].unit) == (0.0, "m")
-    # Mean and horizon both move by 2 m / 20; nothing varies.
-    assert rows["TOY"].value == pytest.approx(2 * 0.1**2, rel=1e-5)
-    clouds = [through_sensor(scene, PROTOCOL).points for scene in (near[0], far[0])]
-    assert rows["CD 3D"].value == pytest.approx(chamfer_squared(*clouds))
+    assert rows["W1 range"].unit == "m"
 
 
 def test_floors_are_between_the_drives():

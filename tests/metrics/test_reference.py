@@ -100,24 +100,20 @@ def test_kept_scans_are_few_and_the_halves_have_different_drives():
     assert whole(reference)["toy_kid"].rows("real").shape == (8, 2)
 
 
-def test_halves_are_whole_drives_or_ends_of_one():
-    names = ["a/0", "a/1", "a/2", "b/0", "c/0", "c/1", "d/0"]
-    halves = split_halves(names)  # a, then c and b into the smaller half, then d
-    assert [halves[name] for name in names] == [0, 0, 0, 1, 1, 1, 0]
-    assert split_halves(["a/0", "a/3", "a/1"]) == {"a/0": 0, "a/1": 0, "a/3": 1}
-
-
-def test_a_drive_that_outweighs_the_others_is_divided():
-    """Drives of 50, 3 and 1: 27 and 27, of which the first are the start of the longest drive."""
-    sizes = {"long": 50, "some": 3, "one": 1}
+@pytest.mark.parametrize(
+    ("sizes", "first"),
+    [
+        ({"a": 3, "b": 1, "c": 2, "d": 1}, ["a/00", "a/01", "a/02", "d/00"]),  # a, then c, b, d
+        ({"a": 3}, ["a/00", "a/01"]),
+        ({"a": 4, "b": 1, "c": 1}, [f"a/{i:02d}" for i in range(4)]),  # twice as many is still left
+        ({"long": 50, "some": 3, "one": 1}, [f"long/{i:02d}" for i in range(27)]),
+    ],
+)
+def test_halves_are_whole_drives_unless_one_outweighs_the_others(sizes, first):
     names = [f"{drive}/{i:02d}" for drive, count in sizes.items() for i in range(count)]
-    halves = split_halves(names)
-    first = {name for name in names if halves[name] == 0}
-    assert first == {f"long/{i:02d}" for i in range(27)}
-    assert [*halves.values()].count(1) == 27
-    # Twice as many is still left: 4 of one drive, 2 of two others.
-    halves = split_halves(["a/0", "a/1", "a/2", "a/3", "b/0", "c/0"])
-    assert [halves[name] for name in ("a/0", "a/3", "b/0", "c/0")] == [0, 0, 1, 1]
+    halves = split_halves(names[::-1])
+    assert [name for name in names if halves[name] == 0] == first
+    assert len(halves) == len(names)
 
 
 @pytest.mark.parametrize(

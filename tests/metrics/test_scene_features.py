@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from r3dpa.nn.backbones.rangevit import _NAMES, RangeViT
 from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
 
 SENSOR = LidarSensor(beams=16, columns=64)
-CENTRE, CORNER = DEFAULT.with_sensor(SENSOR), PUBLISHED.with_sensor(SENSOR)
+CENTRE, CORNER = (replace(protocol, sensor=SENSOR) for protocol in (DEFAULT, PUBLISHED))
 WIDTHS = (4, 4, 4, 4, 4, 4, 4, 4, 3)
 # Batches of other sizes are added up in another order; features are of size 1.
 FLOAT32 = {"atol": 1e-5, "rtol": 1e-5}
@@ -77,7 +77,7 @@ def test_images_and_their_points_take_one_way():
 
 
 def test_protocols_come_back_from_plain_values():
-    assert Protocol.from_dict(CORNER.to_dict()) == CORNER
+    assert Protocol.from_dict(asdict(CORNER)) == CORNER
 
 
 # --- spaces ---

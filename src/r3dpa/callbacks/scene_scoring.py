@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -112,7 +112,7 @@ class SceneScorer(L.Callback):
                     "a file of `r3dpa reference`, or --scorer.num_scenes 0 to score no scenes"
                 )
             scans = datamodule.all_set.scans
-            setting = PROTOCOLS[self.protocol or "default"].with_sensor(datamodule.sensor)
+            setting = replace(PROTOCOLS[self.protocol or "default"], sensor=datamodule.sensor)
             names = (*FREE_SPACES, *(name for name in self.ckpt if name not in FREE_SPACES))
             spaces = feature_spaces(self.spaces or names, self.ckpt, setting, device)
             about = {

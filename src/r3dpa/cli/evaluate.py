@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -58,7 +59,7 @@ def reference(
     scans = evenly(scans, limit)
     if len(scans) < 2:
         raise ValueError(f"{data}: {len(scans)} scans of the split {split}; at least 2 are needed")
-    setting = PROTOCOLS[protocol].with_sensor(module.sensor)
+    setting = replace(PROTOCOLS[protocol], sensor=module.sensor)
     found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
     job = ReferenceStatistics.prepare(found, setting, [scan.name for scan in scans], about)

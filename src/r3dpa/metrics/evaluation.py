@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -132,7 +132,7 @@ def evaluate(
         extra["bad_samples"] = bad
     about |= {
         "backbones": {space.label: dict(space.card) for space in spaces},
-        "protocol": protocol.to_dict(),
+        "protocol": asdict(protocol),
         "reference": reference.describe(),
         "commit": source_commit(),
         "source": source,
@@ -287,7 +287,7 @@ def _floors(
 
 
 def _verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) -> str:
-    """Which distances are near their floor, and whether the scenes are realistic, in one line."""
+    """Distances near their floor, and whether the scenes are realistic, in one line."""
     near, far, poor = [], [], []
     for row in rows:
         floor = floors.get(row.name)

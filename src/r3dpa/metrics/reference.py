@@ -7,6 +7,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from glob import escape
 from pathlib import Path
 from typing import Any, Self
@@ -188,7 +189,7 @@ class ReferenceStatistics:
             tensors[key] = value.contiguous()
         card = {
             "version": _VERSION,
-            "protocol": self.protocol.to_dict(),
+            "protocol": asdict(self.protocol),
             "spaces": self.spaces,
             "names": self.names,
             "about": self.about,

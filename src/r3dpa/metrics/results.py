@@ -48,6 +48,7 @@ _ABOUT: dict[str, Any] = {
     "extra": {},  # anything else, such as "bad_samples": those left out, each with the reason
 }
 _MARKDOWN: dict[Mark, str] = {"": "{}", "best": "**{}**", "second": "_{}_", "tie": "= {}"}
+_LATEX_ESCAPES = str.maketrans(LATEX_ESCAPE_RULES)
 _LATEX: dict[Mark, str] = {
     "": "{}",
     "best": r"\textbf{{{}}}",
@@ -276,9 +277,10 @@ class EvaluationTable:
         heads = []
         for result in map(_first, self.columns.values()):
             scale = rf"$\times 10^{{{result.scale}}}$" * bool(result.scale)
-            heads.append(f"{_latex(result.name)} {arrows[result.direction]} {scale}{result.unit}")
+            name = result.name.translate(_LATEX_ESCAPES)
+            heads.append(f"{name} {arrows[result.direction]} {scale}{result.unit}")
         found = self._lines(lambda result, mark: _LATEX[mark].format(result.printed(result.value)))
-        lines = [[_latex(first), *cells] for first, *cells in found]
+        lines = [[first.translate(_LATEX_ESCAPES), *cells] for first, *cells in found]
         table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
         for rule in ("toprule", "midrule", "bottomrule"):
             table = table.replace(r"\hline", f"\\{rule}", 1)
@@ -427,8 +429,3 @@ def _cells(row: MetricResult) -> tuple[str, ...]:
 def _first(column: Sequence[MetricResult | None]) -> MetricResult:
     """A result of a column, for direction, unit and scale."""
     return next(filter(None, column))
-
-
-def _latex(text: str) -> str:
-    """A text with commands escaped."""
-    return "".join(LATEX_ESCAPE_RULES.get(character, character) for character in text)

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from r3dpa.geometry import (
-    EMPTY_RANGE_M,
-    LidarSensor,
-    SphericalProjection,
-    points_of,
-    range_image,
-)
+from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, points_of, range_image
 from r3dpa.metrics.functional_bev import BEVGrid
 
 Unprojection = Literal["corner", "centre"]
@@ -64,17 +58,9 @@ class Protocol:
         """Cells seen from above."""
         return BEVGrid(cell_m=self.voxel_m)
 
-    def with_sensor(self, sensor: LidarSensor) -> Self:
-        """The same protocol for another sensor."""
-        return replace(self, sensor=sensor)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and strings."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Inverse of :meth:`to_dict`."""
+        """Inverse of ``dataclasses.asdict``."""
         return cls(**{**values, "sensor": LidarSensor(**values["sensor"])})
 
 
@@ -180,7 +166,6 @@ def usable_scenes(
 
 
 def _finite(name: str, what: str, values: Tensor) -> Tensor:
-    """Values as float32 on the CPU."""
     values = values.detach().float().cpu()
     if broken := int((~values.isfinite()).sum()):
         raise ValueError(
