@@ -48,11 +48,18 @@ class TestSimulate:
 
         return run
 
-    def test_options_reach_the_manifest_and_the_table(self, simulate, capsys):
-        words = ["--return_mode", "dual", "--weather.visibility_m", 50]
-        words += ["--weather.clear_sky", "false", "--effects.range_noise", "off"]
-        manifest = simulate(*words, "--effects.soft_raydrop=on")
-        assert manifest["effects"] == {"range_noise": "off"}
+    def test_options_of_both_kinds_reach_the_manifest_and_the_table(
+        self, simulate, tmp_path, capsys
+    ):
+        config = tmp_path / "request.yaml"
+        config.write_text(
+            "seed: 3\ndrives: ['0003']\nweather: {visibility_m: 50}\n"
+            "effects: {range_noise: off, soft_raydrop: on}\n"
+        )
+        words = ["--config", config, "--return_mode", "dual", "--weather.clear_sky", "false"]
+        manifest = simulate(*words, "--effects.ego_occlusion=off")
+        assert manifest["effects"] == {"ego_occlusion": "off", "range_noise": "off"}
+        assert (manifest["seed"], manifest["drives"]) == (3, ["0003"])
         assert manifest["sensor"]["return_mode"] == "dual"
         assert manifest["sensor"]["lasers"]["inclination_rad"] == [0.02, -0.1]
         weather = manifest["weather"]
@@ -62,17 +69,6 @@ class TestSimulate:
         assert lines["range_noise"].split()[1:4] == ["0", "0", "1"]
         assert lines["range_noise"].endswith("switched off")
         assert lines["detection_limit"].split()[1:4] == ["1", "0", "0"]
-
-    def test_switches_in_yaml_and_on_the_command_line(self, simulate, tmp_path):
-        config = tmp_path / "request.yaml"
-        config.write_text(
-            "seed: 3\ndrives: ['0003']\nweather: {rain_mm_h: 2}\n"
-            "effects: {range_noise: off, soft_raydrop: on}\n"
-        )
-        manifest = simulate("--config", config, "--effects.ego_occlusion", "off")
-        assert manifest["effects"] == {"ego_occlusion": "off", "range_noise": "off"}
-        assert (manifest["seed"], manifest["drives"]) == (3, ["0003"])
-        assert manifest["weather"]["rain_mm_h"] == 2
 
     @pytest.mark.parametrize(
         ("words", "message"),
@@ -191,25 +187,23 @@ class TestView:
         (folder / "origins" / "0000000004.origin").write_bytes(origins.tobytes())
         return folder
 
-    def show(self, source, out, num=8, reference=None):
+    def show(self, source, out):
         """Printed text, and the data of the written page."""
-        text = view(source, out=out, num=num, reference=reference)
+        text = view(source, out=out)
         page = (out / "view.html").read_text("utf-8")
         found = json.loads(re.search(r'id="page">(.*?)</script>', page, re.DOTALL)[1])
         return text, found, [header["name"] for header in found["scans"]]
 
     def test_writes_two_pictures_and_a_page_and_prints_their_paths(self, drive, tmp_path):
         out = tmp_path / "new" / "out"
-        scan = drive / "data" / "0000000004.bin"
-        text, page, names = self.show(tmp_path / "root", out, reference=scan)
+        text, page, names = self.show(tmp_path / "root", out)
         written = ["birds_eye.png", "range_images.png", "view.html"]
         assert sorted(path.name for path in out.iterdir()) == written
         for name in written:
             assert str(out / name) in text.splitlines()
         for name in written[:2]:
             assert np.asarray(Image.open(out / name)).std() > 10
-        assert names == [self.NAME, "reference: data/0000000004"]
-        assert page["reference"] == 1
+        assert names == [self.NAME]
         assert {"semantic", "instance", "origin"} < set(page["scans"][0]["columns"])
         assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]
         assert [row[:2] for row in page["categories"]["origin"]] == [[int(Origin.RAIN), "rain"]]

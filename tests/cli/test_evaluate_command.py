@@ -159,14 +159,6 @@ def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp
         evaluate(*words)
 
 
-def test_an_image_without_returns_is_named(reference_file, tmp_path):
-    images = np.full((3, 1, 16, 64), 10.0, np.float32)
-    images[1] = -1
-    np.savez(tmp_path / "img.npz", images)
-    with pytest.raises(ValueError, match=r"img\.npz, sample .*1.*: has no point .*skip_bad"):
-        evaluate("--samples", tmp_path / "img.npz", "--reference", reference_file)
-
-
 def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path):
     torch.manual_seed(0)
     network, weights = MinkowskiNet((2,) * 9), tmp_path / "fsvd.ckpt"
@@ -197,7 +189,6 @@ def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path
         (["--spaces", "fgeo"], "10 generated scenes for the 64 features of FGEO.*allow_few"),
         (["--spaces", "fwid"], "the reference has no features of fwid, only of fgeo"),
         (["--ckpt.frid", "x.ckpt"], r"--ckpt\.frid: frid is not among the spaces \(fgeo\)"),
-        (["--samples", "nowhere"], "nowhere: there is no such file or folder"),
     ],
 )
 def test_wrong_options_are_named(reference_file, samples, words, message):
@@ -210,8 +201,6 @@ def test_wrong_options_of_a_reference_are_named(data, reference_file, tmp_path):
     out = tmp_path / "new.safetensors"
     with pytest.raises(ValueError, match=r"reference\.safetensors exists: delete it"):
         command.reference(data=data, out=reference_file, spaces=("fgeo",))
-    with pytest.raises(ValueError, match="is no folder of scans and no data YAML"):
-        command.reference(data=tmp_path / "nothing", out=out, spaces=("fgeo",))
     with pytest.raises(ValueError, match="1 scans of the split all; at least 2 are needed"):
         command.reference(data=data, out=out, spaces=("fgeo",), limit=1)
     with pytest.raises(ValueError, match=r"frid needs its official weights: give --ckpt\.frid"):

@@ -33,7 +33,7 @@ from r3dpa.metrics.evaluation import (
     reference_spaces,
 )
 from r3dpa.metrics.reference import ReferenceStatistics, compute_reference
-from r3dpa.metrics.results import Evaluation, report, save_reports
+from r3dpa.metrics.results import report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
 from r3dpa.modules import GenerativeModule
@@ -100,9 +100,10 @@ class SceneScorer(L.Callback):
             rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
             return
         device = str(pl_module.device)
-        statistics = self._loaded()
+        statistics: AnyReference
         scans: list[Scan] = []
-        if statistics is not None:
+        if self.reference is not None:
+            statistics = load_reference(Path(self.reference), self.split)
             spaces = reference_spaces(statistics, self.spaces, self.ckpt, device, self.protocol)
         else:
             datamodule = getattr(trainer, "datamodule", None)
@@ -158,23 +159,22 @@ class SceneScorer(L.Callback):
                 skip_bad=self.skip_bad,
             )
         except TooFewScenesError as error:  # the losses of the test are still to be printed
-            trainer.print(f"nothing is compared with real scans: {error}; see {_parts(folder)}")
+            trainer.print(f"nothing is compared with real scans: {error}; see {folder / 'sampled'}")
             return
-        shutil.rmtree(_parts(folder))
+        shutil.rmtree(folder / "sampled")
         evaluation = comparison.evaluation
         save_reports(evaluation, statistics.about.get("split"), folder)
         if comparison.figures:
             save_figures(folder, **comparison.figures)
         trainer.print(report(evaluation, statistics.about.get("split")))
-        _log(trainer, evaluation, trainer.global_step or pl_module.loaded_step)
-
-    def _loaded(self) -> AnyReference | None:
-        if self.reference is None:
-            return None
-        try:
-            return load_reference(Path(self.reference), self.split)
-        except ValueError as error:
-            raise ValueError(f"scorer.reference: {error}") from error
+        values = {
+            f"test/{row.name.replace(' ', '_')}": row.value
+            for row in evaluation.rows
+            if row.value is not None
+        }
+        for logger in trainer.loggers:
+            logger.log_metrics(values, trainer.global_step or pl_module.loaded_step)
+            logger.save()
 
     def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> int:
         """Writes the batches of this process; network evaluations per scene, 0 without any."""
@@ -229,21 +229,6 @@ def _stamp(scans: Sequence[Scan]) -> str:
     return hashlib.sha256(repr(keys).encode()).hexdigest()
 
 
-def _parts(folder: Path) -> Path:
-    return folder / "sampled"
-
-
 def _part(folder: Path, first: int) -> Path:
     """File of the batch that starts with this scene."""
-    return _parts(folder) / f"{first:06d}.safetensors"
-
-
-def _log(trainer: L.Trainer, evaluation: Evaluation, step: int) -> None:
-    values = {
-        f"test/{row.name.replace(' ', '_')}": row.value
-        for row in evaluation.rows
-        if row.value is not None
-    }
-    for logger in trainer.loggers:
-        logger.log_metrics(values, step)
-        logger.save()
+    return folder / "sampled" / f"{first:06d}.safetensors"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +25,13 @@ def check(path: Path) -> None:
         sys.exit(1)
 
 
-def view(
-    source: Path, *, out: Path | None = None, num: PositiveInt = 8, reference: Path | None = None
-) -> str:
+def view(source: Path, *, out: Path | None = None, num: PositiveInt = 8) -> str:
     """Draw scans as range images, from above, and as a page with point clouds to turn.
 
     Args:
         source: A ``.bin``, ``.ply`` or ``.npz`` file, or a folder of ``.bin`` scans in any layout.
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
         num: Scans to show at most, evenly spread over the folder.
-        reference: Scan to show beside the others, such as a real one beside simulated ones.
     """
     from r3dpa import viz
     from r3dpa.cli.scene_files import page_scans, write_page
@@ -45,18 +41,14 @@ def view(
     check_folder(out)
     readers = page_scans(source)
     scans = [read() for read in evenly(readers, num)]
-    beside = None
-    if reference is not None:
-        first = page_scans(reference)[0]()
-        beside = replace(first, name=f"reference: {first.name}")  # unlike every other name
-    drawn = {scan.name: scan.points for scan in [*scans, *([beside] if beside else [])]}
+    drawn = {scan.name: scan.points for scan in scans}
     resolved = source.resolve()
     out = out or Path("view") / (resolved.name if resolved.is_dir() else resolved.stem)
     strips = viz.range_strips(drawn, SphericalProjection(LidarSensor()))
     paths = [
         viz.save(strips, out / "range_images.png"),
         viz.save(viz.birds_eye_sheet(drawn), out / "birds_eye.png"),
-        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view", beside),
+        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view"),
     ]
     line = f"{len(scans)} of {len(readers)} scans in {source}"
     return "\n".join([line, *map(str, paths), "open the .html file in a browser"])

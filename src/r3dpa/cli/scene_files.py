@@ -172,11 +172,9 @@ def page_scans(source: Path) -> list[Callable[[], viz.PageScan]]:
     return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 
 
-def write_page(
-    path: Path, scans: Sequence[viz.PageScan], title: str, beside: viz.PageScan | None = None
-) -> Path:
+def write_page(path: Path, scans: Sequence[viz.PageScan], title: str) -> Path:
     """Writes a page of point clouds, coloured by the classes and origins of the simulator too."""
-    page = viz.scan_page(scans, title, _categories(Semantic), _categories(Origin), beside)
+    page = viz.scan_page(scans, title, _categories(Semantic), _categories(Origin))
     with atomic_path(path) as temporary:
         temporary.write_text(page, "utf-8")
     return path
