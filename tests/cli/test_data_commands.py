@@ -228,7 +228,7 @@ class TestView:
 
     def test_ply_and_npz_files_are_scans_too(self, tmp_path):
         write_ply(tmp_path / "one.ply", points()[:, :3])
-        write_npz(tmp_path / "many.npz", {"a": points(), "b": points()[:, :3]})
+        write_npz(tmp_path / "many.npz", {"a": points(), "b": points()[:, :3]}.items())
         assert self.show(tmp_path / "one.ply", tmp_path / "ply")[2] == [f"{tmp_path.name}/one"]
         assert self.show(tmp_path / "many.npz", tmp_path / "npz")[2] == ["many/a", "many/b"]
 

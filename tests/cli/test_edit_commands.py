@@ -50,8 +50,8 @@ def files(tmp_path_factory):
     checkpoint(folder, None)
     points = read_scan(folder / "a.bin")
     write_bin(folder / "tilted.bin", read_scan(folder / "a.bin", SENSOR)[:, [2, 1, 0, 3]])
-    write_npz(folder / "one.npz", {"scan": points})
-    write_npz(folder / "two.npz", {"x": points, "y": points})
+    write_npz(folder / "one.npz", {"scan": points}.items())
+    write_npz(folder / "two.npz", {"x": points, "y": points}.items())
     for name, size in (("m.png", (64, 16)), ("other.png", (128, 32))):
         mask = Image.new("L", size)
         mask.putpixel((20, 8), 255)

@@ -88,7 +88,9 @@ def test_folder_of_r3dpa_sample_is_read_once(tmp_path):
     for name, points in (("000000", CLOUDS[0]), ("000001", CLOUDS[1])):
         write_bin(tmp_path / "bin" / f"{name}.bin", points[:, :3])
         write_ply(tmp_path / "ply" / f"{name}.ply", points[:, :3])
-    write_npz(tmp_path / "scenes.npz", {"000000": CLOUDS[0][:, :3], "000001": CLOUDS[1][:, :3]})
+    write_npz(
+        tmp_path / "scenes.npz", {"000000": CLOUDS[0][:, :3], "000001": CLOUDS[1][:, :3]}.items()
+    )
     with pytest.raises(ScanError, match=r"several formats \(2 \.bin, 1 \.npz, 2 \.ply\).*"):
         read_samples(tmp_path, SENSOR)
     (tmp_path / "metadata.json").touch()
@@ -271,7 +273,7 @@ def encoded_array(array):
 
 
 def cut(path):
-    write_npz(path / "a.npz", {"x": CLOUDS[0]})
+    write_npz(path / "a.npz", {"x": CLOUDS[0]}.items())
     (path / "a.npz").write_bytes((path / "a.npz").read_bytes()[:-30])
 
 

@@ -125,7 +125,7 @@ def test_round_trips(tmp_path, width):
     assert np.array_equal(read_scan(tmp_path / "new/a.bin"), expected)
     write_ply(tmp_path / "a.ply", torch.from_numpy(points))
     assert np.array_equal(read_ply(tmp_path / "a.ply"), points)
-    write_npz(tmp_path / "a.npz", {"one": points, "two": torch.from_numpy(points[:1])})
+    write_npz(tmp_path / "a.npz", {"one": points, "two": torch.from_numpy(points[:1])}.items())
     archive = read_npz(tmp_path / "a.npz")
     assert np.array_equal(archive["one"], points)
     assert np.array_equal(archive["two"], points[:1])

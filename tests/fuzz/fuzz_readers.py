@@ -114,7 +114,7 @@ def readers(folder: Path) -> dict[str, Reader]:
     write_ply(ply, points)
     add(".ply", ply, lambda: read_ply(ply))
     npz, packed = folder / "a.npz", folder / "packed.npz"
-    write_npz(npz, {"a": points, "b/c": points})
+    write_npz(npz, {"a": points, "b/c": points}.items())
     add(".npz", npz, lambda: (consume(read_samples(npz, SENSOR)), read_npz(npz)))
     array = io.BytesIO()
     np.save(array, points)

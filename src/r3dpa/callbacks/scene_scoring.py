@@ -107,7 +107,7 @@ class SceneScorer(L.Callback):
             spaces = reference_spaces(statistics, self.spaces, self.ckpt, device, self.protocol)
         else:
             datamodule = getattr(trainer, "datamodule", None)
-            if not isinstance(datamodule, LidarDataModule) or datamodule.all_set is None:
+            if not isinstance(datamodule, LidarDataModule) or not hasattr(datamodule, "all_set"):
                 raise ValueError(
                     f"scorer.reference: {type(datamodule).__name__} does not list its scans: give "
                     "a file of `r3dpa reference`, or --scorer.num_scenes 0 to score no scenes"

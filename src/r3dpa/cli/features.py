@@ -68,7 +68,6 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
             # Before Lightning starts the other processes, which would wait and time out.
             data.prepare_data()
             data.setup("predict")
-            assert data.all_set is not None
             projection = data.geometry.projection
             arguments = data.all_set.scans, extractor, projection, sizes, folder, trainer.precision
             if plan(*arguments).missing:  # complete grids may lie on a read-only disk

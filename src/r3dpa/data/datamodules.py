@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import DrawnPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
-from r3dpa.data.loaders import LoaderModule, at_least, ready
+from r3dpa.data.loaders import LoaderModule, at_least
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
@@ -108,9 +108,6 @@ class LidarDataModule(LoaderModule):
         self.augmentation = augmentation
         if self.features_dir is not None:
             augmentation.check_extractor(extractor, self.grid_size[1])
-        self.train_set: LidarDataset | None = None
-        self.val_set: LidarDataset | None = None
-        self.all_set: LidarDataset | None = None
 
     @property
     def feature_dim(self) -> int:
@@ -174,15 +171,15 @@ class LidarDataModule(LoaderModule):
         )
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
-        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE: :class:`LatentBatch`."""
-        images = ready(self.train_set)
+        """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
+        images = self.train_set
         self.train_set = LidarDataset(
             images.scans, images.projection, images.codec, images.grids, posteriors
         )
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
-        dataset = ready(self.train_set)
+        dataset = self.train_set
         if not len(dataset):
             raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
         if getattr(self.trainer, "overfit_batches", 0) > 0:
@@ -194,7 +191,7 @@ class LidarDataModule(LoaderModule):
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """Held-out scans in order, none twice; no loader in a fit where nothing is held out."""
-        dataset = ready(self.val_set)
+        dataset = self.val_set
         if len(dataset):
             return self.loader(dataset, train=False)
         if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
@@ -205,7 +202,7 @@ class LidarDataModule(LoaderModule):
 
     def predict_dataloader(self) -> DataLoader[Any]:
         """All scans in order, none twice."""
-        return self.loader(ready(self.all_set), train=False)
+        return self.loader(self.all_set, train=False)
 
     def _find_features_dir(self, features_dir: str | None) -> Path | None:
         if features_dir is not None or self.extractor is None:
@@ -328,8 +325,6 @@ class PointDataModule(LoaderModule):
                 "trained without feature grids."
             )
         self.source, self.prepare = source, prepare
-        self.train_set: DrawnPoints | None = None
-        self.val_set: DrawnPoints | None = None
 
     def prepare_data(self) -> None:
         """Simulate the scans, where the source does."""
@@ -344,9 +339,8 @@ class PointDataModule(LoaderModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
-        points = ready(self.train_set)
-        return self.loader(points, train=True, with_epoch=True, collate_fn=list)
+        return self.loader(self.train_set, train=True, with_epoch=True, collate_fn=list)
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out scans in order, none twice, each drawn the same every time."""
-        return self.loader(ready(self.val_set), train=False, collate_fn=list)
+        return self.loader(self.val_set, train=False, collate_fn=list)

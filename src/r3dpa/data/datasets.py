@@ -18,26 +18,16 @@ from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
 class LidarBatch(TypedDict):
     """Batch of the training modules.
 
-    ``range_image`` ``(B, 1, H, W)`` float32 in [-1, 1]; ``valid_mask`` ``(B, 1, H, W)`` bool, True
-    where a pixel has a return; ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
+    ``range_image`` ``(B, 1, H, W)`` float32 in [-1, 1] and ``valid_mask`` ``(B, 1, H, W)`` bool,
+    True where a pixel has a return; where they are cached, instead ``posterior_moments``
+    ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents, see
+    :class:`r3dpa.nn.Posterior`. ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
     where no grids are used; ``index`` ``(B,)`` int64 position in the data set; ``name`` B strings.
     """
 
-    range_image: Tensor
-    valid_mask: Tensor
-    feature_grid: NotRequired[Tensor]
-    index: Tensor
-    name: list[str]
-
-
-class LatentBatch(TypedDict):
-    """Replaces a :class:`LidarBatch` where the posteriors of the VAE are cached.
-
-    ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents,
-    see :class:`r3dpa.nn.Posterior`; the rest is that of :class:`LidarBatch`.
-    """
-
-    posterior_moments: Tensor
+    range_image: NotRequired[Tensor]
+    valid_mask: NotRequired[Tensor]
+    posterior_moments: NotRequired[Tensor]
     feature_grid: NotRequired[Tensor]
     index: Tensor
     name: list[str]

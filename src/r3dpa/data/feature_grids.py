@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -71,12 +71,8 @@ class GridSettings:
     grid_size: tuple[int, int]
     extractor: dict[str, Any]
     dim: int
-    dtype: str
+    dtype: Literal["float16"]
     precision: str
-
-    def __post_init__(self) -> None:
-        if self.dtype != "float16":
-            raise ValueError(f"dtype must be float16, got {self.dtype!r}")
 
     @classmethod
     def of(
@@ -99,7 +95,7 @@ class GridSettings:
             folder=Path(features_dir) / f"{self.grid_size[0]}x{self.grid_size[1]}",
             settings=json.dumps(vars(self), indent=1),
             shape=(math.prod(self.grid_size), self.dim),
-            dtype="float16",
+            dtype=self.dtype,
             what="feature grids",
             remedy=f"{REMEDY}, or give the data module an extractor",
         )

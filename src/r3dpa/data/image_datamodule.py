@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.data.images import ImageEntry, ImageSource
-from r3dpa.data.loaders import LoaderModule, at_least, ready
+from r3dpa.data.loaders import LoaderModule, at_least
 from r3dpa.data.scans import evenly
 from r3dpa.data.store import CachedTensors
 
@@ -114,8 +114,6 @@ class ImageDataModule(LoaderModule):
         at_least(2, val_every=val_every)
         self.source, self.image_size = source, image_size
         self.val_every, self.mirrored = val_every, mirrored
-        self.train_set: ImageDataset | None = None
-        self.val_set: ImageDataset | None = None
 
     def setup(self, stage: str) -> None:
         """Index the images; ``ImageError`` if there are none, or a file is damaged."""
@@ -140,10 +138,10 @@ class ImageDataModule(LoaderModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches."""
-        return self.loader(ready(self.train_set), train=True, kind="images")
+        return self.loader(self.train_set, train=True, kind="images")
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Held-out images in order, none twice."""
-        return self.loader(ready(self.val_set), train=False, kind="held-out images")
+        return self.loader(self.val_set, train=False, kind="held-out images")
 
     test_dataloader = val_dataloader

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sized
-from typing import Any, TypeVar, cast
+from collections.abc import Iterator, Sized
+from typing import Any, cast
 
 import numpy as np
 import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
-
-T = TypeVar("T")
 
 
 class EpochSampler(DistributedSampler[Any]):
@@ -112,20 +110,19 @@ def training_loader(
     dataset: Dataset[Any],
     batch_size: int,
     *,
-    num_workers: int = 0,
     seed: int = 0,
     num_replicas: int = 1,
     rank: int = 0,
     limit_batches: float = 1.0,
     with_epoch: bool = False,
-    collate_fn: Callable[[list[Any]], Any] | None = None,
     kind: str = "scans",
+    **options: Any,
 ) -> ResumableLoader:
     """Shuffled, resumable loader of full batches; draws nothing from the global random state.
 
     ``batch_size`` is per process, ``limit_batches`` is ``limit_train_batches`` of the trainer,
-    ``with_epoch`` indexes the data set with ``(epoch, index)``. ``ValueError`` if the data set is
-    smaller than one batch over all processes.
+    ``with_epoch`` indexes the data set with ``(epoch, index)``, ``options`` are of ``DataLoader``.
+    ``ValueError`` if the data set is smaller than one batch over all processes.
     """
     num_samples = len(cast(Sized, dataset))
     if num_samples < batch_size * num_replicas:
@@ -133,20 +130,24 @@ def training_loader(
             f"{num_samples} training {kind} do not fill one batch of {batch_size} {kind} for each "
             f"of {num_replicas} processes: use a smaller batch_size or more {kind}."
         )
+    sampler = EpochSampler(dataset, seed, num_replicas, rank, with_epoch)
     loader = ResumableLoader(
-        dataset,
-        batch_size=batch_size,
-        sampler=EpochSampler(dataset, seed, num_replicas, rank, with_epoch),
-        num_workers=num_workers,
-        drop_last=True,
-        pin_memory=torch.cuda.is_available(),
-        collate_fn=collate_fn,
-        persistent_workers=num_workers > 0,
-        generator=torch.Generator(),  # the default one would draw from the global random state
+        dataset, sampler=sampler, drop_last=True, **_common(batch_size, **options)
     )
     batches = limit_batches if isinstance(limit_batches, int) else limit_batches * len(loader)
     loader.batches_per_epoch = min(int(batches), len(loader))
     return loader
+
+
+def _common(batch_size: int, num_workers: int = 0, **options: Any) -> dict[str, Any]:
+    """Options of every loader, by name as Lightning needs them."""
+    return options | {
+        "batch_size": batch_size,
+        "num_workers": num_workers,
+        "pin_memory": torch.cuda.is_available(),
+        "persistent_workers": num_workers > 0,
+        "generator": torch.Generator(),  # the default draws from the global random state
+    }
 
 
 class LoaderModule(LightningDataModule):
@@ -164,36 +165,16 @@ class LoaderModule(LightningDataModule):
         """Loader as :func:`training_loader`, or of all samples in order."""
         trainer = self.trainer
         replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
+        options |= {"batch_size": self.batch_size, "num_workers": self.num_workers}
         if train:
-            return training_loader(
-                dataset,
-                self.batch_size,
-                num_workers=self.num_workers,
-                seed=self.seed,
-                num_replicas=replicas,
-                rank=rank,
-                limit_batches=1.0 if trainer is None else trainer.limit_train_batches,
-                kind=kind,
-                **options,
-            )
-        return DataLoader(
-            dataset,
-            batch_size=self.batch_size,
-            # Some samples come twice, so that all processes have as many batches.
-            sampler=DistributedSampler(dataset, replicas, rank, shuffle=False),
-            num_workers=self.num_workers,
-            pin_memory=torch.cuda.is_available(),
-            persistent_workers=self.num_workers > 0,
-            generator=torch.Generator(),  # the default one would draw from the global random state
-            **options,
+            limit = 1.0 if trainer is None else trainer.limit_train_batches
+            options |= {"limit_batches": limit, "seed": self.seed, "kind": kind}
+            return training_loader(dataset, num_replicas=replicas, rank=rank, **options)
+        # Some samples come twice, so that all processes have as many batches.
+        in_order: DistributedSampler[Any] = DistributedSampler(
+            dataset, replicas, rank, shuffle=False
         )
-
-
-def ready(dataset: T | None) -> T:
-    """A data set that ``setup`` has made; ``ValueError`` if it has not."""
-    if dataset is None:
-        raise ValueError("Call prepare_data() and setup('fit') before asking for a loader.")
-    return dataset
+        return DataLoader(dataset, sampler=in_order, **_common(**options))
 
 
 def at_least(least: int, **values: int | None) -> None:

@@ -9,7 +9,7 @@ import os
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
@@ -40,8 +40,6 @@ _PLY_NAMES += ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32",
 _PLY_TYPES = dict(
     zip(_PLY_NAMES, ["i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"] * 2, strict=True)
 )
-#: Raised for archives that are damaged, or packed or encrypted in a way that is not read.
-ARCHIVE_ERRORS = (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError)
 
 
 class ScanError(DataError):
@@ -234,22 +232,17 @@ def read_ply(path: str | Path) -> np.ndarray:
         ) from error
 
 
-def write_npz(
-    path: str | Path,
-    scans: Mapping[str, np.ndarray | torch.Tensor]
-    | Iterable[tuple[str, np.ndarray | torch.Tensor]],
-) -> None:
+def write_npz(path: str | Path, scans: Iterable[tuple[str, np.ndarray | torch.Tensor]]) -> None:
     """Write many scans to one compressed ``.npz`` file, atomically and one after the other.
 
-    ``scans`` are points ``(P, 3)`` or ``(P, 4)`` by name, or pairs of name and points, which need
-    not be in memory together; ``ValueError`` for another shape, NaN or infinite values.
+    ``scans`` are pairs of a name and points ``(P, 3)`` or ``(P, 4)``, which need not be in memory
+    together; ``ValueError`` for another shape, NaN or infinite values.
     """
-    pairs = scans.items() if isinstance(scans, Mapping) else scans
     with (
         atomic_path(path) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
-        for name, points in pairs:
+        for name, points in scans:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, _rows(points))
 
@@ -274,7 +267,7 @@ def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                 if info.compress_size > size or info.file_size > max(2**30, 100 * size):
                     raise ValueError("it is far larger than the file")
                 yield info.filename.removesuffix(".npy"), _array(archive.read(info))
-    except ARCHIVE_ERRORS as error:
+    except (*UNPICKLING_ERRORS, zlib.error, lzma.LZMAError) as error:
         raise ScanError(f"{where}: is damaged or no .npz file of numbers ({error})") from error
 
 
@@ -316,7 +309,6 @@ def files_below(root: Path) -> Iterator[Path]:
 
 
 def _drive_files(drive: Path) -> Iterator[Path]:
-    """Scans of a drive in the KITTI-360 layout."""
     return filter(_is_scan, (drive / VELODYNE).glob("*"))
 
 

@@ -204,7 +204,6 @@ class SceneWriter:
         return file
 
     def _write(self, range_m: Tensor, nfe: int) -> None:
-        """Write one batch."""
         for index, scene in enumerate(range_m, self.num_done):
             if scene.isnan().any():
                 raise ValueError(

@@ -1,4 +1,4 @@
-"""Tensors on disk, one row per scan or image: appended by any process, read from memory maps.
+"""Tensors on disk, one row per scan or image, appended by any process.
 
 A store is a folder::
 
@@ -16,13 +16,12 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import mmap
 import os
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
-from itertools import count
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
@@ -95,6 +94,10 @@ class Store:
     def row_bytes(self) -> int:
         """Size of a row in bytes."""
         return math.prod(self.shape) * _DTYPES[self.dtype].itemsize
+
+    def rows(self, shard: int) -> Path:
+        """File of the rows of a shard."""
+        return self.folder / f"shard_{shard:05d}.rows"
 
     def places(self) -> dict[ItemKey, tuple[int, int]]:
         """Shard and row of each key; ``StoreError`` if a journal is damaged."""
@@ -236,14 +239,13 @@ class StoreWriter:
 
     def _open(self) -> tuple[FileIO, FileIO]:
         """Rows and journal; without buffers, which would be written after an error."""
-        for shard in count(self._shard):
-            if self._files is not None:
-                break
-            rows = self._store.folder / f"shard_{shard:05d}.rows"
+        shard = self._shard
+        while self._files is None:
+            rows = self._store.rows(shard)
+            shard += 1
             with suppress(FileExistsError):
                 file = rows.open("xb", buffering=0)
                 self._files = file, FileIO(rows.with_suffix(".jsonl"), "ab", opener=no_follow)
-        assert self._files is not None
         return self._files
 
 
@@ -257,7 +259,7 @@ class CachedTensors(Generic[Item]):
         self.store, self.items = store, list(items)
         names = {item.name: item for item in items}
         self._places = {key: at for key, at in store.places().items() if key[0] in names}
-        self._maps: dict[int, mmap.mmap] = {}
+        self._files: dict[int, int] = {}  # descriptor by shard
         if missing := names.keys() - {key[0] for key in self._places}:
             raise self._missing([names[name] for name in sorted(missing)])
 
@@ -269,34 +271,25 @@ class CachedTensors(Generic[Item]):
         place = self._places.get(item.cache_key)
         if place is None:
             raise self._missing([item])
-        shard, row = place
-        size = self.store.row_bytes
-        start, mapping = row * size, self._mapped(shard)
-        # The size of the file now: to touch what was cut off since would kill the process.
-        if mapping.size() < start + size:
-            raise self._lost(shard, "was cut short")
-        # Read as a whole: page by page, as they are touched, a disk is slower.
-        page_start = start // mmap.PAGESIZE * mmap.PAGESIZE
-        mapping.madvise(mmap.MADV_WILLNEED, page_start, start - page_start + size)
-        store = self.store
-        values = np.frombuffer(mapping, _DTYPES[store.dtype], math.prod(store.shape), start)
+        store, (shard, row) = self.store, place
+        values = np.empty(store.shape, _DTYPES[store.dtype])
+        path = store.rows(shard)
+        try:
+            if shard not in self._files:
+                self._files[shard] = os.open(path, os.O_RDONLY)
+                weakref.finalize(self, os.close, self._files[shard])
+            # One read of the whole row: a map would be read page by page, and a page that was cut
+            # off since would kill the process.
+            complete = (
+                os.preadv(self._files[shard], [values.data], row * values.nbytes) == values.nbytes
+            )
+        except FileNotFoundError:
+            complete = False
+        if not complete:
+            what = f"{path} is gone or was cut short since its journal was read"
+            raise store.damaged(path.with_suffix(".jsonl"), what)
         # Torch converts half precision eight times as fast as NumPy.
-        return torch.from_numpy(values.reshape(store.shape).copy()).float()
-
-    def _mapped(self, shard: int) -> mmap.mmap:
-        if shard not in self._maps:
-            try:
-                with (self.store.folder / f"shard_{shard:05d}.rows").open("rb") as file:
-                    # Read-only: a private copy would count as memory, 42 GB for a large shard.
-                    self._maps[shard] = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            except (FileNotFoundError, ValueError) as error:
-                raise self._lost(shard, "is gone or empty") from error
-        return self._maps[shard]
-
-    def _lost(self, shard: int, what: str) -> StoreError:
-        rows = self.store.folder / f"shard_{shard:05d}.rows"
-        what = f"{rows} {what} since its journal was read"
-        return self.store.damaged(rows.with_suffix(".jsonl"), what)
+        return torch.from_numpy(values).float()
 
     def _missing(self, items: Sequence[Cacheable]) -> StoreError:
         more = f" and {len(items) - 1} more" if len(items) > 1 else ""
@@ -307,7 +300,7 @@ class CachedTensors(Generic[Item]):
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_maps": {}}
+        return self.__dict__ | {"_files": {}}
 
 
 def append(file: FileIO, data: bytes) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.datasets import LatentBatch, LidarBatch, LidarDataset
+from r3dpa.data.datasets import LidarBatch, LidarDataset
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
@@ -91,7 +91,7 @@ class FlowMatching(GenerativeModule):
         super().on_fit_start()
         if not self.cache_latents or cast(Any, self.trainer).fast_dev_run:
             return
-        dataset = cast(LidarDataset, self._datamodule.train_set)
+        dataset = self._datamodule.train_set
         geometry = self.scan_geometry.to_dict()
         posteriors = encoded_once(
             self,
@@ -111,13 +111,13 @@ class FlowMatching(GenerativeModule):
         """The SiT alone."""
         return {"sit": self.sit}
 
-    def training_step(self, batch: LidarBatch | LatentBatch, batch_idx: int) -> Tensor:
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
         with torch.no_grad():
             if "posterior_moments" in batch:
-                posterior = Posterior(cast(LatentBatch, batch)["posterior_moments"])
+                posterior = Posterior(batch["posterior_moments"])
             else:
-                posterior = self.vae.encode(cast(LidarBatch, batch)["range_image"])
+                posterior = self.vae.encode(batch["range_image"])
             draws = self.draw_path(len(posterior.mean))
             latents = posterior.sample(draws.posterior_noise)
             normalised = self.latent_norm.normalise(latents)

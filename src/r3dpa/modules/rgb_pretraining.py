@@ -139,7 +139,7 @@ class RGBPretraining(L.LightningModule):
         A ``fast_dev_run`` makes those of its batches alone.
         """
         trainer, datamodule = self.trainer, self._datamodule
-        entries = cast(ImageDataset, datamodule.train_set).entries
+        entries = datamodule.train_set.entries
         if cast(Any, trainer).fast_dev_run:
             batches = int(trainer.limit_train_batches)
             entries = entries[: batches * datamodule.batch_size * trainer.world_size]
