@@ -104,9 +104,7 @@ def _stand_ins() -> dict[str, ModuleType]:
         "timm": {},
         "timm.models": {},
         "timm.models.vision_transformer": {
-            "PatchEmbed": PatchEmbed,
-            "Attention": Attention,
-            "Mlp": Mlp,
+            cls.__name__: cls for cls in (PatchEmbed, Attention, Mlp)
         },
         "omegaconf": {"OmegaConf": _Configuration},
         "dictdot": {"dictdot": _Dot},
@@ -136,19 +134,12 @@ def _never(*args: Any, **kwargs: Any) -> Any:
 class PatchEmbed(nn.Module):
     """Patches of an image as tokens, as ``timm.layers.PatchEmbed`` numbers and names them."""
 
-    def __init__(
-        self,
-        img_size: tuple[int, int],
-        patch_size: int,
-        in_chans: int,
-        embed_dim: int,
-        bias: bool = True,
-    ) -> None:
+    def __init__(self, size: tuple[int, int], patch: int, channels: int, width: int, bias: bool):
         super().__init__()
-        self.patch_size = (patch_size, patch_size)
-        self.grid_size = (img_size[0] // patch_size, img_size[1] // patch_size)
+        self.patch_size = (patch, patch)
+        self.grid_size = (size[0] // patch, size[1] // patch)
         self.num_patches = self.grid_size[0] * self.grid_size[1]
-        self.proj = nn.Conv2d(in_chans, embed_dim, patch_size, patch_size, bias=bias)
+        self.proj = nn.Conv2d(channels, width, patch, patch, bias=bias)
 
     def forward(self, image: Tensor) -> Tensor:
         return self.proj(image).flatten(2).transpose(1, 2)
@@ -157,12 +148,9 @@ class PatchEmbed(nn.Module):
 class Attention(nn.Module):
     """Multi-head attention with the weights of ``timm.layers.Attention``."""
 
-    def __init__(
-        self, dim: int, num_heads: int = 8, qkv_bias: bool = False, qk_norm: bool = False
-    ) -> None:
+    def __init__(self, dim: int, num_heads: int, qkv_bias: bool, qk_norm: bool) -> None:
         super().__init__()
         self.num_heads = num_heads
-        self.fused_attn = True
         self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
         self.q_norm = nn.LayerNorm(dim // num_heads) if qk_norm else nn.Identity()
         self.k_norm = nn.LayerNorm(dim // num_heads) if qk_norm else nn.Identity()
@@ -173,11 +161,7 @@ class Attention(nn.Module):
         split = self.qkv(tokens).view(batch, number, 3, self.num_heads, -1)
         query, key, value = split.permute(2, 0, 3, 1, 4)
         query, key = self.q_norm(query), self.k_norm(key)
-        if self.fused_attn:
-            mixed = F.scaled_dot_product_attention(query, key, value)
-        else:
-            scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
-            mixed = scores.softmax(dim=-1) @ value
+        mixed = F.scaled_dot_product_attention(query, key, value)
         return self.proj(mixed.transpose(1, 2).reshape(batch, number, width))
 
 
@@ -185,15 +169,10 @@ class Mlp(nn.Module):
     """Two linear layers with the weights of ``timm.layers.Mlp``, without dropout."""
 
     def __init__(
-        self,
-        in_features: int,
-        hidden_features: int,
-        act_layer: Callable[[], nn.Module],
-        drop: float = 0.0,
+        self, in_features: int, hidden_features: int, act_layer: type[nn.Module], drop: int
     ) -> None:
         super().__init__()
-        if drop:
-            raise ValueError(f"the stand-in for timm knows no dropout, got {drop}")
+        assert not drop
         self.fc1 = nn.Linear(in_features, hidden_features)
         self.act = act_layer()
         self.fc2 = nn.Linear(hidden_features, in_features)
@@ -236,11 +215,9 @@ class OneProcess:
     def gather(self, values: Tensor) -> Tensor:
         return values
 
-    def wait_for_everyone(self) -> None:
-        """Returns at once."""
+    def wait_for_everyone(self) -> None: ...
 
-    def end_training(self) -> None:
-        """Returns at once."""
+    def end_training(self) -> None: ...
 
 
 class _Dot(dict):

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import lightning as L
 import numpy as np
@@ -46,26 +47,16 @@ class _Cpu:
 def official_sit(code: OfficialCode, checkpoint: Checkpoint, **given: Any) -> nn.Module:
     """The official SiT with the sizes of ``sit`` in a checkpoint; fresh weights."""
     sizes = checkpoint.network("sit").arguments
-    arguments = {
-        "input_size": sizes["input_size"],
-        "in_channels": sizes["in_channels"],
+    same = ("input_size", "in_channels", "num_classes", "qk_norm", "patch_size", "hidden_size")
+    same += ("depth", "num_heads", "mlp_ratio", "projector_dim")
+    arguments = {name: sizes[name] for name in same} | {
         "encoder_depth": sizes["alignment_depth"],
-        "num_classes": sizes["num_classes"],
+        "decoder_hidden_size": sizes["hidden_size"],
         "class_dropout_prob": 0.0,
         "bn_momentum": 0.1,
         "fused_attn": True,
-        "qk_norm": sizes["qk_norm"],
-    } | given
-    return code["models.sit"].SiT(
-        patch_size=sizes["patch_size"],
-        hidden_size=sizes["hidden_size"],
-        decoder_hidden_size=sizes["hidden_size"],
-        depth=sizes["depth"],
-        num_heads=sizes["num_heads"],
-        mlp_ratio=sizes["mlp_ratio"],
-        projector_dim=sizes["projector_dim"],
-        **arguments | {"z_dims": [sizes["feature_dim"]]},
-    )
+    }
+    return code["models.sit"].SiT(**arguments | given | {"z_dims": [sizes["feature_dim"]]})
 
 
 def official_vae(code: OfficialCode, checkpoint: Checkpoint) -> nn.Module:
@@ -122,31 +113,13 @@ def write_official_scenes(
     """Runs ``main`` of the official ``generate.py``: Euler steps, decode, all of its files."""
     generate = code["generate"]
     overlay: dict[str, Any] = {
-        "cuda": Overlay(
-            torch.cuda,
-            is_available=lambda: True,
-            device_count=_Cpu,
-            set_device=_nothing,
-            empty_cache=_nothing,
-        ),
+        "cuda": Mock(is_available=lambda: True, device_count=_Cpu),
         "load": lambda path, map_location: torch.load(path, weights_only=True),
     }
     if noise is not None:
         batches = iter(noise.split(batch_size))
         overlay["randn"] = lambda *shape, device: next(batches)
-    alone = Overlay(
-        None,
-        init_process_group=_nothing,
-        get_rank=lambda: 0,
-        get_world_size=lambda: 1,
-        broadcast=_nothing,
-        barrier=_nothing,
-        destroy_process_group=_nothing,
-    )
-
-    def vae() -> Any:
-        return official_vae(code, checkpoint)
-
+    alone = Mock(get_rank=lambda: 0, get_world_size=lambda: 1)
     options = Namespace(
         tf32=False,
         global_seed=0,
@@ -171,7 +144,7 @@ def write_official_scenes(
             tqdm=lambda steps, **_: steps,
             SiT_models={_MODEL: partial(official_sit, code, checkpoint)},
             UNet_models={},
-            vae_models={_VAE: vae},
+            vae_models={_VAE: partial(official_vae, code, checkpoint)},
         ),
         contextlib.redirect_stdout(io.StringIO()),
         torch.enable_grad(),  # it switches gradients off for good
@@ -213,9 +186,8 @@ def train_official(
         keep("discriminator", function.discriminator, weights["discriminator"])
         return function
 
-    samples = [
-        {"image": scan, "features": grid} for scan, grid in zip(image, features, strict=True)
-    ]
+    batch = {"image": image, "features": features}
+    samples = [dict(zip(batch, pair, strict=True)) for pair in zip(image, features, strict=True)]
     with (
         replaced(
             script,
@@ -290,10 +262,6 @@ def replaced(module: Any, **names: Any) -> Iterator[None]:
         yield
     finally:
         vars(module).update(before)
-
-
-def _nothing(*args: Any, **kwargs: Any) -> None:
-    """In place of what has no meaning for one process on the CPU."""
 
 
 class _GivenDraws(JointAlignment):

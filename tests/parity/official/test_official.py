@@ -1,4 +1,4 @@
-"""The bench against the official code: its stand-ins always, the rest with a checkout at hand."""
+"""Our networks, scenes and training steps against those of a checkout of the official code."""
 
 from __future__ import annotations
 
@@ -9,28 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from official_code import Attention, Mlp, PatchEmbed, load_official
-from official_networks import (
-    at_times,
-    noise_of,
-    random_networks,
-    relative,
-    sits,
-    vaes,
-)
-from official_scripts import (
-    save_for_official,
-    train_official,
-    train_ours,
-    write_official_scenes,
-)
+from official_code import load_official
+from official_networks import noise_of, random_networks, relative, sits, vaes
+from official_scripts import save_for_official, train_official, train_ours, write_official_scenes
 
 from r3dpa.checkpoints import to_official
-from r3dpa.flow import euler, ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import ScanGeometry
-from r3dpa.nn import SiT
-from r3dpa.nn.layers import SelfAttention
 
 SIT = {
     "input_size": [4, 8],
@@ -61,55 +46,9 @@ def networks():
     return random_networks(SIT, VAE)
 
 
-# Stand-ins
-
-
-@pytest.mark.parametrize("qk_norm", [False, True])
-@pytest.mark.parametrize("fused", [False, True])
-def test_attention_is_that_of_our_transformers(qk_norm, fused):
-    theirs = Attention(24, num_heads=3, qkv_bias=True, qk_norm=qk_norm)
-    ours = SelfAttention(24, 3, qk_norm)
-    ours.load_state_dict(theirs.state_dict())
-    theirs.fused_attn = fused
-    tokens = torch.randn(2, 7, 24)
-    assert torch.allclose(theirs(tokens), ours(tokens), atol=1e-6)
-
-
-def test_patches_and_mlp_are_those_of_our_sit():
-    sit = SiT((4, 6), hidden_size=32, depth=1, num_heads=2, alignment_depth=1)
-    patches = PatchEmbed((4, 6), 2, 8, 32)
-    patches.load_state_dict(sit.x_embedder.state_dict())
-    latents = torch.randn(2, 8, 4, 6)
-    assert patches.grid_size == sit.grid_size
-    assert patches.num_patches == 6
-    assert torch.equal(patches(latents), sit.x_embedder(latents))
-    mlp = Mlp(32, 128, lambda: torch.nn.GELU(approximate="tanh"), drop=0)
-    mlp.load_state_dict(sit.blocks[0].mlp.state_dict())
-    tokens = torch.randn(2, 6, 32)
-    assert torch.allclose(mlp(tokens), sit.blocks[0].mlp(tokens), atol=1e-6)
-
-
 def test_another_folder_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"is no unchanged checkout of commit aa08e6d"):
         load_official(tmp_path)
-
-
-# Our side of the comparison
-
-
-def test_noise_is_that_of_the_generator_and_of_the_seed(networks):
-    noise = noise_of(networks, 2, seed=5)
-    sit = networks.network("ema").build().eval()
-    parts = [networks.network(name).build() for name in ("vae", "ema_latent_norm")]
-    geometry = ScanGeometry.from_dict(networks.geometry)
-    generator = SceneGenerator(parts[0], sit, parts[1], geometry, SamplerConfig("euler", 3))
-    times = ode_times(3)
-    expected = euler(at_times(sit, times[:-1]), noise, times)
-    assert torch.allclose(generator.generate(range(2), 5).latents, expected, atol=1e-5)
-    assert not torch.equal(noise, noise_of(networks, 2, seed=6))
-
-
-# With a checkout
 
 
 def test_import_leaves_no_module_and_no_file_behind(repo):
@@ -131,12 +70,8 @@ def test_velocity_and_image_are_the_official_ones(code, networks):
     labels = torch.zeros(2, dtype=torch.long)
     net = sits(code, networks)
     with torch.no_grad():
-        assert (
-            relative(
-                net.ours.velocity(latents, time_), net.theirs.inference(latents, time_, labels)
-            )
-            < 1e-5
-        )
+        expected = net.theirs.inference(latents, time_, labels)
+        assert relative(net.ours.velocity(latents, time_), expected) < 1e-5
         net = vaes(code, networks)
         assert relative(net.ours.decode(latents), net.theirs.decode(latents).sample) < 1e-5
 
