@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from r3dpa.losses import alignment_loss, flow_matching_loss
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 from r3dpa.nn.vae import VAE
@@ -65,3 +66,15 @@ def vae_of(config):
         attention_levels=config["attn_levels"],
         legacy_upsample=True,
     )
+
+
+def training_pass(case, network, latents, path):
+    """Outputs of one pass over normalised latents, named as the official code does."""
+    time, noise = case["in/time_input"].flatten(), case["in/noises"]
+    output = network(path.interpolate(latents, noise, time), time, case["in/y"])
+    return {
+        "zs_tilde": output.features,
+        "model_output": output.velocity,
+        "denoising_loss": flow_matching_loss(output.velocity, path.target(latents, noise, time)),
+        "proj_loss": alignment_loss(output.features, case["in/zs"]),
+    }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from recorded_networks import build_norm, build_sit, our_name
+from recorded_networks import build_norm, build_sit, our_name, training_pass
 
 from r3dpa.flow import FeatureGuidance, FeatureTarget, Interpolant
-from r3dpa.losses import alignment_loss, flow_matching_loss
+from r3dpa.losses import alignment_loss
 from r3dpa.nn.sit import sincos_position_embedding
 from r3dpa.nn.velocity_network import time_frequencies
 
@@ -15,18 +15,6 @@ from r3dpa.nn.velocity_network import time_frequencies
 @pytest.fixture(scope="module")
 def case(load_case):
     return load_case("sit")
-
-
-def training_pass(case, sit, latents, path):
-    """Outputs of one pass over normalised latents, named as the official code does."""
-    time, noise = case["in/time_input"].flatten(), case["in/noises"]
-    output = sit(path.interpolate(latents, noise, time), time, case["in/y"])
-    return {
-        "zs_tilde": output.features,
-        "model_output": output.velocity,
-        "denoising_loss": flow_matching_loss(output.velocity, path.target(latents, noise, time)),
-        "proj_loss": alignment_loss(output.features, case["in/zs"]),
-    }
 
 
 def under(prefix, outputs):

@@ -16,7 +16,7 @@ from r3dpa.nn.backbones.minkowski import (
     to_points,
     to_voxels,
 )
-from r3dpa.nn.backbones.sparse import SparseConv, Voxels, kernel_offsets, pool_voxels, voxelize
+from r3dpa.nn.backbones.sparse import SparseConv, Voxels, pool_voxels, voxelize
 
 NETWORKS = {"minkowskinet": MinkowskiNet, "spvcnn": SPVCNN}
 STAGES = [f"stage{i}" for i in range(1, 5)] + [f"up{i}" for i in range(1, 5)]
@@ -66,13 +66,6 @@ def layer(case, name):
     conv = SparseConv(*kernel.shape[-2:], size)
     conv.load_state_dict({"kernel": kernel})
     return conv
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_sparse_layers_offsets(layers, size):
-    for stride in (1, 2, 4):
-        expected = layers[f"out/kernel_offsets_k{size}_tensor_stride{stride}"]
-        assert (torch.tensor(kernel_offsets(size)) * stride).tolist() == expected.tolist()
 
 
 @torch.no_grad()

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from recorded_networks import our_name, weights_of
+from recorded_networks import our_name, training_pass, weights_of
 
 from r3dpa.checkpoints import from_official, to_official
 from r3dpa.flow import Interpolant
-from r3dpa.losses import alignment_loss, flow_matching_loss
+from r3dpa.losses import alignment_loss
 from r3dpa.nn import LatentNorm, UNet
 
 PATH = Interpolant("linear")
@@ -49,14 +49,8 @@ def build(case):
 
 
 def outputs_of(case, unet, latents):
-    time, noise = case["in/time_input"].flatten(), case["in/noises"]
-    output = unet(PATH.interpolate(latents, noise, time), time, case["in/y"])
-    return {
-        "zs_tilde": output.features,
-        "model_output": output.velocity,
-        "denoising_loss": flow_matching_loss(output.velocity, PATH.target(latents, noise, time)),
-        "proj_loss": alignment_loss(output.features, case["in/zs"]).mean(),
-    }
+    outputs = training_pass(case, unet, latents, PATH)
+    return outputs | {"proj_loss": outputs["proj_loss"].mean()}
 
 
 def evaluation(case):
