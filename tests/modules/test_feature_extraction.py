@@ -11,7 +11,7 @@ from lightning import Trainer
 
 from r3dpa.data import FeatureGrids, StoreError, find_scans, write_feature_grids
 from r3dpa.geometry import LidarSensor, SphericalProjection
-from r3dpa.modules import FeatureExtraction, MissingScans
+from r3dpa.modules import FeatureExtraction
 from r3dpa.nn.backbones import GeometricFeatures
 
 pytestmark = [
@@ -42,10 +42,8 @@ def extract(scans, out, extractor=None, sizes=SIZES, batch_size=2, **options):
     trainer = Trainer(
         **options, logger=False, enable_checkpointing=False, enable_progress_bar=False
     )
-    extraction = FeatureExtraction(extractor, PROJECTION, sizes, out)
-    missing = MissingScans(scans, extractor, PROJECTION.sensor, batch_size)
-    result = trainer.predict(extraction, missing, return_predictions=False)
-    assert not result
+    extraction = FeatureExtraction(extractor, PROJECTION, sizes, out, scans, batch_size)
+    assert not trainer.predict(extraction, return_predictions=False)
 
 
 def read(out, scans, size):

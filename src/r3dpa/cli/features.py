@@ -17,7 +17,7 @@ from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
-from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
+from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.nn.backbones.point_features import SOURCES, feature_source
 
 # Of the trainer's options, those that matter where nothing is trained and every scan counts.
@@ -80,11 +80,11 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
                 f"done; {todo.num_bytes / 1e9:.3g} GB needed, in {stores}\n"
             )
             sys.stdout.flush()  # into a log file at once
-        extraction = FeatureExtraction(extractor, projection, sizes, folder)
-        missing = MissingScans(scans, extractor, data.sensor, data.batch_size, data.num_workers)
+        loading = {"batch_size": data.batch_size, "num_workers": data.num_workers}
+        extraction = FeatureExtraction(extractor, projection, sizes, folder, scans, **loading)
         started = time.monotonic()
         try:
-            trainer.predict(extraction, missing, return_predictions=False)
+            trainer.predict(extraction, return_predictions=False)
         except SystemExit as stop:
             if stop.code == 1:  # Lightning turns Ctrl-C into this
                 raise KeyboardInterrupt from None

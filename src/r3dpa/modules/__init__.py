@@ -1,7 +1,7 @@
 """Training stages and feature extraction as LightningModules."""
 
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.feature_extraction import FeatureExtraction, MissingScans
+from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.image_vae import ImageVAETraining
 from r3dpa.modules.joint_alignment import JointAlignment
@@ -17,7 +17,6 @@ __all__ = [
     "ImageVAETraining",
     "JointAlignment",
     "LossWeights",
-    "MissingScans",
     "OptimizerConfig",
     "PointPretraining",
     "RGBPretraining",

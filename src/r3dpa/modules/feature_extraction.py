@@ -7,27 +7,32 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch import LightningModule
 from torch.utils.data import DataLoader, DistributedSampler
 
 from r3dpa.data.datasets import PointDataset, PointSample
 from r3dpa.data.feature_grids import Extractor, GridSettings, pooled_grids
 from r3dpa.data.scans import Scan
 from r3dpa.data.store import StoreWriter
-from r3dpa.geometry import LidarSensor, Projection
+from r3dpa.geometry import Projection
 
 
 class FeatureExtraction(LightningModule):
-    """Writes the feature grids of the scans that it is given, as ``trainer.predict`` runs it.
+    """Writes the feature grids of scans, as ``trainer.predict`` runs it without further data.
 
-    Each process appends to a shard of its own, so that what is made survives whatever ends the
-    run. Nothing is returned.
+    Each process gets its share of the scans and appends to a shard of its own, so that what is made
+    survives whatever ends the run. Nothing is returned.
 
     Args:
-        extractor: Frozen network, see :class:`r3dpa.data.Extractor`.
-        projection: That of the range images; needed in the first process only.
+        extractor: Frozen network, see :class:`r3dpa.data.Extractor`; its ``prepare`` runs in the
+            loader processes.
+        projection: That of the range images; only that of the first process counts. At least one
+            point of a scan must lie within the range limits of its sensor.
         grid_sizes: Rows and columns (h, w) of the grids; all are pooled from one pass.
         features_dir: Folder of the grids of this extractor.
+        scans: Scans to extract; only the list of the first process counts.
+        batch_size: Scans per batch and process.
+        num_workers: Loader processes per process.
 
     Raises:
         StoreError: While it runs, if the store cannot be written, or features are not finite.
@@ -39,17 +44,38 @@ class FeatureExtraction(LightningModule):
         projection: Projection | None,
         grid_sizes: Sequence[tuple[int, int]],
         features_dir: str | Path,
+        scans: Sequence[Scan],
+        batch_size: int = 1,
+        num_workers: int = 0,
     ) -> None:
         super().__init__()
+        self.allow_zero_length_dataloader_with_multiple_devices = True  # fewer scans than processes
         self.extractor: Extractor = extractor
-        self.projection = projection
+        self.projection, self.scans = projection, list(scans)
         self.grid_sizes = list(grid_sizes)
         self.features_dir = Path(features_dir)
+        self.batch_size, self.num_workers = batch_size, num_workers
         self._writers: dict[tuple[int, int], StoreWriter] = {}
 
     def setup(self, stage: str) -> None:
-        """Takes the projection of the first process: others may lack the scans it is fitted to."""
-        self.projection = self.trainer.strategy.broadcast(self.projection)
+        """Takes scans and projection of the first process: others may lack what is needed."""
+        given = self.projection, self.scans
+        self.projection, self.scans = self.trainer.strategy.broadcast(given)
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """The share of this process, in order; no scan is given twice."""
+        own = self.scans[self.trainer.global_rank :: self.trainer.world_size]
+        sensor = cast(Projection, self.projection).sensor
+        dataset = PointDataset(own, sensor, self.extractor.prepare)
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            # Of one process, so that Lightning does not divide the share once more.
+            sampler=DistributedSampler(dataset, num_replicas=1, rank=0, shuffle=False),
+            num_workers=self.num_workers,
+            collate_fn=list,
+            generator=torch.Generator(),  # the default would draw from the global random state
+        )
 
     def transfer_batch_to_device(
         self, batch: list[PointSample], device: torch.device, dataloader_idx: int
@@ -82,49 +108,3 @@ class FeatureExtraction(LightningModule):
         for writer in self._writers.values():
             writer.close()
         self._writers.clear()
-
-
-class MissingScans(LightningDataModule):
-    """Scans for :class:`FeatureExtraction`: each process gets its share, none is given twice.
-
-    Args:
-        scans: Scans to extract; only the list of the first process counts.
-        extractor: Its ``prepare`` runs in the loader processes.
-        sensor: At least one point of a scan must lie within its range limits.
-        batch_size: Scans per batch and process.
-        num_workers: Loader processes per process.
-    """
-
-    def __init__(
-        self,
-        scans: Sequence[Scan],
-        extractor: Extractor,
-        sensor: LidarSensor,
-        batch_size: int = 1,
-        num_workers: int = 0,
-    ) -> None:
-        super().__init__()
-        self.allow_zero_length_dataloader_with_multiple_devices = True  # fewer scans than processes
-        self.scans = list(scans)
-        self.extractor, self.sensor = extractor, sensor
-        self.batch_size, self.num_workers = batch_size, num_workers
-
-    def setup(self, stage: str) -> None:
-        """Takes the list of the first process."""
-        assert self.trainer is not None
-        self.scans = self.trainer.strategy.broadcast(self.scans)
-
-    def predict_dataloader(self) -> DataLoader[Any]:
-        """The share of this process, in order."""
-        assert self.trainer is not None
-        own = self.scans[self.trainer.global_rank :: self.trainer.world_size]
-        dataset = PointDataset(own, self.sensor, self.extractor.prepare)
-        return DataLoader(
-            dataset,
-            batch_size=self.batch_size,
-            # Of one process, so that Lightning does not divide the share once more.
-            sampler=DistributedSampler(dataset, num_replicas=1, rank=0, shuffle=False),
-            num_workers=self.num_workers,
-            collate_fn=list,
-            generator=torch.Generator(),  # the default would draw from the global random state
-        )
