@@ -138,40 +138,8 @@ class TestClipping:
             assert torch.equal(module.clipped[0][name], gradient), name
 
 
-def trained_keys(weights):
-    """All but the latent statistics, which follow the VAE in every forward pass."""
-    return [
-        key
-        for key in weights
-        if not key.startswith("latent_norm.") and "running_" not in key and "num_batches" not in key
-    ]
-
-
 @pytest.mark.numerics
 class TestNonFiniteGradients:
-    def test_a_bad_step_changes_neither_weights_nor_moments_nor_averages(self):
-        """Only VAE and SiT see the NaN, yet the discriminator keeps its weights too."""
-        module = train(
-            stage_module("joint", ema_decay=0.5),
-            TinyData([False, True, False]),
-            gradient_clip_val=1.0,
-        )
-        bad = norms_by_network(module.grads[1])
-        assert {network for network, norm in bad.items() if norm != norm} == {"vae", "sit"}
-        (first, first_moments), (second, second_moments), (third, _) = module.states
-        for key in trained_keys(first):
-            assert torch.equal(second[key], first[key]), key
-        for key in ("ema.latent_norm.running_mean", "ema.latent_norm.running_var"):
-            assert torch.equal(second[key], first[key]), key
-        assert len(second_moments) == len(first_moments) > 0
-        for before, after in zip(first_moments, second_moments, strict=True):
-            for key, value in before.items():
-                assert torch.equal(after[key], value), key
-        for prefix in ("vae.encoder", "vae.decoder", "discriminator", "sit.b", "ema.sit.b"):
-            weights = [key for key in trained_keys(first) if key.startswith(prefix)]
-            assert not all(torch.equal(third[key], second[key]) for key in weights), prefix
-        assert all(value.isfinite().all() for value in third.values() if value.is_floating_point())
-
     def test_a_bad_first_step_leaves_no_moments(self):
         module = train(stage_module("joint"), TinyData([True, False]))
         (_, first_moments), (weights, second_moments) = module.states
@@ -186,6 +154,9 @@ class TestNonFiniteGradients:
         with pytest.raises(RuntimeError, match=message):
             train(module, TinyData([True, False, True, True, False]), StepGuard(2))
         assert len(module.states) == 3
+        resumed = StepGuard()
+        resumed.load_state_dict(module.guard.state_dict())
+        assert (resumed.skipped, resumed.in_a_row) == (module.guard.skipped, 2) == (3, 2)
         assert all(value.isfinite().all() for value in module.state_dict().values())
 
 
