@@ -12,10 +12,8 @@ from r3dpa.flow import (
     Interpolant,
     ab2,
     euler,
-    euler_maruyama,
     midpoint,
     ode_times,
-    sde_times,
 )
 from r3dpa.flow.times import step_pairs
 
@@ -118,22 +116,3 @@ def test_velocity_in_half_precision_on_a_float32_state(dtype):
     assert float32_state < 2e-1 * unit_roundoff(dtype) + 1e-6
     half = torch.bfloat16 if dtype == torch.float32 else dtype
     assert error(half, half) > 3 * float32_state
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("path", ["linear", "cosine"])
-@pytest.mark.numerics("cosine path at the data")
-def test_sde_starts_and_ends_with_finite_numbers(path, dtype):
-    """Steps from exactly t = 1, and to exactly t = 0 by ``denoise``, in every precision."""
-    interpolant, generator = Interpolant(path), torch.Generator().manual_seed(0)
-    x = torch.randn(4, 16, generator=generator)
-    velocity = torch.randn(4, 16, generator=generator).to(dtype)
-    for last in ("denoise", "mean"):
-        options = {"interpolant": interpolant, "last": last}
-        steps = x.to(dtype), sde_times(4), generator
-        assert euler_maruyama(lambda x, time: velocity, *steps, **options).isfinite().all()
-    ends = torch.tensor([0.0, 0.0, 1.0, 1.0])
-    assert interpolant.sde_drift(velocity, x, ends).isfinite().all()
-    divided = velocity - ends[:, None] * interpolant.score(velocity, x, ends)
-    assert not divided[:2].isfinite().any()
-    assert divided[2:].isfinite().all()
