@@ -30,7 +30,7 @@ from r3dpa.metrics.functional import (
     fd_infinity,
     frechet_distance_of,
     polynomial_mmd,
-    precision_recall,
+    shared_balls,
 )
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.scene import DEFAULT
@@ -96,7 +96,7 @@ def expected(name):
     if name == "kid":
         return {"X KID": polynomial_mmd(real, made, generator, 100, 10)[0]}
     if name == "prdc":
-        return {f"X {share}": value for share, value in precision_recall(real, made).items()}
+        return {f"X {name}": s.mean().item() for name, s in shared_balls(real, made).items()}
     if name == "ranges":
         return {"W1 range": wasserstein_distance(real[real > 0].numpy(), made[made > 0].numpy())}
     if name == "bev":

@@ -9,7 +9,7 @@ import torch
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
-from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, precision_recall
+from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, shared_balls
 from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation, EvaluationTable
@@ -110,8 +110,8 @@ def test_values_are_those_of_the_metrics_one_by_one(reference):
     assert rows["TOY"].value == pytest.approx(frechet, rel=1e-6)
     infinite, _ = fd_infinity(toy(real), toy(made), torch.Generator().manual_seed(0))
     assert rows["TOY inf"].value == pytest.approx(infinite, rel=1e-6)
-    shares = precision_recall(toy(real), toy(made))
-    assert {name: rows[f"TOY {name}"].value for name in shares} == shares
+    for name, shares in shared_balls(toy(real), toy(made)).items():
+        assert rows[f"TOY {name}"].value == shares.mean().item()
     assert (rows["JSD"].num_samples, rows["JSD"].num_references) == (30, 40)
     assert rows["W1 range"].unit == "m"
 

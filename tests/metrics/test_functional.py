@@ -18,7 +18,7 @@ from r3dpa.metrics.functional import (
     frechet_distance_of,
     merge_packed,
     polynomial_mmd,
-    precision_recall,
+    shared_balls,
     squared_mmd,
 )
 from r3dpa.metrics.functional_bev import (
@@ -118,6 +118,10 @@ def test_polynomial_mmd_over_subsets():
 # Precision, recall, density, coverage
 
 
+def precision_recall(real, generated, k=5):
+    return {name: s.mean().item() for name, s in shared_balls(real, generated, k).items()}
+
+
 def prdc_by_loops(real, generated, k):
     def radius(points, i):
         return sorted((points[i] - points[j]).norm() for j in range(len(points)) if j != i)[k - 1]
@@ -139,7 +143,7 @@ def prdc_by_loops(real, generated, k):
 def test_prdc_against_loops(monkeypatch, offset):
     monkeypatch.setattr("r3dpa.metrics.functional._BLOCK", 7)  # several blocks, the last one short
     real, generated = draw(30, 3) + offset, 1.2 * draw(24, 3, seed=1) + 0.5 + offset
-    result = precision_recall(real, generated, num_neighbors=3)
+    result = precision_recall(real, generated, 3)
     assert result == pytest.approx(prdc_by_loops(real, generated, 3))
     assert 0 < result["precision"] < 1
     assert 0 < result["coverage"] < 1

@@ -8,12 +8,7 @@ from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.feature_distances import metrics_of
-from r3dpa.metrics.reference import (
-    ReferenceStatistics,
-    compute_reference,
-    resume_or_start,
-    split_halves,
-)
+from r3dpa.metrics.reference import ReferenceStatistics, compute_reference, split_halves
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -160,10 +155,10 @@ def test_resumed_is_the_same_as_undisturbed(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         empty(27).update(killed(KeyboardInterrupt), [TOY], partial)
-    assert resume_or_start(empty(27), partial).num_done == 16
+    assert ReferenceStatistics.load(partial).num_done == 16
     with pytest.raises(OSError, match="disk"):  # saved every 9 scans, in whole batches
         empty(27).update(killed(OSError("disk")), [TOY], partial, every=9)
-    resumed = resume_or_start(empty(27), partial)
+    resumed = ReferenceStatistics.load(partial)
     assert resumed.num_done == 16
     resumed.update(list(scenes(27))[16:], [TOY], partial)
     resumed.save(partial)

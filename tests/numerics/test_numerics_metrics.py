@@ -20,7 +20,7 @@ from r3dpa.metrics.functional import (
     frechet_distance_of,
     merge_packed,
     polynomial_mmd,
-    precision_recall,
+    shared_balls,
     squared_mmd,
 )
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance
@@ -239,7 +239,7 @@ def test_a_broken_feature_is_named_by_its_row(value, dtype):
     for compare in (
         frechet_distance_of,
         squared_mmd,
-        precision_recall,
+        shared_balls,
         lambda a, b: fd_infinity(a, b, generator()),
         lambda a, b: polynomial_mmd(a, b, generator(), 2, 10),
     ):
@@ -261,6 +261,6 @@ def test_constant_features_have_finite_distances(dtype):
     assert squared_mmd(same, same).item() == pytest.approx(0, abs=1e-12)
     assert fd_infinity(same, other, generator())[0] == pytest.approx(gap, rel=1e-2)
     for made in (same, other):
-        assert all(map(math.isfinite, precision_recall(same, made).values()))
+        assert all(share.isfinite().all() for share in shared_balls(same, made).values())
     standardised = (same - same.mean(0)) / same.std(0)
     assert not standardised.isfinite().all()

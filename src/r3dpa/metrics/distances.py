@@ -225,11 +225,9 @@ class _Histograms(SceneMetric):
 
 
 class BEVHistogramDistance(_Histograms):
-    """JSD and TV of how many clouds occupy each cell seen from above.
+    """JSD and TV of how many clouds occupy each cell of ``grid`` seen from above.
 
-    Args:
-        grid: Cells.
-        num_groups: Groups of generated scenes that the bootstrap resamples.
+    The bootstrap resamples ``num_groups`` groups of generated scenes.
     """
 
     def __init__(self, grid: BEVGrid, num_groups: int = 1) -> None:
@@ -262,9 +260,7 @@ class BEVHistogramDistance(_Histograms):
 class RangeHistogramDistance(_Histograms):
     """Earth mover's distance (W1) of the ranges of all returns, metres, in bins of 0.1 m.
 
-    Args:
-        range_max_m: Largest range.
-        num_groups: Groups of generated scenes that the bootstrap resamples.
+    The bootstrap resamples ``num_groups`` groups of generated scenes.
     """
 
     def __init__(self, range_max_m: float, num_groups: int = 1) -> None:
@@ -294,11 +290,7 @@ class MinimumMatchingDistance(SceneMetric):
 
     Points beyond the grid do not count in MMD, by its definition. The 3D distance, in square
     metres, is the mean over up to 200 real scans, each with the nearest generated scene by cells.
-
-    Args:
-        protocol: Cells, sensor, and which point of a pixel stands for it.
-        max_real: Real scans that are kept; default: all.
-        max_generated: Generated scenes that are kept; default: all.
+    All are kept without ``max_real`` and ``max_generated``.
 
     Attributes:
         reference_cells: Occupied cells ``(n,)`` of real scans without images, as in the official

@@ -38,13 +38,10 @@ _BATCH = 8
 
 
 class FeatureMetric(SceneMetric):
-    """Moments of all features in float64, and the features of the scenes that are kept.
+    """Moments of all features of width F in float64, and the features of the scenes that are kept.
 
-    Args:
-        num_features: Feature width F.
-        label: Of the feature space, in results.
-        space: Key of the features if ``update`` gets those of several spaces.
-        max_real: Real scans whose features are kept; default: all.
+    ``label`` names the feature space in results, ``space`` is the key of its features if ``update``
+    gets those of several spaces.
     """
 
     real_moments: Tensor

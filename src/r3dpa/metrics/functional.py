@@ -260,12 +260,6 @@ def curve_rmse(curve_a: NDArray[np.float64], curve_b: NDArray[np.float64]) -> fl
     return float(np.sqrt(np.mean((curve_a[both] - curve_b[both]) ** 2))) if both.any() else np.nan
 
 
-def precision_recall(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dict[str, float]:
-    """Precision, recall, density and coverage: the means of :func:`shared_balls`."""
-    balls = shared_balls(real, generated, num_neighbors)
-    return {name: by_sample.mean().item() for name, by_sample in balls.items()}
-
-
 def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dict[str, Tensor]:
     """Samples in the balls of the other set; a ball reaches to the k-th neighbour in its own set.
 

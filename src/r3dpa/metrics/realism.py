@@ -259,9 +259,8 @@ class RealismTable:
         """Rows and notes for JSON, null where a number is unknown."""
         rows = [row._asdict() | {"within_3x": row.within} for row in self.rows]
         for row in rows:
-            row |= {
-                k: None for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)
-            }
+            unknown = [k for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)]
+            row |= dict.fromkeys(unknown)
         return {"rows": rows, "notes": list(self.notes)}
 
 

@@ -235,23 +235,26 @@ def compute_reference(
     out: Path,
     renew: bool = False,
 ) -> ReferenceStatistics:
-    """Statistics of scans as a file; reads or resumes what an earlier call has left.
+    """Statistics of the scans of an empty job as a file; reads or resumes what it finds there.
 
-    Args:
-        job: Empty statistics of the scans.
-        scans_from: Scans of the job from a number on.
-        spaces: Those that the statistics were prepared for.
-        out: File to write; a ``ValueError`` if another process does.
-        renew: Replace files of other jobs, such as those of other scans; else a ``ValueError``.
+    ``scans_from`` gives the scans of the job from a number on. A ``ValueError`` if another process
+    writes ``out`` or, without ``renew``, which replaces it, if the file is of another job.
     """
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
         for path in out.parent.glob(f".{escape(out.stem)}.*.partial.*"):
             path.unlink(missing_ok=True)  # of a killed call
         statistics = job
-        for path in (partial, out):
+        for path in filter(Path.exists, (partial, out)):
             try:
-                statistics = resume_or_start(statistics, path)
+                stored = ReferenceStatistics.load(path)
+                for key in ("protocol", "spaces", "names", "about"):
+                    if getattr(stored, key) != getattr(job, key):
+                        raise ValueError(
+                            f"{path} is of another job: its {key} differ. Repeat that command to "
+                            "complete it, delete the file to start anew, or give another --out"
+                        )
+                statistics = stored
             except ValueError as error:
                 if not renew:
                     raise
@@ -265,20 +268,6 @@ def compute_reference(
             statistics.save(out)
             partial.unlink(missing_ok=True)
         return statistics
-
-
-def resume_or_start(reference: ReferenceStatistics, partial: Path) -> ReferenceStatistics:
-    """Statistics that an interrupted job has saved, or the given ones without a file."""
-    if not partial.exists():
-        return reference
-    stored = ReferenceStatistics.load(partial)
-    for key in ("protocol", "spaces", "names", "about"):
-        if getattr(stored, key) != getattr(reference, key):
-            raise ValueError(
-                f"{partial} is of another job: its {key} differ. Repeat that command to complete "
-                "it, delete the file to start anew, or give another --out"
-            )
-    return stored
 
 
 def _card(space: SceneFeatures) -> dict[str, Any]:

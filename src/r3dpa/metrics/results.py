@@ -133,11 +133,8 @@ class MetricResult:
 class Evaluation:
     """All numbers of one set of samples against one reference; ``str`` gives them as a table.
 
-    Args:
-        label: Of the generator or the run.
-        rows: One for each metric.
-        about: Provenance, with the keys of ``_ABOUT`` and values that JSON can hold; those left out
-            get its defaults.
+    ``about`` is the provenance, with the keys of ``_ABOUT`` and values that JSON can hold; those
+    left out get its defaults.
     """
 
     label: str

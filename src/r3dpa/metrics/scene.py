@@ -102,10 +102,8 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
 
     Returns:
         The scene with all fields: points ``(P, 3)`` and range ``(H, W)`` float32 on the CPU,
-        ``EMPTY_RANGE_M`` without a return; the intensity ``(H, W)`` if it was known.
-
-    Raises:
-        ValueError: If the scene, which the message names, cannot be used.
+        ``EMPTY_RANGE_M`` without a return; the intensity ``(H, W)`` if it was known. A
+        ``ValueError`` names a scene that cannot be used.
     """
     projection, sensor = protocol.projection, protocol.sensor
     if scene.range_m is not None:
