@@ -16,8 +16,13 @@ import torch
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Stage, Table
 from r3dpa.io import command, machine, versions
-from r3dpa.metrics import results as metric_results
-from r3dpa.metrics.results import Evaluation, EvaluationTable, save_text
+from r3dpa.metrics.results import (
+    Evaluation,
+    EvaluationTable,
+    published_evaluation,
+    save_csv,
+    save_text,
+)
 from r3dpa.metrics.scene_features import SPACES
 from r3dpa.metrics.seeds import mean_of_seeds, relative_change
 
@@ -97,13 +102,9 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
             file.with_suffix(suffix).unlink(missing_ok=True)
         return f"{table.name}: {table.caption}\n\nno row has a result", results
     distances = [evaluation.only(_DISTANCES) for evaluation in means]
-    source = f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}"
+    source = "KITTI-360, train-val", f"R3DPA (ICRA 2026), {table.name.replace('_', ' ')}"
     published = [  # other networks and other data than here
-        metric_results.published_evaluation(
-            row.label, row.published, "KITTI-360, train-val", source
-        )
-        for row in table.rows
-        if row.published
+        published_evaluation(r.label, r.published, *source) for r in table.rows if r.published
     ]
     shown = EvaluationTable((*published, *distances))
     measured = {row.name: row.direction == "lower" for e in distances for row in e.rows}
@@ -122,7 +123,7 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
     listed = "\n".join(f"- {line}" for line in notes)
     save_text(file.with_suffix(".md"), f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
     save_text(file.with_suffix(".tex"), f"% {' '.join(head.split())}\n{shown.latex()}")
-    metric_results.save_csv(means, file.with_suffix(".csv"))
+    save_csv(means, file.with_suffix(".csv"))
     stored = {
         "table": table.name,
         "caption": table.caption,
@@ -141,12 +142,7 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
             for row in table.rows
         ],
         "orders": [order._asdict() for order in orders],
-        "curves": {
-            stage.name: _thinned(stage)
-            for row in table.rows
-            for chain in row.stages.values()
-            for stage in chain
-        },
+        "curves": {stage.name: _thinned(stage) for chain in table.chains for stage in chain},
         "failed": dict(failed),
     }
     save_text(file.with_suffix(".json"), json.dumps(stored, indent=1) + "\n")
@@ -158,7 +154,6 @@ def _by_seed(found: Mapping[int, Evaluation], key: str) -> dict[int, dict[str, A
 
 
 def _described(table: Table, orders: Sequence[Order]) -> list[str]:
-    """Each order of the paper in a line."""
     labels = {row.key: row.label for row in table.rows}
     lines: dict[str, list[str]] = {}
     for order in orders:

@@ -31,10 +31,7 @@ _SMALL_ERROR = 0.01  # negligible error of latents (of unit variance) without a 
 _LEVELS = {"draft": 10.0, "good": 4.0, "best": 1.0}  # largest error over the negligible one
 _AS_CHEAP = 1.1
 
-_TITLES = {
-    "mixture": "exact velocity of 128 Gaussians in 64 dimensions",
-    "model": "trained model",
-}
+_TITLES = {"mixture": "exact velocity of 128 Gaussians in 64 dimensions", "model": "trained model"}
 
 
 class Errors(NamedTuple):
@@ -227,7 +224,8 @@ class Finding(NamedTuple):
 
 def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any]) -> str:
     """Writes all files; returns the text of the summary."""
-    content = facts | {"problems": {name: _record(part) for name, part in found.items()}}
+    records = {name: _record(part) for name, part in found.items()}
+    content = facts | {"problems": records}
     save_text(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     name = "model" if "model" in found else "mixture"
     viz.save(_picture(name, found[name]), out / "pareto.png")
@@ -246,17 +244,15 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
     tail += [f"{key}: {one_line(values)}" for key, values in facts.items()]
     lines = ["# What accuracy costs in time", "", "![Pareto front](pareto.png)", ""]
     for key, part in found.items():
-        steps = sentences(front_of(part.rows, part.timing.tolerance))
         lines += [f"## {_TITLES[key]}", "", "What each further second buys:", ""]
-        lines += [*(f"- {sentence}" for sentence in steps), "", "```", _table(part), *_notes(part)]
-        lines += ["```", ""]
+        lines += [f"- {sentence}" for sentence in records[key]["sentences"]]
+        lines += ["", "```", _table(records[key]["rows"]), *_notes(part), "```", ""]
     save_text(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
     files = sorted(path.name for path in out.iterdir() if path.is_file())
     return "\n".join([*lines[4:], *tail, f"files: {', '.join(files)}"])
 
 
 def _record(found: Finding) -> dict[str, Any]:
-    """Plain values, without samples."""
     front = front_of(found.rows, found.timing.tolerance)
     unsure = [row.label for row in found.rows if not row.converged]
     return {
@@ -277,16 +273,10 @@ def _record(found: Finding) -> dict[str, Any]:
 
 
 def _picture(name: str, found: Finding) -> Figure:
-    """Error against time."""
-
     def points(rows: Sequence[Row]) -> list[viz.ParetoPoint]:
         return [
             viz.ParetoPoint(
-                row.label,
-                row.way.name,
-                row.seconds,
-                row.error,
-                row.interval,
+                *(row.label, row.way.name, row.seconds, row.error, row.interval),
                 filled=row.way.precision == "bf16",
             )
             for row in rows
@@ -317,16 +307,13 @@ _COLUMNS = (
 )
 
 
-def _table(found: Finding) -> str:
-    """All rows."""
+def _table(rows: Sequence[dict[str, Any]]) -> str:
     lines = []
-    for row in found.rows:
-        values = row.record()
-        cells = [
-            "-" if values[key] is None else format(values[key] * factor, style)
-            for _, key, factor, style in _COLUMNS
-        ]
-        lines.append([row.label + ("" if row.converged else " ?"), *cells])
+    for row in rows:
+        line = [row["label"] + ("" if row["converged"] else " ?")]
+        for _, key, factor, style in _COLUMNS:
+            line.append("-" if row[key] is None else format(row[key] * factor, style))
+        lines.append(line)
     return text_table(lines, ["row", *(column[0] for column in _COLUMNS)])
 
 

@@ -38,7 +38,6 @@ _SOLVERS: tuple[tuple[Solver, float], ...] = (
 )
 _EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
 _PRECISION_STEPS = 32
-_BATCH = {"cuda": 64, "cpu": 4}
 Advance = Callable[[int], object]  # of a progress bar, by evaluations
 
 
@@ -98,10 +97,10 @@ def sampling(
     """
     device = usable_device(device)
     kind = device.partition(":")[0]
-    usual = Effort(256, 1000, _EVALUATIONS, 20, _BATCH[kind])
+    batch, toy = {"cuda": 64, "cpu": 4}[kind], _TOY_QUICK if quick else _TOY
+    usual = Effort(256, 1000, _EVALUATIONS, 20, batch)
     if quick:
-        usual = Effort(8, 200, _EVALUATIONS[1:-3], 3, _BATCH[kind])
-    toy = _TOY_QUICK if quick else _TOY
+        usual = Effort(8, 200, _EVALUATIONS[1:-3], 3, batch)
     chosen = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
     about, work = {}, Work()
     problems: dict[str, Callable[[], Finding]] = {
@@ -184,7 +183,6 @@ def run_problem(
 def _solved(
     num: int, size: int, solve: Callable[[range], Solved], nfe: int, advance: Advance
 ) -> Solved:
-    """Samples in batches."""
     parts = []
     for first in range(0, num, size):
         indices = range(first, min(first + size, num))

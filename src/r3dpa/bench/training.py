@@ -120,7 +120,6 @@ def training(
 
 
 def _experiments(conf: Path, stage: str, quick: bool) -> list[Path]:
-    """The experiment, and the one of the small networks that is given after it."""
     paths = [conf / "experiment" / f"{name}.yaml" for name in [stage, f"{stage}_demo"][: 1 + quick]]
     for path in paths:
         if not path.is_file():
@@ -153,7 +152,6 @@ def _silence_lightning() -> None:
 
 
 def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
-    """Trains one stage in this process."""
     L.seed_everything(0, verbose=False)
     module = _build(files, folder / f"{stage}.safetensors")
     meter = _StepMeter(settings.steps)
