@@ -14,13 +14,15 @@ import yaml
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.nn import VAE, ImageVAE, LatentNorm, SiT, UNet
+from r3dpa.nn import VAE, LatentNorm, SiT, UNet
 from r3dpa.simulation import simulate
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 ELSEWHERE = {  # by the test that starts them
     "test_rgb_stages": "data/dead_leaves data/images experiment/image_vae net/image_vae_demo "
-    "experiment/rgb_pretraining experiment/rgb_pretraining_demo",
+    "experiment/rgb_pretraining experiment/rgb_pretraining_demo net/sd_vae",
+    "test_shipped_networks": "net/vae_h2p4d8 net/vae_h1p4d4 net/vae_h16d4 net/vae_h16p2d16 "
+    "net/vae_demo",
     "test_stage_cli": "data/points experiment/waffleiron_s",
     "test_documented_commands": "launch/nodes",
     "part of experiments here": "net/discriminator net/discriminator_demo",
@@ -37,7 +39,6 @@ STARTS = {
     "joint_demo": "demo_folder",
     "flow_matching_demo": "demo",
 }
-VAES = sorted(path.stem for path in CONF.glob("net/vae_*.yaml"))
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {
     "trainer.accelerator": "cpu",
@@ -57,10 +58,10 @@ pytestmark = pytest.mark.filterwarnings(*WARNINGS)
 
 def test_no_file_is_left_out():
     files = {path.relative_to(CONF).with_suffix("").as_posix() for path in CONF.rglob("*.yaml")}
-    started = {"smoke", "trainer", "trainer_demo", "net/sd_vae"}
+    started = {"smoke", "trainer", "trainer_demo"}
     started |= {f"experiment/{name}" for name in STARTS}
     started |= {f"data/{name}" for name in STARTS.values()}
-    started |= {f"net/{name}" for name in (*VAES, *VELOCITIES)}
+    started |= {f"net/{name}" for name in VELOCITIES}
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     assert files == started | elsewhere
     assert not started & elsewhere
@@ -140,19 +141,6 @@ def test_demo_grids_are_the_tokens_and_features_come_from_shipped_weights():
         assert settings["extractor"]["class_path"].endswith("WaffleIronS")
         sit = net("sit_demo" if "demo" in data else "sit_b2")
         assert settings["grid_size"] == [size // sit["patch_size"] for size in sit["input_size"]]
-
-
-@pytest.mark.parametrize("name", [*VAES, "sd_vae"])
-def test_autoencoders_are_built_at_their_own_size(name):
-    """On the meta device, which has shapes and no memory."""
-    image = torch.empty(1, 3, 256, 256) if name == "sd_vae" else torch.empty(1, 1, 64, 1024)
-    with torch.device("meta"):
-        network = (ImageVAE if name == "sd_vae" else VAE)(**net(name))
-        latents = network.encode(image.to("meta")).mean
-        assert network.decode(latents).shape == image.shape
-    stride = (8, 8) if name == "sd_vae" else network.stride
-    sides = [side // s for side, s in zip(image.shape[2:], stride, strict=True)]
-    assert list(latents.shape[1:]) == [net(name)["latent_channels"], *sides]
 
 
 @pytest.mark.parametrize("name", VELOCITIES)

@@ -123,22 +123,17 @@ class TestForms:
             assert num_written(grids / "8x64") == 2
             assert capsys.readouterr().out.endswith(f" per second, in {grids / '8x64'}\n")
 
-    def test_several_sizes_from_one_pass(self, data):
-        out = data.parent / "sizes"
-        words = ["--grid_sizes", "[[2, 8], [4, 16]]"]
-        features("--data", data, "--out", out, *words, "--data.init_args.limit", 2)
-        assert [num_written(out / size) for size in ("2x8", "4x16")] == [4, 4]
-
-    def test_scalr_by_its_checkpoint_in_the_configuration(self, data, tmp_path):
+    def test_scalr_by_its_checkpoint_in_the_configuration_at_several_sizes(self, data, tmp_path):
         network = WaffleIron(width=4, depth=1, head_dim=5)
         weights = {f"module.{official_name(k)}": v for k, v in network.state_dict().items()}
         torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
         words = ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
         words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
         words += ["--data.init_args.limit", 1, "--out", tmp_path / "grids"]
+        words += ["--grid_sizes", "[[2, 8], [4, 16]]"]
         features("--data", data, *words)
         assert any_settings(tmp_path / "grids").extractor["name"] == "scalr"
-        assert num_written(tmp_path / "grids") == 2
+        assert [num_written(tmp_path / "grids" / size) for size in ("2x8", "4x16")] == [2, 2]
 
 
 @pytest.mark.parametrize(
@@ -147,7 +142,6 @@ class TestForms:
         (["--data", "no/folder"], "--data no/folder: is no folder of scans and no data YAML"),
         (["--data", "{scans}"], "there is no extractor: give --extractor, one of scalr, "),
         (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
-        (["--data", "{yaml}", "--grid_sizes", "[[3, 8]]"], "grid.*3"),
         (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
     ],
 )

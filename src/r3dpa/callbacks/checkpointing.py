@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from pathlib import Path
@@ -32,8 +31,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         # A file object: torch's own errors do not name the reason.
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)
-            file.flush()
-            os.fsync(file.fileno())  # else a loss of power could leave an empty file of this name
 
 
 class RunCheckpoint(ModelCheckpoint):
