@@ -17,40 +17,31 @@ from r3dpa.geometry import LidarSensor
 
 
 # 10 training scans and batches of 2: an epoch has 5 batches. Stops: within the first epoch, at its
-# end, and within the second.
-@pytest.mark.parametrize(("workers", "stop"), [(2, 3), (0, 5), (0, 7)])
-def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop, fit):
-    whole = fit(data(num_workers=workers), 12)
+# end, and within the second; then of epochs of 3 batches; then of 2 batches a step.
+@pytest.mark.parametrize(
+    ("workers", "stop", "total", "options"),
+    [
+        (2, 3, 12, {}),
+        (0, 5, 12, {}),
+        (0, 7, 12, {}),
+        (0, 2, 8, {"limit_train_batches": 3}),
+        (0, 3, 8, {"limit_train_batches": 3}),
+        (0, 2, 6, {"accumulate_grad_batches": 2, "val_check_interval": 2}),
+    ],
+)
+def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop, total, options, fit):
+    whole = fit(data(num_workers=workers), total, **options).seen
     saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
-    first = fit(data(num_workers=workers), stop, saver)
-    second = fit(data(num_workers=workers), 12, ckpt_path=tmp_path / f"c/step={stop}.ckpt")
-    assert first.seen == whole.seen[:stop]
-    assert second.seen == whole.seen[stop:]
-    assert len(whole.seen) == 12
-    for epoch in (whole.seen[:5], whole.seen[5:10]):
-        assert sorted(chain(*epoch)) == list(range(10))
-    assert whole.seen[:5] != whole.seen[5:10]
-
-
-@pytest.mark.parametrize("stop", [2, 3])
-def test_resume_under_limited_epochs(tmp_path, data, stop, fit):
-    options = {"limit_train_batches": 3}
-    whole = fit(data(), 8, **options)
-    saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=stop, filename="{step}")
-    fit(data(), stop, saver, **options)
+    first = fit(data(num_workers=workers), stop, saver, **options).seen
     path = tmp_path / f"c/step={stop}.ckpt"
-    second = fit(data(), 8, ckpt_path=path, **options)
-    assert second.seen == whole.seen[stop:]
-    assert whole.seen[3:5] != whole.seen[:2]
-
-
-def test_resume_with_accumulation_and_validation_within_the_epoch(tmp_path, data, fit):
-    options = {"accumulate_grad_batches": 2, "val_check_interval": 2}
-    whole = fit(data(), 6, **options)
-    saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=2, filename="{step}")
-    fit(data(), 2, saver, **options)
-    second = fit(data(), 6, ckpt_path=tmp_path / "c/step=2.ckpt", **options)
-    assert second.seen == whole.seen[4:]
+    second = fit(data(num_workers=workers), total, ckpt_path=path, **options).seen
+    assert len(first) == stop * options.get("accumulate_grad_batches", 1)
+    assert first + second == whole
+    per_epoch = options.get("limit_train_batches", 5)
+    epochs = whole[:per_epoch], whole[per_epoch : 2 * per_epoch]
+    assert epochs[0] != epochs[1]
+    for epoch in epochs:
+        assert len(set(chain(*epoch))) == 2 * per_epoch
 
 
 def test_order_does_not_depend_on_workers_but_on_the_seed(tmp_path, data, fit):

@@ -90,19 +90,14 @@ def test_a_damaged_chunk_of_a_png_names_the_file(folder):
         source.read(source.entries()[0], 8)
 
 
-def cut_before_a_header(data):
-    return data[: data.index(b"n01/2")]
-
-
-def cut_within_a_header(data):
-    return data[: data.index(b"n01/2") + 100]
-
-
-def damage_a_header(data):
-    return data.replace(b"n01/2", b"n02/2")
-
-
-@pytest.mark.parametrize("damage", [cut_before_a_header, cut_within_a_header, damage_a_header])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[: data.index(b"n01/2")],  # before a header
+        lambda data: data[: data.index(b"n01/2") + 100],  # within it
+        lambda data: data.replace(b"n01/2", b"n02/2"),  # no longer of its checksum
+    ],
+)
 def test_a_shard_that_ends_too_soon_is_refused(damage, shards):
     """tarfile takes what it cannot read behind the first member for the end."""
     path = shards / "000.tar"

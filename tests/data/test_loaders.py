@@ -25,25 +25,25 @@ def batches(loader, epoch):
     return [batch.tolist() for batch in loader]
 
 
+def of_all_ranks(num_replicas, batch_size, count, epoch, state=None):
+    """Global batches: position i of rank r is position i * processes + r."""
+    ranks = []
+    for rank in range(num_replicas):
+        loader = training_loader(
+            Numbers(count), batch_size // num_replicas, num_replicas=num_replicas, rank=rank
+        )
+        if state:
+            loader.load_state_dict(state)
+        ranks.append(batches(loader, epoch))
+    return [list(chain(*zip(*parts, strict=True))) for parts in zip(*ranks, strict=True)]
+
+
 @pytest.mark.parametrize("count", [64, 70, 79])
 def test_global_batches_do_not_depend_on_the_number_of_processes(count):
-    per_count = {}
-    for processes in (1, 2, 4):
-        ranks = [
-            batches(
-                training_loader(Numbers(count), 8 // processes, num_replicas=processes, rank=rank),
-                epoch=3,
-            )
-            for rank in range(processes)
-        ]
-        # Position i of rank r is position i * processes + r of the global batch.
-        per_count[processes] = [
-            [sample for group in zip(*parts, strict=True) for sample in group]
-            for parts in zip(*ranks, strict=True)
-        ]
-    assert per_count[1] == per_count[2] == per_count[4]
-    assert len(per_count[1]) == count // 8
-    seen = list(chain(*per_count[1]))
+    one, two, four = (of_all_ranks(processes, 8, count, epoch=3) for processes in (1, 2, 4))
+    assert one == two == four
+    assert len(one) == count // 8
+    seen = list(chain(*one))
     assert len(set(seen)) == len(seen)
 
 
@@ -92,19 +92,8 @@ def test_an_old_iterator_that_dies_late_does_not_disturb_the_next_pass():
 def test_resume_with_another_number_of_processes_of_the_same_total_batch():
     one = training_loader(Numbers(40), 8)
     whole = batches(one, 0)
-    iterator = iter(one)
-    next(iterator)
-    state = one.state_dict()
-    ranks = []
-    for rank in range(2):
-        two = training_loader(Numbers(40), 4, num_replicas=2, rank=rank)
-        two.load_state_dict(state)
-        ranks.append(batches(two, 0))
-    joined = [
-        [sample for pair in zip(*parts, strict=True) for sample in pair]
-        for parts in zip(*ranks, strict=True)
-    ]
-    assert joined == whole[1:]
+    next(iter(one))
+    assert of_all_ranks(2, 8, 40, epoch=0, state=one.state_dict()) == whole[1:]
 
 
 def test_place_in_other_data_or_within_a_batch_is_refused():

@@ -1,6 +1,5 @@
 import json
 import struct
-import zipfile
 
 import numpy as np
 import pytest
@@ -78,43 +77,33 @@ def test_points_are_little_endian_float32_rows(tmp_path):
     assert points.tolist() == [[1.5, -2, 3, 0.25], [4, 5, 6, 1]]
 
 
-def broken(kind):
-    values = POINTS.copy()
-    if kind == "nan":
-        values[1, 2] = np.nan
-    elif kind == "inf":
-        values[2, 3] = np.inf
-    elif kind == "near":
-        values[:, :3] = 0.5
-    data = values.tobytes()
-    return {"short": data[:-3], "empty": b""}.get(kind, data)
+def changed(place, value):
+    points = POINTS.copy()
+    points[place] = value
+    return points.tobytes()
 
 
-REASONS = {
-    "short": "45 bytes, not a multiple of 16",
-    "empty": "is empty",
-    "nan": "NaN or infinite values in 1 of 3 points",
-    "inf": "NaN or infinite values in 1 of 3 points",
-    "near": r"no point within the sensor's range 1\.\.56 m",
-}
-
-
-@pytest.mark.parametrize("kind", REASONS)
-def test_broken_scan_is_named_with_its_reason(tmp_path, kind):
-    file = tmp_path / f"{kind}.bin"
-    file.write_bytes(broken(kind))
-    with pytest.raises(ScanError, match=f"{kind}.bin: .*{REASONS[kind]}"):
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (POINTS.tobytes()[:-3], "45 bytes, not a multiple of 16"),
+        (b"", "is empty"),
+        (changed((1, 2), np.nan), "NaN or infinite values in 1 of 3 points"),
+        (changed((2, 3), np.inf), "NaN or infinite values in 1 of 3 points"),
+        (changed(np.s_[:, :3], 0.5), r"no point within the sensor's range 1\.\.56 m"),
+        (None, "cannot be read"),
+    ],
+)
+def test_broken_scan_is_named_with_its_reason(tmp_path, data, reason):
+    file = tmp_path / "a.bin"
+    if data is None:
+        file.symlink_to(tmp_path / "gone")
+    else:
+        file.write_bytes(data)
+    with pytest.raises(ScanError, match=rf"a\.bin: .*{reason}"):
         read_scan(file, LidarSensor())
     (problem,) = problems(tmp_path)
     assert problem.startswith(f"bad: {file}: ")
-
-
-def test_unreadable_scan_is_named(tmp_path):
-    with pytest.raises(ScanError, match=r"gone\.bin: cannot be read"):
-        read_scan(tmp_path / "gone.bin")
-    (tmp_path / "folder.bin").mkdir()
-    with pytest.raises(ScanError, match=r"folder\.bin: cannot be read"):
-        read_scan(tmp_path / "folder.bin")
 
 
 @pytest.mark.parametrize("width", [3, 4])
@@ -130,17 +119,6 @@ def test_round_trips(tmp_path, width):
     assert np.array_equal(archive["one"], points)
     assert np.array_equal(archive["two"], points[:1])
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.npz", "a.ply", "new"]
-
-
-def test_a_small_archive_of_much_memory_is_refused(tmp_path):
-    """The directory says 2 GiB."""
-    path = tmp_path / "a.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.npy", b"\0" * 2**20)
-    data = path.read_bytes()
-    path.write_bytes(data.replace(struct.pack("<I", 2**20), struct.pack("<I", 2**31)))
-    with pytest.raises(ScanError, match="far larger than the file"):
-        read_npz(path)
 
 
 def test_ply_of_other_programs(tmp_path):

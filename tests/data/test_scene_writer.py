@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from r3dpa.data import scene_writer
-from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
@@ -57,34 +56,30 @@ def test_every_format_holds_the_points_of_the_range_images(tmp_path):
     assert len(files(tmp_path)) == 3 + 2 * 5  # nothing hidden is left
 
 
-@pytest.mark.parametrize(("formats", "prefix"), [(("bin",), "bin/"), (("bin", "ply", "npz"), "")])
-def test_samples_are_read_from_the_folder(tmp_path, formats, prefix):
-    range_m = scenes(3)
-    write(tmp_path, range_m, formats=formats)
-    samples = list(read_samples(tmp_path, SENSOR))
-    assert [sample.name for sample in samples] == [f"{prefix}{index:06d}" for index in range(3)]
-    for sample, scene in zip(samples, range_m, strict=True):
-        assert torch.equal(sample.points[:, :3], points_of(scene, PROJECTION))
-
-
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
+    """With the evaluations so far, and without the images of a batch that was not recorded."""
     range_m = scenes(7)
     with writer(tmp_path, 7) as first:
-        first.put(range_m[:2])
-        first.put(range_m[2:4])
+        first.put(range_m[:2], nfe=7)
+        first.put(range_m[2:4], nfe=10)
     assert files(tmp_path) == [
         *(".unfinished.json", ".unfinished.npy"),
         *(f"bin/{index:06d}.bin" for index in range(4)),
     ]
+    with (tmp_path / ".unfinished.npy").open("ab") as file:
+        file.write(b"half of an image")
     kept = (tmp_path / "bin" / "000003.bin").stat().st_mtime_ns
     with writer(tmp_path, 7) as second:
-        assert second.num_done == 4
-        second.put(range_m[4:])
+        assert (second.num_done, second.evaluations) == (4, 2 * 7 + 2 * 10)
+        second.put(range_m[4:], nfe=4)
         second.close()
+        assert second.evaluations == 2 * 7 + 2 * 10 + 3 * 4
         second.finish({})
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
     assert (tmp_path / "bin" / "000003.bin").stat().st_mtime_ns == kept
     assert not [name for name in files(tmp_path) if name.startswith(".")]
+    with writer(tmp_path, 7, overwrite=True) as third:
+        assert (third.num_done, third.evaluations) == (0, 0)
 
 
 def test_an_error_before_the_first_scene_leaves_nothing(tmp_path):
@@ -102,17 +97,6 @@ def test_a_run_that_stops_before_its_last_file_only_needs_that(tmp_path):
         assert second.num_done == 2
         second.close()
         second.finish({})
-    assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
-
-
-def test_half_a_batch_is_written_again(tmp_path):
-    """The images of a batch whose end was not recorded are cut off."""
-    range_m = scenes(4)
-    with writer(tmp_path, 4) as first:
-        first.put(range_m[:2])
-    with (tmp_path / ".unfinished.npy").open("ab") as file:
-        file.write(b"half of an image")
-    write(tmp_path, range_m)
     assert np.array_equal(np.load(tmp_path / "range_m.npy"), range_m.numpy())
 
 
@@ -134,19 +118,6 @@ def test_lost_range_images_are_not_made_up(tmp_path, damage):
         writer(tmp_path, 4)
     assert files(tmp_path) == before
     write(tmp_path, scenes(4), overwrite=True)
-
-
-def test_evaluations_of_all_scenes_outlive_an_interrupt(tmp_path):
-    with writer(tmp_path, 5) as first:
-        first.put(scenes(2), nfe=7)
-        first.put(scenes(1), nfe=10)
-    with writer(tmp_path, 5) as second:
-        assert second.evaluations == 2 * 7 + 10
-        second.put(scenes(2), nfe=4)
-        second.close()
-        assert second.evaluations == 2 * 7 + 10 + 2 * 4
-    with writer(tmp_path, 5, overwrite=True) as third:
-        assert third.evaluations == 0
 
 
 def test_an_error_of_the_thread_ends_the_block(tmp_path):

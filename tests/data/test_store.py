@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from r3dpa.data import StoreError, store
 from r3dpa.data.store import CachedTensors, Store, tensor_cache
@@ -271,24 +271,13 @@ def test_a_damaged_journal_is_named(halves, change, reason):
     assert_holds(halves, items(0, 3))
 
 
-class Reading(Dataset):
-    def __init__(self, tensors):
-        self.tensors = tensors
-
-    def __len__(self):
-        return len(self.tensors.items)
-
-    def __getitem__(self, index):
-        return self.tensors.read(self.tensors.items[index])
-
-
 def test_readers_in_several_processes_while_another_one_writes(halves):
     fill(halves, (0, 20))
     fill(halves, (20, 40), shard=1)
     given = [items(0, 40)[i] for i in torch.randperm(40).tolist()]
     tensors = CachedTensors(halves, given)
     tensors.read(given[0])
-    loader = DataLoader(Reading(tensors), None, num_workers=2)
+    loader = DataLoader(given, None, num_workers=2, collate_fn=tensors.read)
     with halves.writer() as writer:
         for number, (item, read) in enumerate(zip(given, loader, strict=True)):
             assert torch.equal(read, tensor_of(item).half().float())

@@ -87,11 +87,12 @@ def test_few_bytes_that_ask_for_much_memory(tmp_path, count):
         read_npz(tmp_path / "a.npz")
 
 
-def test_a_directory_that_claims_more_than_the_archive_holds(tmp_path):
+@pytest.mark.parametrize("offset", [20, 24])  # of the packed and of the unpacked size
+def test_a_directory_that_claims_more_than_the_archive_holds(tmp_path, offset):
     np.savez(tmp_path / "a.npz", a=POINTS)
     data = bytearray((tmp_path / "a.npz").read_bytes())
-    packed_size = data.index(b"PK\x01\x02") + 20
-    data[packed_size : packed_size + 4] = (2**31).to_bytes(4, "little")
+    size = data.index(b"PK\x01\x02") + offset
+    data[size : size + 4] = (2**31).to_bytes(4, "little")
     (tmp_path / "a.npz").write_bytes(data)
     with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': .*larger than the file"):
         read_npz(tmp_path / "a.npz")
