@@ -65,7 +65,7 @@ test-nodes: $(READY) ## two nodes on one machine, in network namespaces
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/scale_out
 
 fuzz: $(READY) ## 100000 damaged files for all readers: about 6 minutes
-	nice -n 15 env OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/fuzz_readers.py --inputs 100000
+	nice -n 15 env OMP_NUM_THREADS=1 FUZZ_INPUTS=5000 $(BIN)/pytest -q tests/fuzz/test_fuzz_readers.py
 
 notebooks: $(READY) ## run the notebooks, keeping their outputs
 	$(BIN)/pytest --nbmake --nbmake-timeout=300 --overwrite notebooks
