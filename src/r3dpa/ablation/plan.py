@@ -116,17 +116,13 @@ class _Scale(NamedTuple):
             for word in reversed(self.words):  # one may use those before it
                 text = text.replace(f"{{{word}}}", self.words[word])
             used = [n for n in _NAME.findall(text) if n not in ("seed", "out")]
+            place = f"{file}: commands.{name}"
             if unknown := [n for n in used if n not in stages]:
-                known = ", ".join([*stages, *self.words])
-                raise ValueError(
-                    f"{file}: commands.{name}: {{{unknown[0]}}} is nothing known before it; give "
-                    f"one of {known}"
-                )
+                known = f"nothing known before it; give one of {', '.join([*stages, *self.words])}"
+                raise ValueError(f"{place}: {{{unknown[0]}}} is {known}")
             words = shlex.split(text.replace("{seed}", str(seed)))
             if words[:1] != ["fit"] or not words[1:] or words[1].startswith("-"):
-                raise ValueError(
-                    f"{file}: commands.{name}: {text!r} is no command `fit EXPERIMENT ...`"
-                )
+                raise ValueError(f"{place}: {text!r} is no command `fit EXPERIMENT ...`")
             content = json.dumps([words[1:], self.resolve(text.replace("{seed}", "0"))])
             for n in used:
                 checkpoint = f"{{out}}/stages/{stages[n].name}/checkpoints/last.ckpt"
@@ -161,9 +157,7 @@ def make_plan(
     no table or scale, a file is invalid, or a seed is negative or occurs twice.
     """
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise ValueError(
-            f"--seeds must be different numbers from 0 on, at least one, got {list(seeds)}"
-        )
+        raise ValueError(f"--seeds must be different numbers from 0 on, got {list(seeds)}")
     if not scale.is_file():
         known = sorted(other.stem for other in scale.parent.glob("*.yaml"))
         raise ValueError(f"{scale}: there is no such scale; give one of {', '.join(known) or '-'}")

@@ -27,7 +27,7 @@ from r3dpa.metrics.scene_features import SPACES
 from r3dpa.metrics.seeds import mean_of_seeds, relative_change
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
-_ALIKE = 0.05  # a few times the differences of such rows in the paper
+_ALIKE = 0.05  # share; a few times the differences of such rows in the paper
 _POINTS = 100  # at most, of a curve in the JSON file
 
 Results = Mapping[str, Mapping[int, Evaluation]]
@@ -35,12 +35,10 @@ Results = Mapping[str, Mapping[int, Evaluation]]
 
 
 class Order(NamedTuple):
-    """Result for one order of the paper in one metric.
+    """Result for one order of the paper: ``claim`` (better, worse, alike) of two rows in a metric.
 
-    ``claim`` (better, worse, alike) is by the paper's numbers in this metric if it printed both.
     ``change`` and ``interval`` are those of :func:`relative_change`. ``holds`` is yes if the
-    interval lies inside the claim, no if outside, else unclear; *alike* is a difference of at most
-    5 %.
+    interval lies inside the claim, no if outside, else unclear.
     """
 
     first: str
@@ -53,7 +51,10 @@ class Order(NamedTuple):
 
 
 def order_results(table: Table, results: Results, metrics: Mapping[str, bool]) -> list[Order]:
-    """Orders for which there are results; ``metrics`` is True where lower values are better."""
+    """Orders for which there are results; ``metrics`` is True where lower values are better.
+
+    The paper's numbers of a metric, if it printed both, go before its general claim.
+    """
     printed = {row.key: row.published for row in table.rows}
     found = []
     for (claim, first, second), (metric, lower) in product(table.orders, metrics.items()):
@@ -62,7 +63,7 @@ def order_results(table: Table, results: Results, metrics: Mapping[str, bool]) -
         mean, (low, high) = change
         x, y = printed[first].get(metric), printed[second].get(metric)
         if claim == "better" and x is not None and y is not None and x != y and (x < y) != lower:
-            claim = "worse"  # the printed numbers are the reverse of the general claim
+            claim = "worse"
         if claim == "alike":
             inside, outside = max(-low, high) <= _ALIKE, low > _ALIKE or high < -_ALIKE
         else:

@@ -107,7 +107,6 @@ class MixtureProblem:
 
     def __init__(self, mixture: GaussianMixture, num: int, batch: int = 256) -> None:
         self.mixture, self.batch, self._timed_batch = mixture, num, batch
-        self.device = mixture.means.device
 
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Samples of these indices, each from its own noise."""

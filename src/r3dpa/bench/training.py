@@ -10,7 +10,7 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
@@ -52,7 +52,7 @@ class StepSettings:
     quick: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass
 class StageCost:
     """Cost of training one stage.
 
@@ -61,12 +61,12 @@ class StageCost:
     """
 
     stage: str
-    step_seconds: list[float]
-    loss: float
-    peak_host_bytes: int
-    peak_gpu_bytes: int | None
-    flop: int
-    images_per_second: float
+    step_seconds: list[float] = field(default_factory=list)
+    loss: float = 0.0
+    peak_host_bytes: int = 0
+    peak_gpu_bytes: int | None = None
+    flop: int = 0
+    images_per_second: float = 0.0
 
     def row(self) -> dict[str, str]:
         """Cells of the table."""
@@ -154,7 +154,7 @@ def _silence_lightning() -> None:
 def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings) -> StageCost:
     L.seed_everything(0, verbose=False)
     module = _build(files, folder / f"{stage}.safetensors")
-    meter = _StepMeter(settings.steps)
+    cost = StageCost(stage)
     trainer = L.Trainer(
         accelerator=settings.device,
         devices=1,
@@ -164,22 +164,16 @@ def _measure(stage: str, files: list[Path], folder: Path, settings: StepSettings
         gradient_clip_val=1.0,
         limit_val_batches=0,
         logger=False,
-        callbacks=[meter],
+        callbacks=[_StepMeter(settings.steps, cost)],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
         default_root_dir=folder,
     )
     trainer.fit(module, datamodule=_data(module, folder, stage, settings.batch_size))
-    return StageCost(
-        stage,
-        meter.seconds,
-        meter.loss,
-        meter.peak_host_bytes,
-        meter.peak_gpu_bytes,
-        meter.flop,
-        settings.batch_size / median(meter.seconds[1:] or meter.seconds),
-    )
+    seconds = median(cost.step_seconds[1:] or cost.step_seconds)
+    cost.images_per_second = settings.batch_size / seconds
+    return cost
 
 
 def _build(files: list[Path], fresh_vae: Path) -> GenerativeModule:
@@ -226,13 +220,8 @@ def _data(module: GenerativeModule, folder: Path, stage: str, batch_size: int) -
 class _StepMeter(L.Callback):
     """Time of each step with its batch on the device, loss and memory; FLOP of one step more."""
 
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-        self.seconds: list[float] = []
-        self.flop = 0
-        self._start = self.loss = 0.0
-        self.peak_host_bytes = 0
-        self.peak_gpu_bytes: int | None = None
+    def __init__(self, steps: int, cost: StageCost) -> None:
+        self.steps, self.cost, self._start = steps, cost, 0.0
         self._counting = ExitStack()
         self._counter = FlopCounterMode(display=False)
 
@@ -247,12 +236,12 @@ class _StepMeter(L.Callback):
         device = trainer.strategy.root_device
         if trainer.global_step > self.steps:
             self._counting.close()
-            self.flop = self._counter.get_total_flops()
+            self.cost.flop = self._counter.get_total_flops()
             return
-        self.seconds.append(self._now(trainer) - self._start)
-        self.loss = float(trainer.callback_metrics["train/loss"])
-        self.peak_host_bytes = peak_bytes(torch.device("cpu"))
-        self.peak_gpu_bytes = peak_bytes(device) if device.type == "cuda" else None
+        self.cost.step_seconds.append(self._now(trainer) - self._start)
+        self.cost.loss = float(trainer.callback_metrics["train/loss"])
+        self.cost.peak_host_bytes = peak_bytes(torch.device("cpu"))
+        self.cost.peak_gpu_bytes = peak_bytes(device) if device.type == "cuda" else None
 
     @staticmethod
     def _now(trainer: L.Trainer) -> float:
