@@ -58,6 +58,18 @@ def save(module, path):
     return path
 
 
+def skipped(folder, stage="joint", fault=constant_loss):
+    """File of the batch of a training whose only step is broken."""
+    train(guarded(stage, [0], fault), NamedData(1), default_root_dir=folder)
+    (file,) = (folder / "bad_batches").iterdir()
+    return file
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return skipped(tmp_path_factory.mktemp("joint"))
+
+
 def rows(text):
     return {line.split("  ")[0]: line.split()[-1] for line in text.splitlines() if "  " in line}
 
@@ -66,8 +78,7 @@ def rows(text):
 def test_the_losses_of_the_step_come_back(stage, tmp_path):
     """At the first step the weights are the initial ones; the fault itself is no part of them."""
     ckpt = save(stage_module(stage), tmp_path / "before.safetensors")
-    train(guarded(stage, [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
-    (file,) = (tmp_path / "bad_batches").iterdir()
+    file = skipped(tmp_path, stage)
     kept = BadBatch.read(file)
     text = replay(file, ckpt)
     assert SENSOR.beams == kept.tensors["range_image"].shape[2]
@@ -83,19 +94,15 @@ def test_the_losses_of_the_step_come_back(stage, tmp_path):
 
 def test_a_broken_input_is_told_from_a_broken_layer(tmp_path):
     ckpt = save(stage_module("joint"), tmp_path / "before.safetensors")
-    train(guarded("joint", [0], infinite_image), NamedData(1), default_root_dir=tmp_path)
-    (file,) = (tmp_path / "bad_batches").iterdir()
-    text = replay(file, ckpt)
+    text = replay(skipped(tmp_path, fault=infinite_image), ckpt)
     assert "input range_image: 1 of 256 values are not finite" in text
     assert rows(text)["drive/0a"] == "nan"
     assert rows(text)["drive/0b"] != "nan"  # alone, it is sound
     assert text.endswith("finite inputs into others: none")
 
 
-def test_the_layer_at_fault_is_named(tmp_path):
+def test_the_layer_at_fault_is_named(file, tmp_path):
     """A bias that overflows: all later layers are as bad, but only this one had sound inputs."""
-    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
-    (file,) = (tmp_path / "bad_batches").iterdir()
     module = stage_module("joint")
     module.sit.blocks[1].mlp.fc1.bias.data[0] = torch.inf
     text = replay(file, save(module, tmp_path / "broken.safetensors"))
@@ -105,9 +112,7 @@ def test_the_layer_at_fault_is_named(tmp_path):
     assert line.endswith(", the first sit.blocks.1.mlp.fc1")
 
 
-def test_networks_of_another_size_are_refused(tmp_path):
-    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
-    (file,) = (tmp_path / "bad_batches").iterdir()
+def test_networks_of_another_size_are_refused(file, tmp_path):
     kept = BadBatch.read(file)
     wide = {**kept.tensors, "feature_grid": torch.zeros(2, 8, 7)}
     other = dataclasses.replace(kept, tensors=wide, about=kept.about | {"step": 1}).save(
@@ -121,9 +126,7 @@ def test_networks_of_another_size_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("precision", "said"), [("16-true", True), ("bf16-mixed", False), ("32-true", False)]
 )
-def test_a_precision_that_is_not_repeated_is_said(precision, said, tmp_path):
-    train(guarded("joint", [0], constant_loss), NamedData(1), default_root_dir=tmp_path)
-    (file,) = (tmp_path / "bad_batches").iterdir()
+def test_a_precision_that_is_not_repeated_is_said(precision, said, file, tmp_path):
     kept = BadBatch.read(file)
     kept = dataclasses.replace(kept, about=kept.about | {"precision": precision, "step": 1})
     text = replay(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from tiny_networks import VAE_ARGS
+from tiny_networks import SIT_ARGS, VAE_ARGS
 
 from r3dpa.callbacks import EMASnapshots
 from r3dpa.checkpoints import (
@@ -30,16 +30,6 @@ from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
 GEOMETRY = ScanGeometry(
     SphericalProjection(LidarSensor(beams=16, columns=64)), RangeCodec(), (2, 8)
 )
-SIT_ARGS = {
-    "input_size": [4, 16],
-    "in_channels": 4,
-    "hidden_size": 16,
-    "depth": 1,
-    "num_heads": 2,
-    "alignment_depth": 1,
-    "feature_dim": 4,
-    "projector_dim": 4,
-}
 
 
 def module(kind=FlowMatching, **more):

@@ -74,13 +74,6 @@ class TestABadStep:
         for key, value in before.items():
             assert torch.equal(after_bad[key], value), key
 
-    @pytest.mark.parametrize("fault", [infinite_image, huge_latents, constant_loss])
-    def test_breaks_weights_or_statistics_without_guard(self, fault):
-        """The naive way; an infinite loss with finite gradients only moves them on."""
-        module = train(guarded("joint", [1], fault), NamedData(2), None)
-        sound = all(value.isfinite().all() for value in module.state_dict().values())
-        assert sound == (fault is constant_loss)
-
 
 class TestTheReport:
     def test_names_the_scans_and_keeps_the_batch(self, tmp_path):

@@ -78,7 +78,10 @@ class PictureLogger(L.Callback):
             image = val_set[len(val_set) // 2]["range_image"]
             pictures["reconstruction"] = self._reconstruction(module, image)
         if self.num_scenes and module.ema is not None:
-            pictures["samples"] = self._samples(module, module.ema)
+            generator = averaged_generator(module, module.ema, self.sampler)
+            scenes = generator.generate(range(self.num_scenes), self.seed)
+            projection = generator.geometry.projection
+            pictures["samples"] = viz.scenes_sheet(list(scenes.range_m.cpu()), projection)
         folder = Path(trainer.default_root_dir) / "pictures"
         step = trainer.global_step or module.loaded_step
         for name, figure in pictures.items():
@@ -99,11 +102,6 @@ class PictureLogger(L.Callback):
         agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
 
-    def _samples(self, module: GenerativeModule, average: EMA) -> Figure:
-        generator = averaged_generator(module, average, self.sampler)
-        scenes = generator.generate(range(self.num_scenes), self.seed)
-        return viz.scenes_sheet(list(scenes.range_m.cpu()), generator.geometry.projection)
-
 
 def averaged_generator(
     module: GenerativeModule,
@@ -112,12 +110,7 @@ def averaged_generator(
     precision: Literal["fp32", "bf16"] = "fp32",
 ) -> SceneGenerator:
     """Samples from the averaged weights of a module."""
+    geometry, path = module.scan_geometry, module.interpolant.path
     return SceneGenerator(
-        module.vae,
-        average.sit,
-        average.latent_norm,
-        module.scan_geometry,
-        sampler,
-        module.interpolant.path,
-        precision,
+        module.vae, average.sit, average.latent_norm, geometry, sampler, path, precision
     )
