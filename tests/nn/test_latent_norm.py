@@ -50,6 +50,9 @@ def test_a_broken_latent_leaves_the_statistics_alone(value, replace):
     assert norm.normalise(broken).isfinite().all() == replace
     for key, value_before in before.items():
         assert torch.equal(norm.state_dict()[key], value_before)
+    naive = nn.BatchNorm2d(3, affine=False)
+    naive(torch.nan_to_num(torch.full((2, 3, 2, 2), torch.inf)) * torch.rand(2, 3, 2, 2))
+    assert naive.running_var.isinf().all()  # and stays so for good
 
 
 @pytest.mark.numerics
@@ -60,16 +63,27 @@ def test_statistics_survive_a_large_mean():
     norm.update(far)
     expected = far.double().var((0, 2, 3))
     torch.testing.assert_close(norm.running_var.double(), expected, atol=0, rtol=1e-6)
+    count = far.numel() // 3
+    naive = (far.square().mean((0, 2, 3)) - far.mean((0, 2, 3)).square()) * count / (count - 1)
+    assert ((naive - expected).abs() / expected).max() > 0.1
 
 
 @pytest.mark.numerics
 def test_a_later_update_does_not_change_the_backward_of_an_earlier_pass():
-    norm, latents = LatentNorm(3), raw_latents().requires_grad_()
-    normalised = norm.normalise(latents)
-    norm.update(raw_latents(seed=1))
-    normalised.sum().backward()
+    def gradient(normalise, update):
+        latents = raw_latents().requires_grad_()
+        normalised = normalise(latents)
+        update(raw_latents(seed=1))
+        normalised.sum().backward()
+        return latents.grad
+
+    norm = LatentNorm(3)
     expected = torch.full((4, 3, 4, 6), 1.0001**-0.5)  # variance 1 of the fresh norm
-    torch.testing.assert_close(latents.grad, expected)
+    torch.testing.assert_close(gradient(norm.normalise, norm.update), expected)
+
+    plain = nn.BatchNorm2d(3, affine=False)
+    naive = gradient(lambda x: plain.eval()(x), lambda x: plain.train()(x))
+    assert (naive - 1).abs().max() > 0.1
 
 
 def test_half_precision_latents_are_normalised_in_float32():

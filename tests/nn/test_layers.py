@@ -37,6 +37,8 @@ def test_group_norm_of_half_precision_images_has_float32_statistics():
     actual = GroupNorm(32).half()(image.half())
     torch.testing.assert_close(actual.float(), expected, atol=5e-3, rtol=0)
     assert actual.dtype == torch.float16
+    naive_variance = image.half().square().flatten(2).mean(-1)
+    assert naive_variance.isinf().any()
 
 
 @pytest.mark.numerics
@@ -47,6 +49,8 @@ def test_attention_with_large_queries_survives_half_precision():
     expected = block(image)
     actual = block.half()(image.half()).float()
     torch.testing.assert_close(actual, expected, atol=0.01 * expected.abs().max().item(), rtol=0)
+    query = block.q(block.norm(image.half())).flatten(2)
+    assert (query.transpose(1, 2) @ query).isinf().any()  # scaled after the product
 
 
 def test_synced_batch_norm_in_one_process_is_batch_norm():

@@ -160,15 +160,11 @@ def test_feature_is_the_mean_of_the_patch_tokens_normalised():
     assert feature.tolist() == pytest.approx([1.5, -9.75], rel=1e-5)
 
 
-def test_rangevit_refuses_sizes():
-    for name, value, message in (
-        ("trained_size", (16, 30), "do not divide"),
-        ("band_rows", 5, "bands of 5 rows"),
+def test_sizes_that_do_not_divide_are_refused():
+    for build, message in (
+        (lambda: rangevit(trained_size=(16, 30)), "do not divide"),
+        (lambda: rangevit(band_rows=5), "bands of 5 rows"),
+        (lambda: LIPLoc(picture_side=32, patch_side=7), "patches of 7"),
     ):
         with pytest.raises(ValueError, match=message):
-            rangevit(**{name: value})
-
-
-def test_pictures_of_other_patches_are_refused():
-    with pytest.raises(ValueError, match="patches of 7"):
-        LIPLoc(picture_side=32, patch_side=7)
+            build()

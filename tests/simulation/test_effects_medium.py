@@ -41,20 +41,15 @@ def applied(effect, scene, sensor=SENSOR, before=()):
 
 
 @pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
-def test_second_echoes_leave_the_first_alone(effect, weather):
-    scene = Scene((WALL, CAR), weather=weather)
-    single, dual = applied(effect, scene), applied(effect, scene, before=[DualReturn()])
-    for one, two in zip(single.first.columns(), dual.first.columns(), strict=True):
+def test_echoes_of_the_air_lie_before_the_target_and_second_ones_leave_the_first(effect, weather):
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=weather)
+    before, after = surfaces(scene), applied(effect, scene)
+    dual = applied(effect, scene, before=[DualReturn()])
+    for one, two in zip(after.first.columns(), dual.first.columns(), strict=True):
         assert (one == two).all()
     # A hard echo that lost against the air, or one from the air that lost, comes second.
     assert (dual.second.power > 0).any()
     assert (dual.second.power <= dual.first.power).all()
-
-
-@pytest.mark.parametrize(("effect", "weather"), CALLED, ids=NAMES)
-def test_echoes_of_the_air_lie_before_the_target(effect, weather):
-    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=weather)
-    before, after = surfaces(scene), applied(effect, scene)
     air = after.first.origin > 0
     assert air.any()
     assert (after.first.range_m[air] <= before.first.range_m[air] + 1e-4).all()
