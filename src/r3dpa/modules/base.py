@@ -99,18 +99,14 @@ class GenerativeModule(L.LightningModule):
         self.sit = sit
         self.discriminator = discriminator
         self.latent_norm = latent_norm or LatentNorm(vae.latent_channels)
-        self.weights = weights
-        self.optimizer_config = optimizer
+        self.weights, self.optimizer_config = weights, optimizer
         self.interpolant = Interpolant(path)
         self.latent_shape = (vae.latent_channels, *sit.input_size)
-        self.time_sampling = time_sampling
+        self.time_sampling, self.seed = time_sampling, seed
         self.init_from = init_from
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
-        self.rgb_weights = rgb_weights
-        self.keep_projector = keep_projector
-        self.seed = seed
-        self.channels_last = channels_last
-        self.compiles = compile
+        self.rgb_weights, self.keep_projector = rgb_weights, keep_projector
+        self.channels_last, self.compiles = channels_last, compile
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -216,7 +212,8 @@ class GenerativeModule(L.LightningModule):
             parts["reconstruction"] = weights.reconstruction * error
         if weights.kl != 0:
             parts["kl"] = weights.kl * posterior.kl().mean()
-        if self.discriminator is not None and weights.adversarial != 0 and self._adversarial:
+        adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
+        if self.discriminator is not None and adversarial:
             with frozen(self.discriminator):
                 logits = self.discriminator(reconstruction)
             parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
@@ -224,21 +221,17 @@ class GenerativeModule(L.LightningModule):
             parts["reconstruction"] = steps.zero_loss(self.vae)
         return parts
 
-    @property
-    def _adversarial(self) -> bool:
-        """Whether the adversarial losses count yet."""
-        return self.global_step >= self.weights.adversarial_start
-
     def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
         """Hinge loss on scans and detached reconstructions; a plain 0 before its start."""
         if self.discriminator is None:
             return {}
-        if self.weights.discriminator == 0 or not self._adversarial:
+        weights = self.weights
+        if weights.discriminator == 0 or self.global_step < weights.adversarial_start:
             return {"discriminator": steps.zero_loss(self.discriminator)}
         real = self.discriminator(image)
         fake = self.discriminator(reconstruction.detach())
         loss = losses.discriminator_loss(real, fake)
-        return {"discriminator": self.weights.discriminator * loss}
+        return {"discriminator": weights.discriminator * loss}
 
     def vae_alignment_losses(
         self, latents: Tensor, features: Tensor | None, draws: PathDraws
