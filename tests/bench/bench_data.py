@@ -55,23 +55,14 @@ def bench_epoch(benchmark, loaded, workers, one_thread):
 
 
 @pytest.mark.benchmark(group="feature grid of one scan, 768 wide", min_rounds=3)
-class BenchGrid:
-    @pytest.fixture
-    def values(self, points):
-        return torch.randn(len(points), DIM, generator=torch.Generator().manual_seed(0))
-
-    def bench_pool_cells(self, benchmark, points, values, alone):
-        xyz = points[:, :3].contiguous()
-        benchmark(pool_cells, xyz, values, PROJECTION, GRID_SIZE)
-
-    def bench_floor_one_sum_over_all_features(self, benchmark, values, alone):
-        benchmark(values.sum)
+def bench_pool_cells(benchmark, points, alone):
+    values = torch.randn(len(points), DIM, generator=torch.Generator().manual_seed(0))
+    benchmark(pool_cells, points[:, :3].contiguous(), values, PROJECTION, GRID_SIZE)
 
 
 @pytest.mark.benchmark(group="read one feature grid")
-class BenchStore:
-    def bench_store(self, benchmark, scans, tmp_path, alone):
-        extractor = GeometricFeatures(DIM)
-        write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path)
-        store = FeatureGrids(tmp_path, scans, PROJECTION, GRID_SIZE, extractor)
-        benchmark(lambda: store.read(scans[0]))
+def bench_store(benchmark, scans, tmp_path, alone):
+    extractor = GeometricFeatures(DIM)
+    write_feature_grids(scans, extractor, PROJECTION, [GRID_SIZE], tmp_path)
+    store = FeatureGrids(tmp_path, scans, PROJECTION, GRID_SIZE, extractor)
+    benchmark(lambda: store.read(scans[0]))
