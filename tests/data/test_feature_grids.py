@@ -176,15 +176,6 @@ def test_other_grid_size_is_named_by_the_reader(made, projection, scaled_points)
         assert words in str(caught.value)
 
 
-def test_missing_grid_names_the_scan_and_the_command(made, projection, make_scans, folder):
-    _, root = made
-    make_scans(folder / "a", 4)
-    with pytest.raises(StoreError, match=r"a/0000000003\.bin.*r3dpa features"):
-        FeatureGrids(root, find_scans(folder), projection, GRID)
-    with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
-        FeatureGrids(root / "none", find_scans(folder), projection, GRID)
-
-
 @pytest.mark.parametrize("lost_bytes", [16, 0])
 def test_replaced_scan_is_noticed_and_made_again(lost_bytes, made, projection, scaled_points):
     scans, root = made
@@ -208,7 +199,7 @@ def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points,
     with pytest.raises(error):
         write_feature_grids(scans, extractor, projection, [GRID], root)
     FeatureGrids(root, scans[:4], projection, GRID)
-    with pytest.raises(StoreError, match="No feature grids of "):
+    with pytest.raises(StoreError, match=r"No feature grids of .*\.bin.*r3dpa features"):
         FeatureGrids(root, scans, projection, GRID)
     scans[4].path.write_bytes(data)
     assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1

@@ -233,98 +233,70 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
     assert capsys.readouterr().out == ""
 
 
-def images_file(change):
-    def write(path):
-        stack = torch.stack([image(0), image(1)])
-        np.savez(path / "img.npz", change(stack).numpy())
-
-    return write
+def changed(value, *index):
+    stack = torch.stack([image(0), image(1)])
+    stack[index] = value
+    return stack.numpy()
 
 
-def setting(value, *index):
-    def change(stack):
-        stack[index] = value
-        return stack
-
-    return images_file(change)
-
-
-def tensor_file(content):
-    return lambda path: torch.save(content, path / "a.pth")
-
-
-def array_file(array):
-    return lambda path: np.save(path / "a.npy", array)
-
-
-def bytes_file(name, content):
-    return lambda path: (path / name).write_bytes(content)
-
-
-def encoded_array(array):
+def encoded(array, save=np.save):
     stream = io.BytesIO()
-    np.save(stream, array)
+    save(stream, array)
     return stream.getvalue()
 
 
-def cut(path):
-    write_npz(path / "a.npz", {"x": CLOUDS[0]}.items())
-    (path / "a.npz").write_bytes((path / "a.npz").read_bytes()[:-30])
+def flipped(data):
+    return data[:120] + bytes([data[120] ^ 255]) + data[121:]
 
 
-def flipped(path):
-    np.savez_compressed(path / "a.npz", np.random.default_rng(0).random((9, 4)))
-    data = bytearray((path / "a.npz").read_bytes())
-    data[120] ^= 255
-    (path / "a.npz").write_bytes(data)
-
-
+IMAGES, ONES = changed(0.0, 0, 4), np.ones((2, 5, 4, 8), np.float32)
+CLOUD = encoded(np.random.default_rng(0).random((9, 4)), np.savez_compressed)
 BAD = {
-    "empty file": (bytes_file("a.txt", b""), r"a\.txt: is empty"),
-    "other text": (bytes_file("a.txt", b"model: r3dpa\n"), r"a\.txt: is not text rows"),
-    "ragged text": (bytes_file("a.txt", b"1 2 3\n4 5\n"), r"a\.txt: is not text rows"),
-    "narrow text": (bytes_file("a.txt", b"9 2\n4 5\n"), r"a\.txt: has rows of 2 numbers; needs 3"),
-    "NaN": (bytes_file("a.txt", b"9 2 nan\n4 5 6\n"), r"a\.txt: has NaN or inf.* 1 of 2 points"),
-    "far": (bytes_file("a.txt", b"0 0 99\n0 0 0.5"), r"a\.txt: has no point within .* 1\.\.56 m"),
-    "no point": (array_file(np.zeros((0, 3), np.float32)), r"a\.npy: has no point within"),
-    "no image": (array_file(np.zeros((0, 5, 4, 8), np.float32)), r"a\.npy: no sample .* empty"),
-    "bytes": (array_file(np.ones((2, 5, 4, 8), np.uint8)), r"a\.npy: holds uint8 numbers; metres"),
-    "vector": (array_file(np.ones(3)), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
-    "cut .npy": (
-        bytes_file("a.npy", encoded_array(np.ones((2, 5, 4, 8), np.float32))[:-300]),
-        r"a\.npy: cannot be read as an array \(mmap length",
-    ),
-    "cut .npz": (cut, r"a\.npz: "),
-    "damaged .npz": (flipped, r"a\.npz.* is damaged"),
-    "no member": (lambda path: np.savez(path / "a.npz"), r"a\.npz: "),
-    "no tensor": (tensor_file({"model": {}}), r"a\.pth: cannot be .*; needs a tensor"),
-    "no .pth": (bytes_file("a.pth", b"\x80\x02"), r"a\.pth: cannot be read as tensors alone"),
+    "empty file": ("a.txt", b"", r"a\.txt: is empty"),
+    "other text": ("a.txt", b"model: r3dpa\n", r"a\.txt: is not text rows"),
+    "ragged text": ("a.txt", b"1 2 3\n4 5\n", r"a\.txt: is not text rows"),
+    "narrow text": ("a.txt", b"9 2\n4 5\n", r"a\.txt: has rows of 2 numbers; needs 3"),
+    "NaN": ("a.txt", b"9 2 nan\n4 5 6\n", r"a\.txt: has NaN or inf.* 1 of 2 points"),
+    "far": ("a.txt", b"0 0 99\n0 0 0.5", r"a\.txt: has no point within .* 1\.\.56 m"),
+    "no point": ("a.npy", ONES[:0, 0, 0, :3], r"a\.npy: has no point within"),
+    "no image": ("a.npy", ONES[:0], r"a\.npy: no sample .* empty"),
+    "bytes": ("a.npy", ONES.astype(np.uint8), r"a\.npy: holds uint8 numbers; metres"),
+    "vector": ("a.npy", np.ones(3), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
+    "cut .npy": ("a.npy", encoded(ONES)[:-300], r"a\.npy: cannot be read as an array \(mmap len"),
+    "cut .npz": ("a.npz", CLOUD[:-30], r"a\.npz: "),
+    "damaged .npz": ("a.npz", flipped(CLOUD), r"a\.npz.* is damaged"),
+    "no member": ("a.npz", b"PK\x05\x06" + bytes(18), r"a\.npz: "),
+    "no tensor": ("a.pth", {"model": {}}, r"a\.pth: cannot be .*; needs a tensor"),
+    "no .pth": ("a.pth", b"\x80\x02", r"a\.pth: cannot be read as tensors alone"),
     "unlike parts": (
-        tensor_file({"depth": torch.ones(1, 4, 8), "xyz": torch.ones(3, 4, 9)}),
+        "a.pth",
+        {"depth": torch.ones(1, 4, 8), "xyz": torch.ones(3, 4, 9)},
         r"a\.pth: cannot be read as tensors alone \(Sizes",
     ),
-    "channels": (tensor_file(torch.ones(3, 4, 8)), r"a\.pth: has 3 channels; needs range"),
+    "channels": ("a.pth", torch.ones(3, 4, 8), r"a\.pth: has 3 channels; needs range"),
     "image size": (
-        tensor_file(torch.ones(5, 8, 4)),
+        "a.pth",
+        torch.ones(5, 8, 4),
         r"a\.pth: has an image of 8 x 4 pixels, but the sensor has 4 x 8; use images of",
     ),
-    "encoded": (images_file(lambda s: s[:, :1] / 56 - 1), r"000000: .*values go from -1 to 0\.07"),
-    "NaN range": (setting(torch.nan, 1, 0, 3), r"img\.npz, sample 000001: has NaN .* 8 pixels"),
-    "NaN xyz": (setting(torch.nan, 1, 2, 3), r"sample 000001: channel 0 is not the length .* 8 of"),
-    "NaN intensity": (setting(torch.nan, 0, 4, 3), r"000000: has NaN .* 8 pixels"),
-    "order": (images_file(lambda s: s[:, [1, 2, 3, 0, 4]].abs()), r"channel 0 is not the length"),
-    "mixed": (
-        lambda path: [write(path) for write in (cut, tensor_file(image()))],
-        r"several formats \(1 \.npz, 1 \.pth\)",
-    ),
-    "nothing": (bytes_file("a.png", b"x"), r"holds no samples; what can be read: clouds"),
+    "encoded": ("a.npy", IMAGES[:, :1] / 56 - 1, r"000000: .*values go from -1 to 0\.07"),
+    "NaN range": ("a.npy", changed(np.nan, 1, 0, 3), r"a\.npy, sample 000001: has NaN .* 8 pixels"),
+    "NaN xyz": ("a.npy", changed(np.nan, 1, 2, 3), r"sample 000001: channel 0 is not .* 8 of"),
+    "NaN intensity": ("a.npy", changed(np.nan, 0, 4, 3), r"000000: has NaN .* 8 pixels"),
+    "order": ("a.npy", abs(IMAGES[:, [1, 2, 3, 0, 4]]), r"channel 0 is not the length"),
+    "nothing": ("a.png", b"x", r"holds no samples; what can be read: clouds"),
 }
 
 
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_file_is_named_with_what_was_found(tmp_path, kind):
-    write, message = BAD[kind]
-    write(tmp_path)
+    name, content, message = BAD[kind]
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    elif isinstance(content, np.ndarray):
+        np.save(tmp_path / name, content)
+    else:
+        torch.save(content, tmp_path / name)
     with pytest.raises(ScanError, match=message) as caught:
         list(read_samples(tmp_path, SENSOR))
     assert str(tmp_path) in str(caught.value)
