@@ -116,10 +116,8 @@ class Augmentation:
         if self.flip:
             reason = "flip: the encoder of the VAE does not commute with mirroring"
         elif self.rotate and latent_columns % grid_columns:
-            reason = (
-                f"rotate: {grid_columns} grid columns do not divide the {latent_columns} columns "
-                "of the latents"
-            )
+            columns = f"{latent_columns} columns of the latents"
+            reason = f"rotate: {grid_columns} grid columns do not divide the {columns}"
         else:
             return
         raise ValueError(
@@ -128,14 +126,14 @@ class Augmentation:
         )
 
 
+@dataclass(eq=False, repr=False)
 class AugmentedDataset(Dataset[dict[str, Any]]):
     """Samples ``(epoch, index)`` of a dataset in the view drawn for them."""
 
-    def __init__(
-        self, dataset: LidarDataset, augmentation: Augmentation, seed: int, grid_columns: int
-    ) -> None:
-        self.dataset, self.augmentation = dataset, augmentation
-        self.seed, self.grid_columns = seed, grid_columns
+    dataset: LidarDataset
+    augmentation: Augmentation
+    seed: int
+    grid_columns: int
 
     def __len__(self) -> int:
         return len(self.dataset)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from glob import has_magic
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -172,10 +173,7 @@ class LidarDataModule(LoaderModule):
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
         """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
-        images = self.train_set
-        self.train_set = LidarDataset(
-            images.scans, images.projection, images.codec, images.grids, posteriors
-        )
+        self.train_set = replace(self.train_set, posteriors=posteriors)
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled, resumable loader of full batches; in order under ``overfit_batches``."""
@@ -191,9 +189,8 @@ class LidarDataModule(LoaderModule):
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
         """Held-out scans in order, none twice; no loader in a fit where nothing is held out."""
-        dataset = self.val_set
-        if len(dataset):
-            return self.loader(dataset, train=False)
+        if len(self.val_set):
+            return self.loader(self.val_set, train=False)
         if self.trainer is not None and self.trainer.state.fn in ("validate", "test"):
             raise ValueError(f"No held-out scan in {self.scans}: {_EMPTY_SPLIT}")
         return []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
@@ -33,6 +34,7 @@ class LidarBatch(TypedDict):
     name: list[str]
 
 
+@dataclass(eq=False, repr=False)
 class LidarDataset(Dataset[dict[str, Any]]):
     """Range image and mask, or cached posterior, and feature grid of each scan; nothing random.
 
@@ -44,16 +46,11 @@ class LidarDataset(Dataset[dict[str, Any]]):
         posteriors: Moments ``(2C, h, w)`` of a frozen VAE, which replace image and mask.
     """
 
-    def __init__(
-        self,
-        scans: Sequence[Scan],
-        projection: Projection,
-        codec: RangeCodec,
-        grids: CachedTensors[Scan] | None = None,
-        posteriors: CachedTensors[Scan] | None = None,
-    ) -> None:
-        self.scans, self.projection, self.codec = list(scans), projection, codec
-        self.grids, self.posteriors = grids, posteriors
+    scans: list[Scan]
+    projection: Projection
+    codec: RangeCodec
+    grids: CachedTensors[Scan] | None = None
+    posteriors: CachedTensors[Scan] | None = None
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -91,16 +88,16 @@ class PointSample(NamedTuple):
     prepared: Any
 
 
+@dataclass(eq=False, repr=False)
 class PointDataset(Dataset[Any]):
     """Points of each scan, prepared for a network by the loader processes.
 
     ``ScanError`` for a scan without a point within the range limits of ``sensor``.
     """
 
-    def __init__(
-        self, scans: Sequence[Scan], sensor: LidarSensor, prepare: Callable[..., Any]
-    ) -> None:
-        self.scans, self.sensor, self.prepare = list(scans), sensor, prepare
+    scans: Sequence[Scan]
+    sensor: LidarSensor
+    prepare: Callable[..., Any]
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -112,21 +109,14 @@ class PointDataset(Dataset[Any]):
         return PointSample(scan, key, points, self.prepare(points))
 
 
+@dataclass(eq=False, repr=False)
 class DrawnPoints(PointDataset):
     """Random preparation of points, ``prepare(points, generator)``.
 
     An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
     """
 
-    def __init__(
-        self,
-        scans: Sequence[Scan],
-        sensor: LidarSensor,
-        prepare: Callable[[Tensor, np.random.Generator], Any],
-        seed: int,
-    ) -> None:
-        super().__init__(scans, sensor, prepare)
-        self.seed = seed
+    seed: int
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NotRequired, TypedDict
 
 import numpy as np
@@ -32,19 +33,15 @@ class ImageBatch(TypedDict):
     name: list[str]
 
 
+@dataclass(eq=False, repr=False)
 class ImageDataset(Dataset[dict[str, Any]]):
     """Square images of some entries of a source, or cached posteriors of a VAE, or both."""
 
-    def __init__(
-        self,
-        source: ImageSource,
-        entries: Sequence[ImageEntry],
-        size: int,
-        posteriors: CachedTensors[ImageEntry] | None = None,
-        with_images: bool = True,
-    ) -> None:
-        self.source, self.entries, self.size = source, list(entries), size
-        self.posteriors, self.with_images = posteriors, with_images
+    source: ImageSource
+    entries: Sequence[ImageEntry]
+    size: int
+    posteriors: CachedTensors[ImageEntry] | None = None
+    with_images: bool = True
 
     def __len__(self) -> int:
         return len(self.entries)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -191,17 +191,6 @@ class ObjectLibrary:
             ) from error
 
 
-class _Part(NamedTuple):
-    """Sums over the cells of one class, weighted with its share of each cell."""
-
-    features: Tensor
-    directions: Tensor
-    weight: float
-    num_scans: int
-    num_cells: int
-    num_points: int
-
-
 @torch.no_grad()  # not inference mode: a target of guidance takes part in a backward pass
 def object_library(
     scans: Iterable[Scan],
@@ -231,7 +220,8 @@ def object_library(
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
     wanted = _wanted(classes)
     lift = getattr(extractor, "lift", torch.nn.Identity())
-    found: dict[str, _Part] = {}
+    # By class: features and directions, weighted; weight; numbers of scans, cells and points.
+    found: dict[str, tuple[Any, ...]] = {}
     shown: set[int] = set()
     for scan in scans:
         whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
@@ -259,8 +249,8 @@ def object_library(
                 )
             shares = counts / totals[cells].double()
             directions = shares @ F.normalize(lifted, dim=1)
-            part = _Part(shares @ lifted, directions, shares.sum().item(), 1, len(cells), len(own))
-            found[name] = _Part(*map(add, found[name], part)) if name in found else part
+            part = shares @ lifted, directions, shares.sum().item(), 1, len(cells), len(own)
+            found[name] = tuple(map(add, found[name], part)) if name in found else part
     missing = [name for name in wanted if name not in found]
     if not found or (classes is not None and missing):
         seen = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
@@ -270,12 +260,12 @@ def object_library(
         )
     features, results = [], []
     for name in (name for name in wanted if name in found):
-        sums = found[name]
-        mean = sums.features / sums.weight
-        cosine = (F.normalize(mean, dim=0) @ sums.directions / sums.weight).item()
-        counts = sums.num_scans, sums.num_cells, sums.num_points
+        total, directions, weight, num_scans, num_cells, num_points = found[name]
+        mean = total / weight
+        cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
         features.append(mean.float())
-        results.append(ObjectClass(name, *counts, max(0.0, 1 - cosine)))
+        spread = max(0.0, 1 - cosine)
+        results.append(ObjectClass(name, num_scans, num_cells, num_points, spread))
     return ObjectLibrary(
         torch.stack(features),
         tuple(results),

@@ -22,7 +22,7 @@ def encoded_once(
     root: Path,
     settings: Mapping[str, Any],
     items: Sequence[Item],
-    dataset_of: Callable[[Sequence[Item]], Dataset[Any]],
+    dataset_of: Callable[[list[Item]], Dataset[Any]],
     image: str,
 ) -> CachedTensors[Item]:
     """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
