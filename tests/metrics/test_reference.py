@@ -62,12 +62,6 @@ def test_moments_and_histograms_are_those_of_all_scans():
     assert (
         moments.count == metrics["cells"].count("real") == metrics["matching"].count("real") == 11
     )
-    values = torch.cat([scene.range_m.flatten() for scene in scenes()])
-    counts, _ = np.histogram(values.numpy(), bins=560, range=(0, 56))
-    ranges = metrics["ranges"].real_bins
-    assert ranges.sum() == len(values)
-    # Float32 may put a range beside the border of its bin; the CDF then differs by that return.
-    assert np.abs(np.cumsum(counts) - np.cumsum(ranges.numpy())).max() <= 5
     clouds = [through_sensor(scene, PROTOCOL).points for scene in scenes()]
     expected = PROTOCOL.grid.histogram(clouds)
     assert torch.equal(metrics["cells"].real_bins.view(100, 100).long(), expected)
@@ -83,16 +77,11 @@ def test_kept_scans_are_few_and_the_halves_have_different_drives():
     drives = [{n.split("/")[0] for n in reference.names_of_half(half)} for half in (0, 1)]
     assert drives[0].isdisjoint(drives[1])
     assert [reference.count(half) for half in (0, 1)] == [7, 4]
-    for half in reference.halves:
-        metrics = metrics_of(half)
-        assert metrics["toy_frechet"].rows("real").shape == (4, 2)
-        assert len(metrics["matching"].kept("real")[0]) == 2
     kept = [name for half in (0, 1) for name in names_of_kept(reference, half)]
     images = {scene.name: scene.range_m for scene in scenes()}
     _, stored = whole(reference)["matching"].kept("real")
     for name, image in zip(kept, stored, strict=True):
         assert torch.equal(image, images[name])
-    assert whole(reference)["toy_kid"].rows("real").shape == (8, 2)
 
 
 @pytest.mark.parametrize(
