@@ -161,12 +161,6 @@ BAD = [
 ]
 
 
-def test_a_bad_scene_is_named_with_the_option_that_leaves_it_out(reference):
-    message = r"bad/4: none of 1 points has.*\. --skip_bad leaves such scenes out"
-    with pytest.raises(ValueError, match=message):
-        rows_of([*scenes(1, 5), BAD[3][0]], reference)
-
-
 def test_bad_scenes_are_left_out_and_listed(reference):
     """They change no number, do not count as scenes, and everything printed tells of them."""
     good = list(scenes(1, 10))
@@ -193,7 +187,10 @@ def test_only_as_many_good_scenes_as_the_protocol_counts():
     assert found.about["extra"]["scenes"].startswith("only the first 20 were used")
 
 
-def test_bad_scenes_alone_are_an_error(reference):
+def test_bad_scenes_are_errors_alone_or_without_the_option(reference):
+    message = r"bad/4: none of 1 points has.*\. --skip_bad leaves such scenes out"
+    with pytest.raises(ValueError, match=message):
+        rows_of([*scenes(1, 5), BAD[3][0]], reference)
     with pytest.raises(TooFewScenesError, match=r"0 generated .* 8 cannot .* bad/1: no pixel"):
         rows_of([bad for bad, _ in BAD], reference, skip_bad=True)
 

@@ -19,7 +19,6 @@ from r3dpa.data.loaders import training_loader
 from r3dpa.metrics.functional import Moments, frechet_distance, merge_packed
 from r3dpa.modules import LossWeights
 from r3dpa.modules.steps import frozen
-from r3dpa.nn.layers import SyncedBatchNorm2d
 
 pytestmark = pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
 
@@ -145,18 +144,6 @@ def test_101_samples_on_two_processes_are_101_samples(dtype):
     padded_count, padded = distance(DistributedSampler)
     assert padded_count == 102
     assert abs(padded / expected - 1) > 0.01
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.numerics("synchronised batch norm in one process")
-def test_one_process_has_the_plain_batch_norm(dtype, one_process):
-    ours, plain, synced = SyncedBatchNorm2d(3), nn.BatchNorm2d(3), nn.SyncBatchNorm(3)
-    image = drawn(0, 2, 3, 4, 5).to(dtype)
-    assert torch.equal(ours(image), plain(image))
-    for key, value in plain.state_dict().items():
-        assert torch.equal(ours.state_dict()[key], value), key
-    with pytest.raises((ValueError, RuntimeError), match="SyncBatchNorm expected input tensor"):
-        synced(image)
 
 
 @pytest.mark.numerics("resume in the middle")

@@ -259,7 +259,7 @@ def _floors(
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
     """Rows of the first half of the reference as if it were generated, against the second."""
-    if min(map(reference.count, (0, 1))) < 2:
+    if min(len(reference.names_of_half(index)) for index in (0, 1)) < 2:
         return {}
     names = [space.name for space in spaces]
     metrics = reference.metrics(names, max_images=(None, num_images))

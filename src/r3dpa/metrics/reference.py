@@ -27,7 +27,7 @@ from r3dpa.metrics.scene_features import SceneFeatures
 
 _ABOUT = "r3dpa_reference"  # key of the file's metadata
 _VERSION = 3
-_EVERY = 2000  # scans between two saves of an unfinished reference
+_EVERY = 500  # scans between two saves of an unfinished reference
 
 _log = logging.getLogger(__name__)
 
@@ -59,9 +59,8 @@ class ReferenceStatistics:
                 f"a reference needs at least 2 scans with names of their own, got {len(names)}"
                 + (f"; given twice: {', '.join(twice[:5])}" if twice else "")
             )
-        self.protocol, self.spaces, self.about = protocol, spaces, about
+        self.protocol, self.spaces, self.about, self.num_done = protocol, spaces, about, 0
         self.names, self._half_of = tuple(names), split_halves(names)
-        self.num_done = 0
         sizes = [len(self.names_of_half(index)) for index in (0, 1)]
         rows, images = (
             _kept_of_halves(limit, sizes)
@@ -93,10 +92,6 @@ class ReferenceStatistics:
         parts = [metrics_of(half) for half in self.halves]
         for name, metric in metrics_of(metrics).items():
             metric.adopt_real(*(part[name] for part in parts))
-
-    def count(self, half: int) -> int:
-        """Scans of a half that were added."""
-        return metrics_of(self.halves[half])["cells"].count("real")
 
     def names_of_half(self, index: int) -> list[str]:
         """Names of the scans of a half, in their order."""
@@ -140,36 +135,27 @@ class ReferenceStatistics:
         scenes: Iterable[EvaluationScene],
         spaces: Sequence[SceneFeatures],
         partial: Path | None = None,
-        every: int = _EVERY,
     ) -> None:
         """Add the scans that are missing; interruptions change no bit of the result.
 
         Args:
             scenes: The scans ``names[num_done:]``, in that order.
             spaces: Those that the statistics were prepared for.
-            partial: File to save to every ``every`` scans and on a ``KeyboardInterrupt``.
-            every: Rounded up to whole batches.
+            partial: File to save to every 500 scans.
         """
-        saved, whole = self.num_done, True  # never saved in the middle of a batch
-        try:
-            for batch, features in with_features(usable_scenes(scenes, self.protocol), spaces):
-                expected = self.names[self.num_done : self.num_done + len(batch)]
-                if tuple(scene.name for scene in batch) != expected:
-                    raise ValueError(f"{batch[0].name}: not the next scan; give all, in order")
-                whole = False
-                for index, part in enumerate(self.halves):
-                    own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
-                    of_half = {name: values[own] for name, values in features.items()}
-                    update_with(part, [batch[i] for i in own], of_half, real=True)
-                self.num_done += len(batch)
-                whole = True
-                if partial is not None and self.num_done - saved >= every:
-                    self.save(partial)
-                    saved = self.num_done
-        except KeyboardInterrupt:
-            if whole and partial is not None and self.num_done:
+        saved = self.num_done
+        for batch, features in with_features(usable_scenes(scenes, self.protocol), spaces):
+            expected = self.names[self.num_done : self.num_done + len(batch)]
+            if tuple(scene.name for scene in batch) != expected:
+                raise ValueError(f"{batch[0].name}: not the next scan; give all, in order")
+            for index, part in enumerate(self.halves):
+                own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
+                of_half = {name: values[own] for name, values in features.items()}
+                update_with(part, [batch[i] for i in own], of_half, real=True)
+            self.num_done += len(batch)
+            if partial is not None and self.num_done - saved >= _EVERY:
                 self.save(partial)
-            raise
+                saved = self.num_done
 
     def _states(self) -> Iterator[tuple[str, SceneMetric, str, Tensor]]:
         """Key in the file, metric, name and value of each state; a feature space has one set."""

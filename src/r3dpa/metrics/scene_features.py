@@ -77,10 +77,7 @@ class SceneFeatures:
 
 
 def scene_features(
-    name: str,
-    ckpt: str | Path | None = None,
-    protocol: Protocol = DEFAULT,
-    device: str = "cpu",
+    name: str, ckpt: str | Path | None = None, protocol: Protocol = DEFAULT, device: str = "cpu"
 ) -> SceneFeatures:
     """Feature space by its name; a ``ValueError`` names what is unknown, missing or unfit."""
     if name not in SPACES:
