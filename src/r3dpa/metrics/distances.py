@@ -311,7 +311,7 @@ class MinimumMatchingDistance(SceneMetric):
 
     def clouds(self, images: Tensor) -> list[Tensor]:
         """Points ``(P, 3)`` of each range image."""
-        projection, corner = self.protocol.projection, self.protocol.corner
+        projection, corner = self.protocol.projection, self.protocol.unprojection == "corner"
         return [points_of(image, projection, corner) for image in images]
 
     def matching(self) -> Matching:

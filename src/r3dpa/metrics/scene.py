@@ -44,11 +44,6 @@ class Protocol:
     sensor: LidarSensor = LidarSensor()
 
     @property
-    def corner(self) -> bool:
-        """Whether pixels stand for their corners."""
-        return self.unprojection == "corner"
-
-    @property
     def projection(self) -> SphericalProjection:
         """Points to pixels and back."""
         return SphericalProjection(self.sensor)
@@ -136,7 +131,7 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
             f"{sensor.range_min_m:g}..{sensor.range_max_m:g} m; leave it out and say so, or check "
             "its unit"
         )
-    points = points_of(range_m, projection, protocol.corner)
+    points = points_of(range_m, projection, protocol.unprojection == "corner")
     return EvaluationScene(scene.name, points, range_m, intensity)
 
 
