@@ -79,15 +79,6 @@ def test_grids_are_those_of_the_data_module(scans, expected, tmp_path):
         assert torch.equal(read(tmp_path, scans, size), read(expected, scans, size))
 
 
-def test_grid_is_the_mean_of_its_points(scans, tmp_path):
-    """All points of a scan in one cell, by hand; float16 has 11 bits."""
-    extract(scans, tmp_path, Threefold(), [(1, 1)], batch_size=5)
-    for scan, grid in zip(scans, read(tmp_path, scans, (1, 1)), strict=True):
-        points = np.fromfile(scan.path, np.float32).reshape(-1, 4)
-        mean = 3 * points.mean(axis=0, dtype=np.float64)
-        np.testing.assert_allclose(grid[0], mean, rtol=2**-11, atol=1e-6)
-
-
 def test_bf16_differs_little(scans, expected, tmp_path):
     """Phases up to about 6 rounded to 8 bits, over the norm sqrt(8) of the kernel features."""
     extract(scans, tmp_path, precision="bf16-mixed")

@@ -7,7 +7,6 @@ import torch
 import yaml
 from tiny_stages import FEATURE_DIM, QUIET, stage_module, train
 
-from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.modules import LossWeights
@@ -63,22 +62,6 @@ def joint_checkpoint(smoke_args, unet_file, tmp_path_factory):
     more += ["--model.init_args.ema_decay", "0", "--model.init_args.optimizer.lr", "0.01"]
     main(smoke_args("joint", run_dir, *more))
     return run_dir / "checkpoints" / "last.ckpt"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", ["vae_alignment", "flow_matching"])
-def test_stages_start_and_go_on_from_one_another(
-    stage, smoke_args, unet_file, joint_checkpoint, tmp_path
-):
-    """The joint stage is that of the fixture; flow matching takes its VAE and its UNet."""
-    more = ["--model.init_args.sit", str(unet_file), "--trainer.logger=false"]
-    if stage == "flow_matching":
-        more += ["--model.init_args.init_from", str(joint_checkpoint)]
-        more += ["--model.init_args.init_networks", "[vae, sit, latent_norm]"]
-    main(smoke_args(stage, tmp_path, *more))
-    content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
-    assert content["global_step"] == 3
-    assert read_checkpoint(tmp_path / "checkpoints" / "last.ckpt").network("sit").kind is UNet
 
 
 def test_a_scene_does_not_depend_on_its_batch(joint_checkpoint):

@@ -75,7 +75,10 @@ def test_random_scenes_call_for_every_effect_and_do_without_it():
     for seed in SEEDS:
         found = scanned(seed)
         assert np.isfinite(found.points).all()
+        assert [record.name for record in found.effects] == NAMES
         for record in found.effects:
+            assert record.reason
+            assert record.rays == 0 or record.status == "ran", record
             touched[record.name] += record.rays > 0
             idle[record.name] += record.status == "not_called"
     assert min(touched.values()) >= 1, touched

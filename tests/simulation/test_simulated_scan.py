@@ -6,8 +6,7 @@ import pytest
 from sweeps import box
 
 from r3dpa.simulation import scan as module
-from r3dpa.simulation.effects import EFFECTS
-from r3dpa.simulation.scan import Simulator, calibrated_intensity, effect_name, simulate_scan
+from r3dpa.simulation.scan import Simulator, calibrated_intensity, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
     Material,
@@ -53,17 +52,6 @@ def test_types_and_ranges(street_scan):
     assert set(np.unique(labels & 0xFFFF)) <= set(Semantic)
     assert set(np.unique(origins)) <= set(Origin)
     assert np.linalg.norm(points[:, :3], axis=1).max() < 120
-
-
-def test_every_effect_is_accounted_for(street_scan):
-    assert [record.name for record in street_scan.effects] == [effect_name(e) for e in EFFECTS]
-    status = {record.name: record.status for record in street_scan.effects}
-    for name in ("rolling_shutter", "foliage_occlusion", "glass", "detection_limit"):
-        assert status[name] == "ran"
-    for name in ("fog", "rain", "snow", "wet_ground", "dual_return"):
-        assert status[name] == "not_called"
-    assert all(record.reason for record in street_scan.effects)
-    assert all(record.rays > 0 or record.status != "ran" for record in street_scan.effects)
 
 
 def test_labels_name_the_object_and_points_in_the_air_have_none():
