@@ -15,6 +15,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +29,6 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from r3dpa.checkpoints import Checkpoint, to_official
-from r3dpa.checkpoints.networks import NetworkState
 from r3dpa.modules import JointAlignment
 from r3dpa.modules.steps import PathDraws
 
@@ -100,16 +100,7 @@ def save_for_official(code: OfficialCode, checkpoint: Checkpoint, folder: Path) 
     torch.save(content, folder / "checkpoints" / f"{_STEP:07d}.pt")
 
 
-def write_official_scenes(
-    code: OfficialCode,
-    checkpoint: Checkpoint,
-    experiment: Path,
-    out: Path,
-    num: int,
-    batch_size: int,
-    steps: int,
-    noise: Tensor | None = None,
-) -> np.ndarray:
+def write_official_scenes(code, checkpoint, experiment, out, num, batch_size, steps, noise=None):
     """Runs ``main`` of the official ``generate.py``: Euler steps, decode, all of its files."""
     generate = code["generate"]
     overlay: dict[str, Any] = {
@@ -161,15 +152,7 @@ class Trained(NamedTuple):
     weights: dict[str, dict[str, Tensor]]
 
 
-def train_official(
-    code: OfficialCode,
-    checkpoint: Checkpoint,
-    image: Tensor,
-    features: Tensor,
-    draws: tuple[Tensor, Tensor, Tensor],
-    steps: int,
-    folder: Path,
-) -> Trained:
+def train_official(code, checkpoint, image, features, draws, steps, folder) -> Trained:
     """Runs ``main`` of the official ``train_repae.py`` for some steps on one batch."""
     script = code["train_repae"]
     weights, process = to_official(checkpoint), OneProcess(time.perf_counter)
@@ -223,9 +206,7 @@ def train_official(
     )
 
 
-def _training_options(
-    code: OfficialCode, checkpoint: Checkpoint, image: Tensor, steps: int, folder: Path
-) -> Namespace:
+def _training_options(code, checkpoint, image, steps, folder):
     """Those of the second stage as published, but without compiling and in full precision."""
     configs, sizes = code.repo / "configs", checkpoint.network("sit").arguments
     options = code["train_repae"].parse_args(["--exp-name", "joint"])
@@ -291,13 +272,7 @@ class _Timer(L.Callback):
         self.seconds.append(self.clock() - self.start)
 
 
-def train_ours(
-    checkpoint: Checkpoint,
-    image: Tensor,
-    features: Tensor,
-    draws: tuple[Tensor, Tensor, Tensor],
-    steps: int,
-) -> Trained:
+def train_ours(checkpoint, image, features, draws, steps) -> Trained:
     """Trains as `train_official` does, by a Trainer with one optimiser and one backward pass."""
     networks: dict[str, Any] = {
         name: checkpoint.network(name).build()
@@ -307,8 +282,6 @@ def train_ours(
     module.draws = PathDraws(*draws)
     timer = _Timer(time.perf_counter)
     batch = {"range_image": image, "feature_grid": features}
-    level = logging.getLogger("lightning.pytorch").level
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # advice on loaders and loggers
         trainer = L.Trainer(
@@ -321,14 +294,9 @@ def train_ours(
             enable_progress_bar=False,
             enable_model_summary=False,
         )
-        trainer.fit(module, DataLoader([batch] * steps, batch_size=None))  # type: ignore[arg-type]
-    logging.getLogger("lightning.pytorch").setLevel(level)
+        trainer.fit(module, DataLoader([batch] * steps, batch_size=None))
     states = {
-        name: NetworkState(
-            checkpoint.network(name).class_path,
-            checkpoint.network(name).init_args,
-            network.state_dict(),
-        )
+        name: replace(checkpoint.network(name), state_dict=network.state_dict())
         for name, network in networks.items()
     }
     content = to_official(Checkpoint(checkpoint.path, checkpoint.stage, states))
