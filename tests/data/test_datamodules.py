@@ -44,13 +44,11 @@ def test_resume_goes_on_with_the_next_batch(tmp_path, data, workers, stop, total
         assert len(set(chain(*epoch))) == 2 * per_epoch
 
 
-def test_order_does_not_depend_on_workers_but_on_the_seed(tmp_path, data, fit):
-    orders = [fit(data(num_workers=w), 6).seen for w in (0, 2)]
-    assert orders[0] == orders[1]
-    assert fit(data(seed=1), 6).seen != orders[0]
+def test_the_order_depends_on_the_seed(data, fit):
+    assert fit(data(seed=1), 5).seen != fit(data(), 5).seen
 
 
-def test_overfit_batches_takes_the_first_scans_again_and_again(tmp_path, data, fit):
+def test_overfit_batches_takes_the_first_scans_again_and_again(data, fit):
     module = fit(data(), 4, overfit_batches=2)
     assert module.seen == [[0, 1], [2, 3], [0, 1], [2, 3]]
 

@@ -72,24 +72,16 @@ def test_a_scan_out_of_range_is_named(tmp_path, projection):
         LidarDataset(scans, projection, RangeCodec())[0]
 
 
-@pytest.fixture
-def scans(tmp_path, make_scans):
-    return find_scans(make_scans(tmp_path / "scans", 5))
-
-
-@pytest.fixture
-def posteriors(tmp_path, scans):
+def test_posteriors_turn_with_the_scan(tmp_path, make_scans, projection):
+    scans = find_scans(make_scans(tmp_path / "scans", 5))
     cache = tensor_cache(tmp_path / "c", "posterior", {"vae": "abc"}, (4, 2, 16))
+    moments = torch.randn(5, 4, 2, 16, generator=torch.Generator().manual_seed(3))
     with cache.writer() as writer:
-        moments = torch.randn(5, 4, 2, 16, generator=torch.Generator().manual_seed(3))
         writer.add([scan.cache_key for scan in scans], moments)
-    return CachedTensors(cache, scans), moments
-
-
-def test_posteriors_turn_with_the_scan(scans, projection, posteriors):
-    sample = LidarDataset(scans, projection, RangeCodec(), posteriors=posteriors[0])[1]
+    posteriors = CachedTensors(cache, scans)
+    sample = LidarDataset(scans, projection, RangeCodec(), posteriors=posteriors)[1]
     seen = View(columns=3, mirrored=False, grid_columns=8).sample(sample)
-    assert torch.equal(seen["posterior_moments"], posteriors[1][1].roll(6, -1))
+    assert torch.equal(seen["posterior_moments"], moments[1].roll(6, -1))
     assert (seen["index"], seen["name"]) == (1, scans[1].name)
 
 

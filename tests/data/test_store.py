@@ -255,6 +255,7 @@ def test_a_torn_line_and_rows_beyond_the_journal_do_not_count(halves, tail):
         (lambda lines: [b"{}\n", *lines[1:]], "KeyError"),
         (lambda lines: [lines[0].replace(b"160", b"1.5"), *lines[1:]], "no whole number"),
         (lambda lines: [*lines, lines[2].replace(b"2}", b"3}")], "fewer than its 4 rows"),
+        (lambda lines: [lines[0].replace(b"drive", b".."), *lines[1:]], "name of scan in line 1"),
     ],
 )
 def test_a_damaged_journal_is_named(halves, change, reason):

@@ -15,7 +15,6 @@ from safetensors.torch import save_file
 
 from r3dpa.data import read_samples
 from r3dpa.data.scans import read_npz
-from r3dpa.data.store import Store
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
 from r3dpa.metrics.official_statistics import OfficialStatistics
@@ -33,14 +32,6 @@ def test_bad_and_good_names():
         assert refuse_name(name), name
     for name in ("a", "a/b", "2013_05_28_drive_0003_sync/0000000000", "..a", "ü 1"):
         assert refuse_name(name) is None
-
-
-def test_journal_of_a_store(tmp_path):
-    (tmp_path / "shard_00000.rows").write_bytes(bytes(8))
-    line = json.dumps({"scan": "../../x", "bytes": 16, "row": 0}) + "\n"
-    (tmp_path / "shard_00000.jsonl").write_text(line)
-    with pytest.raises(ValueError, match=r"shard_00000\.jsonl is damaged .*name of scan in line 1"):
-        Store(tmp_path, "{}", (2,)).places()
 
 
 def test_members_of_archives(tmp_path):

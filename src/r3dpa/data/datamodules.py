@@ -213,7 +213,6 @@ class LidarDataModule(LoaderModule):
         return Path(scans) / "feature_grids" / cast(Extractor, self.extractor).name
 
     def _scans_and_projection(self) -> tuple[list[Scan], list[Scan], Projection]:
-        """Training and held-out scans within ``limit``, and the projection."""
         train, val = self.split()
         projection: Projection = SphericalProjection(self.sensor)
         if self.projection_kind == "rings":

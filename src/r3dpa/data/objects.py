@@ -276,7 +276,6 @@ def object_library(
 
 
 def _wanted(classes: Sequence[str] | None) -> dict[str, int]:
-    """Ids of classes by name."""
     if classes is None:
         return _ID
     if not classes or len(set(classes)) < len(classes):

@@ -140,7 +140,6 @@ def read_samples(
 
 
 def _find(folder: Path) -> list[tuple[str, Path]]:
-    """Names and paths of the sample files of a folder."""
     if not folder.is_dir():
         raise ScanError(f"{folder}: there is no such file or folder")
     ours = (folder / "metadata.json").is_file()

@@ -381,7 +381,6 @@ def check(path: str | Path) -> tuple[str, bool]:
 
 
 def _compare_layout(root: Path, counts: dict[str, int]) -> list[str]:
-    """Lines about missing folders and incomplete drives."""
     raw, simulated = root / RAW, expected_scans(root)
     if not root.exists():
         return [f"missing: {root}"]

@@ -143,7 +143,6 @@ class SceneWriter:
         self._state.unlink()
 
     def _written_before(self) -> tuple[int, int]:
-        """Scenes and evaluations of an interrupted run of the same request."""
         try:
             state = json.loads(self._state.read_text(encoding="utf-8"))
             found, num_done = state["request"], int(state["num_done"])
