@@ -90,9 +90,6 @@ def rewritten(path, checkpoint):
     return path
 
 
-# Writing
-
-
 def test_steps_are_fractions_of_the_training(tmp_path):
     """Of 64 steps: 1/32, 1/16 and 1/8 are 2, 4 and 8."""
     names = run(EMASnapshots(), module(), tmp_path, range(1, 65))
@@ -206,9 +203,6 @@ def test_a_run_of_the_command_line_keeps_and_extends_them(smoke_args, vae_checkp
         "step_0000003.safetensors",
     ]
     assert second.stat().st_mtime_ns == written
-
-
-# Reading
 
 
 def test_a_snapshot_of_the_same_latents_is_used_as_it_is(pair):

@@ -172,8 +172,6 @@ def points(num_points=200, seed=0):
 
 
 class TestView:
-    NAME = "2013_05_28_drive_0003_sync/0000000004"
-
     @pytest.fixture
     def drive(self, tmp_path) -> Path:
         """A drive in the KITTI-360 layout with one scan, its labels and its origins."""
@@ -203,7 +201,7 @@ class TestView:
             assert str(out / name) in text.splitlines()
         for name in written[:2]:
             assert np.asarray(Image.open(out / name)).std() > 10
-        assert names == [self.NAME]
+        assert names == ["2013_05_28_drive_0003_sync/0000000004"]
         assert {"semantic", "instance", "origin"} < set(page["scans"][0]["columns"])
         assert [row[:2] for row in page["categories"]["semantic"]] == [[int(Semantic.CAR), "car"]]
         assert [row[:2] for row in page["categories"]["origin"]] == [[int(Origin.RAIN), "rain"]]

@@ -231,18 +231,6 @@ def test_a_stage_without_velocity_says_so(smoke_args, vae_checkpoint, tmp_path, 
     assert not (tmp_path / "evaluation").exists()
 
 
-def flat(rows):
-    """Every number of every row by name; an interval has two."""
-    return {
-        f"{name} {place}": number
-        for name, row in rows.items()
-        for place, number in enumerate(
-            part for value in row for part in (value if isinstance(value, tuple) else [value])
-        )
-        if number is not None
-    }
-
-
 @pytest.mark.ddp
 @pytest.mark.slow  # two more starts of the command
 def test_two_processes_give_the_numbers_of_one(reference, words, tmp_path):
@@ -253,6 +241,9 @@ def test_two_processes_give_the_numbers_of_one(reference, words, tmp_path):
     two = ["--trainer.devices=2", "--trainer.strategy=ddp"]
     command = [sys.executable, "-m", "r3dpa", *words(tmp_path / "two", *more, *two)]
     subprocess.run(command, check=True, timeout=300, capture_output=True)
-    two, one = (flat(values(tmp_path / name)) for name in ("two", "one"))
+    two, one = (
+        {name: row[0] for name, row in values(tmp_path / run).items() if row[0] is not None}
+        for run in ("two", "one")
+    )
     assert two == pytest.approx(one, rel=1e-5, abs=1e-6, nan_ok=True)
     assert not (tmp_path / "two" / "evaluation" / "sampled").exists()

@@ -26,9 +26,6 @@ def centre_of(picture, colour):
     return np.argwhere(share @ colour > 0.6).mean(axis=0)
 
 
-# Range images
-
-
 def test_range_image_picture_keeps_rows_and_columns_and_enlarges_them():
     range_m = torch.full((8, 32), -1.0)
     range_m[2, 5] = 10.0
@@ -62,9 +59,6 @@ def test_range_images_of_every_float_type_and_empty_where_nan_or_zero():
 def test_encoded_picture_spans_the_bytes_and_rounds_down():
     image = torch.tensor([[-1.3, -1.0, 0.0, 1.0, 1.3]])
     assert viz.encoded_picture(image).tolist() == [[0, 0, 127, 255, 255]]
-
-
-# Points
 
 
 def test_from_above_forward_is_up_and_left_is_left():
@@ -126,9 +120,6 @@ def test_points_refuse_other_columns_and_colours():
     for points, colours in ((torch.ones(4, 2), None), (torch.ones(4, 3), torch.ones(2, 3))):
         with pytest.raises(ValueError, match="give x, y, z and one RGB"):
             viz.birds_eye_picture(points, colours=colours)
-
-
-# Figures
 
 
 def test_scenes_sheet_has_a_row_of_three_pictures_per_scene():
@@ -221,9 +212,6 @@ def test_a_mask_is_drawn_on_grey_and_colours_its_part_alone():
     picture = np.asarray(sheet.axes[0].images[0].get_array(), int)
     assert (np.ptp(picture[:, :8], axis=-1) <= 1).all()
     assert (picture[:, 8:, 0] > picture[:, 8:, 1] + 20).all()
-
-
-# Files
 
 
 def test_saved_pictures_keep_every_pixel_and_figures_their_size(tmp_path):

@@ -45,8 +45,6 @@ class BadBatch:
     @classmethod
     def read(cls, path: Path) -> BadBatch:
         """Reads what :meth:`save` wrote; another or a damaged file is named in a ValueError."""
-        if not path.is_file():
-            raise FileNotFoundError(f"no file {path}; give one of <run_dir>/bad_batches")
         try:
             with safe_open(path, framework="pt") as file:
                 about = json.loads((file.metadata() or {}).get("r3dpa", "{}"))
