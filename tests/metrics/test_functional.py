@@ -164,13 +164,6 @@ def test_every_point_of_the_published_grid_has_a_cell():
     assert cells.tolist() == [0, 2000 * 2000 - 1]
 
 
-def test_histogram_counts_clouds():
-    counts = GRID.histogram([cloud((0.1, 0.1), (0.2, 0.2)), cloud((0.5, 0.5), (-1.5, 0.5))])
-    assert counts[4, 4] == 2
-    assert counts[2, 4] == 1
-    assert counts.sum() == 3
-
-
 def test_histogram_distances_by_hand():
     """Shares (1, 0) and (1/2, 1/2): m = (3/4, 1/4), (ln 4/3 + ln 2/3 / 2 + ln 2 / 2) / 2."""
     result = histogram_distance(torch.tensor([2, 0, 0]), torch.tensor([3, 3, 0]))

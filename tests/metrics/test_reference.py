@@ -67,18 +67,15 @@ def test_moments_and_histograms_are_those_of_all_scans():
     assert torch.equal(metrics["cells"].real_bins.view(100, 100).long(), expected)
 
 
-def names_of_kept(reference, half):
-    places, _ = metrics_of(reference.halves[half])["matching"].kept("real")
-    return [reference.names_of_half(half)[place] for place in places]
-
-
 def test_kept_scans_are_few_and_the_halves_have_different_drives():
     reference = filled()
     drives = [{n.split("/")[0] for n in reference.names_of_half(half)} for half in (0, 1)]
     assert drives[0].isdisjoint(drives[1])
     assert [len(reference.names_of_half(half)) for half in (0, 1)] == [7, 4]
-    kept = [name for half in (0, 1) for name in names_of_kept(reference, half)]
-    images = {scene.name: scene.range_m for scene in scenes()}
+    images, kept = {scene.name: scene.range_m for scene in scenes()}, []
+    for index, half in enumerate(reference.halves):
+        places, _ = metrics_of(half)["matching"].kept("real")
+        kept += [reference.names_of_half(index)[place] for place in places]
     _, stored = whole(reference)["matching"].kept("real")
     for name, image in zip(kept, stored, strict=True):
         assert torch.equal(image, images[name])
