@@ -21,7 +21,6 @@ import pytest
 import wandb
 import yaml
 from resolved_fits import resolved
-from scipy.stats import ttest_1samp
 
 from r3dpa.ablation import budget_of, make_plan, run_plan, write_table
 from r3dpa.ablation import runs as runner
@@ -95,34 +94,34 @@ def test_paper_scale_has_the_networks_of_the_paper():
     assert "1 rgb_pretraining of 1000000 steps, 3 joint" in budget_of(plan)
 
 
-class TestContentOfAStage:
-    def test_given_weights_replace_the_pretraining(self, tmp_path):
-        names = {}
-        for content in (b"one", b"other"):
-            weights = tmp_path / f"{content.decode()}.pt"
-            weights.write_bytes(content)
-            plan = plan_of("demo", rgb_weights=weights)
-            assert all(stage.on_scans for stage in plan.stages)
-            rows = rows_of(plan)
-            stage = rows["table_2", "2_rgb"].stages[0][-1]
-            assert stage.config["model"]["init_args"]["rgb_weights"] == str(weights)
-            assert str(weights) in stage.words
-            for key in ("1_scratch", "3_aligned"):
-                names.setdefault(key, []).append(set(names_of(rows["table_2", key].stages[0])))
-        assert names["1_scratch"][0] == names["1_scratch"][1]
-        assert not names["3_aligned"][0] & names["3_aligned"][1]
+def test_given_weights_replace_the_pretraining(tmp_path):
+    names = {}
+    for content in (b"one", b"other"):
+        weights = tmp_path / f"{content.decode()}.pt"
+        weights.write_bytes(content)
+        plan = plan_of("demo", rgb_weights=weights)
+        assert all(stage.on_scans for stage in plan.stages)
+        rows = rows_of(plan)
+        stage = rows["table_2", "2_rgb"].stages[0][-1]
+        assert stage.config["model"]["init_args"]["rgb_weights"] == str(weights)
+        assert str(weights) in stage.words
+        for key in ("1_scratch", "3_aligned"):
+            names.setdefault(key, []).append(set(names_of(rows["table_2", key].stages[0])))
+    assert names["1_scratch"][0] == names["1_scratch"][1]
+    assert not names["3_aligned"][0] & names["3_aligned"][1]
 
-    def test_settings_of_the_test_do_not_count(self, tmp_path):
-        names = []
-        for new in ("", "--scorer.num_scenes 7", "--data.init_args.num_scans 145"):
-            text = (TABLES / "scale" / "demo.yaml").read_text()
-            text = text.replace("{here}", str(TABLES / "scale"))
-            (tmp_path / "demo.yaml").write_text(text.replace("steps 400", f"steps 400 {new}"))
-            table = TABLES / "table_4"
-            plan = make_plan(table, tmp_path / "demo.yaml", (0,), tmp_path, resolved)
-            names.append(names_of(plan.stages))
-        assert names[0] == names[1]
-        assert not set(names[0]) & set(names[2])
+
+def test_settings_of_the_test_do_not_count(tmp_path):
+    names = []
+    for new in ("", "--scorer.num_scenes 7", "--data.init_args.num_scans 145"):
+        text = (TABLES / "scale" / "demo.yaml").read_text()
+        text = text.replace("{here}", str(TABLES / "scale"))
+        (tmp_path / "demo.yaml").write_text(text.replace("steps 400", f"steps 400 {new}"))
+        table = TABLES / "table_4"
+        plan = make_plan(table, tmp_path / "demo.yaml", (0,), tmp_path, resolved)
+        names.append(names_of(plan.stages))
+    assert names[0] == names[1]
+    assert not set(names[0]) & set(names[2])
 
 
 ROW = {"label": "x", "commands": {"a": "fit joint --preset demo"}}
@@ -187,22 +186,14 @@ def evaluation(extra=None, **values):
     return Evaluation("x", rows, about)
 
 
-class TestSeeds:
-    def test_mean_and_students_interval(self):
-        values = (1.0, 2.0, 4.0)
-        row = mean_of_seeds("row", [evaluation(JSD=v) for v in values]).row("JSD")
-        expected = ttest_1samp(values, 0).confidence_interval()
-        assert row.value == pytest.approx(7 / 3)
-        assert row.interval == pytest.approx((expected.low, expected.high))
-        assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
-
-    def test_a_row_with_fewer_seeds_keeps_what_must_be_known_of_each(self):
-        few = evaluation({"bad_samples": ["7"]}, JSD=2.0)
-        few = replace(few, rows=(replace(few.rows[0], note="few scenes"),))
-        mean = mean_of_seeds("row", [evaluation(JSD=1.0, MMD=2.0), few])
-        assert mean.row("JSD").note == "few scenes"
-        assert mean.row("MMD") is None
-        assert mean.bad_samples == ["7"]
+def test_a_row_with_fewer_seeds_keeps_what_must_be_known_of_each():
+    few = evaluation({"bad_samples": ["7"]}, JSD=2.0)
+    few = replace(few, rows=(replace(few.rows[0], note="few scenes"),))
+    mean = mean_of_seeds("row", [evaluation(JSD=1.0, MMD=2.0), few])
+    assert mean.row("JSD").note == "few scenes"
+    assert mean.row("MMD") is None
+    assert mean.bad_samples == ["7"]
+    assert mean_of_seeds("row", [evaluation(JSD=1.0)]).row("JSD").interval == (0.9, 1.1)
 
 
 @pytest.mark.parametrize(
