@@ -29,12 +29,7 @@ _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # others would convert the 
 
 
 def features(args: list[str]) -> None:
-    """Runs the command with its name and the words after it.
-
-    Raises:
-        ValueError: If an argument is missing or out of its range, or a scan or the store cannot be
-            used; the message names it.
-    """
+    """Runs the command with its name and the words after it."""
     ignore_harmless_warnings()
     parser = features_parser("r3dpa data features")
     config = parser.parse_args(with_data_class(args[1:]))
@@ -100,11 +95,7 @@ def _extract(data: LidarDataModule, trainer: Trainer, sizes: list[tuple[int, int
 
 
 def read_data(source: Path) -> LidarDataModule:
-    """Data module of a folder of scans or a data YAML, without features; simulates its scans.
-
-    Raises:
-        ValueError: If the path is neither.
-    """
+    """Data module of a folder of scans or a data YAML, without features; simulates its scans."""
     parser = features_parser("r3dpa data reference")
     config = parser.parse_args(with_data_class(["--data", str(source)]))
     config.data.init_args.extractor = config.data.init_args.features_dir = None

@@ -44,11 +44,7 @@ _ON_SHEET, _ON_PAGE = 16, 8
 
 
 def read_clouds(path: Path) -> dict[str, NDArray]:
-    """Points ``(P, 3)`` or ``(P, 4)`` of each scan of a ``.bin``, ``.ply`` or ``.npz`` file.
-
-    Raises:
-        ScanError: If the file cannot be used; names it.
-    """
+    """Points ``(P, 3)`` or ``(P, 4)`` of each scan of a ``.bin``, ``.ply`` or ``.npz`` file."""
     if path.suffix == ".npz":
         clouds = read_npz(path)
     elif path.suffix in (".bin", ".ply"):

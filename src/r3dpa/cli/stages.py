@@ -225,11 +225,6 @@ def _with_preset(words: list[str]) -> list[str]:
 
 
 def run(args: list[str]) -> None:
-    """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``.
-
-    Raises:
-        ValueError: If the configuration cannot be used; errors of a running training have the
-            attribute ``during_training``.
-    """
+    """Runs a stage command: ``["fit", "--config", "x.yaml"]``, ``["fit", "joint"]``."""
     ignore_harmless_warnings()
     StageCLI([args[0], *_with_preset(args[1:])])
