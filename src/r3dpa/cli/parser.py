@@ -152,7 +152,7 @@ class SceneOptions:
     batch_size: PositiveInt = 8
     device: str = "auto"
     weights: Literal["ema", "last"] = "ema"
-    formats: tuple[str, ...] = ("bin",)
+    formats: tuple[Literal["bin", "ply", "npz"], ...] = ("bin",)
     pictures: NonNegativeInt = 16
     overwrite: bool = False
 

@@ -22,7 +22,6 @@ from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
 from r3dpa.io import atomic_path, delete_unfinished, no_follow, only_writer
 
-SCENE_FORMATS = ("bin", "ply", "npz")
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
@@ -44,14 +43,14 @@ class SceneWriter:
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
     request and the number of scenes written. At most two batches are in memory. An error of the
     thread is raised by the next :meth:`put`, by :meth:`close`, or at the end of the block.
-    ``ValueError`` if a format is unknown, another process writes to ``out``, or it holds scenes, or
-    unfinished ones of another request.
+    ``ValueError`` if another process writes to ``out``, or it holds scenes, or unfinished ones of
+    another request.
 
     Args:
         out: Folder; one process at a time writes to it.
         num: Number of scenes.
         projection: Projection of the range images.
-        formats: Of :data:`SCENE_FORMATS`.
+        formats: Files of points: ``bin``, ``ply``, ``npz``.
         request: All settings that determine the scenes, as JSON values.
         overwrite: Start anew in a folder that holds scenes, finished or not.
 
@@ -69,9 +68,6 @@ class SceneWriter:
         request: dict[str, Any],
         overwrite: bool = False,
     ) -> None:
-        if unknown := [name for name in formats if name not in SCENE_FORMATS]:
-            known = ", ".join(SCENE_FORMATS)
-            raise ValueError(f"formats must be some of {known}, got {unknown[0]!r}")
         self.out, self.num, self.num_done, self.evaluations = out, num, 0, 0
         self._projection = projection
         self._formats = tuple(formats)
