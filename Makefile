@@ -20,7 +20,7 @@ FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.ya
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
-	test-faults test-torture test-nodes fuzz notebooks demo clean bench bench-training \
+	test-faults test-nodes fuzz notebooks demo clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -57,9 +57,6 @@ test-numerics: $(READY) ## hard numerical cases
 
 test-faults: $(READY) ## kill, fill, cut: what is lost, and what the user sees
 	$(BIN)/pytest tests/faults
-
-test-torture: $(READY) ## 30 bad steps of each stage; exact resume with two processes
-	$(BIN)/pytest tests/modules/test_torture.py tests/modules/test_exact_resume.py
 
 test-nodes: $(READY) ## two nodes on one machine, in network namespaces
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/scale_out
