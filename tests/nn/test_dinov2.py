@@ -36,15 +36,6 @@ def test_features_of_any_grid_are_normalised_and_use_the_image(network):
 
 
 @torch.no_grad()
-def test_constant_positions_stay_constant_when_resized(network):
-    network.pos_embed[:, 1:] = torch.arange(16.0)
-    resized = network._positions((2, 7))
-    assert torch.allclose(resized[:, 1:], torch.arange(16.0).expand(1, 14, 16), atol=1e-5)
-    assert torch.equal(resized[:, 0], network.pos_embed[:, 0])
-    assert network._positions((4, 4)) is network.pos_embed
-
-
-@torch.no_grad()
 def test_weights_are_loaded_strictly(network, tmp_path):
     path = tmp_path / "dinov2.pth"
     torch.save(network.state_dict(), path)

@@ -147,9 +147,9 @@ def test_features_have_unit_norm_and_follow_the_kernel():
     assert error.square().mean().sqrt() < 0.125
 
 
-def test_lift_is_linear_and_the_seed_decides():
+def test_lift_is_linear():
     scans = [wall(), pole(), pole()[:0]]
-    one, other = GeometricFeatures(64), GeometricFeatures(64, seed=1)
+    one = GeometricFeatures(64)
     # As for a loader process.
     prepare = pickle.loads(pickle.dumps(GeometricFeatures(64).prepare))  # noqa: S301
     together = one.point_features([prepare(points) for points in scans])
@@ -157,8 +157,6 @@ def test_lift_is_linear_and_the_seed_decides():
         assert torch.equal(one.lift(features), one(points))
     pooled = one.lift(together[0].mean(dim=0, keepdim=True))
     assert torch.allclose(pooled, one(scans[0]).mean(dim=0, keepdim=True), atol=1e-5)
-    assert not torch.allclose(one(scans[0]), other(scans[0]), atol=0.01)
-    assert one.settings != other.settings
     assert not list(one.parameters())
     assert not one.state_dict()
     with pytest.raises(ValueError, match="dim must be even and at least 2, got 3"):

@@ -5,13 +5,13 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from r3dpa.nn.layers import AttentionBlock, Downsample, GroupNorm, SyncedBatchNorm2d, Upsample
+from r3dpa.nn.layers import AttentionBlock, GroupNorm, SyncedBatchNorm2d, Upsample, downsample
 
 
 @pytest.mark.parametrize("stride", [(1, 2), (1, 4), (2, 1), (2, 2)])
 def test_resampling_changes_the_size_and_commutes_with_rotation(stride):
     small, large = torch.randn(2, 4, 4, 8), torch.randn(2, 4, 4 * stride[0], 8 * stride[1])
-    down, up = Downsample(4, stride), Upsample(4, stride)
+    down, up = downsample(4, stride), Upsample(4, stride)
     assert down(large).shape == small.shape
     assert up(small).shape == large.shape
     columns = 3 * stride[1]

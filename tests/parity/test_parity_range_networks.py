@@ -12,6 +12,7 @@ import torch
 from r3dpa.geometry import LidarSensor
 from r3dpa.nn.backbones import liploc, rangevit
 from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
+from r3dpa.nn.backbones.official import load_strictly, renamed
 from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
 
 STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # no parameters
@@ -150,7 +151,7 @@ def test_liploc_encoder_feature(load_case, pictures, tmp_path, close):
         config["depth"],
         config["num_heads"],
     )
-    liploc.load_official(network, weights)
+    load_strictly(network, weights, renamed(liploc._NAMES))
     range_m = pictures["in/depth"][None]
     close(network(range_m), case["out/feature"])
     # As the authors release it: the whole model, of which the rest has no part in the features.
@@ -167,6 +168,6 @@ def test_liploc_encoder_released_sizes(official_listing):
     with torch.device("meta"):
         network = LIPLoc()
     weights = empty(listing["state_dict"])
-    liploc.load_official(network, weights)
+    load_strictly(network, weights, renamed(liploc._NAMES))
     assert sum(value.numel() for value in network.parameters()) == listing["param_count"]
     assert network.dim == listing["feature_dim"]

@@ -12,10 +12,12 @@ from r3dpa.nn.backbones.minkowski import (
     MinkowskiNet,
     Points,
     corners,
+    official_name,
     scaled_widths,
     to_points,
     to_voxels,
 )
+from r3dpa.nn.backbones.official import load_strictly
 from r3dpa.nn.backbones.sparse import SparseConv, Voxels, pool_voxels, voxelize
 
 NETWORKS = {"minkowskinet": MinkowskiNet, "spvcnn": SPVCNN}
@@ -48,7 +50,7 @@ def network(case, name):
     widths = scaled_widths(config["cr"], config["layer_num"])
     size = {"voxel_m": config["voxel_size"]} if name == "spvcnn" else {}
     network = NETWORKS[name](widths, config["input_dims"], config["num_class"], **size).eval()
-    network.load_official(case.weights())
+    load_strictly(network, case.weights(), official_name)
     return network
 
 
@@ -194,7 +196,7 @@ def test_released_sizes(official_listing, name, rate):
     with torch.device("meta"):
         network = NETWORKS[name](widths)
         weights = {key: torch.empty(shape) for key, shape in listing["state_dict"].items()}
-    network.load_official(weights)
+    load_strictly(network, weights, official_name)
     assert sum(p.numel() for p in network.parameters()) == listing["param_count"]
     assert widths[-1] * 16 == listing["metric_feature_dim"]
     if rate == "0.5":

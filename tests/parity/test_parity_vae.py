@@ -6,7 +6,7 @@ import pytest
 import torch
 from recorded_networks import vae_of
 
-from r3dpa.nn.layers import Downsample, Upsample
+from r3dpa.nn.layers import Upsample, downsample
 from r3dpa.nn.vae import Posterior
 
 
@@ -87,7 +87,7 @@ def strided_layers(case, vae):
     for key in case.keys("in/layer_"):
         image, name = case[key], key.removeprefix("in/layer_")
         stride = tuple(int(size) for size in name.split("x"))
-        down = Downsample(image.shape[1], stride)
+        down = downsample(image.shape[1], stride)
         down.load_state_dict(case.weights(f"w_down_{name}/"))
         up = Upsample(image.shape[1], stride, legacy=True)
         up.load_state_dict(case.weights(f"w_up_{name}/"))

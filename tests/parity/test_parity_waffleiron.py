@@ -19,7 +19,8 @@ from r3dpa.nn.backbones import (
     collate_scans,
     prepare_scan,
 )
-from r3dpa.nn.backbones.point_features import load_official
+from r3dpa.nn.backbones.official import load_strictly
+from r3dpa.nn.backbones.point_features import official_name
 
 # parity/README.md: tokens reach 69, float32 and float64 runs differ by 3.4e-5.
 TOKENS = {"atol": 1e-4, "rtol": 0.0}
@@ -55,7 +56,7 @@ def network(case, grid):
     config = case.config
     network = WaffleIron(config["nb_channels"], config["depth"], grid.cells, config["nb_class"])
     assert network.plane_sizes == [tuple(size) for size in config["grid_shape"]]
-    load_official(network, case.weights())
+    load_strictly(network, case.weights(), official_name)
     return network.eval()
 
 
@@ -147,7 +148,7 @@ def test_released_sizes(official_listing):
     with torch.device("meta"):
         network = WaffleIron(head_dim=config["nb_class"])
         weights = {key: torch.empty(shape) for key, shape in listing["state_dict"].items()}
-    load_official(network, weights)
+    load_strictly(network, weights, official_name)
     assert sum(p.numel() for p in network.parameters()) == listing["param_count"] == 60_222_996
     head = sum(p.numel() for p in network.head.parameters())
     assert listing["param_count"] - head == listing["param_count_without_classif"]

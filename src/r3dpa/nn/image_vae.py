@@ -97,35 +97,23 @@ def _levels(
     resampler: Callable[[int], nn.Module],
 ) -> nn.ModuleList:
     """Levels of the given widths; all but the last end with a resampling layer called ``name``."""
-    before = [widths[0], *widths[:-1]]
-    resamplers = [*[resampler] * (len(widths) - 1), None]
-    return nn.ModuleList(
-        _Level(*level, num_blocks, groups, name)
-        for level in zip(before, widths, resamplers, strict=True)
-    )
+    levels = nn.ModuleList()
+    before = widths[0]
+    for index, width in enumerate(widths):
+        sizes = [(before, width), *[(width, width)] * (num_blocks - 1)]
+        blocks = nn.ModuleList(_ResBlock(*size, groups) for size in sizes)
+        last = index == len(widths) - 1
+        resampling = nn.ModuleList([] if last else [resampler(width)])
+        levels.append(_Level({"resnets": blocks, name: resampling}))
+        before = width
+    return levels
 
 
-class _Level(nn.Module):
-    def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        resampler: Callable[[int], nn.Module] | None,
-        num_blocks: int,
-        groups: int,
-        name: str,
-    ) -> None:
-        super().__init__()
-        self.resnets = nn.ModuleList(
-            _ResBlock(out_channels if index else in_channels, out_channels, groups)
-            for index in range(num_blocks)
-        )
-        self.name = name
-        self.add_module(name, nn.ModuleList([resampler(out_channels)] if resampler else []))
-
+class _Level(nn.ModuleDict):
     def forward(self, hidden: Tensor) -> Tensor:
-        for layer in (*self.resnets, *getattr(self, self.name)):
-            hidden = layer(hidden)
+        for layers in self.values():
+            for layer in layers.children():
+                hidden = layer(hidden)
         return hidden
 
 
@@ -156,11 +144,8 @@ class _ResBlock(nn.Module):
         self.conv1 = nn.Conv2d(in_channels, out_channels, 3, padding=1)
         self.norm2 = nn.GroupNorm(groups, out_channels, _NORM_EPS)
         self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1)
-        self.conv_shortcut = (
-            nn.Identity()
-            if in_channels == out_channels
-            else nn.Conv2d(in_channels, out_channels, 1)
-        )
+        same = in_channels == out_channels
+        self.conv_shortcut = nn.Identity() if same else nn.Conv2d(in_channels, out_channels, 1)
 
     def forward(self, hidden: Tensor) -> Tensor:
         change = self.conv1(F.silu(self.norm1(hidden)))

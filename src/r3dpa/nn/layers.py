@@ -98,17 +98,10 @@ class WideCircularConv2d(CircularConv2d):
             return super().forward(image.to(at_least_float32(self.weight).dtype))
 
 
-class Downsample(nn.Module):
+def downsample(channels: int, stride: Size) -> nn.Sequential:
     """Strided convolution of LiDM, by ``stride`` (1, 2), (1, 4), (2, 1) or (2, 2)."""
-
-    def __init__(self, channels: int, stride: Size) -> None:
-        super().__init__()
-        kernel_size, pads = _DOWNSAMPLE[_supported(stride)]
-        self.conv = CircularConv2d(channels, channels, kernel_size, stride, pads)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """``(B, C, H, W)`` to ``(B, C, H / stride rows, W / stride columns)``."""
-        return self.conv(image)
+    kernel_size, pads = _DOWNSAMPLE[_supported(stride)]
+    return named_layers(conv=CircularConv2d(channels, channels, kernel_size, stride, pads))
 
 
 class Upsample(nn.Module):
@@ -171,11 +164,8 @@ class ResBlock(nn.Module):
         self.conv1 = CircularConv2d(in_channels, out_channels, kernel_size)
         self.norm2 = GroupNorm(out_channels)
         self.conv2 = CircularConv2d(out_channels, out_channels, kernel_size)
-        self.nin_shortcut = (
-            nn.Identity()
-            if in_channels == out_channels
-            else nn.Conv2d(in_channels, out_channels, 1)
-        )
+        same = in_channels == out_channels
+        self.nin_shortcut = nn.Identity() if same else nn.Conv2d(in_channels, out_channels, 1)
 
     def forward(self, image: Tensor) -> Tensor:
         """``(B, in_channels, H, W)`` to ``(B, out_channels, H, W)``."""

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from r3dpa.nn.layers import (
     AttentionBlock,
     CircularConv2d,
-    Downsample,
     GroupNorm,
     ResBlock,
     Upsample,
     WideCircularConv2d,
     at_least_float32,
+    downsample,
 )
 
 Size = tuple[int, int]
@@ -208,7 +208,7 @@ class _Encoder(nn.Module):
         first, last = levels[0][1], levels[-1][1]
         self.conv_in = CircularConv2d(in_channels, first, (3, 3))
         self.down = nn.ModuleList(
-            _Level(level, num_blocks, (3, 3), "downsample", Downsample) for level in levels
+            _Level(level, num_blocks, (3, 3), "downsample", downsample) for level in levels
         )
         self.mid = _Middle(last)
         self.norm_out = GroupNorm(last)

@@ -54,7 +54,6 @@ class GeometricFeatures(nn.Module):
 
     Args:
         dim: Width D of the features, even.
-        seed: Seed of W and Q.
 
     Attributes:
         name: ``"geometric"``.
@@ -71,14 +70,14 @@ class GeometricFeatures(nn.Module):
     frequencies: Tensor
     basis: Tensor
 
-    def __init__(self, dim: int = 768, seed: int = 0) -> None:
+    def __init__(self, dim: int = 768) -> None:
         super().__init__()
         if dim < 2 or dim % 2:
             raise ValueError(f"dim must be even and at least 2, got {dim}.")
         self.dim = dim
-        self.settings: dict[str, Any] = {"seed": seed, "version": 2}
+        self.settings: dict[str, Any] = {"seed": 0, "version": 2}
         width = min(dim, _KERNEL_WIDTH)
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         frequencies = torch.randn(len(CENTRES), width // 2, generator=generator) / _BANDWIDTH
         self.register_buffer("centres", torch.tensor(CENTRES), persistent=False)
         self.register_buffer("spreads", torch.tensor(SPREADS), persistent=False)
@@ -139,11 +138,10 @@ class GeometricFeatures(nn.Module):
         Args:
             prepared: ``(P_i, 9)`` of each scan, as ``prepare`` returns them.
         """
-        return [self._kernel_features(values.to(self.basis.device)) for values in prepared]
-
-    def _kernel_features(self, values: Tensor) -> Tensor:
-        phase = ((values - self.centres) / self.spreads) @ self.frequencies
-        return torch.cat([phase.cos(), phase.sin()], dim=1) / math.sqrt(phase.shape[1])
+        values = ((own.to(self.basis.device) - self.centres) / self.spreads for own in prepared)
+        phases = (own @ self.frequencies for own in values)
+        root = math.sqrt(self.frequencies.shape[1])
+        return [torch.cat([phase.cos(), phase.sin()], dim=1) / root for phase in phases]
 
     def lift(self, values: Tensor) -> Tensor:
         """Linear, norm-preserving map of ``point_features``, or of means of them, to ``dim``."""

@@ -86,7 +86,7 @@ class LIPLoc(nn.Module):
             sizes = _sizes(weights)
             heads = usual_heads(sizes["width"]) if num_heads is None else num_heads
             network = cls(**sizes, num_heads=heads)
-            load_official(network, weights)
+            load_strictly(network, weights, renamed(_NAMES))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         return network
@@ -129,11 +129,6 @@ def wrapped_grey_levels(range_m: Tensor) -> Tensor:
     """
     levels = torch.trunc(range_m.float() * GREY_LEVELS_PER_M)
     return torch.remainder(levels, 256).to(torch.uint8)
-
-
-def load_official(network: LIPLoc, weights: Mapping[str, Tensor]) -> None:
-    """Loads every key of the official encoder, named without ``encoder_lidar.model.``."""
-    load_strictly(network, weights, renamed(_NAMES))
 
 
 def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:

@@ -138,14 +138,10 @@ class MinkowskiNet(nn.Module):
         try:
             weights = _network_weights(read_released(path, _RELEASED))
             network = cls(*_sizes(weights))
-            network.load_official(weights)
+            load_strictly(network, weights, official_name)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         return network
-
-    def load_official(self, weights: Mapping[str, Tensor]) -> None:
-        """Loads every key of an official state dict."""
-        load_strictly(self, weights, official_name)
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
         """Features ``(P, F)`` before the head, in the order of the input.

@@ -155,18 +155,13 @@ class ScaLR(TokenFeatures):
         try:
             weights = _scalr_weights(read_released(path, _RELEASED))
             network = _network_like(weights, grid)
-            load_official(network, weights)
+            load_strictly(network, weights, official_name)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         return cls(network, grid)
 
 
 official_name = renamed(_OFFICIAL_NAMES)
-
-
-def load_official(network: WaffleIron, weights: Mapping[str, Tensor]) -> None:
-    """Loads every key of an official state dict of WaffleIron into a network with a head."""
-    load_strictly(network, weights, official_name)
 
 
 def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:

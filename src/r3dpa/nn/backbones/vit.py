@@ -178,14 +178,13 @@ class DINOv2(nn.Module):
         image = ((image + 1) / 2 - self.mean) / self.std
         image = F.interpolate(image, sides, mode="bicubic")
         tokens = with_class_token(self.cls_token, self.patch_embed["proj"](image))
-        tokens = tokens + self._positions(grid_size)
+        table_size = (self.grid_size, self.grid_size)
+        tokens = tokens + resized_positions(
+            self.pos_embed, table_size, grid_size, "bicubic", antialias=True
+        )
         for block in self.blocks:
             tokens = block(tokens)
         return self.norm(tokens)[:, 1:]
-
-    def _positions(self, grid_size: tuple[int, int]) -> Tensor:
-        table_size = (self.grid_size, self.grid_size)
-        return resized_positions(self.pos_embed, table_size, grid_size, "bicubic", antialias=True)
 
     def _load(self, path: Path) -> None:
         released = "a released dinov2_vit?14_pretrain.pth, without registers"
