@@ -124,14 +124,9 @@ class TestCheckpoints:
         assert "ema_decay: 0.7" in (tmp_path / "config.yaml").read_text()
 
     @pytest.mark.parametrize("option", ["--ckpt_path", "--model.init_args.init_from"])
-    def test_a_missing_or_damaged_file_is_named(self, option, vae_checkpoint, refused, tmp_path):
-        path = tmp_path / "half.ckpt"
+    def test_a_missing_file_is_named(self, option, refused, tmp_path):
+        path = tmp_path / "none.ckpt"
         assert str(path) in refused("joint", option, path, error=FileNotFoundError)
-        data = vae_checkpoint.read_bytes()
-        path.write_bytes(data[: len(data) // 2])
-        message = refused("joint", option, path)
-        assert str(path) in message
-        assert "damaged" in message
 
     @pytest.mark.parametrize("command", ["fit", "predict"])
     def test_a_url_or_a_setting_makes_none_run_code(self, command, smoke_args, tmp_path):

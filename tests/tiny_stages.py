@@ -109,34 +109,39 @@ STAGES = {
 }
 
 
+ARGUMENTS = {
+    "vae": {
+        "latent_channels": 4,
+        "channels": 32,
+        "channel_multipliers": [1, 1],
+        "strides": [[2, 2]],
+        "num_res_blocks": 1,
+    },
+    "sit": {
+        "input_size": [4, 8],
+        "in_channels": 4,
+        "hidden_size": 8,
+        "depth": 2,
+        "num_heads": 2,
+        "alignment_depth": 1,
+        "feature_dim": FEATURE_DIM,
+        "projector_dim": 8,
+    },
+    "discriminator": {"channels": 4, "num_layers": 1},
+    "latent_norm": {"channels": 4},
+}
+
+
 def tiny_sit():
-    return SiT(
-        input_size=(4, 8),
-        in_channels=4,
-        hidden_size=8,
-        depth=2,
-        num_heads=2,
-        alignment_depth=1,
-        feature_dim=FEATURE_DIM,
-        projector_dim=8,
-    )
+    return SiT(**ARGUMENTS["sit"])
 
 
 def stage_module(stage, sit=tiny_sit, **kwargs):
     """A stage with networks for :class:`TinyData`: latents of 4 x 8, grids of 2 x 4."""
     torch.manual_seed(0)
-    networks = {
-        "vae": VAE(
-            latent_channels=4,
-            channels=32,
-            channel_multipliers=(1, 1),
-            strides=((2, 2),),
-            num_res_blocks=1,
-        ),
-        "sit": sit(),
-    }
+    networks = {"vae": VAE(**ARGUMENTS["vae"]), "sit": sit()}
     if stage != "flow_matching":
-        networks["discriminator"] = PatchDiscriminator(channels=4, num_layers=1)
+        networks["discriminator"] = PatchDiscriminator(**ARGUMENTS["discriminator"])
     # A fresh SiT has zero gates and output: no gradient would get past them.
     for parameter in networks["sit"].parameters():
         nn.init.normal_(parameter, std=0.3)

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import torch
 from tiny_stages import (
+    ARGUMENTS,
     QUIET,
     SENSOR,
     NamedData,
@@ -22,27 +23,6 @@ from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli.runs import replay
 
 pytestmark = QUIET
-ARGUMENTS = {
-    "vae": {
-        "latent_channels": 4,
-        "channels": 32,
-        "channel_multipliers": [1, 1],
-        "strides": [[2, 2]],
-        "num_res_blocks": 1,
-    },
-    "sit": {
-        "input_size": [4, 8],
-        "in_channels": 4,
-        "hidden_size": 8,
-        "depth": 2,
-        "num_heads": 2,
-        "alignment_depth": 1,
-        "feature_dim": 6,
-        "projector_dim": 8,
-    },
-    "discriminator": {"channels": 4, "num_layers": 1},
-    "latent_norm": {"channels": 4},
-}
 
 
 def save(module, path):
@@ -50,10 +30,7 @@ def save(module, path):
     for name, arguments in ARGUMENTS.items():
         network = getattr(module, name)
         if network is not None:
-            kind = type(network)
-            networks[name] = NetworkState(
-                f"{kind.__module__}.{kind.__qualname__}", arguments, network.state_dict()
-            )
+            networks[name] = NetworkState.of(network, arguments)
     save_checkpoint(Checkpoint(path, module.stage, networks), path)
     return path
 

@@ -196,22 +196,6 @@ def test_fresh_networks_have_velocity_zero_and_blocks_of_sit_do_nothing():
     assert 0.015 < sit.t_embedder.mlp[0].weight.std() < 0.025
 
 
-def test_position_embedding_is_a_buffer_unless_it_is_to_be_learned():
-    fixed, learned = fresh(SiT), fresh(SiT, learn_pos_embed=True)
-    assert "pos_embed" not in dict(fixed.named_parameters())
-    assert learned.get_parameter("pos_embed").requires_grad
-    assert set(fixed.state_dict()) == set(learned.state_dict())
-    learned.load_state_dict(fixed.state_dict())
-
-
-def test_the_row_for_no_class_is_the_last_one():
-    sit = build(SiT, num_classes=2, class_dropout=True)
-    latents, time = inputs(sit)
-    assert sit.y_embedder.embedding_table.weight.shape == (3, 16)
-    no_class = sit.velocity(latents, time, torch.tensor([2, 2]))
-    assert not torch.equal(no_class, sit.velocity(latents, time, torch.tensor([0, 1])))
-
-
 @pytest.mark.numerics
 def test_token_norm_of_constant_tokens_is_finite():
     sit = build(SiT)
