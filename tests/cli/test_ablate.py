@@ -374,7 +374,6 @@ def test_files_and_text_of_a_table(command, tmp_path, processes, capsys):
     assert r"\bottomrule" in (out / "table_x.tex").read_text()
     stored = json.loads((out / "table_x.json").read_text())
     assert [row["values"] for row in stored["rows"]] == [{"0": {"JSD": 1.0}}] * 2
-    assert list(stored["curves"].values()) == [{"train/loss": [[0, 1], [2.0, 1.0]]}] * 3
 
 
 def test_an_interrupted_training_continues(command, tmp_path, processes):
@@ -525,11 +524,6 @@ def test_two_rows_from_nothing_to_the_tables(command, tmp_path, processes):
     processes.run = main
     main(command[:-2])
     assert processes.kinds() == ALL
-    stored = json.loads((tmp_path / "out" / "table_x.json").read_text())
-    for row in stored["rows"]:
-        vae, flow = (stored["curves"][name] for name in row["stages"]["0"])
-        assert len(vae["train/loss"][0]) == len(vae["train/loss"][1]) == 3
-        assert "train/denoising" in flow
     assert len(list((tmp_path / "out").glob("wandb/offline-run-*/*.wandb"))) == 2
     wandb.teardown()  # else it keeps its settings of now for all tests after this one
 

@@ -11,7 +11,7 @@ from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance
-from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.reference import ReferenceStatistics, cards_of
 from r3dpa.metrics.results import EvaluationTable
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
@@ -30,7 +30,7 @@ def toy(scenes):
     return torch.stack([torch.stack([i.mean(), i.std(), i[5].mean()]) for i in images]) / 20
 
 
-TOY = SceneFeatures("toy", "TOY", 3, CARD, toy)
+TOY = SceneFeatures("toy", 3, CARD, toy)
 
 
 def scenes(seed=0, count=40, noise=0.0):
@@ -48,7 +48,7 @@ def scenes(seed=0, count=40, noise=0.0):
 
 def reference_of(real, protocol=PROTOCOL, spaces=(TOY,)):
     names = [scene.name for scene in real]
-    reference = ReferenceStatistics.prepare(spaces, protocol, names, {"split": "val"})
+    reference = ReferenceStatistics(protocol, cards_of(spaces), names, {"split": "val"})
     reference.update(real, spaces)
     return reference
 

@@ -27,7 +27,7 @@ def features(scenes):
     return torch.stack([torch.stack([i.mean(), i.std(), i[20].mean()]) for i in images]) / 20
 
 
-FRID = SceneFeatures("frid", "FRID", 3, {"in_channels": 4}, features)
+FRID = SceneFeatures("frid", 3, {"in_channels": 4}, features)
 
 
 def scenes(seed, count):

@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.feature_distances import metrics_of
-from r3dpa.metrics.reference import ReferenceStatistics, compute_reference, split_halves
+from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference, split_halves
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -23,7 +23,7 @@ def toy(scenes):
     return torch.stack([torch.stack([s.range_m.mean(), s.range_m.std()]) for s in scenes])
 
 
-TOY = SceneFeatures("toy", "TOY", 2, CARD, toy)
+TOY = SceneFeatures("toy", 2, CARD, toy)
 
 
 def scenes(count=11):
@@ -37,7 +37,7 @@ def scenes(count=11):
 def empty(count=11, spaces=(TOY,), **changes):
     about = {"data": "somewhere", "split": "val", "commit": "c0ffee"}
     names = [scene.name for scene in scenes(count)]
-    return ReferenceStatistics.prepare(spaces, replace(PROTOCOL, **changes), names, about)
+    return ReferenceStatistics(replace(PROTOCOL, **changes), cards_of(spaces), names, about)
 
 
 def filled(count=11):
@@ -109,7 +109,7 @@ def test_halves_are_whole_drives_unless_one_outweighs_the_others(sizes, first):
 def test_as_many_scans_are_kept_as_the_protocol_asks_for(sizes, limit, kept):
     names = [f"{drive}/{i:02d}" for drive, count in enumerate(sizes) for i in range(count)]
     protocol = replace(PROTOCOL, num_samples=limit, num_mmd_references=limit)
-    reference = ReferenceStatistics.prepare([TOY], protocol, names, {})
+    reference = ReferenceStatistics(protocol, cards_of([TOY]), names, {})
     reference.update((EvaluationScene(n, None, torch.full((16, 64), 9.0)) for n in names), [TOY])
     metrics = [*map(metrics_of, reference.halves), whole(reference)]
     wanted = (*kept, sum(kept))

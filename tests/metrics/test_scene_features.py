@@ -134,7 +134,7 @@ def test_gpus_do_not_round_the_factors_of_convolutions():
         return torch.zeros(len(scenes), 2)
 
     before = torch.backends.cudnn.allow_tf32
-    SceneFeatures("toy", "TOY", 2, {}, extract)(seen(1))
+    SceneFeatures("toy", 2, {}, extract)(seen(1))
     assert inside == [(False, True)]
     assert torch.backends.cudnn.allow_tf32 == before
 
@@ -190,6 +190,6 @@ def test_spaces_that_cannot_be_had_are_named(name, ckpt, message):
 
 def test_broken_features_name_the_scene():
     card = {"backbone": "none", "layer": "", "weights": None, "preprocessing": ""}
-    space = SceneFeatures("x", "X", 1, card, lambda scenes: torch.tensor([[0.0], [math.nan]]))
+    space = SceneFeatures("x", 1, card, lambda scenes: torch.tensor([[0.0], [math.nan]]))
     with pytest.raises(ValueError, match="1: its features of X hold NaN"):
         space(seen(2))

@@ -76,11 +76,6 @@ class Table(NamedTuple):
     rows: list[Row]
     orders: list[tuple[str, str, str]]
 
-    @property
-    def chains(self) -> list[list[Stage]]:
-        """Stages of each row and seed."""
-        return [chain for row in self.rows for chain in row.stages.values()]
-
 
 class Plan(NamedTuple):
     """Tables to be made in a folder at a scale, and options of ``r3dpa reference``."""
@@ -95,7 +90,8 @@ class Plan(NamedTuple):
     @property
     def chains(self) -> list[list[Stage]]:
         """Stages of each row and seed."""
-        return [chain for table in self.tables for chain in table.chains]
+        rows = [row for table in self.tables for row in table.rows]
+        return [chain for row in rows for chain in row.stages.values()]
 
     @property
     def stages(self) -> list[Stage]:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shlex
 from collections.abc import Mapping, Sequence
 from itertools import product
-from statistics import fmean
 from typing import Any, Literal, NamedTuple
 
 import torch
 
 from r3dpa import viz
-from r3dpa.ablation.plan import Plan, Stage, Table
+from r3dpa.ablation.plan import Plan, Table
 from r3dpa.io import command, machine, versions
 from r3dpa.metrics.results import (
     Evaluation,
@@ -28,7 +26,6 @@ from r3dpa.metrics.seeds import mean_of_seeds, relative_change
 
 _DISTANCES = ("JSD", "MMD", *(space.upper() for space in SPACES))
 _ALIKE = 0.05  # share; a few times the differences of such rows in the paper
-_POINTS = 100  # at most, of a curve in the JSON file
 
 Results = Mapping[str, Mapping[int, Evaluation]]
 """Evaluations by row and seed; a failed one is missing."""
@@ -77,9 +74,9 @@ def order_results(table: Table, results: Results, metrics: Mapping[str, bool]) -
 def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[str, Results]:
     """Writes ``<table>.md``, ``.tex``, ``.csv`` and ``.json`` from the existing results.
 
-    The first two have the distances, the CSV every metric, and the JSON every seed, the training
-    curves, the orders of the paper and the reasons of failures by name of the job. Returns the
-    table for the terminal, and the evaluations by row and seed.
+    The first two have the distances, the CSV every metric, and the JSON every seed, the orders of
+    the paper and the reasons of failures by name of the job. Returns the table for the terminal,
+    and the evaluations by row and seed.
     """
     results: dict[str, dict[int, Evaluation]] = {row.key: {} for row in table.rows}
     means, lost = [], []
@@ -143,7 +140,6 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
             for row in table.rows
         ],
         "orders": [order._asdict() for order in orders],
-        "curves": {stage.name: _thinned(stage) for chain in table.chains for stage in chain},
         "failed": dict(failed),
     }
     save_text(file.with_suffix(".json"), json.dumps(stored, indent=1) + "\n")
@@ -167,18 +163,6 @@ def _described(table: Table, orders: Sequence[Order]) -> list[str]:
             f"[{low:+.0f}, {high:+.0f}]"
         )
     return [f"Paper: {claim}. Here: {'; '.join(found)}" for claim, found in lines.items()]
-
-
-def _thinned(stage: Stage) -> dict[str, list[list[float]]]:
-    """Steps and values of each loss of a stage: means of up to 100 parts."""
-    found = {}
-    for name, (steps, values) in viz.read_curves(stage.folder).items():
-        if name.startswith(("train/", "val/")):
-            size = math.ceil(len(steps) / _POINTS)
-            starts = range(0, len(steps), size)
-            means = [float(f"{fmean(values[start : start + size]):.5g}") for start in starts]
-            found[name] = [[fmean(steps[start : start + size]) for start in starts], means]
-    return found
 
 
 def log_rows(

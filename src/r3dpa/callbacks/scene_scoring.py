@@ -32,7 +32,7 @@ from r3dpa.metrics.evaluation import (
     load_reference,
     reference_spaces,
 )
-from r3dpa.metrics.reference import ReferenceStatistics, compute_reference
+from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
 from r3dpa.metrics.results import report, save_reports
 from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures
@@ -123,7 +123,7 @@ class SceneScorer(L.Callback):
                 "commit": source_commit(),
             }
             scan_names = [scan.name for scan in scans]
-            statistics = ReferenceStatistics.prepare(spaces, setting, scan_names, about)
+            statistics = ReferenceStatistics(setting, cards_of(spaces), scan_names, about)
         check_counts(self.num_scenes, statistics, spaces, self.allow_few)
         self._job = (statistics, spaces, scans)
 

@@ -47,7 +47,7 @@ def reference(
     from r3dpa.data.scans import evenly, read_scan
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
-    from r3dpa.metrics.reference import ReferenceStatistics, compute_reference
+    from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
     from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
@@ -62,7 +62,8 @@ def reference(
     setting = replace(PROTOCOLS[protocol], sensor=module.sensor)
     found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
-    job = ReferenceStatistics.prepare(found, setting, [scan.name for scan in scans], about)
+    names = [scan.name for scan in scans]
+    job = ReferenceStatistics(setting, cards_of(found), names, about)
 
     def scans_from(start: int) -> Iterator[EvaluationScene]:
         for scan in scans[start:]:

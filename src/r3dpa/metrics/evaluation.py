@@ -87,7 +87,7 @@ def evaluate(
     protocol = reference.protocol
     metrics = scene_metrics(
         protocol,
-        {space.name: (space.label, space.dim) for space in spaces},
+        {space.name: space.dim for space in spaces},
         num_groups=_GROUPS,
         max_images=(None, protocol.num_mmd_samples),
     )
@@ -174,9 +174,8 @@ def scene_distance(
     """
     space, _, kind = name.partition(" ")
     spaces = [] if name in _ROWS else [scene_features(space.lower(), ckpt, protocol, device)]
-    cards = {space.name: (space.label, space.dim) for space in spaces}
     limits = (protocol.num_mmd_references, protocol.num_mmd_samples)
-    metrics = scene_metrics(protocol, cards, max_images=limits)
+    metrics = scene_metrics(protocol, {s.name: s.dim for s in spaces}, max_images=limits)
     for scenes, is_real in ((real, True), (generated, False)):
         usable = usable_scenes((EvaluationScene(*scene) for scene in scenes), protocol)
         for batch, features in with_features(usable, spaces):

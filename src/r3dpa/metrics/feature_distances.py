@@ -40,18 +40,16 @@ _BATCH = 8
 class FeatureMetric(SceneMetric):
     """Moments of all features of width F in float64, and the features of the scenes that are kept.
 
-    ``label`` names the feature space in results, ``space`` is the key of its features if ``update``
-    gets those of several spaces.
+    ``label`` names the feature space in results; in small letters it is the key of its features if
+    ``update`` gets those of several spaces.
     """
 
     real_moments: Tensor
     generated_moments: Tensor
 
-    def __init__(
-        self, num_features: int, label: str = "", space: str = "", max_real: int | None = None
-    ) -> None:
+    def __init__(self, num_features: int, label: str = "", max_real: int | None = None) -> None:
         super().__init__(max_real)
-        self.num_features, self.label, self.space = num_features, label, space
+        self.num_features, self.label = num_features, label
         empty = torch.zeros(1 + num_features + num_features**2, dtype=torch.float64)
         self._add_states("moments", empty, merge_packed)
         self._add_kept(torch.zeros(0, num_features))
@@ -64,7 +62,9 @@ class FeatureMetric(SceneMetric):
     ) -> None:
         """Add ``(N, F)`` features, or such by space; NaN or another width is a ``ValueError``."""
         side = SIDES[not real]
-        values = (features if isinstance(features, Tensor) else features[self.space]).detach()
+        values = (
+            features if isinstance(features, Tensor) else features[self.label.lower()]
+        ).detach()
         added = Moments.of(values, f"{side} features")
         merged = Moments.unpack(getattr(self, f"{side}_moments")).merge(added)
         setattr(self, f"{side}_moments", merged.pack())
@@ -196,15 +196,15 @@ _OF_SPACE = {
 
 def scene_metrics(
     protocol: Protocol,
-    spaces: Mapping[str, tuple[str, int]],
+    spaces: Mapping[str, int],
     num_groups: int = 1,
     max_rows: int | None = None,
     max_images: tuple[int | None, int | None] = (None, None),
 ) -> MetricCollection:
     """All metrics of scenes: ``cells``, ``ranges``, ``matching`` and four for each feature space.
 
-    ``update`` takes ``clouds``, ``range_m``, ``features`` by space, ``names`` and ``real``; see
-    :func:`update_with`.
+    ``spaces`` has the widths by name. ``update`` takes ``clouds``, ``range_m``, ``features`` by
+    space, ``names`` and ``real``; see :func:`update_with`.
     """
     metrics: dict[str, SceneMetric] = {
         "cells": BEVHistogramDistance(protocol.grid, num_groups),
@@ -212,13 +212,10 @@ def scene_metrics(
         "matching": MinimumMatchingDistance(protocol, *max_images),
     }
     groups = [[name] for name in metrics]
-    for name, (label, width) in spaces.items():
-        own = {
-            f"{name}_{kind}": metric(width, label, name, max_rows)
-            for kind, metric in _OF_SPACE.items()
-        }
-        metrics |= own
-        groups.append(list(own))
+    for name, width in spaces.items():
+        for kind, metric in _OF_SPACE.items():
+            metrics[f"{name}_{kind}"] = metric(width, name.upper(), max_rows)
+        groups.append([f"{name}_{kind}" for kind in _OF_SPACE])
     return MetricCollection(dict(metrics), compute_groups=groups)
 
 

@@ -40,6 +40,7 @@ class ReferenceStatistics:
     Attributes:
         halves: Metrics of :func:`scene_metrics` with the real scans of each half. Together they
             keep features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
+        spaces: Cards of the feature spaces, see :func:`cards_of`.
         num_done: Scans added so far.
 
     Raises:
@@ -70,22 +71,11 @@ class ReferenceStatistics:
             self.metrics(max_rows=rows[i], max_images=(images[i], None)) for i in (0, 1)
         )
 
-    @classmethod
-    def prepare(
-        cls,
-        spaces: Sequence[SceneFeatures],
-        protocol: Protocol,
-        names: Sequence[str],
-        about: dict[str, Any],
-    ) -> Self:
-        """Empty statistics of these scans."""
-        return cls(protocol, {space.name: _card(space) for space in spaces}, names, about)
-
     def metrics(self, spaces: Iterable[str] | None = None, **options: Any) -> MetricCollection:
         """Empty metrics of the protocol and of some or all feature spaces."""
-        chosen = self.spaces if spaces is None else {name: self.spaces[name] for name in spaces}
-        cards = {name: (card["label"], card["dim"]) for name, card in chosen.items()}
-        return scene_metrics(self.protocol, cards, **options)
+        chosen = self.spaces if spaces is None else spaces
+        widths = {name: self.spaces[name]["dim"] for name in chosen}
+        return scene_metrics(self.protocol, widths, **options)
 
     def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures] = ()) -> None:
         """Sets the real side of metrics to the scans of both halves."""
@@ -115,7 +105,7 @@ class ReferenceStatistics:
                     f"the reference has no features of {space.name}, only of "
                     f"{', '.join(self.spaces) or 'none'}: choose among these, or compute it again"
                 )
-            theirs, own = self.spaces[space.name], _card(space)
+            theirs, own = self.spaces[space.name], cards_of([space])[space.name]
             differing = [key for key in {**theirs, **own} if theirs.get(key) != own.get(key)]
             if differing:
                 given = ", ".join(f"{k} {own.get(k)} not {theirs.get(k)}" for k in differing)
@@ -256,8 +246,9 @@ def compute_reference(
         return statistics
 
 
-def _card(space: SceneFeatures) -> dict[str, Any]:
-    return {**space.card, "dim": space.dim, "label": space.label}
+def cards_of(spaces: Iterable[SceneFeatures]) -> dict[str, dict[str, Any]]:
+    """What a reference stores of feature spaces, by name."""
+    return {s.name: {**s.card, "dim": s.dim, "label": s.label} for s in spaces}
 
 
 def split_halves(names: Sequence[str]) -> dict[str, int]:

@@ -49,17 +49,20 @@ class SceneFeatures:
 
     Args:
         name: One of :data:`SPACES`.
-        label: Head of the column in tables.
         dim: Width F of the features.
         card: ``backbone``, ``layer``, ``weights`` (SHA-256 or None) and ``preprocessing``.
         extract: Features ``(B, F)`` of scenes that :func:`through_sensor` made.
     """
 
     name: str
-    label: str
     dim: int
     card: dict[str, Any]
     extract: Callable[[Sequence[EvaluationScene]], Tensor]
+
+    @property
+    def label(self) -> str:
+        """Head of the column in tables."""
+        return self.name.upper()
 
     @torch.inference_mode()
     def __call__(self, scenes: Sequence[EvaluationScene]) -> Tensor:
@@ -132,7 +135,7 @@ def range_vit_space(network: RangeViT) -> SceneFeatures:
 
     card = _card(network, "decoder, means of bands of rows", "pixel corners, -1 where empty")
     card["in_channels"] = network.in_channels
-    return SceneFeatures("frid", "FRID", network.dim, card, extract)
+    return SceneFeatures("frid", network.dim, card, extract)
 
 
 def lip_loc_space(network: LIPLoc, protocol: Protocol) -> SceneFeatures:
@@ -147,7 +150,7 @@ def lip_loc_space(network: LIPLoc, protocol: Protocol) -> SceneFeatures:
 
     preprocessing = f"{GREY_LEVELS_PER_M} grey levels a metre, {protocol.liploc_cast} to 8 bits"
     card = _card(network, "mean patch token, normalised", preprocessing)
-    return SceneFeatures("fld", "FLD", network.dim, card, extract)
+    return SceneFeatures("fld", network.dim, card, extract)
 
 
 def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
@@ -171,7 +174,7 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
 
     preprocessing = f"voxels of {voxel_m:g} m, first point, no intensity"
     card = _card(network, f"before the head, means of {NUM_BINS} rings", preprocessing)
-    return SceneFeatures(name, name.upper(), NUM_BINS * network.widths[-1], card, extract)
+    return SceneFeatures(name, NUM_BINS * network.widths[-1], card, extract)
 
 
 def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
@@ -194,7 +197,7 @@ def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
         "preprocessing": f"intensity {_INTENSITY:g} for all points",
         "version": extractor.settings["version"],
     }
-    return SceneFeatures(name, name.upper(), dim, card, extract)
+    return SceneFeatures(name, dim, card, extract)
 
 
 def _card(network: nn.Module, layer: str, preprocessing: str) -> dict[str, Any]:
