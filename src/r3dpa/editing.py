@@ -1,5 +1,6 @@
 """Edits of scans with an unconditional model: inpaint, mix, complete, vary, interpolate.
 
+Arguments outside the ranges that the docstrings state are a ``ValueError``.
 Letters: B scenes, S sources, H beams, W columns, C latent channels, h x w latent size, N tokens,
 F feature width.
 """
@@ -41,9 +42,6 @@ class EditSettings:
         shift: Finer steps near noise (above 1) or data (below 1).
         strength: Length of the guidance term in velocities, in [0, 1]; 0 for none.
         window: First and last time that is guided; 0 data, 1 noise.
-
-    Raises:
-        ValueError: If the solver is unknown or a number out of its range.
     """
 
     solver: str = "midpoint"
@@ -99,9 +97,6 @@ class SceneEditor:
             guided edits would store activations for.
         settings: Solver and guidance.
         batch_size: Scenes made together.
-
-    Raises:
-        ValueError: If ``batch_size`` is below 1 or the networks are half precision.
     """
 
     def __init__(
@@ -212,9 +207,6 @@ class SceneEditor:
             token_weights: ``(S, N)``, see :func:`r3dpa.geometry.regions.sector_weights`.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
-
-        Raises:
-            ValueError: If the shapes do not fit each other or the network.
         """
         times = self.settings.times(1.0)
         stitched = FeatureTarget.stitched([grid[None] for grid in features], token_weights).features
@@ -253,13 +245,10 @@ class SceneEditor:
 
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
-            missing: ``(H, W)`` bool; the scan is not read there.
+            missing: ``(H, W)`` bool, neither empty nor full; the scan is not read there.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
             start: First time, in (0, 1]; 1 discards the interpolation, which only large gaps need.
-
-        Raises:
-            ValueError: If the mask is empty or full.
         """
         check_mask(missing, "mask of what is missing")
         times = self.settings.times(start).tolist()
@@ -303,9 +292,6 @@ class SceneEditor:
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
             start: Time of the noise, in (0, 1]; larger values keep less of the scan.
-
-        Raises:
-            ValueError: If ``start`` is outside.
         """
         times, latents = self.settings.times(start), self.encode(range_m[None])
 
@@ -326,9 +312,6 @@ class SceneEditor:
             first_m: ``(H, W)`` metres, -1 without a return; the first frame is its round trip.
             second_m: Likewise, the last frame.
             frames: How many, at least 2.
-
-        Raises:
-            ValueError: If there are fewer than 2 frames.
         """
         if frames < 2:
             raise ValueError(f"frames must be at least 2, the two scans; got {frames}")

@@ -249,11 +249,8 @@ class SceneGenerator:
         """Draws one scene per index, asynchronously on a GPU.
 
         Args:
-            indices: Numbers of the scenes, or how many: 4 for ``range(4)``.
+            indices: Numbers of the scenes, or how many: 4 for ``range(4)``; at most ``batch_size``.
             seed: Number of the collection.
-
-        Raises:
-            ValueError: If there are more than ``batch_size`` of them.
         """
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)

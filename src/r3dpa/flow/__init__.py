@@ -1,4 +1,7 @@
-"""Flow matching without networks: paths, solvers, guidance and editing over velocity functions."""
+"""Flow matching without networks: paths, solvers, guidance and editing over velocity functions.
+
+Arguments outside the ranges and shapes that the docstrings state are a ``ValueError``.
+"""
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean

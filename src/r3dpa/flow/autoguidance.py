@@ -36,10 +36,6 @@ def autoguided(
         scale: Strength, at least 1; at 1 the result is ``velocity`` itself.
         interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
             waits for a GPU.
-
-    Raises:
-        ValueError: If ``scale`` or ``interval`` is out of range or, when called, the two velocities
-            have different shapes.
     """
     first, last = interval
     if not (math.isfinite(scale) and scale >= 1):
@@ -92,9 +88,6 @@ def renormalised(
         scale: Positive number.
         shift: ``(C,)`` on the device of the latents.
         interpolant: Path of both models.
-
-    Raises:
-        ValueError: If ``scale`` is not positive and finite, or ``shift`` has not one axis.
     """
     if not (math.isfinite(scale) and scale > 0) or shift.dim() != 1:
         raise ValueError(

@@ -50,9 +50,6 @@ def invert(
             :func:`r3dpa.flow.times.ode_times`; a first time below 1 goes part of the way.
         solver: A key of :data:`r3dpa.flow.solvers.ODE_SOLVERS`.
         interpolant: Path of the velocity.
-
-    Raises:
-        ValueError: If the times do not decrease or there is no solver of that name.
     """
     if step_pairs(times)[0][0] < times[-1]:
         raise ValueError(
@@ -86,9 +83,6 @@ def renoised(
             ``(B, 1, h, w)``.
         noise: ``(B, ...)`` standard Gaussian draw.
         interpolant: Path of the velocity.
-
-    Raises:
-        ValueError: If the mask is not bool or does not fit, or the noise has another shape.
     """
     inverted, data = trajectory.states[0], trajectory.states[-1]
     _check_mask(edit_mask, data)
@@ -144,9 +138,6 @@ def spherical_mean(first: Tensor, second: Tensor, share: float) -> Tensor:
         share: In [0, 1].
 
     For parallel or opposite noises it is the straight mean.
-
-    Raises:
-        ValueError: If the shapes differ or the share is outside [0, 1].
     """
     if first.shape != second.shape or not 0 <= share <= 1:
         raise ValueError(
@@ -197,9 +188,6 @@ def pnp_flow_feature(
         times: ``(T,)`` decreasing times from 1 to 0.
         noise: T Gaussian draws ``(B, C, h, w)``, one per time.
         exponent: Step sizes are ``t^exponent``.
-
-    Raises:
-        ValueError: If ``edit_mask`` does not fit the latents or there are not T draws.
     """
     _check_mask(edit_mask, latents)
     draws = list(noise)

@@ -42,9 +42,6 @@ class FeatureTarget:
     Args:
         features: ``(B, N, F)``, any length per vector; a zero vector is a cell without points.
         token_mask: ``(B, N)`` bool, tokens to guide. Default: all.
-
-    Raises:
-        ValueError: If a shape or dtype is wrong.
     """
 
     features: Tensor
@@ -69,9 +66,6 @@ class FeatureTarget:
         Args:
             sources: S features ``(B, N, F)``.
             token_weights: ``(S, N)`` of 0 or above: share of each source in each token.
-
-        Raises:
-            ValueError: If the shapes do not fit or a weight is below 0 or not finite.
         """
         shapes = {tuple(source.shape) for source in sources}
         tokens = next(iter(shapes))[1:2] if len(shapes) == 1 else ()
@@ -138,7 +132,8 @@ class FeatureGuidance:
             ``aligned_pass`` of a network.
         target: What to reach.
         scale: Strength, 0 or above.
-        relative: Measure the strength in velocities rather than in gradients.
+        relative: Measure the strength in velocities rather than in gradients; then ``scale`` is at
+            most ``max_ratio``. Not with ``legacy``.
         interval: First and last time that is guided, in [0, 1]. Shorter ones read the times, which
             waits for a GPU.
         max_ratio: Longest term, see above; infinity for any length.
@@ -150,11 +145,6 @@ class FeatureGuidance:
     Attributes:
         velocity: The velocity function without guidance.
         history: One record per guided evaluation, on the device of the latents.
-
-    Raises:
-        ValueError: If an option is out of its range: ``relative`` takes no scale above
-            ``max_ratio`` and is not ``legacy``. When called, if the projected features have another
-            shape than the target.
     """
 
     def __init__(
@@ -216,11 +206,7 @@ class FeatureGuidance:
         return guided
 
     def term(self, x: Tensor, time: Tensor) -> Tensor:
-        """``scale`` times the gradient ``(B, ...)`` of the energy: the term before its limits.
-
-        Raises:
-            ValueError: If the guidance is relative.
-        """
+        """``scale`` times the gradient ``(B, ...)`` of the energy: the term before its limits."""
         if self._relative:
             raise ValueError("relative guidance has no term without a velocity")
         return self._scale * self._evaluate(x, time)[2]

@@ -40,9 +40,6 @@ class Interpolant:
     Args:
         path: Which path.
 
-    Raises:
-        ValueError: If ``path`` is neither ``linear`` nor ``cosine``.
-
     Example:
         >>> path = Interpolant()
         >>> path.interpolate(torch.tensor([4.0]), torch.tensor([0.0]), torch.tensor([0.25]))
@@ -128,9 +125,6 @@ def sample_time(
         batch_size: Number of samples B.
         kind: Distribution of the times.
         generator: Source of randomness; the draw is made on its device. Default: torch's own.
-
-    Raises:
-        ValueError: If ``kind`` is neither ``uniform`` nor ``lognormal``.
     """
     device = None if generator is None else generator.device
     time = torch.empty(batch_size, device=device, dtype=torch.float32)

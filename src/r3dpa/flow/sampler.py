@@ -87,11 +87,7 @@ class SamplerConfig:
         draws: torch.Generator | Iterable[Tensor],
         interpolant: Interpolant,
     ) -> Tensor:
-        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``.
-
-        Raises:
-            ValueError: If the numbers of the solver do not fit together.
-        """
+        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``."""
         if self.solver == "euler_maruyama":
             return euler_maruyama(
                 velocity,

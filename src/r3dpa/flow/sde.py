@@ -52,10 +52,6 @@ def euler_maruyama(
             step of drift, which for ``eta=1`` removes the noise twice and shrinks detail (data of
             standard deviation 0.1 comes out at 0.077 from t = 0.04).
         change_drift: ``(drift, x, time) -> drift`` applied in every step but the last.
-
-    Raises:
-        ValueError: If ``times`` do not decrease, the ``denoise`` step does not end at 0, ``last``
-            is unknown, ``eta`` is below 0, or the draws do not suffice or have another shape.
     """
     if last not in ("denoise", "mean"):
         raise ValueError(f"last must be 'denoise' or 'mean', got {last!r}")

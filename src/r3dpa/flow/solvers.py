@@ -177,11 +177,7 @@ ODE_SOLVERS: dict[str, Callable[..., Tensor]] = {
 def ode_solver(
     name: str, interpolant: Interpolant = LINEAR, after_step: AfterStep = unchanged
 ) -> OdeSolver:
-    """The solver of that name, for velocities of that path.
-
-    Raises:
-        ValueError: If :data:`ODE_SOLVERS` has none of that name.
-    """
+    """The solver of that name, for velocities of that path."""
     _check_name(name)
     if name in ("dpmpp_2m", "unipc"):
         return partial(ODE_SOLVERS[name], interpolant=interpolant, after_step=after_step)
@@ -189,11 +185,7 @@ def ode_solver(
 
 
 def evaluations(solver: str, steps: int) -> int:
-    """Network evaluations per sample of a solver, known before it runs.
-
-    Raises:
-        ValueError: If there is no solver of that name or no step.
-    """
+    """Network evaluations per sample of a solver, known before it runs."""
     _check_name(solver)
     if steps < 1:
         raise ValueError(f"a solver needs at least one step, got {steps}")
@@ -201,11 +193,7 @@ def evaluations(solver: str, steps: int) -> int:
 
 
 def steps_for(solver: str, nfe: int) -> int:
-    """Largest number of steps of a solver within a number of network evaluations.
-
-    Raises:
-        ValueError: If there is no solver of that name or one step takes more evaluations.
-    """
+    """Largest number of steps of a solver within a number of network evaluations."""
     _check_name(solver)
     steps = {"heun": (nfe + 1) // 2, "midpoint": nfe // 2}.get(solver, nfe)
     if steps < 1:

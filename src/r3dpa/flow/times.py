@@ -19,10 +19,6 @@ def ode_times(num_steps: int, start: float = 1.0, stop: float = 0.0, shift: floa
     above ``start`` goes from data towards noise.
 
     Source: resolution-dependent shift of Stable Diffusion 3 (Esser et al. 2024, eq. 23).
-
-    Raises:
-        ValueError: If there is no step, the times are not two different ones in [0, 1] or the
-            shift is not above 0.
     """
     _check_num_steps(num_steps)
     if not (0 <= start <= 1 and 0 <= stop <= 1) or start == stop:
@@ -41,9 +37,6 @@ def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
 
     The last step is noise-free. Detail finer than about ``last`` standard deviations is lost with
     few steps near the data; 0.005 keeps it.
-
-    Raises:
-        ValueError: If there is no step or ``last`` is not in (0, 1).
     """
     _check_num_steps(num_steps)
     if not 0 < last < 1:
@@ -72,11 +65,7 @@ def batch_time(time: float, x: Tensor) -> Tensor:
 
 
 def per_sample(values: Tensor, x: Tensor) -> Tensor:
-    """``(B,)`` values with the axes of ``x``, to be broadcast.
-
-    Raises:
-        ValueError: If there is not one value per sample.
-    """
+    """``(B,)`` values with the axes of ``x``, to be broadcast."""
     if values.shape != x.shape[:1]:
         raise ValueError(
             f"time must hold one value per sample, shape ({x.shape[0]},), got {tuple(values.shape)}"

@@ -109,11 +109,7 @@ class Autoencoder(nn.Module):
         return rows // self.stride[0], columns // self.stride[1]
 
     def encode(self, image: Tensor) -> Posterior:
-        """Posterior of the raw latents of images ``(B, in_channels, H, W)`` in [-1, 1].
-
-        Raises:
-            ValueError: If the strides do not divide the size.
-        """
+        """Posterior of the raw latents of images ``(B, in_channels, H, W)`` in [-1, 1]."""
         self.latent_size((image.shape[-2], image.shape[-1]))
         return Posterior(self.quant_conv(self.encoder(image)))
 

@@ -71,9 +71,6 @@ class TokenFeatures(nn.Module):
         dim: Width of the features.
         settings: Everything that determines the features, see :class:`r3dpa.data.Extractor`.
         prepare: :class:`PreparedScan` of the points ``(P, 4)`` of one scan; holds no weights.
-
-    Raises:
-        ValueError: If ``network`` has other planes than ``grid``.
     """
 
     name: str
@@ -195,9 +192,6 @@ class WaffleIronS(TokenFeatures):
     Args:
         weights: File written by that training. Default: the one that comes with the package.
         dim: Width D of the features, at least that of the tokens (128 for those shipped).
-
-    Raises:
-        ValueError: If the file cannot be read, or ``dim`` is below the width of the tokens.
     """
 
     mean: Tensor
