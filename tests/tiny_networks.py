@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import torch
 
@@ -61,6 +60,6 @@ def aligned_velocity(velocity, project_features):
             with torch.no_grad():
                 return velocity(x.detach(), time)
 
-        return SimpleNamespace(features=project_features(x, time), velocity=finish)
+        return project_features(x, time), finish
 
     return evaluate

@@ -24,8 +24,6 @@ from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_in
 from r3dpa.geometry.gaps import filled, range_error_m, refined
 from r3dpa.geometry.regions import check_mask, mask_of_tokens, token_mask
 
-__all__ = ["EditResult", "EditSettings", "SceneEditor"]
-
 _FIT_STEPS, _FIT_RATE = 3, 0.05  # of Adam, at each time of a completion
 _FIT_SMOOTH = 0.01  # of encoded range: errors below count by their square
 _FIT_EPS = 0.1  # of the gradient's length: less would make steps of the rounding of small ones

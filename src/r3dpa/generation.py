@@ -16,24 +16,11 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sampler import Quality, SamplerConfig, Solver
+from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
-
-__all__ = [
-    "Autoguidance",
-    "Quality",
-    "SamplerConfig",
-    "SceneBatch",
-    "SceneGenerator",
-    "SceneVAE",
-    "Solver",
-    "scene_indices",
-    "scene_noise",
-    "scene_random",
-]
 
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 

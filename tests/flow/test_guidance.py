@@ -303,11 +303,11 @@ def test_the_velocity_of_an_aligned_pass_is_that_of_the_network():
     for options in ({}, {"alignment_depth": 3}, {"qk_norm": True}):
         sit, x, time = network(**options), noise(), torch.tensor([0.1, 0.5, 0.9])
         leaf = x.clone().requires_grad_()
-        one = sit.aligned_pass(leaf, time)
-        assert torch.equal(one.features, sit.project_features(x, time))
-        assert torch.equal(one.velocity(), sit.velocity(x, time))
-        assert not one.velocity().requires_grad
-        one.features.sum().backward()
+        features, finish = sit.aligned_pass(leaf, time)
+        assert torch.equal(features, sit.project_features(x, time))
+        assert torch.equal(finish(), sit.velocity(x, time))
+        assert not finish().requires_grad
+        features.sum().backward()
         assert leaf.grad.abs().max() > 0
 
 

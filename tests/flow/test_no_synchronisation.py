@@ -11,7 +11,8 @@ from tiny_networks import tiny_networks
 
 from r3dpa.flow import FeatureGuidance, FeatureTarget, heun, ode_times, spherical_mean
 from r3dpa.flow.editing import invert, kept, renoised
-from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, Solver
+from r3dpa.flow.sampler import Solver
+from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)

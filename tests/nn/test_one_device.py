@@ -56,9 +56,9 @@ def backward(*results):
 @pytest.mark.parametrize("make", [sit, unet])
 def test_velocity_networks(make):
     network, latents, time = on_device(make), values(*LATENTS), values(2)
-    aligned = network.aligned_pass(latents, time)
+    features, finish = network.aligned_pass(latents, time)
     table = network.modulations(values(5))
-    backward(*network(latents, time), aligned.features, aligned.velocity())
+    backward(*network(latents, time), features, finish())
     backward(network.project_features(latents, time), network.velocity_at(latents, table[:1]))
     backward(network.halve_().velocity(latents, time))
 

@@ -27,8 +27,8 @@ from r3dpa.bench.problems import (
 )
 from r3dpa.bench.report import Errors, Finding, Row, write_report
 from r3dpa.checkpoints import read_checkpoint
+from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import evaluations, steps_for
-from r3dpa.generation import SamplerConfig, Solver
 from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
 #: Solvers with the shift of their grids.

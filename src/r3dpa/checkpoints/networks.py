@@ -35,23 +35,6 @@ def path_of(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _network_class(class_path: str) -> type[nn.Module]:
-    """The class of a network, looked up inside ``r3dpa.nn`` only."""
-    module_path, _, name = str(class_path).rpartition(".")
-    if f"{module_path}.".startswith(_ALLOWED_PACKAGE):
-        try:
-            found = getattr(importlib.import_module(module_path), name)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"class {class_path!r} does not exist here ({error})") from None
-        is_network = isinstance(found, type) and issubclass(found, nn.Module)
-        if is_network and found.__module__.startswith(_ALLOWED_PACKAGE):
-            return found
-    raise ValueError(
-        f"class {class_path!r} is not allowed: a checkpoint may only name networks defined in "
-        "r3dpa.nn. Edit the class_path if the class was moved; otherwise do not trust the file"
-    )
-
-
 def shapes_of(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     """Shape of each tensor by key."""
     return {key: tuple(value.shape) for key, value in weights.items()}
@@ -99,7 +82,20 @@ class NetworkState:
     @property
     def kind(self) -> type[nn.Module]:
         """The class; raises a ``ValueError`` if it is not one of ``r3dpa.nn``."""
-        return _network_class(self.class_path)
+        module_path, _, name = str(self.class_path).rpartition(".")
+        if f"{module_path}.".startswith(_ALLOWED_PACKAGE):
+            try:
+                found = getattr(importlib.import_module(module_path), name)
+            except (ImportError, AttributeError) as error:
+                raise ValueError(f"class {self.class_path!r} does not exist ({error})") from None
+            is_network = isinstance(found, type) and issubclass(found, nn.Module)
+            if is_network and found.__module__.startswith(_ALLOWED_PACKAGE):
+                return found
+        raise ValueError(
+            f"class {self.class_path!r} is not allowed: a checkpoint may only name networks "
+            "defined in r3dpa.nn. Edit the class_path if the class was moved; otherwise do not "
+            "trust the file"
+        )
 
     @property
     def arguments(self) -> dict[str, Any]:

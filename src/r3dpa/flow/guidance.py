@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -20,19 +20,8 @@ from r3dpa.flow.times import check_interval, per_sample
 _COSINE_EPS = 1e-6
 
 
-class AlignedEvaluation(Protocol):
-    """A network evaluation that has reached the projected features and can be finished."""
-
-    @property
-    def features(self) -> Tensor:
-        """``(B, N, F)`` projected features, differentiable in the latents."""
-
-    @property
-    def velocity(self) -> Callable[[], Tensor]:
-        """Finishes the evaluation: ``(B, ...)``, without a gradient."""
-
-
-AlignedVelocity = Callable[[Tensor, Tensor], AlignedEvaluation]
+Finish = Callable[[], Tensor]
+AlignedVelocity = Callable[[Tensor, Tensor], tuple[Tensor, Finish]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +117,9 @@ class FeatureGuidance:
 
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)`` without guidance.
-        aligned: The same with projected features, see :class:`AlignedEvaluation`: the
-            ``aligned_pass`` of a network.
+        aligned: The same arguments to projected features ``(B, N, F)``, differentiable in the
+            latents, and a function that finishes the evaluation and returns the velocity
+            ``(B, ...)`` without a gradient: the ``aligned_pass`` of a network.
         target: What to reach.
         scale: Strength, 0 or above.
         relative: Measure the strength in velocities rather than in gradients; then ``scale`` is at
@@ -196,8 +186,8 @@ class FeatureGuidance:
         inside = (time >= first) & (time <= last)
         if self._idle or not (everywhere or inside.any()):
             return self.velocity(x, time)
-        evaluation, energy, gradient = self._evaluate(x, time)
-        velocity = evaluation.velocity()
+        finish, energy, gradient = self._evaluate(x, time)
+        velocity = finish()
         term = self._limited(gradient, velocity)
         if not everywhere:
             term = torch.where(per_sample(inside, x), term, 0.0)
@@ -214,17 +204,14 @@ class FeatureGuidance:
     def energy(self, x: Tensor, time: Tensor) -> Tensor:
         """Energy ``(B,)`` of samples, guided or not; not recorded."""
         with torch.no_grad():
-            return self._energy(self._aligned(_at_least_float32(x), time).features)
+            return self._energy(self._aligned(_at_least_float32(x), time)[0])
 
     @property
     def corrector_velocity(self) -> Velocity:
-        """Velocity of Heun's second slope: guided, but for ``legacy``."""
+        """Velocity of Heun's second slope and of the SDE drift: guided, but for ``legacy``."""
         return self.velocity if self._legacy else self
 
-    @property
-    def sde_velocity(self) -> Velocity:
-        """Velocity that the SDE drift is made of: guided, but for ``legacy``."""
-        return self.velocity if self._legacy else self
+    sde_velocity = corrector_velocity
 
     @property
     def change_drift(self) -> DriftChange | None:
@@ -244,17 +231,17 @@ class FeatureGuidance:
         self._record(energy, drift, term)
         return drift + per_sample(time, x) * term
 
-    def _evaluate(self, x: Tensor, time: Tensor) -> tuple[AlignedEvaluation, Tensor, Tensor]:
-        """Unfinished evaluation, energies ``(B,)`` and their gradient ``(B, ...)``."""
+    def _evaluate(self, x: Tensor, time: Tensor) -> tuple[Finish, Tensor, Tensor]:
+        """Rest of the evaluation, energies ``(B,)`` and their gradient ``(B, ...)``."""
         with torch.inference_mode(False), torch.enable_grad():
             leaf = _at_least_float32(x.detach().clone()).requires_grad_()
             # A view: module hooks, such as those of torch's FLOP counter, take no leaf.
-            evaluation = self._aligned(leaf.view_as(leaf), time.clone())
-            energy = self._energy(evaluation.features)
+            features, finish = self._aligned(leaf.view_as(leaf), time.clone())
+            energy = self._energy(features)
             (gradient,) = torch.autograd.grad(energy.sum(), leaf)
         finite = gradient.flatten(1).isfinite().all(dim=1)
         self._num_dropped += (~finite).sum()
-        return evaluation, energy.detach(), torch.where(per_sample(finite, x), gradient, 0.0)
+        return finish, energy.detach(), torch.where(per_sample(finite, x), gradient, 0.0)
 
     def _energy(self, features: Tensor) -> Tensor:
         if features.shape != self._target.shape:

@@ -6,12 +6,11 @@ from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE, Posterior
-from r3dpa.nn.velocity_network import EMA, AlignedPass, VelocityNetwork, VelocityOutput
+from r3dpa.nn.velocity_network import EMA, VelocityNetwork, VelocityOutput
 
 __all__ = [
     "EMA",
     "VAE",
-    "AlignedPass",
     "ImageVAE",
     "LatentNorm",
     "PatchDiscriminator",

@@ -170,14 +170,10 @@ class UNet(VelocityNetwork):
                     layer.bfloat16()
         return self
 
-    @property
-    def _narrow(self) -> torch.dtype:
-        """Dtype of the activations between the first and the last layer: bfloat16 once halved."""
-        return self.middle_block.get_parameter("0.in_layers.2.weight").dtype
-
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
         hidden = self.ape(self.input_layer(latents, modulations))
-        kept = [hidden.to(self._narrow)]
+        narrow = self.middle_block.get_parameter("0.in_layers.2.weight").dtype  # after halve_
+        kept = [hidden.to(narrow)]
         for block in self.input_blocks[1:]:
             kept.append(block(kept[-1], modulations))
         return self.middle_block(kept[-1], modulations), *kept

@@ -30,13 +30,6 @@ class VelocityOutput(NamedTuple):
     features: Tensor
 
 
-class AlignedPass(NamedTuple):
-    """Features ``(B, N, F)`` and a function that returns the velocity ``(B, C, h, w)``."""
-
-    features: Tensor
-    velocity: Callable[[], Tensor]
-
-
 class VelocityNetwork(nn.Module, ABC):
     """Network with two heads: velocity of the latents, and features at an inner depth (REPA).
 
@@ -90,11 +83,11 @@ class VelocityNetwork(nn.Module, ABC):
 
     def aligned_pass(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
-    ) -> AlignedPass:
-        """Features with a gradient and the velocity without one, from a single evaluation.
+    ) -> tuple[Tensor, Callable[[], Tensor]]:
+        """Features ``(B, N, F)``, and a function that returns the velocity ``(B, C, h, w)``.
 
-        Feature guidance needs both: layers up to the aligned depth run forward and backward, the
-        others forward only.
+        Feature guidance needs both, the velocity without a gradient: layers up to the aligned depth
+        run forward and backward, the others forward only.
         """
         self._check(latents, time)
         modulations = self.modulations(time, labels)
@@ -106,7 +99,7 @@ class VelocityNetwork(nn.Module, ABC):
             with torch.no_grad():
                 return self._finish(detached, constant)
 
-        return AlignedPass(self._project(activations[0]), velocity)
+        return self._project(activations[0]), velocity
 
     def velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
         """Velocity ``(B, C, h, w)`` from precomputed modulations.
