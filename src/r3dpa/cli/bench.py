@@ -123,7 +123,12 @@ def ablate(
 
     if not tables.is_dir() and (conf_folder().parent / tables).is_dir():
         tables = conf_folder().parent / tables
-    scale_file = _scale_file(tables, scale)
+    if not tables.is_dir():
+        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
+    scale_file = Path(scale)
+    if scale_file.suffix not in (".yaml", ".yml"):
+        folder = tables if (tables / "scale").is_dir() else tables.parent
+        scale_file = folder / "scale" / f"{scale}.yaml"
     folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
     plan = ablation.make_plan(tables, scale_file, seeds, folder, _resolved, rgb_weights)
@@ -143,17 +148,6 @@ def ablate(
     _say(f"tables: {', '.join(str(file) for file in files if file.is_file()) or 'none'}")
     if failed:
         sys.exit(1)
-
-
-def _scale_file(tables: Path, scale: str) -> Path:
-    """The YAML file of a scale: itself, or by its name in the folder of the tables."""
-    if not tables.is_dir():
-        raise ValueError(f"{tables}: is no folder; give that of a table, or of several")
-    if Path(scale).suffix in (".yaml", ".yml"):
-        return Path(scale)
-    near = [folder / "scale" for folder in (tables, tables.resolve().parent)]
-    place = next((folder for folder in near if folder.is_dir()), near[-1])
-    return place / f"{scale}.yaml"
 
 
 def _resolved(command: str) -> dict[str, Any]:

@@ -154,7 +154,7 @@ def complete(
 
     import torch
 
-    from r3dpa.cli.edit_session import EditSession, held_out_errors
+    from r3dpa.cli.edit_session import EditSession
     from r3dpa.geometry import SphericalProjection, regions
 
     session = EditSession(EditOptions(**options), num)
@@ -187,15 +187,9 @@ def complete(
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
     run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
-    return session.write(
-        "complete",
-        arguments,
-        {f"scan {scan.stem}": source, "known part": known},
-        partial(run, start=start),
-        missing,
-        ("kept", "missing"),
-        measure=partial(held_out_errors, range_m=source.range_m, missing=missing),
-    )
+    run = partial(run, start=start)
+    scans = {f"scan {scan.stem}": source, "known part": known}
+    return session.write("complete", arguments, scans, run, missing, ("kept", "missing"))
 
 
 def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any) -> str:

@@ -120,13 +120,11 @@ class EditSession:
         parts: Tensor | None = None,
         part_names: Sequence[str] = (),
         guided: bool = False,
-        measure: Callable[[Tensor], dict[str, Any]] = lambda _: {},
     ) -> str:
         """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
         ``arguments`` are its own options, for the metadata; ``parts`` ``(H, W)`` says to which of
-        the named parts each pixel belongs; ``measure`` gives errors of results ``(B, H, W)`` by
-        method, where the scan was held out.
+        the named parts each pixel belongs.
         """
         options, settings = self.options, asdict(self.settings)
         if not guided:
@@ -157,8 +155,9 @@ class EditSession:
                 "vae_error_m": result.vae_error_m,
                 "round_trip_m": result.round_trip_m,
             }
-            if held_out := measure(result.range_m):
-                request["held_out"] = held_out
+            if command == "complete" and parts is not None:
+                whole = next(iter(scans.values())).range_m
+                request["held_out"] = _held_out_errors(result.range_m, whole, parts)
             writer.finish(request)
         return (
             f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
@@ -214,7 +213,7 @@ class EditSession:
             temporary.write_text(page, "utf-8")
 
 
-def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
+def _held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
     """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
 
     Ranges are compared where the scan and all methods have a return; empty without any there.

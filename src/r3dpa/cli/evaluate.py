@@ -163,12 +163,9 @@ def _made_with(samples: Path) -> dict[str, Any]:
 def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     """Compare scans with real ones, each measure beside the distance between real drives.
 
-    A reference of a single drive is split in two halves in time, which gives a lower floor than two
-    drives would; a note below the table says so.
-
     Args:
         scans: Folder of ``.bin`` scans (A); one drive per folder.
-        reference: Folder of real scans (B), of two or more drives; a single one is halved.
+        reference: Folder of real scans (B); a single drive gives no floor.
         out: JSON file for the table.
     """
     from tqdm import tqdm
@@ -178,29 +175,20 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from r3dpa.metrics import ScanStatistics, realism_table, scan_statistics
 
     check_file(out)
-    statistics, notes = {}, []
+    statistics: list[dict[str, ScanStatistics]] = []
     for name, source in (("A", scans), ("B", reference)):
-        found = find_scans(source)
-        notes.append(f"{name}: {source}")
-        drives = [scan.drive for scan in found]
-        if name == "B" and len(found) == 1:
-            notes.append("B is a single scan: there is no floor; give a reference of two drives")
-        elif name == "B" and len(set(drives)) == 1:
-            middle = len(found) // 2
-            drives = ["first half"] * middle + ["second half"] * (len(found) - middle)
-            notes.append(
-                "B is a single drive: the floor compares its first half with its second one, which "
-                "are more alike than two drives; all ratios come out too high"
-            )
         of_drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-        for scan, drive in zip(tqdm(found, name, unit="scan", disable=None), drives, strict=True):
+        for scan in tqdm(find_scans(source), name, unit="scan", disable=None):
             points = read_scan(scan.path)
             try:
-                of_drives[drive] += scan_statistics(points)
+                of_drives[scan.drive] += scan_statistics(points)
             except ValueError as error:
                 raise ScanError(f"{scan.path}: {error}") from error
-        statistics[name] = of_drives
-    table = realism_table(statistics["A"], statistics["B"], notes)
+        statistics.append(of_drives)
+    notes = [f"A: {scans}", f"B: {reference}"]
+    if len(statistics[1]) == 1:
+        notes.append("B is a single drive: there is no floor; give a reference of two drives")
+    table = realism_table(statistics[0], statistics[1], notes)
     if out is not None:
         with atomic_path(out) as temporary:
             temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")

@@ -20,8 +20,14 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
 
 
-class OneLineErrors(ArgumentParser):
-    """Parser that reports what is wrong in one line."""
+class Parser(ArgumentParser):
+    """Parser with errors in one line; ``--quick`` stands for ``--quick true``."""
+
+    def add_argument(self, *args: Any, **kwargs: Any) -> Any:
+        """Adds an argument; boolean ones need no value."""
+        if kwargs.get("type") is bool:
+            kwargs |= {"nargs": "?", "const": True}
+        return super().add_argument(*args, **kwargs)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Prints the message and exits with status 2; parsers of nested classes raise it."""
@@ -44,16 +50,6 @@ def _short(message: str) -> str:
         message = f"{head}{found[0] if found else 'cannot be used'} (got {value})"
     message = re.sub(r'Parser key "([^"]+)": ', r"--\1: ", " ".join(message.split()).rstrip("."))
     return re.sub(r"Expected an? <class '(\w+)'>", r"expected \1", message)
-
-
-class Parser(OneLineErrors):
-    """Parser of a function; ``--quick`` stands for ``--quick true``."""
-
-    def add_argument(self, *args: Any, **kwargs: Any) -> Any:
-        """Adds an argument; boolean ones need no value."""
-        if kwargs.get("type") is bool:
-            kwargs |= {"nargs": "?", "const": True}
-        return super().add_argument(*args, **kwargs)
 
 
 def _with_lists(parser: Parser, words: Sequence[str]) -> list[str]:

@@ -18,7 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.cli.parser import OneLineErrors
+from r3dpa.cli.parser import Parser
 from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
 from r3dpa.modules import GenerativeModule
 
@@ -35,7 +35,7 @@ _HARMLESS = (
 )
 
 
-class StageParser(OneLineErrors, LightningArgumentParser):
+class StageParser(Parser, LightningArgumentParser):
     """Parser of stages and data modules."""
 
 
@@ -197,9 +197,8 @@ class StageCLI(LightningCLI):
 
 def _newest(run_dir: Path) -> str | None:
     """The checkpoint of a run that was written last; None if there is none."""
-    found = (run_dir / "checkpoints").glob("*.ckpt")
-    whole = [path for path in found if not path.name.startswith(".")]
-    return str(max(whole, key=lambda path: path.stat().st_mtime_ns)) if whole else None
+    found = list((run_dir / "checkpoints").glob("[!.]*.ckpt"))
+    return str(max(found, key=lambda path: path.stat().st_mtime_ns)) if found else None
 
 
 def _with_preset(words: list[str]) -> list[str]:
