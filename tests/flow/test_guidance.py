@@ -285,20 +285,6 @@ def test_a_network_without_guidance_is_the_unguided_sampler_bit_by_bit(solver):
     assert (guided[0] - plain[0]).abs().max() > 0.01
 
 
-@pytest.mark.parametrize(
-    ("solver", "relative"), [("heun", False), ("unipc", True), ("euler_maruyama", True)]
-)
-def test_guided_samples_do_not_depend_on_their_batch(solver, relative):
-    sit, x = network(), noise()
-    mask = torch.rand(3, 8, generator=torch.Generator().manual_seed(5)) > 0.5
-    options = {"scale": 0.8 if relative else 20.0, "relative": relative}
-    together = solve(solver, guidance_of(sit, mask, **options), x)
-    guidance = guidance_of(sit, mask[:1], batch=1, **options)
-    alone = solve(solver, guidance, x[:1])
-    torch.testing.assert_close(together[:1], alone, atol=1e-4, rtol=1e-4)  # rounding, amplified
-    assert (alone - solve(solver, sit.velocity, x[:1])).abs().max() > 0.02
-
-
 def test_the_velocity_of_an_aligned_pass_is_that_of_the_network():
     for options in ({}, {"alignment_depth": 3}, {"qk_norm": True}):
         sit, x, time = network(**options), noise(), torch.tensor([0.1, 0.5, 0.9])

@@ -51,15 +51,9 @@ def test_sde_drift_is_changed_in_every_step_but_the_last():
     assert result.item() == pytest.approx((-5) - 0.25 * (-5 + 10))
 
 
-def test_sde_noise_is_given_or_drawn_from_a_generator():
-    x, times = standard_noise(2, 3), sde_times(4)
-    generator = torch.Generator().manual_seed(5)
-    draws = torch.randn(3, 2, 3, generator=generator, dtype=torch.float64)
-    given = euler_maruyama(growth, x, times, draws)
-    assert torch.equal(given, euler_maruyama(growth, x, times, list(draws)))
-    one, same = (
-        euler_maruyama(growth, x, times, torch.Generator().manual_seed(5)) for _ in range(2)
-    )
+def test_sde_noise_repeats_with_its_generator():
+    generators = [torch.Generator().manual_seed(5) for _ in range(2)]
+    one, same = (euler_maruyama(growth, standard_noise(2, 3), sde_times(4), g) for g in generators)
     assert torch.equal(one, same)
 
 

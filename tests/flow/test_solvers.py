@@ -118,28 +118,6 @@ def test_adams_bashforth_integrates_polynomials_on_uneven_grids(solver, degree, 
     )
 
 
-def test_adams_bashforth_on_a_uniform_grid_has_the_textbook_weights():
-    """Weights 3/2, -1/2 and 23/12, -16/12, 5/12; read from a velocity that is 1 at one time."""
-
-    def weights(solver, steps):
-        times = ode_times(steps, 0.0, 1.0)
-
-        def pulse(at):
-            return lambda x, time: (time == times[at]).double()[:, None]
-
-        start = torch.zeros(1, 1).double()
-        before = times[:-1]
-        return [
-            (steps * (solver(pulse(at), start, times) - solver(pulse(at), start, before))).item()
-            for at in range(steps)
-        ]
-
-    assert weights(ab2, 4) == pytest.approx([0, 0, -1 / 2, 3 / 2], abs=1e-12)
-    assert weights(ab3, 5) == pytest.approx([0, 0, 5 / 12, -16 / 12, 23 / 12], abs=1e-12)
-    # The second step of AB3 is one of AB2 and amends the first from Euler's to the trapezoidal.
-    assert weights(ab3, 2) == pytest.approx([-1 / 2 - 1 / 2, 3 / 2 + 1 / 2])
-
-
 def published(velocity, x, times, interpolant, correct):
     """DPM-Solver++(2M) and UniPC-2 (B_2) as published: h, phi and the linear system of UniC.
 
