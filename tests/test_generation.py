@@ -241,20 +241,6 @@ def test_samplers_that_cannot_be_are_refused(options, message):
         SamplerConfig(**options)
 
 
-@pytest.mark.parametrize("encoding", ["linear", "log2"])
-def test_ranges_are_empty_or_within_the_limits(encoding):
-    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(encoding), (2, 8))
-    scenes = generator(geometry=geometry).generate(range(3))
-    assert scenes.range_m.shape == (3, SENSOR.beams, SENSOR.columns)
-    assert scenes.latents.shape == (3, *LATENT_SHAPE)
-    assert scenes.range_m.dtype == torch.float32
-    empty = scenes.range_m == -1
-    inside = (scenes.range_m > SENSOR.range_min_m) & (scenes.range_m < SENSOR.range_max_m)
-    assert (empty | inside).all()
-    assert empty.any()
-    assert inside.any()
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("sampler", [ODE, SDE], ids=["ode", "sde"])

@@ -79,13 +79,6 @@ class TestInpaint:
         assert result.nfe == 10
         assert len(calls) == 10 + 5  # and the way back without an edit, which is measured
 
-    def test_the_round_trip_shrinks_with_the_steps(self, generator, scan):
-        few, many = (
-            SceneEditor(generator, EditSettings(steps=n)).inpaint(scan, MASK, [0]).round_trip_m
-            for n in (2, 12)
-        )
-        assert many < few / 4
-
     def test_masks_that_leave_nothing_are_refused(self, editor, scan):
         for mask in (torch.zeros(16, 64, dtype=torch.bool), torch.ones(16, 64, dtype=torch.bool)):
             with pytest.raises(ValueError, match=r"selects (nothing|all)"):
@@ -169,11 +162,6 @@ class TestVaryAndInterpolate:
             for start in (0.1, 0.5, 1.0)
         ]
         assert far[0] < far[1] < far[2]
-
-    def test_all_noise_forgets_the_scan(self, editor, scan):
-        one = editor.vary(scan, [0], start=1.0).latents
-        other = editor.vary(torch.full_like(scan, 9.0), [0], start=1.0).latents
-        assert one.equal(other)
 
     def test_the_ends_come_back_and_the_middle_lies_between(self, generator, scan):
         editor = SceneEditor(generator, EditSettings(steps=24))

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -9,7 +7,6 @@ from r3dpa.nn.backbones import (
     ScaLR,
     WaffleIron,
     feature_source,
-    point_features,
 )
 from r3dpa.nn.backbones.point_features import official_name
 
@@ -31,13 +28,6 @@ def test_each_name_gives_its_extractor(scalr_file):
         assert (source.name, source.dim) == (name, 4)
     assert feature_source("geometric").dim == 768
     assert feature_source("scalr", str(scalr_file), 4).settings["weights"]
-
-
-def test_waffleiron_s_takes_weights_or_has_its_own(monkeypatch):
-    """With a stand-in for the network, whose weights are not part of this test."""
-    monkeypatch.setattr(point_features, "WaffleIronS", lambda weights, dim: (weights, dim))
-    assert feature_source("waffleiron-s") == (None, 768)
-    assert feature_source("waffleiron-s", "a.safetensors", 64) == (Path("a.safetensors"), 64)
 
 
 def test_refused_names_and_checkpoints(scalr_file):

@@ -83,10 +83,8 @@ def read_checkpoint(
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool = False) -> Path:
     """Writes ``<name>.safetensors`` (all weights) and ``<name>.yaml`` (everything else).
 
-    Both appear complete or not at all; the second holds the hash of the first. Returns ``path``.
-
-    Raises:
-        ValueError: If the name ends otherwise or the files exist.
+    Both appear complete or not at all; the second holds the hash of the first. Files that
+    exist are a ``ValueError`` without ``overwrite``. Returns ``path``.
     """
     path = Path(path)
     if path.suffix != ".safetensors":

@@ -127,11 +127,7 @@ class NetworkState:
         return network
 
     def checked(self, name: str = "") -> NetworkState:
-        """This state, once class and arguments fit the weights; allocates no memory.
-
-        Raises:
-            ValueError: As :meth:`build`, starting with ``name``.
-        """
+        """This state; a ``ValueError`` as of :meth:`build`, but without memory for weights."""
         try:
             with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
                 network = self.new()

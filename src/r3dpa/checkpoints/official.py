@@ -140,9 +140,6 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
 
     The statistics of ``ema`` are those of ``latent_norm`` if the checkpoint has no others. Without
     the options of an official run, ``args`` is made from the arguments of the networks.
-
-    Raises:
-        ValueError: If a network has no official counterpart.
     """
     content: dict[str, Any] = {}
     for key, (sit_name, norm_name) in _SIT_NETWORKS.items():
