@@ -34,7 +34,9 @@ READERS = {
         f"fit {key}": lambda ckpt, out, scans, key=key: fit_words(scans, out, key, ckpt)
         for key in ("--ckpt_path", "--model.init_args.init_from")
     },
+    "test": lambda ckpt, out, scans: ["test", *fit_words(scans, out, "--ckpt_path", ckpt)[1:]],
     "sample": lambda ckpt, out, scans: ["sample", "--ckpt", ckpt, "--out", out],
+    "convert": lambda ckpt, out, scans: ["convert", ckpt, out.with_suffix(".safetensors")],
 }
 
 

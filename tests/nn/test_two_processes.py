@@ -88,6 +88,10 @@ def test_synced_batch_norm(processes, offset, tolerance):
         for result in (first, second):
             ours = result[2][key].to(value.dtype)
             torch.testing.assert_close(ours, value, atol=1e-6, rtol=1e-6)
+    values = image.detach().float().transpose(0, 1).flatten(1)
+    one_pass = values.square().mean(1) - values.mean(1).square()
+    off = (one_pass / values.var(1, correction=0) - 1).abs().max()
+    assert offset == 0 or off > 0.01
 
 
 def test_evaluation_uses_the_running_statistics(processes):

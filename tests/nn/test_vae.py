@@ -52,6 +52,9 @@ def test_kl_of_half_precision_moments_is_finite():
 @pytest.mark.numerics
 def test_empty_scan_and_far_latents_are_finite_in_bf16(vae):
     image = torch.full((1, 1, 8, 64), -1.0)
+    torch.nn.init.zeros_(vae.encoder.conv_in.weight)  # the bias alone: constant channels
+    hidden = vae.encoder.conv_in(image).flatten(2)
+    assert ((hidden - hidden.mean(2, keepdim=True)) / hidden.std(2, keepdim=True)).isnan().any()
     with torch.autocast("cpu", torch.bfloat16):
         posterior = vae.encode(image)
         decoded = vae.decode(10 * torch.randn(1, 4, 2, 8))

@@ -203,6 +203,8 @@ def test_features_whose_squares_are_infinite_still_guide(dtype):
     term = guidance_of(1.0, tokens).term(x, time)
     assert (term.flatten(1).norm(dim=1) > 0.01).all()
     torch.testing.assert_close(guidance_of(1.0, large).term(x, time), term, atol=1e-4, rtol=1e-3)
+    far_target = guidance_of(1.0, tokens, length=2.0**70)
+    torch.testing.assert_close(far_target.term(x, time), term, atol=1e-4, rtol=1e-3)
     squares = large(x, time).float().square().sum(dim=-1, keepdim=True)
     assert (large(x, time).float() * squares.rsqrt() == 0).all()
 

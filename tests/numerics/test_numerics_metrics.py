@@ -9,9 +9,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import jensenshannon
 from tiny import drawn
 
-from r3dpa.metrics import FrechetDistance, RangeHistogramDistance
+from r3dpa.metrics import BEVHistogramDistance, FrechetDistance, RangeHistogramDistance
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.functional import (
     Moments,
@@ -23,7 +24,7 @@ from r3dpa.metrics.functional import (
     shared_balls,
     squared_mmd,
 )
-from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance
+from r3dpa.metrics.functional_bev import BEVGrid, chamfer_squared, histogram_distance
 from r3dpa.metrics.results import MetricResult
 
 FEW = settings(derandomize=True, max_examples=15, deadline=None, database=None)
@@ -135,6 +136,31 @@ def test_any_partition_gives_the_moments_of_the_whole(dtype):
     assert max(worst) > 0.01
 
 
+@pytest.mark.numerics("accumulation of moments")
+def test_a_shift_leaves_the_covariance():
+    x = drawn(0, 500, 4).double()
+    moments = Moments.of(x + 1e4)
+    torch.testing.assert_close(moments.covariance(), x.T.cov(), rtol=1e-9, atol=1e-10)
+    products = (x + 1e4).T @ (x + 1e4) - 500 * torch.outer(moments.mean, moments.mean)
+    assert (products / 499 - x.T.cov()).abs().max() > 1e-9  # in float64
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, *DTYPES])
+@pytest.mark.numerics("Jensen-Shannon distance and empty counts")
+def test_both_names_of_the_distance_and_no_value_of_nothing(dtype):
+    """Disjoint counts: ln 2 and its root; bins that are empty in both do not matter."""
+    a, b = torch.tensor([[4, 2, 0, 0], [0, 0, 0, 7]]).to(dtype)
+    found = histogram_distance(a, b)
+    assert found.jsd_divergence == pytest.approx(math.log(2), rel=1e-12)
+    assert found.jsd_distance == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+    for name, empty in (("first", (0 * a, b)), ("second", (a, 0 * b))):
+        with pytest.raises(ValueError, match=f"{name} histogram is empty"):
+            histogram_distance(*empty)
+    with np.errstate(invalid="ignore"):
+        assert math.isnan(jensenshannon((0 * a).double(), b.double()))
+    assert jensenshannon(a.double(), b.double()) - found.jsd_divergence > 0.1
+
+
 @pytest.mark.numerics("Jensen-Shannon distance and empty counts")
 def test_the_distance_of_any_counts_is_within_its_limits():
     negative = []
@@ -185,6 +211,19 @@ def test_a_difference_within_the_intervals_is_a_tie():
     assert [one.value, other.value] == pytest.approx([floor, floor], rel=0.1)
     assert one.value != other.value
     assert min(one.value, other.value) > 0.05
+
+
+@pytest.mark.numerics("empty cloud in a matching")
+def test_an_empty_cloud_is_refused_by_name():
+    """A missing scan must neither be the best match nor make the mean NaN."""
+    cloud, empty = drawn(0, 30, 3), torch.zeros(0, 3)
+    with pytest.raises(ValueError, match="generated cloud 1 has no point"):
+        BEVHistogramDistance(BEVGrid(4.0, 1.0)).update([cloud, empty], real=False)
+    for name, pair in (("points_a", (empty, cloud)), ("points_b", (cloud, empty))):
+        with pytest.raises(ValueError, match=f"{name} has no point"):
+            chamfer_squared(*pair)
+    means = [torch.cdist(other, cloud).mean().item() for other in (cloud, empty)]
+    assert math.isnan(min(reversed(means))) != math.isnan(min(means))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

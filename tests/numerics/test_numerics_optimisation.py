@@ -19,6 +19,7 @@ from r3dpa.data.loaders import training_loader
 from r3dpa.metrics.functional import Moments, frechet_distance, merge_packed
 from r3dpa.modules import LossWeights
 from r3dpa.modules.steps import frozen
+from r3dpa.nn.layers import SyncedBatchNorm2d
 
 pytestmark = pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
 
@@ -144,6 +145,16 @@ def test_101_samples_on_two_processes_are_101_samples(dtype):
     padded_count, padded = distance(DistributedSampler)
     assert padded_count == 102
     assert abs(padded / expected - 1) > 0.01
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.numerics("synchronised batch norm in one process")
+def test_one_process_has_the_plain_batch_norm(dtype, one_process):
+    ours, plain, image = SyncedBatchNorm2d(3), nn.BatchNorm2d(3), drawn(0, 2, 3, 4, 5).to(dtype)
+    assert torch.equal(ours(image), plain(image))
+    assert all(torch.equal(ours.state_dict()[k], value) for k, value in plain.state_dict().items())
+    with pytest.raises((ValueError, RuntimeError), match="SyncBatchNorm expected input tensor"):
+        nn.SyncBatchNorm(3)(image)
 
 
 @pytest.mark.numerics("resume in the middle")
