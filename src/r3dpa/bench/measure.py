@@ -6,7 +6,6 @@ import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -63,19 +62,11 @@ class Comparison:
         return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
 
 
-def compare(
-    cases: Mapping[str, Callable[[], float]],
-    rounds: int,
-    keep: Callable[[int, Callable[[], list[float]]], list[float]] = lambda number, run: run(),
-) -> Comparison:
+def compare(cases: Mapping[str, Callable[[], float]], rounds: int) -> Comparison:
     """Runs each case once a round, the first one twice, after a warm-up round.
 
-    Every second round runs backwards, so that drifts of the machine affect all cases alike.
-
-    Args:
-        cases: Functions that return the seconds that they took, see :func:`timed`.
-        rounds: At least 1.
-        keep: Returns the measurements of a round by number from ``run``, or from an earlier run.
+    Cases return the seconds that they took, see :func:`timed`. Every second round runs backwards,
+    so that drifts of the machine affect all cases alike.
     """
     every = [*cases, next(iter(cases))]
 
@@ -84,8 +75,7 @@ def compare(
         found = {i: cases[every[i]]() for i in (reversed(order) if number % 2 else order)}
         return [found[place] for place in order]
 
-    run(0)
-    taken = [keep(number, partial(run, number)) for number in range(1, rounds + 1)]
+    taken = [run(number) for number in range(rounds + 1)][1:]
     *seconds, again = (list(column) for column in zip(*taken, strict=True))
     return Comparison(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
 
