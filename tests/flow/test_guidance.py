@@ -285,18 +285,6 @@ def test_a_network_without_guidance_is_the_unguided_sampler_bit_by_bit(solver):
     assert (guided[0] - plain[0]).abs().max() > 0.01
 
 
-def test_the_velocity_of_an_aligned_pass_is_that_of_the_network():
-    for options in ({}, {"alignment_depth": 3}, {"qk_norm": True}):
-        sit, x, time = network(**options), noise(), torch.tensor([0.1, 0.5, 0.9])
-        leaf = x.clone().requires_grad_()
-        features, finish = sit.aligned_pass(leaf, time)
-        assert torch.equal(features, sit.project_features(x, time))
-        assert torch.equal(finish(), sit.velocity(x, time))
-        assert not finish().requires_grad
-        features.sum().backward()
-        assert leaf.grad.abs().max() > 0
-
-
 def test_first_blocks_run_forward_and_back_and_the_others_forward():
     """FLOP of a guided evaluation by formula: backward passes give gradients of inputs only."""
     D, N, rows, depth, head = 32, 8, 2, 6, (64, 5)

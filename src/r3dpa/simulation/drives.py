@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,7 +32,7 @@ from r3dpa.io import only_writer, text_table
 from r3dpa.simulation.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
 from r3dpa.simulation.scan import Simulator, check_switches
 from r3dpa.simulation.scene import Weather
-from r3dpa.simulation.sensor import SpinningLidar, load_sensor, sensor_to_dict
+from r3dpa.simulation.sensor import SpinningLidar, load_sensor
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
 VAL_DRIVES = ("0000", "0002")
@@ -144,7 +144,7 @@ def simulate(
         "seed": seed,
         "scans": scans,
         "drives": list(names),
-        "sensor": sensor_to_dict(sensor),
+        "sensor": json.loads(json.dumps(asdict(sensor))),  # lists instead of tuples
         "effects": check_switches(effects or {}),
         "weather": None if weather is None else weather_to_dict(weather),
     }

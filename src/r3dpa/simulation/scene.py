@@ -74,10 +74,6 @@ class Material(IntEnum):
     RETROREFLECTOR = 11
 
 
-#: Materials on which a film of water lies.
-GROUND_MATERIALS = (Material.ASPHALT, Material.PAVING, Material.SOIL)
-
-
 class Shape(IntEnum):
     """Solid of a primitive, by the coordinates ``u`` scaled by its half size.
 

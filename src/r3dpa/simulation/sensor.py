@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -193,12 +192,6 @@ def load_sensor(model: str, **changes: Any) -> SpinningLidar:
             f"there is no sensor {model!r}: give {', '.join(PRESETS)} or a calibration YAML"
         )
     return SpinningLidar(_read_calibration(path), **changes)
-
-
-def sensor_to_dict(sensor: SpinningLidar) -> dict[str, Any]:
-    """The sensor as plain values, as JSON returns them."""
-    values: dict[str, Any] = json.loads(json.dumps(asdict(sensor)))
-    return values
 
 
 def _read_calibration(path: Path) -> Lasers:

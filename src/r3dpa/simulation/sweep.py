@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
 from r3dpa.simulation.raycast import cast, normals
-from r3dpa.simulation.scene import GROUND_MATERIALS, Material, Scene, Semantic
+from r3dpa.simulation.scene import Material, Scene, Semantic
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import (
     GROUND,
@@ -29,7 +29,8 @@ from r3dpa.simulation.solids import (
 )
 
 #: Whether water can lie on each ``Material``: road, pavement, soil.
-IS_GROUND = np.isin(np.arange(len(Material)), GROUND_MATERIALS)
+IS_GROUND = np.zeros(len(Material), dtype=bool)
+IS_GROUND[[Material.ASPHALT, Material.PAVING, Material.SOIL]] = True
 
 # Leaves have random orientation: mean of |cos| over a sphere.
 _FOLIAGE_COS = 0.5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from r3dpa.simulation.draws import Draws, RayIndex
 from r3dpa.simulation.effects.surface import sheets
 from r3dpa.simulation.raycast import cast_single
-from r3dpa.simulation.scene import Material, Scene, Weather
+from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
 from r3dpa.simulation.sweep import Echoes, Effect, Origin, Sweep
@@ -174,12 +174,15 @@ class SunGlare(Effect):
     noise: float = 1e-3
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
-        elevation_deg = scene.weather.sun_elevation_deg
+        weather, elevation_deg = scene.weather, scene.weather.sun_elevation_deg
+        falling = weather.rain_mm_h > 0 or weather.snow_mm_h > 0
+        covered = falling or math.isfinite(weather.visibility_m) or not weather.clear_sky
         tilt_rad = math.hypot(scene.pose.pitch_rad, scene.pose.roll_rad)
         highest_deg = math.degrees(sensor.lasers.inclination_rad[0] + tilt_rad)
         # 0.01 degrees of slack for the rounding of the rays to float32.
         within = elevation_deg <= highest_deg + _SUN_REACH_DEG + 0.01
-        return f"sun {elevation_deg:.1f} deg high" if _shines(scene.weather) and within else None
+        shines = elevation_deg > 0 and within and not covered
+        return f"sun {elevation_deg:.1f} deg high" if shines else None
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Rays within 10 degrees of a visible sun."""
@@ -207,12 +210,6 @@ class SunGlare(Effect):
             range_m = np.float32(nearest) + along
             power = 2 * sweep.min_power[noisy_rays]
             sweep.offer(noisy_rays, range_m, power, NO_SURFACE, Origin.SUN)
-
-
-def _shines(weather: Weather) -> bool:
-    """Whether the sun is up and neither clouds nor fog, rain or snow cover it."""
-    falling = weather.rain_mm_h > 0 or weather.snow_mm_h > 0 or math.isfinite(weather.visibility_m)
-    return weather.clear_sky and weather.sun_elevation_deg > 0 and not falling
 
 
 def _sun_direction(scene: Scene) -> np.ndarray:
