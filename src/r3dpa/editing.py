@@ -156,15 +156,13 @@ class SceneEditor:
 
         Args:
             range_m: ``(H, W)`` metres, -1 without a return.
-            pixel_mask: ``(H, W)`` bool, True where the scan is to change.
+            pixel_mask: ``(H, W)`` bool, True where the scan is to change; neither empty nor full,
+                in tokens too.
             indices: Numbers of the results, or how many.
             seed: Number of their collection.
             feature: ``(F,)`` feature of the object. Default: no guidance.
             start: Time that the way back starts from, in (0, 1]; below 1 part of the content stays.
             dilation: Rings of tokens around those of the mask that are generated anew too.
-
-        Raises:
-            ValueError: If the mask is empty or full, in tokens too, or a shape does not fit.
         """
         times = self.settings.times(start)
         check_mask(pixel_mask, "mask")

@@ -120,11 +120,8 @@ def convert(
     Weights stay equal bit for bit; optimisers are left out. Official training checkpoints keep all
     facts for the way back. A checkpoint without SiT becomes the official VAE file with its
     neighbours for discriminator and latent statistics, which lose some. Arguments are those of
-    ``r3dpa convert``. Returns files, networks and what was not converted, as text.
-
-    Raises:
-        ValueError: As :func:`read_checkpoint`, or if the source has no counterpart in the other
-            layout, or the output exists.
+    ``r3dpa convert``, errors those of :func:`read_checkpoint` and :func:`save_checkpoint`. Returns
+    files, networks and what was not converted, as text.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)

@@ -307,7 +307,6 @@ def _vae_strides(vae: StateDict, args: Options) -> Strides:
 
 
 def _whole(strides: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """Rows and columns of the image per latent."""
     return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
 
 

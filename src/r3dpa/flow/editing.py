@@ -103,12 +103,8 @@ def kept(trajectory: Trajectory, edit_mask: Tensor) -> AfterStep:
     overwritten too.
 
     Args:
-        trajectory: Of the latents to keep, on the grid of the solver.
+        trajectory: Of the latents to keep, on the grid of the solver: another is a ``ValueError``.
         edit_mask: Bool, True where latents are generated anew; broadcasts to ``(B, ...)``.
-
-    Raises:
-        ValueError: If the mask is not bool or does not fit or, when called, the solver is at
-            another time than the trajectory.
     """
     _check_mask(edit_mask, trajectory.states[0])
     times = trajectory.times.tolist()

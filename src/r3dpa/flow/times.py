@@ -45,11 +45,7 @@ def sde_times(num_steps: int, last: float = 0.04) -> Tensor:
 
 
 def step_pairs(times: Tensor) -> list[tuple[float, float]]:
-    """Start and end of every step.
-
-    Raises:
-        ValueError: If there is no step, or the times turn round or repeat.
-    """
+    """Start and end of every step; times that turn round or repeat are a ``ValueError``."""
     if times.dim() != 1 or len(times) < 2:
         raise ValueError(f"a solver needs two or more times, got shape {tuple(times.shape)}")
     steps = list(pairwise(times.tolist()))

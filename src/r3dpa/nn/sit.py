@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32, named_layers, zeroed
 from r3dpa.nn.velocity_network import (
+    MAX_PERIOD,
     TIME_WIDTH,
     VelocityNetwork,
     WideLinear,
     time_frequencies,
 )
 
-_MAX_PERIOD = 10_000.0
 _TOKEN_NORM_EPS = 1e-6
 _TABLE_STD = 0.02
 
@@ -40,7 +40,7 @@ def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
         raise ValueError(f"position embedding needs a width divisible by 4, got {width}")
     rows, columns = grid_size
     exponents = torch.arange(width // 4, dtype=torch.float64) / (width // 4)
-    frequencies = torch.exp(-math.log(_MAX_PERIOD) * exponents)
+    frequencies = torch.exp(-math.log(MAX_PERIOD) * exponents)
 
     def axis_code(positions: Tensor) -> Tensor:
         angles = positions.double()[:, None] * frequencies

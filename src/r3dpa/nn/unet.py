@@ -8,6 +8,7 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Self
 
 import torch
@@ -189,8 +190,7 @@ class UNet(VelocityNetwork):
         return self.out(at_least_float32(hidden))
 
 
-def _norm(channels: int) -> GroupNorm:
-    return GroupNorm(channels, _NORM_EPS)
+_norm = partial(GroupNorm, eps=_NORM_EPS)
 
 
 class _Layers(nn.ModuleList):

@@ -20,7 +20,7 @@ from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.layers import at_least_float32, no_autocast
 
 TIME_WIDTH = 256
-_MAX_PERIOD = 10_000.0
+MAX_PERIOD = 10_000.0
 
 
 class VelocityOutput(NamedTuple):
@@ -232,7 +232,7 @@ def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:
     """
     half = width // 2
     exponents = torch.arange(half, dtype=time.dtype, device=time.device) / half
-    angles = time[:, None] * torch.exp(-math.log(_MAX_PERIOD) * exponents)
+    angles = time[:, None] * torch.exp(-math.log(MAX_PERIOD) * exponents)
     return torch.cat([angles.cos(), angles.sin()], dim=1)
 
 

@@ -268,10 +268,6 @@ def feature_source(name: str, ckpt: str | Path | None = None, dim: int = 768) ->
             shape, without training.
         ckpt: Weights of ``"scalr"`` or ``"waffleiron-s"``; the latter has default weights.
         dim: Width D of the features; of ``"scalr"`` that of its checkpoint.
-
-    Raises:
-        ValueError: If the name is unknown, a checkpoint is missing, superfluous or unreadable, or
-            the source cannot have this ``dim``.
     """
     if name not in SOURCES:
         raise ValueError(f"there is no feature source {name!r}; there are {', '.join(SOURCES)}.")
