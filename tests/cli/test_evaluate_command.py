@@ -2,7 +2,6 @@ import json
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -150,12 +149,8 @@ def test_bad_samples_stop_or_are_listed(reference_file, no_figures, samples, tmp
     note = "samples: samples that cannot be used and are left out: 2"
     assert note in printed
     assert note in (tmp_path / "out" / "table.md").read_text()
-    (samples / "004.bin").unlink()
     (samples.parent / "metadata.json").write_text("{")
     with pytest.raises(ValueError, match=r"metadata\.json: is damaged"):
-        evaluate(*words)
-    (samples.parent / "metadata.json").unlink()
-    with pytest.raises(ValueError, match=r"007: none of 1 points has x.*--skip_bad leaves such"):
         evaluate(*words)
 
 
@@ -203,10 +198,4 @@ def test_wrong_options_of_a_reference_are_named(data, reference_file, tmp_path):
         command.reference(data=data, out=reference_file, spaces=("fgeo",))
     with pytest.raises(ValueError, match="1 scans of the split all; at least 2 are needed"):
         command.reference(data=data, out=out, spaces=("fgeo",), limit=1)
-    with pytest.raises(ValueError, match=r"frid needs its official weights: give --ckpt\.frid"):
-        command.reference(data=data, out=out, spaces=("frid",))
     assert not out.exists()
-    np.full((2, 4), np.nan, "<f4").tofile(tmp_path / "0.bin")
-    np.ones((2, 4), "<f4").tofile(tmp_path / "1.bin")
-    with pytest.raises(ValueError, match=r"0\.bin: has NaN"):
-        command.reference(data=tmp_path, out=out, spaces=("fgeo",))

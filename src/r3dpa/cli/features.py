@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from inspect import signature
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,11 +19,6 @@ from r3dpa.geometry import Projection
 from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.nn.backbones.point_features import SOURCES, feature_source
 
-# Of the trainer's options, those that matter where nothing is trained and every scan counts.
-_TRAINER_OPTIONS = {
-    *("accelerator", "strategy", "devices", "num_nodes", "precision", "plugins"),
-    "enable_progress_bar",
-}
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # others would convert the prepared scans too
 
 
@@ -147,8 +141,8 @@ def features_parser(prog: str) -> StageParser:
     parser.add_argument("--grid_sizes", type=list[tuple[int, int]] | None, help=sizes)
     out = "folder of the grids, in place of features_dir of the data"
     parser.add_argument("--out", type=Path | None, help=out)
-    skipped: Any = set(signature(Trainer).parameters) - _TRAINER_OPTIONS
+    skipped = {"logger", "enable_checkpointing"}
     parser.add_class_arguments(
-        Trainer, "trainer", fail_untyped=False, instantiate=False, sub_configs=True, skip=skipped
+        Trainer, "trainer", fail_untyped=False, instantiate=False, skip=skipped
     )
     return parser
