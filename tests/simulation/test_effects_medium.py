@@ -194,7 +194,7 @@ def test_plume_of_a_car():
     sensor = replace(SENSOR, spin_hz=1e6)  # no time for the car to move
     before, after = surfaces(scene, sensor), applied(Spray(), scene, sensor)
     # Rays at the car's rear have 9 m of spray with 0.2 * 0.5 per metre before them.
-    x, y, z = before.position(slice(None))
+    x, y, z = before.position(np.arange(before.num_rays))
     rear = np.isclose(x, 14, atol=0.01) & (np.abs(y - 1) < 0.4) & (z < -0.5)
     ratio = after.first.power[rear] / before.first.power[rear]
     slant = before.first.range_m[rear] * 9 / 14

@@ -98,7 +98,7 @@ def test_an_actor_that_crosses_is_sheared():
     # Driving away, its face is sheared: the end seen later is farther by v * (time between).
     sweep = swept(Scene((away,)), MovingActors())
     hit = np.flatnonzero(sweep.grid(sweep.first.surface)[LEVEL] == 0)[2:-2]
-    depth = sweep.grid(sweep.position(slice(None)))[1, LEVEL, hit]
+    depth = sweep.grid(sweep.position(np.arange(sweep.num_rays)))[1, LEVEL, hit]
     width = azimuth_of(sweep)[LEVEL][hit[-1]] - azimuth_of(sweep)[LEVEL][hit[0]]
     assert depth[-1] - depth[0] == pytest.approx(10 * width / (2 * np.pi) * 0.1, abs=2e-3)
 

@@ -165,15 +165,10 @@ def _fan(origin: Floats, direction: Floats) -> _Fan:
     steepest = max(abs(float(highest.max())), abs(float(lowest.min())))
     length = np.sqrt(1 - steepest**2)
     most, least = max(float(across.max()), 0.0), min(float(across.min()), 0.0)
-    return _Fan(
-        num_shots,
-        float(np.arcsin(max(least / length, -1.0))),
-        float(np.arcsin(min(most / length, 1.0))),
-        highest,
-        lowest,
-        float(origin[2].min()),
-        float(origin[2].max()),
-    )
+    least = float(np.arcsin(max(least / length, -1.0)))
+    most = float(np.arcsin(min(most / length, 1.0)))
+    lowest_m, highest_m = float(origin[2].min()), float(origin[2].max())
+    return _Fan(num_shots, least, most, highest, lowest, lowest_m, highest_m)
 
 
 def _windows_from(

@@ -145,15 +145,11 @@ def _pose(course: Course, scan: int, sensor_height_m: float) -> Pose:
     heading, _, slope = course.smooth(s)
     cross = course.section(s).cross + course.surface_cross(lateral)
     rocking = generator_for(course.seed, "tilt", course.drive, scan).normal(0.0, 0.002, 2)
-    return Pose(
-        x,
-        y,
-        z + course.surface_m(lateral) + sensor_height_m,
-        heading,
-        course.mount_pitch_rad - math.atan(slope) + rocking[0],
-        # Uphill to the left means: the right side is down.
-        course.mount_roll_rad + math.atan(cross) + rocking[1],
-    )
+    height_m = z + course.surface_m(lateral) + sensor_height_m
+    pitch_rad = course.mount_pitch_rad - math.atan(slope) + rocking[0]
+    # Uphill to the left means: the right side is down.
+    roll_rad = course.mount_roll_rad + math.atan(cross) + rocking[1]
+    return Pose(x, y, height_m, heading, pitch_rad, roll_rad)
 
 
 class _Stream(NamedTuple):

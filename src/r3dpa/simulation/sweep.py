@@ -142,10 +142,8 @@ class Sweep:
             cosine[hit] = np.abs(np.einsum("im,im->m", normal, self.direction.take(hit, axis=1)))
         return cosine
 
-    def position(self, rays: RayIndex) -> Floats:
-        """Hit of the first echo of rays, ``(3, M)`` in the scene frame."""
-        if isinstance(rays, slice):
-            return self.start[:, rays] + self.first.range_m[rays] * self.direction[:, rays]
+    def position(self, rays: NDArray[np.int64]) -> Floats:
+        """Hit of the first echo of rays ``(M,)``, ``(3, M)`` in the scene frame."""
         # Much faster than indexing the second axis.
         towards = self.direction.take(rays, axis=1)
         towards *= self.first.range_m[rays]

@@ -223,15 +223,9 @@ def _sun_direction(scene: Scene) -> np.ndarray:
 def _is_hidden(sweep: Sweep) -> bool:
     """Whether a solid stands between the sensor and the sun, in the middle of the sweep."""
     nothing = np.full(1, NO_SURFACE, dtype=np.int32)
-    _, surface = cast_single(
-        sweep.solids,
-        sweep.start.mean(axis=1, keepdims=True),
-        _sun_direction(sweep.scene)[:, None],
-        np.zeros(1, dtype=np.float32),
-        np.full(1, 1e3),
-        nothing,
-        nothing,
-    )
+    here, towards = sweep.start.mean(axis=1, keepdims=True), _sun_direction(sweep.scene)[:, None]
+    now, reach_m = np.zeros(1, dtype=np.float32), np.full(1, 1e3)
+    _, surface = cast_single(sweep.solids, here, towards, now, reach_m, nothing, nothing)
     return bool(surface[0] != NO_SURFACE)
 
 
