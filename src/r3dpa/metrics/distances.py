@@ -80,6 +80,10 @@ class SceneMetric(Metric):
         """Scenes seen."""
         return int(getattr(self, f"{side}_count"))
 
+    def set_real(self, name: str, value: Tensor) -> None:
+        """Sets one of :meth:`real_states`."""
+        setattr(self, name, [value] if name in self._empty else value)
+
     def adopt_real(self, *others: SceneMetric) -> None:
         """Takes over the real scans of other metrics of this kind, one after the other."""
         self.limits["real"] = None  # each of the others kept as many as it should
@@ -97,14 +101,6 @@ class SceneMetric(Metric):
             self._prune("real")
         names = [name for name in self._defaults if name.startswith("real_")]
         return {n: self._joined(n) if n in self._empty else getattr(self, n) for n in names}
-
-    def load_state(self, name: str, value: Tensor) -> None:
-        """Sets one of :meth:`real_states`; a ``ValueError`` if its shape is another."""
-        grows = name in self._empty
-        expected = (self._empty[name] if grows else getattr(self, name)).shape[grows:]
-        if value.shape[grows:] != expected:
-            raise ValueError(f"{name} of shape {tuple(value.shape)} ends not in {tuple(expected)}")
-        setattr(self, name, [value] if grows else value)
 
     def kept(self, side: str) -> tuple[Tensor, Tensor]:
         """Places ``(n,)`` among all scenes, and values ``(n, ...)``, of those that are kept."""

@@ -142,10 +142,7 @@ class Evaluation:
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        try:
-            about = json.loads(json.dumps(_ABOUT | self.about, allow_nan=False))
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{self.label}: about is not for JSON: {error}") from None
+        about = json.loads(json.dumps(_ABOUT | self.about, allow_nan=False))
         object.__setattr__(self, "rows", tuple(self.rows))
         object.__setattr__(self, "about", about)
 
@@ -402,9 +399,9 @@ def published_evaluation(
     rows = []
     for name, number in printed.items():
         value = float(f"{number}e{PUBLISHED_SCALES[name]}")  # decimal shift, free of rounding
-        row = MetricResult(name, value, scale=PUBLISHED_SCALES[name])
-        samples, references = (counts or {}).get(name, (None, None))
-        rows.append(replace(row, num_samples=samples, num_references=references))
+        scale, (samples, real) = PUBLISHED_SCALES[name], (counts or {}).get(name, (None, None))
+        row = MetricResult(name, value, scale=scale, num_samples=samples, num_references=real)
+        rows.append(row)
     about |= {"protocol": {"name": "published"}, "reference": reference, "source": source}
     return Evaluation(label, tuple(rows), about | {"published": True})
 
