@@ -92,18 +92,15 @@ class TestSample:
             "stage": "joint",
             "step": 3,
             "weights": "ema",
-            "num": 3,
-            "seed": 0,
             "interpolant": "linear",
-            "nfe": 3,
             "precision": "fp32",
-            "batch_size": 8,
-            "drawn_by_last_run": 3,
             "r3dpa": "0.1.0",
             "commit": source_commit(),
             "torch": torch.__version__,
         }
         assert {key: metadata[key] for key in expected} == expected
+        numbers = ("num", "seed", "nfe", "batch_size", "drawn_by_last_run")
+        assert [metadata[key] for key in numbers] == [3, 0, 3, 8, 3]
         assert metadata["sampler"] == asdict(SamplerConfig(steps=3))
         assert metadata["geometry"]["projection"]["sensor"]["beams"] == SENSOR.beams
         assert metadata["seconds_per_scene"] > 0

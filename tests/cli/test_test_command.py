@@ -146,7 +146,6 @@ def test_the_reference_is_kept_while_it_fits(words, smoke_root, tmp_path, monkey
             "4 generated scenes for the 64 features of FGEO; 12.*--scorer.allow_few true",
         ),
         (["--scorer.protocol=published"], "the reference is of the protocol default, not publi"),
-        (["--scorer.split=val"], "the split val does not apply"),
     ],
 )
 def test_what_does_not_fit_is_said_before_scenes_are_sampled(

@@ -69,8 +69,7 @@ def inpaint(
     feature = None
     if objects is not None and object is not None:
         library = ObjectLibrary.load(objects)
-        source_name = feature_source_of(session.checkpoint)
-        library.check_source(source_name, session.feature_dim)
+        library.check_source(feature_source_of(session.checkpoint), session.feature_dim)
         feature = library.feature(object)
     run = partial(session.editor.inpaint, source.range_m, region, num, session.options.seed)
     run = partial(run, feature=feature, start=start, dilation=dilation)

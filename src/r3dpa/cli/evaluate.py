@@ -55,8 +55,7 @@ def reference(
         raise ValueError(f"{out} exists: delete it, or give another --out")
     module = read_data(data)
     train, val = module.limited_split()
-    scans = {"train": train, "val": val, "all": sorted(train + val)}[split]
-    scans = evenly(scans, limit)
+    scans = evenly({"train": train, "val": val, "all": sorted(train + val)}[split], limit)
     if len(scans) < 2:
         raise ValueError(f"{data}: {len(scans)} scans of the split {split}; at least 2 are needed")
     setting = replace(PROTOCOLS[protocol], sensor=module.sensor)
@@ -143,9 +142,8 @@ def evaluate(
 
 def _made_with(samples: Path) -> dict[str, Any]:
     """Entries of the metadata of ``r3dpa sample``; empty for samples of others."""
-    paths = [folder / "metadata.json" for folder in (samples, samples.parent)]
-    path = next(filter(Path.is_file, paths), None)
-    if path is None:
+    path = (samples if (samples / "metadata.json").is_file() else samples.parent) / "metadata.json"
+    if not path.is_file():
         return {}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -154,9 +152,8 @@ def _made_with(samples: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or "r3dpa" not in found:
         return {}
     sampler = found.get("sampler") or {}
-    kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
-    made_with = {key: found.get(key) for key in kept}
-    made_with |= {key: sampler.get(key) for key in ("solver", "steps")}
+    kept = "seed precision feature_source checkpoint stage step weights nfe solver steps"
+    made_with = {key: (found | sampler).get(key) for key in kept.split()}
     return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
 
 

@@ -83,7 +83,6 @@ def sample(
             "checkpoint": str(autoguidance),
             "checkpoint_written": written(autoguidance),
             "step": weak.step,
-            "feature_source": weak.feature_source,
             "scale": scale,
             "interval": list(interval),
         }

@@ -80,17 +80,13 @@ def provenance(
     checkpoint: Checkpoint, options: SceneOptions, num: int, device: str, geometry: ScanGeometry
 ) -> dict[str, Any]:
     """Checkpoint, request, geometry and versions, as the metadata of scenes holds them."""
-    return {
+    trained = ("stage", "step", "feature_source", "interpolant")
+    about = {name: getattr(checkpoint, name) for name in trained}
+    about |= {name: getattr(options, name) for name in ("weights", "seed", "batch_size")}
+    return about | {
         "checkpoint": str(options.ckpt),
         "checkpoint_written": written(options.ckpt),
-        "stage": checkpoint.stage,
-        "step": checkpoint.step,
-        "feature_source": checkpoint.feature_source,
-        "interpolant": checkpoint.interpolant,
-        "weights": options.weights,
         "num": num,
-        "seed": options.seed,
-        "batch_size": options.batch_size,
         "device": device,
         "formats": list(options.formats),
         "geometry": geometry.to_dict(),
