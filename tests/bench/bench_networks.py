@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from r3dpa.bench.measure import compare, flop_of, timed
+from r3dpa.bench.measure import flop_of
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
@@ -82,15 +82,6 @@ class BenchGuidance:
         with torch.no_grad():
             benchmark.extra_info["GFLOP"] = round(flop_of(lambda: ways[way](x, time)) / 1e9, 1)
             benchmark(ways[way], x, time)
-
-    def bench_ratio_of_guided_to_plain(self, benchmark, sit, ways, one_thread):
-        """Interleaved, with its interval: 1.5 times the work of a plain evaluation."""
-        x, time = torch.randn(1, 8, 16, 128), torch.tensor([0.5])
-        cases = {name: timed(lambda way=way: way(x, time)) for name, way in ways.items()}
-        with torch.no_grad():
-            ratio = benchmark.pedantic(compare, (cases, 3), rounds=1).over_first("guided")
-        benchmark.extra_info["guided"] = str(ratio)
-        assert ratio.value < 3
 
 
 @pytest.mark.benchmark(group="point features of one scan")

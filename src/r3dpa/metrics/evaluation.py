@@ -16,7 +16,7 @@ from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
 from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
 from r3dpa.metrics.functional_bev import Matching
-from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics, is_official
+from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
@@ -219,8 +219,8 @@ def check_counts(
 
 
 def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
-    """Complete reference of either kind; ``split`` is of the official file alone."""
-    if is_official(path):
+    """Complete reference, official if it is ``.npy``; ``split`` is of the official file alone."""
+    if path.suffix == ".npy":
         return OfficialStatistics.load(path, split)
     if split is not None:
         raise ValueError(f"{path}: is no official file; the split {split} does not apply to it")

@@ -31,14 +31,6 @@ _FRID = {4: "rangevit_wo_i", 5: "rangevit_w_i"}  # by input channels
 _HISTOGRAM, _CLOUDS = "dataset_bev_hist", "valset_voxelized_bev"
 
 
-def is_official(path: str | Path) -> bool:
-    """Whether a file is in NumPy's format, which no file of ``r3dpa reference`` is."""
-    if not Path(path).is_file():
-        return False
-    with Path(path).open("rb") as stream:
-        return stream.read(6) == b"\x93NUMPY"
-
-
 @dataclass(frozen=True)
 class OfficialStatistics:
     """One split of the official file."""
