@@ -154,7 +154,6 @@ class WeakModel:
     scale: float
     shift: Tensor
     step: int | None
-    feature_source: str | None
 
 
 def read_snapshot(
@@ -216,7 +215,7 @@ def read_snapshot(
     sit = weak.network("ema").build()
     assert isinstance(sit, VelocityNetwork)  # _latent_size
     sit.eval().requires_grad_(False)
-    return WeakModel(sit, scale.item(), shift, weak.step, weak.feature_source)
+    return WeakModel(sit, scale.item(), shift, weak.step)
 
 
 def vae_fingerprint(vae: Weights) -> str:

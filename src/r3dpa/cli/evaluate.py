@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -44,7 +43,7 @@ def reference(
     import torch
 
     from r3dpa.cli.features import read_data
-    from r3dpa.data.scans import evenly, read_scan
+    from r3dpa.data.scans import Scan, evenly, read_scan
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
     from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
@@ -64,11 +63,10 @@ def reference(
     names = [scan.name for scan in scans]
     job = ReferenceStatistics(setting, cards_of(found), names, about)
 
-    def scans_from(start: int) -> Iterator[EvaluationScene]:
-        for scan in scans[start:]:
-            yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
+    def scene(scan: Scan) -> EvaluationScene:
+        return EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
 
-    statistics = compute_reference(job, scans_from, found, out)
+    statistics = compute_reference(job, lambda start: map(scene, scans[start:]), found, out)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
