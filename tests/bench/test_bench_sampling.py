@@ -1,4 +1,4 @@
-"""What accuracy costs in time: certificate, Pareto front, advice and files."""
+"""What accuracy costs in time: certificate, Pareto front, advice, files, and interrupted runs."""
 
 from __future__ import annotations
 
@@ -33,9 +33,11 @@ from r3dpa.bench.report import (
 )
 from r3dpa.bench.sampling import (
     Effort,
+    Work,
     errors_of,
     reference,
     run_problem,
+    sampling,
     settings_of,
 )
 from r3dpa.checkpoints import read_checkpoint
@@ -173,10 +175,10 @@ class TestErrors:
         assert model._generator(way).generate([0]).nfe == way.nfe
 
     def test_error_of_the_precision_alone(self, model):
-        exact, _ = reference(model, 16, 3, lambda n: None)
+        exact, _ = reference(model, 16, 3, Work(), lambda n: None)
         whole = Setting(SamplerConfig("ab2", 8))
         ways = [whole, replace(whole, precision="bf16")]
-        plain, rounded = errors_of(model, ways, exact, lambda n: None)
+        plain, rounded = errors_of(model, ways, exact, Work(), lambda n: None)
         assert plain.precision == 0
         assert 0 < rounded.precision < 0.1
         assert rounded.squared != plain.squared
@@ -237,3 +239,39 @@ class TestFiles:
         assert "(pareto.png)" in summary
         assert "- quality good: " in summary
         assert "quality good: " in text
+
+
+EFFORT = {"samples": 4, "evaluations": (2, 4), "rounds": 3, "batch": 2, "reference_steps": 16}
+
+
+class TestInterruptedRun:
+    def test_it_goes_on_where_it_was(self, ckpt, tmp_path, monkeypatch):
+        """Stopped in the second round of the timing; what was solved is not solved again."""
+        monkeypatch.setattr(bench, "_SOLVERS", (("ab2", 1.0),))
+        monkeypatch.setattr(bench, "_TOY_QUICK", TINY)
+        piece, solve, solved = Work.piece, ModelProblem.solve, []
+
+        def stopping(self, name, make):
+            if self.folder is not None and name == "round_2":
+                raise KeyboardInterrupt
+            return piece(self, name, make)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Work, "piece", stopping)
+            with pytest.raises(KeyboardInterrupt):
+                sampling(tmp_path, ckpt, quick=True, effort=EFFORT)
+        kept = {path.stem for path in (tmp_path / "work").iterdir()}
+        assert {"reference_16_0", "reference_8_2", "errors_0", "round_1"} <= kept
+        with pytest.raises(ValueError, match="other options"):
+            sampling(tmp_path, ckpt, quick=True, effort=EFFORT | {"samples": 6})
+        first = torch.load(tmp_path / "work" / "round_1.pt", weights_only=True)
+        monkeypatch.setattr(
+            ModelProblem, "solve", lambda self, *given: solved.append(given) or solve(self, *given)
+        )
+        sampling(tmp_path, ckpt, quick=True, effort=EFFORT)
+        assert not solved
+        assert not (tmp_path / "work").exists()
+        found = json.loads((tmp_path / "sampling.json").read_text())["problems"]["model"]
+        rounds = [line["rounds"] for line in found["rows"]]
+        assert all(len(each) == 3 for each in rounds)
+        assert rounds[0][0] == first[0]

@@ -209,12 +209,23 @@ def test_files_of_something_else_are_named(tmp_path):
             ReferenceStatistics.load(path)
 
 
-def test_a_missing_tensor_is_named(tmp_path):
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("0.toy_frechet.real_moments", lambda x: x[:-1], r"real_moments of shape \(6,\)"),
+        ("1.toy_frechet.real_values", lambda x: x[:, :1], r"real_values of shape \(4, 1\)"),
+        ("1.matching.real_values", lambda x: x[..., :32], r"real_values of shape \(2, 16, 32\)"),
+        ("1.ranges.real_bins", None, r"tensor 1.ranges.real_bins is missing"),
+    ],
+)
+def test_tensors_of_other_shapes_are_named(tmp_path, key, change, message):
     path = tmp_path / "a.safetensors"
     filled().save(path)
     with safe_open(path, framework="pt") as file:
         tensors, card = {k: file.get_tensor(k) for k in file.keys()}, file.metadata()  # noqa: SIM118
-    del tensors["1.ranges.real_bins"]
+    found = tensors.pop(key)
+    if change is not None:
+        tensors[key] = change(found).contiguous()
     save_file(tensors, path, metadata=card)
-    with pytest.raises(ValueError, match=r"a\.safetensors holds .*1.ranges.real_bins is missing"):
+    with pytest.raises(ValueError, match=rf"a\.safetensors holds .*{message}"):
         ReferenceStatistics.load(path)

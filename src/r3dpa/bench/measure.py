@@ -6,6 +6,7 @@ import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -62,11 +63,19 @@ class Comparison:
         return Ratio.of(self.seconds[name], next(iter(self.seconds.values())))
 
 
-def compare(cases: Mapping[str, Callable[[], float]], rounds: int) -> Comparison:
+def compare(
+    cases: Mapping[str, Callable[[], float]],
+    rounds: int,
+    keep: Callable[[int, Callable[[], list[float]]], list[float]] = lambda number, run: run(),
+) -> Comparison:
     """Runs each case once a round, the first one twice, after a warm-up round.
 
-    Cases return the seconds that they took, see :func:`timed`. Every second round runs backwards,
-    so that drifts of the machine affect all cases alike.
+    Every second round runs backwards, so that drifts of the machine affect all cases alike.
+
+    Args:
+        cases: Functions that return the seconds that they took, see :func:`timed`.
+        rounds: At least 1.
+        keep: Returns the measurements of a round by number from ``run``, or from an earlier run.
     """
     every = [*cases, next(iter(cases))]
 
@@ -75,7 +84,8 @@ def compare(cases: Mapping[str, Callable[[], float]], rounds: int) -> Comparison
         found = {i: cases[every[i]]() for i in (reversed(order) if number % 2 else order)}
         return [found[place] for place in order]
 
-    taken = [run(number) for number in range(rounds + 1)][1:]
+    run(0)
+    taken = [keep(number, partial(run, number)) for number in range(1, rounds + 1)]
     *seconds, again = (list(column) for column in zip(*taken, strict=True))
     return Comparison(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
 

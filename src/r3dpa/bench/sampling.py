@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -27,7 +29,7 @@ from r3dpa.bench.report import Errors, Finding, Row, write_report
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.flow.sampler import SamplerConfig, Solver
 from r3dpa.flow.solvers import evaluations, steps_for
-from r3dpa.io import command, machine, usable_device, versions
+from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
 #: Solvers with the shift of their grids.
 _SOLVERS: tuple[tuple[Solver, float], ...] = (
@@ -54,6 +56,30 @@ _TOY = Effort(1024, 1000, _EVALUATIONS, 20, 256)
 _TOY_QUICK = Effort(256, 1000, _EVALUATIONS[:-2], 3, 256)
 
 
+class Work:
+    """Pieces of an interrupted run in a folder (if any), for the next run of the same request."""
+
+    def __init__(self, folder: Path | None = None, request: Any = None) -> None:
+        self.folder = folder
+        text = json.dumps(request)
+        if self.piece("request", lambda: text) != text:
+            raise ValueError(
+                f"{folder} holds unfinished work of other options or another checkpoint: repeat "
+                "the same command to go on, or delete the folder"
+            )
+
+    def piece(self, name: str, make: Callable[[], Any]) -> Any:
+        """Cached result of ``make``: tensors, numbers, strings, tuples, lists, dictionaries."""
+        if self.folder is None:
+            return make()
+        path = self.folder / f"{name}.pt"
+        if not path.exists():
+            value = make()
+            with atomic_path(path) as temporary:
+                torch.save(value, temporary)
+        return torch.load(path, weights_only=True)
+
+
 def sampling(
     out: Path,
     ckpt: Path | None = None,
@@ -64,9 +90,10 @@ def sampling(
     """Measures what accuracy costs in time, for an exact velocity and for a trained model.
 
     The folder gets ``sampling.json``, ``summary.md``, ``pareto.png`` (error against seconds), and
-    from a model ``quality.json``, as ``r3dpa sample --quality`` reads it. ``effort`` has fields of
-    :class:`Effort` for the model, the usual ones where missing or None. Returns tables, error per
-    second along the front, and where the files are.
+    from a model ``quality.json``, as ``r3dpa sample --quality`` reads it. An interrupted run of a
+    model goes on with the same call; ``ValueError`` if the folder holds unfinished work of another.
+    ``effort`` has fields of :class:`Effort` for the model, the usual ones where missing or None.
+    Returns tables, error per second along the front, and where the files are.
     """
     device = usable_device(device)
     kind = device.partition(":")[0]
@@ -75,7 +102,7 @@ def sampling(
     if quick:
         usual = Effort(8, 200, _EVALUATIONS[1:-3], 3, batch)
     chosen = replace(usual, **{k: v for k, v in (effort or {}).items() if v is not None})
-    about = {}
+    about, work = {}, Work()
     problems: dict[str, Callable[[], Finding]] = {
         # Without a network precision does not apply.
         "mixture": lambda: run_problem(
@@ -86,8 +113,10 @@ def sampling(
         checkpoint = read_checkpoint(ckpt)
         about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
         model = ModelProblem(checkpoint, device, chosen.batch)
+        written = ckpt.stat().st_mtime_ns
+        work = Work(out / "work", [about, written, str(chosen), device, quick])
         ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
-        problems["model"] = lambda: run_problem(model, ways, chosen)
+        problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     facts = {
@@ -96,7 +125,10 @@ def sampling(
         "machine": machine() | {"threads": torch.get_num_threads(), "gpu": gpu},
         "versions": versions(torch, np),
     }
-    return write_report(out, found, facts)
+    text = write_report(out, found, facts)
+    if work.folder is not None:
+        shutil.rmtree(work.folder)
+    return text
 
 
 def settings_of(effort: Effort, precisions: Sequence[Precision] = ()) -> list[Setting]:
@@ -117,17 +149,19 @@ def settings_of(effort: Effort, precisions: Sequence[Precision] = ()) -> list[Se
     return sorted(dict.fromkeys(ways), key=lambda way: samplers.index(way.sampler))
 
 
-def run_problem(problem: Problem, ways: Sequence[Setting], effort: Effort) -> Finding:
+def run_problem(
+    problem: Problem, ways: Sequence[Setting], effort: Effort, work: Work | None = None
+) -> Finding:
     """Error and time of each way to sample, with a progress bar of all network evaluations."""
-    num, steps = effort.samples, effort.reference_steps
+    work, num, steps = work or Work(), effort.samples, effort.reference_steps
     solved = {(way.sampler, precision) for way in ways for precision in (way.precision, "fp32")}
     solving = sum(evaluations(sampler.solver, sampler.steps) for sampler, _ in solved)
     timing = sum(way.nfe * way.batch for way in ways) * (effort.rounds + 1)
     total = num * (3 * steps - 2 + solving) + timing
     # Without a terminal there is no bar.
     with tqdm(total=total, unit="evaluation", unit_scale=True, desc="bench", disable=None) as bar:
-        exact, self_error = reference(problem, steps, num, bar.update)
-        errors = errors_of(problem, ways, exact, bar.update)
+        exact, self_error = reference(problem, steps, num, work, bar.update)
+        errors = errors_of(problem, ways, exact, work, bar.update)
 
         def case(way: Setting, run: Callable[[], float]) -> float:
             seconds = run()
@@ -136,7 +170,8 @@ def run_problem(problem: Problem, ways: Sequence[Setting], effort: Effort) -> Fi
 
         labelled = _labelled(ways, effort.batch)
         cases = {name: partial(case, way, problem.case(way)) for name, way in labelled.items()}
-        measured = compare(cases, effort.rounds)
+        # Complete rounds are kept.
+        measured = compare(cases, effort.rounds, lambda n, run: work.piece(f"round_{n}", run))
     each, rest = problem.flop()
     rows = [
         Row(label, way, error, measured.seconds[label], way.nfe * each + rest, self_error)
@@ -159,17 +194,24 @@ def _solved(
     )
 
 
-def reference(problem: Problem, steps: int, num: int, advance: Advance) -> tuple[Solved, float]:
+def reference(
+    problem: Problem, steps: int, num: int, work: Work, advance: Advance
+) -> tuple[Solved, float]:
     """The converged solution, and the RMSE of its latents from those of half the steps."""
+
+    def solve(count: int, indices: range) -> Solved:
+        name = f"reference_{count}_{indices.start}"
+        return Solved(*work.piece(name, lambda: tuple(problem.converged(count, indices))))
+
     solved, half = (
-        _solved(num, problem.batch, partial(problem.converged, c), 2 * c - 1, advance)
+        _solved(num, problem.batch, partial(solve, c), 2 * c - 1, advance)
         for c in (steps, steps // 2)
     )
     return solved, _rmse(solved.latents, half.latents)
 
 
 def errors_of(
-    problem: Problem, ways: Sequence[Setting], exact: Solved, advance: Advance
+    problem: Problem, ways: Sequence[Setting], exact: Solved, work: Work, advance: Advance
 ) -> list[Errors]:
     """Errors of each setting, and from the same sampler in fp32."""
 
@@ -180,13 +222,18 @@ def errors_of(
             len(exact.latents), problem.batch, partial(problem.solve, way), way.nfe, advance
         )
 
-    errors = []
-    for way in ways:
+    def errors(way: Setting) -> tuple[Any, ...]:
         solved, plain = solve(way.sampler, way.precision), solve(way.sampler, "fp32")
-        squared = _squared(solved.latents, exact.latents).tolist()
-        precision = _rmse(solved.latents, plain.latents)
-        errors.append(Errors(squared, precision, *_range_errors(solved.range_m, exact.range_m)))
-    return errors
+        return (
+            _squared(solved.latents, exact.latents).tolist(),
+            _rmse(solved.latents, plain.latents),
+            *_range_errors(solved.range_m, exact.range_m),
+        )
+
+    return [
+        Errors(*work.piece(f"errors_{index}", partial(errors, way)))
+        for index, way in enumerate(ways)
+    ]
 
 
 def _squared(a: Tensor, b: Tensor) -> Tensor:

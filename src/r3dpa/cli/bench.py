@@ -59,6 +59,8 @@ def sampling(
 ) -> Any:
     """Measure accuracy against time for an exact velocity and a trained model; draw both.
 
+    The same command completes an interrupted run.
+
     Args:
         out: Folder for tables, pictures and ``quality.json``.
         ckpt: Checkpoint of stage joint or flow_matching; default: only a mixture of Gaussians

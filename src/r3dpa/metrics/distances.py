@@ -56,6 +56,19 @@ class SceneMetric(Metric):
         self._empty: dict[str, Tensor] = {}  # rows of the states that are lists of tensors
         self._add_states("count", torch.zeros((), dtype=torch.int64))
 
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """As torchmetrics does it, but an update that fails leaves the state as it was."""
+        states = {name: getattr(self, name) for name in self._defaults}
+        states = {name: v[:] if isinstance(v, list) else v for name, v in states.items()}
+        count = self._update_count
+        try:
+            return super().forward(*args, **kwargs)
+        except Exception:
+            for name, value in states.items():
+                setattr(self, name, value)
+            self._update_count = count
+            raise
+
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distances as rows of a table, with intervals; of this process alone."""
         raise NotImplementedError
@@ -80,9 +93,13 @@ class SceneMetric(Metric):
         """Scenes seen."""
         return int(getattr(self, f"{side}_count"))
 
-    def set_real(self, name: str, value: Tensor) -> None:
-        """Sets one of :meth:`real_states`."""
-        setattr(self, name, [value] if name in self._empty else value)
+    def load_state(self, name: str, value: Tensor) -> None:
+        """Sets one of :meth:`real_states`; a ``ValueError`` if its shape is another."""
+        grows = name in self._empty
+        expected = (self._empty[name] if grows else getattr(self, name)).shape[grows:]
+        if value.shape[grows:] != expected:
+            raise ValueError(f"{name} of shape {tuple(value.shape)} ends not in {tuple(expected)}")
+        setattr(self, name, [value] if grows else value)
 
     def adopt_real(self, *others: SceneMetric) -> None:
         """Takes over the real scans of other metrics of this kind, one after the other."""

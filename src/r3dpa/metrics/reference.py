@@ -195,7 +195,7 @@ class ReferenceStatistics:
                     filled, counts = tensors[key]
                     value[filled] = counts.to(value)
                 else:
-                    metric.set_real(name, tensors[key])
+                    metric.load_state(name, tensors[key])
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
                 f"{path} holds no reference statistics ({first_line(error)}): give the "
