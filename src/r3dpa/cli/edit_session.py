@@ -131,12 +131,8 @@ class EditSession:
             del settings["strength"], settings["window"]
         own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
         request = own | provenance(self.checkpoint, options, self.num, self.device, self.geometry)
-        request |= {
-            "command": command,
-            "scans": {name: scan.path for name, scan in scans.items()},
-            "guided": guided,
-            "settings": settings,
-        }
+        request |= {"command": command, "guided": guided, "settings": settings}
+        request["scans"] = {name: scan.path for name, scan in scans.items()}
         request = json.loads(json.dumps(request, default=str))  # paths as text
         with SceneWriter(
             options.out, self.num, self.projection, options.formats, request, options.overwrite
@@ -148,13 +144,9 @@ class EditSession:
             writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
             writer.close()
             self._show(command, scans, result.range_m, parts, part_names)
-            request |= {
-                "nfe": result.nfe,
-                "seconds": seconds,
-                "cosine": None if result.cosine is None else result.cosine.tolist(),
-                "vae_error_m": result.vae_error_m,
-                "round_trip_m": result.round_trip_m,
-            }
+            measured = ("nfe", "vae_error_m", "round_trip_m")
+            request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
+            request["cosine"] = None if result.cosine is None else result.cosine.tolist()
             if command == "complete" and parts is not None:
                 whole = next(iter(scans.values())).range_m
                 request["held_out"] = _held_out_errors(result.range_m, whole, parts)

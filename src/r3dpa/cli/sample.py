@@ -98,12 +98,8 @@ def sample(
     )
     generator.prepare()
     request = provenance(checkpoint, files, num, device, generator.geometry)
-    request |= {
-        "precision": precision,
-        "compile": compile,
-        "sampler": asdict(sampler),
-        "autoguidance": about_guide,
-    }
+    request |= {"precision": precision, "compile": compile}
+    request |= {"sampler": asdict(sampler), "autoguidance": about_guide}
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
         measured = generate_all(generator, writer, files.batch_size, files.seed)
