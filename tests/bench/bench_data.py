@@ -1,7 +1,5 @@
 """Scans per second from files to batches: reading, projecting, loaders, feature grids."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,18 +1,12 @@
 """Metrics: networks on one scan, JSD, MMD and sparse convolution."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
 from torch.nn import functional as F
 
-from r3dpa.metrics.functional_bev import (
-    BEVGrid,
-    histogram_distance,
-    minimum_matching,
-)
+from r3dpa.metrics.functional_bev import BEVGrid, histogram_distance, minimum_matching
 from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import lip_loc_space, range_vit_space, voxel_space
 from r3dpa.nn.backbones.liploc import LIPLoc

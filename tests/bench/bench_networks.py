@@ -1,7 +1,5 @@
 """Networks of the paper's sizes on one scene: VAE layouts, SiT, sampling, feature networks."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A simulated scan on one core, by weather; the budget of a plain street is 60 ms cast, 100 ms."""
 
-from __future__ import annotations
-
 import pytest
 
 from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan

@@ -1,7 +1,5 @@
 """Scans and data sets of the micro-benchmarks; one thread, so that runs can be compared."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

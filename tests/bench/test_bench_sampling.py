@@ -1,7 +1,5 @@
 """What accuracy costs in time: certificate, Pareto front, advice, files, and interrupted runs."""
 
-from __future__ import annotations
-
 import json
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -14,13 +12,7 @@ import torch
 from tiny_networks import tiny_checkpoint
 
 from r3dpa.bench import sampling as bench
-from r3dpa.bench.problems import (
-    GaussianMixture,
-    MixtureProblem,
-    ModelProblem,
-    Setting,
-    toy_mixture,
-)
+from r3dpa.bench.problems import GaussianMixture, MixtureProblem, ModelProblem, Setting, toy_mixture
 from r3dpa.bench.report import (
     Errors,
     Row,

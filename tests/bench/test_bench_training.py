@@ -1,7 +1,5 @@
 """The bench of training steps at smoke size: counts, memory, work, table, and killed processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Interleaved timing: order, ratios with intervals, A/A check; FLOP and peak."""
 
-from __future__ import annotations
-
 import time
 from itertools import cycle
 

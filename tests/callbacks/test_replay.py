@@ -1,7 +1,5 @@
 """A kept batch runs again with the numbers of the step, and the layer at fault is named."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest
@@ -107,7 +105,6 @@ def test_a_precision_that_is_not_repeated_is_said(precision, said, file, tmp_pat
     kept = BadBatch.read(file)
     kept = dataclasses.replace(kept, about=kept.about | {"precision": precision, "step": 1})
     text = replay(
-        kept.save(tmp_path / "other"),
-        save(stage_module("joint"), tmp_path / "before.safetensors"),
+        kept.save(tmp_path / "other"), save(stage_module("joint"), tmp_path / "before.safetensors")
     )
     assert (f"{precision} is not repeated: run in float32" in text) == said

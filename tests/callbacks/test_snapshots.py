@@ -1,7 +1,5 @@
 """Snapshots of the average: when and what is written, and which may guide which model."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from types import SimpleNamespace

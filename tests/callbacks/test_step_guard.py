@@ -1,7 +1,5 @@
 """A bad step leaves no trace but a count and a file; collapse stops; processes agree."""
 
-from __future__ import annotations
-
 import re
 import signal
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A short training and a checkpoint of random weights, shared by the tests of all commands."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """``r3dpa ablate``: what is shared, what is run, what a failure costs, and what is written."""
 
-from __future__ import annotations
-
 import asyncio
 import csv
 import json

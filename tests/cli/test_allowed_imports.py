@@ -1,7 +1,5 @@
 """What a YAML file or a checkpoint from elsewhere names is not run."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

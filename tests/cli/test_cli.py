@@ -1,7 +1,5 @@
 """The ``r3dpa`` command: help, usage errors, and errors as one line on the terminal."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -3,8 +3,6 @@
 Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

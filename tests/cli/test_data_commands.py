@@ -1,7 +1,5 @@
 """``r3dpa simulate``, ``check``, ``view``, ``objects`` and ``realism``."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

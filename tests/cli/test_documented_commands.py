@@ -3,8 +3,6 @@
 An installed wheel holds the configurations, and its commands find them.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

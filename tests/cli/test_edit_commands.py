@@ -1,7 +1,5 @@
 """``r3dpa inpaint`` and its like: files they write, and what they refuse before networks run."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

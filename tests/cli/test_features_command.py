@@ -3,8 +3,6 @@
 Interrupts and kills are in tests/faults.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage 0 through the real command line: image VAE, pretraining, and what may start from it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

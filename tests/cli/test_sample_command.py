@@ -1,7 +1,5 @@
 """``r3dpa sample``, ``convert`` and ``report``: what they print, write, and refuse."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``r3dpa fit | validate`` with stages other than those of range images; presets, wandb."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``r3dpa test`` at smoke size: samples a checkpoint and compares the scenes with the scans."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Small scans and a small extractor for the tests of r3dpa.data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

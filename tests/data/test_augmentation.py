@@ -30,10 +30,7 @@ def real_scans(real_scans_dir):
     return [torch.from_numpy(read_scan(scan.path)) for scan in find_scans(real_scans_dir)[::12]]
 
 
-SOURCES = [
-    pytest.param("simulated_scans"),
-    pytest.param("real_scans", marks=pytest.mark.data),
-]
+SOURCES = [pytest.param("simulated_scans"), pytest.param("real_scans", marks=pytest.mark.data)]
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Images from folders and tar shards, their cached latents, and dead leaves."""
 
-from __future__ import annotations
-
 import io
 import os
 import tarfile

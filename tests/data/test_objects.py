@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -8,13 +6,7 @@ import torch
 from safetensors.torch import save_file
 
 from r3dpa.data import Scan, ScanError, write_bin
-from r3dpa.data.objects import (
-    CLASS_NAMES,
-    ObjectClass,
-    ObjectLibrary,
-    object_library,
-    read_labels,
-)
+from r3dpa.data.objects import CLASS_NAMES, ObjectClass, ObjectLibrary, object_library, read_labels
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
 from r3dpa.simulation import Semantic
 

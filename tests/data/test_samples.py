@@ -7,13 +7,7 @@ import torch
 
 from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import ScanError, write_bin, write_npz, write_ply
-from r3dpa.geometry import (
-    EMPTY_RANGE_M,
-    LidarSensor,
-    SphericalProjection,
-    range_image,
-    unproject,
-)
+from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, range_image, unproject
 
 SENSOR = LidarSensor(beams=4, columns=8)
 CLOUDS = [

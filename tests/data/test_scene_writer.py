@@ -1,7 +1,5 @@
 """Scenes arrive as files in order; what stops a run is told, and the next run goes on after it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import threading

@@ -1,7 +1,5 @@
 """Metrics are what their functions are, in batches, merged, or in two uneven processes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -26,12 +24,7 @@ from r3dpa.metrics.feature_distances import (
     metrics_of,
     scene_metrics,
 )
-from r3dpa.metrics.functional import (
-    fd_infinity,
-    frechet_distance_of,
-    polynomial_mmd,
-    shared_balls,
-)
+from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, polynomial_mmd, shared_balls
 from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
 from r3dpa.metrics.scene import DEFAULT
 

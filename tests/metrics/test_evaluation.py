@@ -111,10 +111,7 @@ def test_floors_are_between_the_drives():
 
 def test_intervals_are_as_wide_as_fresh_sets_differ():
     """Half a 95 % interval is two standard deviations; both are estimates from few."""
-    sets = [
-        found(1, noise=1.0),
-        *(found(seed, noise=1.0, num_resamples=0) for seed in range(2, 9)),
-    ]
+    sets = [found(1, noise=1.0), *(found(seed, noise=1.0, num_resamples=0) for seed in range(2, 9))]
     for name in ("W1 range", "TOY", "JSD"):
         spread = torch.tensor([rows[name].value for rows in sets]).std().item()
         ratio = sets[0][name].half_width / (2 * spread)

@@ -1,7 +1,5 @@
 """Distances of feature sets and clouds, by hand and against plain loops."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

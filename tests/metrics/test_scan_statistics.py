@@ -1,7 +1,5 @@
 """Scans of a flat road inside a round wall: every count is known by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields
 

@@ -1,7 +1,5 @@
 """Curves of a run, and accuracy against time: lines, labels and scales are where they belong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

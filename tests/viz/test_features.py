@@ -1,7 +1,5 @@
 """Features as colours: which rows look alike, which are empty, and where cells are drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The page of ``r3dpa view``: what it holds, and its script run in node."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json
