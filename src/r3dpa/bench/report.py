@@ -152,8 +152,7 @@ def pareto_front(seconds: Floats, errors: Floats, tolerance: float = 0.0) -> NDA
 
 def _smaller(values: Floats, tolerance: float = 0.0) -> NDArray[np.bool_]:
     """``(R, R)``: whether the first is smaller than the second at the level of 95 %."""
-    scaled = values * (1 + tolerance)
-    return np.array([(row < values).mean(axis=1) >= _LEVEL for row in scaled])
+    return np.array([(row < values).mean(axis=1) >= _LEVEL for row in values * (1 + tolerance)])
 
 
 def sentences(front: Sequence[Row]) -> list[str]:
@@ -318,7 +317,6 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _notes(found: Finding) -> list[str]:
-    """Conditions of the measurement that a reader of the table needs."""
     return [
         f"error: RMSE from Heun-{found.steps} of {found.samples} samples, itself "
         f"{found.self_error:.3g} from half its steps; ?: error too small for that reference",

@@ -113,8 +113,7 @@ def sampling(
         checkpoint = read_checkpoint(ckpt)
         about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
         model = ModelProblem(checkpoint, device, chosen.batch)
-        written = ckpt.stat().st_mtime_ns
-        work = Work(out / "work", [about, written, str(chosen), device, quick])
+        work = Work(out / "work", [about, ckpt.stat().st_mtime_ns, str(chosen), device, quick])
         ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
         problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}

@@ -202,7 +202,6 @@ def _build(files: list[Path], fresh_vae: Path) -> GenerativeModule:
 
 
 def _data(module: GenerativeModule, folder: Path, stage: str, batch_size: int) -> LidarDataModule:
-    """The simulated scans at the size that the networks of a module expect."""
     beams, columns = (
         size * stride for size, stride in zip(module.sit.input_size, module.vae.stride, strict=True)
     )

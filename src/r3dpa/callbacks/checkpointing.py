@@ -158,8 +158,7 @@ class RunCheckpoint(ModelCheckpoint):
 
 
 def _guard(trainer: L.Trainer) -> StepGuard | None:
-    callbacks = cast(Any, trainer).callbacks
-    return next((one for one in callbacks if isinstance(one, StepGuard)), None)
+    return next((one for one in cast(Any, trainer).callbacks if isinstance(one, StepGuard)), None)
 
 
 def _start_next_epoch(trainer: L.Trainer) -> None:

@@ -97,8 +97,7 @@ class PictureLogger(L.Callback):
         sensor = geometry.projection.sensor
         range_m = geometry.codec.decode(image[0, 0], sensor)
         found_m = geometry.codec.decode(module.reconstruct(image)[0, 0].float(), sensor)
-        both = (range_m > 0) & (found_m > 0)
-        error_m = (range_m - found_m).abs()[both].mean().item()
+        error_m = (range_m - found_m).abs()[(range_m > 0) & (found_m > 0)].mean().item()
         agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
 

@@ -180,8 +180,7 @@ class SceneScorer(L.Callback):
         """Writes the batches of this process; network evaluations per scene, 0 without any."""
         assert module.ema is not None
         generator = averaged_generator(module, module.ema, self.sampler, self.precision)
-        starts = range(0, self.num_scenes, self.batch_size)
-        own = starts[trainer.global_rank :: trainer.world_size]
+        own = range(0, self.num_scenes, self.batch_size)[trainer.global_rank :: trainer.world_size]
         quiet, nfe = None if trainer.is_global_zero else True, 0
         for first in tqdm(own, "sampling", unit="batch", disable=quiet):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
@@ -192,7 +191,6 @@ class SceneScorer(L.Callback):
         return nfe
 
     def _made_with(self, trainer: L.Trainer, module: GenerativeModule, nfe: int) -> dict[str, Any]:
-        """Sampler, checkpoint and seed of the scenes."""
         return {
             "solver": self.sampler.solver,
             "steps": self.sampler.steps,
@@ -230,5 +228,4 @@ def _stamp(scans: Sequence[Scan]) -> str:
 
 
 def _part(folder: Path, first: int) -> Path:
-    """File of the batch that starts with this scene."""
     return folder / "sampled" / f"{first:06d}.safetensors"

@@ -102,7 +102,6 @@ def _checkpoint(module: GenerativeModule, path: Path, step: int) -> Checkpoint:
 
 
 def _sit_config(module: GenerativeModule) -> Mapping[str, Any]:
-    """Class and arguments of the SiT, as ``r3dpa fit`` records them."""
     config = module.hparams["sit"]
     if not isinstance(config, Mapping):
         raise ValueError(

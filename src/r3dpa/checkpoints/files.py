@@ -169,7 +169,6 @@ def _refuse_existing(paths: list[Path], overwrite: bool) -> None:
 
 
 def _neighbour(vae: Path, kind: str) -> Path:
-    """Name of the file that belongs to an official VAE file."""
     return vae.with_name(f"{vae.stem}-{kind}.pt")
 
 
@@ -277,8 +276,7 @@ def _network(name: str, config: Any, weights: Mapping[str, Tensor]) -> NetworkSt
             f"it does not say which class and arguments its {name} has (found "
             f"{reprlib.repr(config)}); train with `r3dpa fit`, which records them"
         )
-    state = NetworkState(config["class_path"], config.get("init_args") or {}, weights)
-    return state.checked(name)
+    return NetworkState(config["class_path"], config.get("init_args") or {}, weights).checked(name)
 
 
 def _from_diffusers(path: Path) -> Checkpoint:
@@ -309,7 +307,6 @@ def _from_diffusers(path: Path) -> Checkpoint:
 
 
 def _count(keys: Iterable[str], pattern: str) -> int:
-    """Number of different indices that a pattern finds."""
     return len({found[1] for key in keys if (found := re.match(pattern, key))})
 
 

@@ -241,6 +241,5 @@ def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:
 
 
 def _shortened(lines: list[str]) -> list[str]:
-    """The first lines and a count of the others."""
     rest = len(lines) - _NUM_LISTED
     return lines if rest <= 0 else [*lines[:_NUM_LISTED], f"... and {rest} more"]

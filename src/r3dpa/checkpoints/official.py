@@ -117,7 +117,6 @@ def from_official(
 
 
 def _from_ours(content: Mapping[str, Any], path: Path, sit_args: Options) -> Checkpoint:
-    """Checkpoint from an official file with the entry that ours have."""
     about = content[OURS]
     networks: dict[str, NetworkState] = {}
     for name, config in about["networks"].items():

@@ -138,7 +138,6 @@ def _grouped(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:
 
 
 def _largest(weights: Weights) -> tuple[int, ...]:
-    """Shape of the largest tensor; empty if there is none."""
     return max(shapes_of(weights).values(), key=math.prod, default=())
 
 
@@ -224,7 +223,6 @@ def vae_fingerprint(vae: Weights) -> str:
 
 
 def _vae_note(checkpoint: Checkpoint) -> str | None:
-    """Fingerprint of the VAE of a checkpoint, None if it has none."""
     if "vae" in checkpoint.networks:
         return vae_fingerprint(checkpoint.network("vae").state_dict)
     return checkpoint.left_out.get("vae")

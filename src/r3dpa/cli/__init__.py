@@ -55,7 +55,6 @@ _GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in nam
 
 
 def _help(group: str) -> str:
-    """Usage and summaries of all commands, or of those of a group."""
     shown = {name: command for name, command in COMMANDS.items() if name.startswith(group)}
     lines = [f"  {name:<17}{command.summary}" for name, command in shown.items()]
     title = [] if group else ["Generate LiDAR scenes (R3DPA).", ""]
@@ -65,7 +64,6 @@ def _help(group: str) -> str:
 
 
 def _find(args: list[str]) -> tuple[str, list[str]]:
-    """Full name of the command, and the words after it."""
     name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
     rest = args[len(name.split()) :]
     name = _ALIASES.get(name, name)

@@ -151,7 +151,6 @@ def ablate(
 
 
 def _resolved(command: str) -> dict[str, Any]:
-    """The whole configuration of an ``r3dpa fit`` command."""
     from r3dpa.cli.stages import run
 
     with redirect_stdout(StringIO()) as printed, warnings.catch_warnings():

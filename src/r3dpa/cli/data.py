@@ -102,7 +102,6 @@ def objects(
         [one.name, f"{one.num_scans}", f"{one.num_cells}", f"{one.num_points}", f"{one.spread:.3f}"]
         for one in library.classes
     ]
-    head = ["class", "scans", "cells", "points", "spread"]
-    table = text_table(rows, head, "rrrrr", "plain")
+    table = text_table(rows, ["class", "scans", "cells", "points", "spread"], "rrrrr", "plain")
     spread = "Spread: mean of 1 - cosine between the class's feature and its cells."
     return f"{table}\n{spread}\n{len(scans)} scans, features of {source}, written to {out}"

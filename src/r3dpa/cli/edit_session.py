@@ -180,7 +180,6 @@ class EditSession:
         parts: Tensor | None,
         part_names: Sequence[str],
     ) -> None:
-        """Pictures of each scene, the sheet, the page, the mask and the scans before the edit."""
         out = self.options.out
         before = {name: scan.range_m for name, scan in scans.items()}
         images = torch.stack(list(before.values()))

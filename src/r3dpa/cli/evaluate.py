@@ -60,8 +60,7 @@ def reference(
     setting = replace(PROTOCOLS[protocol], sensor=module.sensor)
     found = feature_spaces(spaces, ckpt, setting, device)
     about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
-    names = [scan.name for scan in scans]
-    job = ReferenceStatistics(setting, cards_of(found), names, about)
+    job = ReferenceStatistics(setting, cards_of(found), [scan.name for scan in scans], about)
 
     def scene(scan: Scan) -> EvaluationScene:
         return EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))

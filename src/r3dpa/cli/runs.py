@@ -69,8 +69,7 @@ def report(run: Path) -> str:
         tenth = max(1, len(values) // 10)
         first, last = fmean(values[:tenth]), fmean(values[-tenth:])
         rows.append([name, f"{first:.5g}", f"{last:.5g}", f"{last - first:+.5g}"])
-    head = ["quantity", "first tenth", "last tenth", "change"]
-    table = text_table(rows, head, "lrrr", "plain")
+    table = text_table(rows, ["quantity", "first tenth", "last tenth", "change"], "lrrr", "plain")
     return f"{table}\ncurves: {run / 'loss_curves.png'}" if drawn else table
 
 
@@ -159,7 +158,6 @@ class _Observer:
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:
-    """The stage with the networks of the checkpoint and the settings of the batch."""
     from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
 
     stages = {stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMatching)}

@@ -196,7 +196,6 @@ class StageCLI(LightningCLI):
 
 
 def _newest(run_dir: Path) -> str | None:
-    """The checkpoint of a run that was written last; None if there is none."""
     found = list((run_dir / "checkpoints").glob("[!.]*.ckpt"))
     return str(max(found, key=lambda path: path.stat().st_mtime_ns)) if found else None
 

@@ -200,8 +200,7 @@ def read_mask(path: str | Path, sensor: LidarSensor) -> Tensor:
             pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: cannot be read as a picture ({first_line(error)})") from error
-    bright = pixels[..., :3].max(axis=2) >= _BRIGHT
-    return torch.from_numpy(bright & (pixels[..., 3] >= _BRIGHT))
+    return torch.from_numpy((pixels[..., :3].max(axis=2) >= _BRIGHT) & (pixels[..., 3] >= _BRIGHT))
 
 
 @dataclass(frozen=True)
@@ -246,8 +245,7 @@ class DeadLeaves(ImageSource):
 
     def read(self, entry: ImageEntry, size: int) -> NDArray[np.uint8]:
         """Draw an image ``(S, S, 3)``."""
-        number = int(entry.name.partition(".")[0])
-        generator = np.random.default_rng((self.seed, number))
+        generator = np.random.default_rng((self.seed, int(entry.name.partition(".")[0])))
         return dead_leaves(generator, size, self.smallest, self.largest)
 
     def settings(self) -> dict[str, Any]:
@@ -290,8 +288,7 @@ def dead_leaves(
         colour = palette[generator.integers(_PALETTE)] + generator.normal(0, 0.05, 3)
         slope = generator.normal(0, 0.06, 2).astype(np.float32)
         roughness = float(generator.exponential(0.06))
-        light = slope[0] * rows / radius + slope[1] * columns / radius
-        shade = light + roughness * texture[box]
+        shade = slope[0] * rows / radius + slope[1] * columns / radius + roughness * texture[box]
         image[box][drawn] = colour.astype(np.float32) + shade[drawn][:, None]
         free[box][drawn] = False
         num_free -= count

@@ -140,7 +140,6 @@ def training_loader(
 
 
 def _common(batch_size: int, num_workers: int = 0, **options: Any) -> dict[str, Any]:
-    """Options of every loader, by name as Lightning needs them."""
     return options | {
         "batch_size": batch_size,
         "num_workers": num_workers,

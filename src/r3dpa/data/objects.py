@@ -264,8 +264,7 @@ def object_library(
         mean = total / weight
         cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
         features.append(mean.float())
-        spread = max(0.0, 1 - cosine)
-        results.append(ObjectClass(name, num_scans, num_cells, num_points, spread))
+        results.append(ObjectClass(name, num_scans, num_cells, num_points, max(0.0, 1 - cosine)))
     return ObjectLibrary(
         torch.stack(features),
         tuple(results),

@@ -367,8 +367,7 @@ def check(path: str | Path) -> tuple[str, bool]:
         return float(intensity.min()), float(intensity.max())
 
     with ThreadPool(8) as pool:
-        examined = pool.imap(examine, scans)
-        results = list(tqdm(examined, total=len(scans), unit="scan", disable=None))
+        results = list(tqdm(pool.imap(examine, scans), total=len(scans), unit="scan", disable=None))
     problems += [result for result in results if isinstance(result, str)]
     lines = [*(f"{drive}: {count} scans" for drive, count in counts.items()), *problems]
     if limits := [result for result in results if not isinstance(result, str)]:

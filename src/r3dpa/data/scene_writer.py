@@ -191,8 +191,7 @@ class SceneWriter:
                 f"{self._unfinished} is gone or cut short, but {self._state} counts "
                 f"{self.num_done} scenes: give --overwrite true to start anew"
             )
-        mode = "r+b" if self.num_done else "wb"
-        file = FileIO(self._unfinished, mode, opener=no_follow)
+        file = FileIO(self._unfinished, "r+b" if self.num_done else "wb", opener=no_follow)
         file.write(header.getvalue())
         file.truncate(end)
         file.seek(end)

@@ -125,7 +125,6 @@ class Store:
         )
 
     def _journal(self, path: Path) -> list[ItemKey]:
-        """Key of each row of a shard."""
         data, rows = path.read_bytes(), path.with_suffix(".rows")
         keys: list[ItemKey] = []
         try:
@@ -169,8 +168,7 @@ def tensor_cache(
     """
     about = {"version": _VERSION, "shape": shape, "settings": settings}
     text = json.dumps(about, indent=1, sort_keys=True)
-    folder = root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    return Store(folder, text, shape)
+    return Store(root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}", text, shape)
 
 
 class StoreWriter:

@@ -16,10 +16,7 @@ from r3dpa.flow.times import check_interval, per_sample
 
 
 def autoguided(
-    velocity: Velocity,
-    weak: Velocity,
-    scale: float,
-    interval: tuple[float, float] = (0.0, 1.0),
+    velocity: Velocity, weak: Velocity, scale: float, interval: tuple[float, float] = (0.0, 1.0)
 ) -> Velocity:
     """Velocity extrapolated from that of a weak model through that of the model itself.
 

@@ -67,10 +67,7 @@ def invert(
 
 
 def renoised(
-    trajectory: Trajectory,
-    edit_mask: Tensor,
-    noise: Tensor,
-    interpolant: Interpolant = LINEAR,
+    trajectory: Trajectory, edit_mask: Tensor, noise: Tensor, interpolant: Interpolant = LINEAR
 ) -> Tensor:
     """Start of an edit: fresh noise inside the mask, the inverted latents elsewhere.
 

@@ -282,6 +282,5 @@ def _at_least_float32(values: Tensor) -> Tensor:
 def _unit(vectors: Tensor) -> Tensor:
     """Unit vectors along the last axis; unlike ``normalize`` the gradient is finite at zero."""
     # Beyond 2^64 the squares are infinite and the cosine would be 0.
-    scale = vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
-    vectors = vectors / scale
+    vectors = vectors / vectors.detach().abs().amax(dim=-1, keepdim=True).clamp(min=1)
     return vectors * torch.rsqrt(vectors.square().sum(dim=-1, keepdim=True) + _COSINE_EPS**2)

@@ -42,8 +42,7 @@ def check_view(
     """
     sensor = projection.sensor
     expected = torch.ones_like(range_m, dtype=torch.bool) if missing is None else ~missing
-    kept_points = points[in_range(points, sensor)]
-    inclination = angles_of(kept_points)[0].rad2deg()
+    inclination = angles_of(points[in_range(points, sensor)])[0].rad2deg()
     lowest, highest = (v.rad2deg().item() for v in projection.ray_angles()[0].aminmax())
     outside = (inclination < lowest - _MARGIN_DEG) | (inclination > highest + _MARGIN_DEG)
     if outside.double().mean() > _MOST_OUTSIDE:

@@ -60,8 +60,7 @@ class SphericalProjection:
         inclination, azimuth = angles_of(points)
         sensor = self.sensor
         row = ((sensor.inclination_max_rad - inclination) / self._pitch).floor().long()
-        column = column_of(azimuth, sensor.columns, self.legacy_seam)
-        return row.clamp(0, sensor.beams - 1), column
+        return row.clamp(0, sensor.beams - 1), column_of(azimuth, sensor.columns, self.legacy_seam)
 
     def ray_angles(self, corner: bool = False) -> tuple[Tensor, Tensor]:
         """Inclination ``(H,)`` and azimuth ``(W,)`` of the pixel centres or corners, radians."""

@@ -63,10 +63,7 @@ def sector(projection: Projection, azimuth_from_deg: float, azimuth_to_deg: floa
 
 
 def box3d(
-    projection: Projection,
-    centre_m: Sequence[float],
-    size_m: Sequence[float],
-    yaw_deg: float = 0.0,
+    projection: Projection, centre_m: Sequence[float], size_m: Sequence[float], yaw_deg: float = 0.0
 ) -> Tensor:
     """Pixels whose ray meets a box within the range limits, and thus what occludes it, too.
 

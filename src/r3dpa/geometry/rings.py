@@ -79,8 +79,7 @@ class RingProjection:
         measured: list[list[Tensor]] = [[] for _ in range(sensor.beams)]
         counts_seen = []
         for scan in scans:
-            returns = scan[_is_return(scan, sensor)]
-            inclination, azimuth = angles_of(returns)
+            inclination, azimuth = angles_of(scan[_is_return(scan, sensor)])
             ring, num_rings = rings_in_order(inclination, azimuth, sensor)
             counts_seen.append(num_rings)
             if num_rings == sensor.beams:

@@ -162,7 +162,6 @@ class SceneMetric(Metric):
             self._prune(side)
 
     def _prune(self, side: str) -> None:
-        """Drops the scenes beyond the limit."""
         limit, order = self.limits[side], self._joined(f"{side}_order")
         if limit is None or len(order) <= limit:
             return
@@ -217,8 +216,7 @@ class _Histograms(SceneMetric):
         """Row of the distance of the sum of the groups ``(G, bins)``."""
 
         def resampled(drawn: Tensor) -> float:
-            weights = torch.bincount(drawn, minlength=len(groups)).to(groups)
-            return distance(weights @ groups)
+            return distance(torch.bincount(drawn, minlength=len(groups)).to(groups) @ groups)
 
         ends = resampling.interval(resampled, min(self.count("generated"), len(groups)))
         return self._row(name, distance(groups.sum(dim=0)), interval=ends, **fields)

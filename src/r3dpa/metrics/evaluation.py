@@ -120,8 +120,7 @@ def evaluate(
         extra["scenes"] = f"{len(names)}, where the protocol asks for {protocol.num_samples}"
     floors: dict[str, MetricResult] = {}
     if isinstance(reference, ReferenceStatistics):
-        num_images = len(match.kept("generated")[0])
-        floors = _floors(reference, spaces, len(names), num_images, resampling)
+        floors = _floors(reference, spaces, len(names), len(match.kept("generated")[0]), resampling)
         extra["verdict"] = _verdict(rows, floors)
     else:
         extra["left_out"] = reference.left_out
@@ -335,8 +334,7 @@ def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> Metric
     if not row.name.endswith(_UNBIASED) and floor.num_samples != row.num_samples:
         fewer = (floor.num_samples or 0) < (row.num_samples or 0)
         text += f", rather {'high' if fewer else 'low'}: the value is of {row.num_samples} scenes"
-    note = "; ".join(filter(None, [row.note, text]))
-    return replace(row, floor=max(floor.value, 0.0), note=note)
+    return replace(row, floor=max(floor.value, 0.0), note="; ".join(filter(None, [row.note, text])))
 
 
 def _figures(

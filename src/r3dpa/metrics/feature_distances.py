@@ -159,8 +159,7 @@ class PolynomialMMD(FeatureMetric):
         if min(counts) < 4:
             return [self._row(name, None, counts, note="needs 4 scenes of both kinds")]
         size = min(_KID_SUBSET_SIZE, min(counts) // 2)  # subsets as large as a set would all be one
-        generator = resampling.generator()
-        mean, std = polynomial_mmd(real, generated, generator, _KID_SUBSETS, size)
+        mean, std = polynomial_mmd(real, generated, resampling.generator(), _KID_SUBSETS, size)
         ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
         return [self._row(name, mean, counts, interval=ends)]
 

@@ -165,7 +165,6 @@ class _ArraysOnly(pickle._Unpickler):
 
 
 def _numbers(values: np.ndarray, ndim: int) -> Tensor:
-    """Finite numbers as float64."""
     if values.ndim != ndim or not np.isfinite(values).all():
         raise ValueError(f"an array of shape {values.shape} instead of {ndim} axes of numbers")
     return torch.from_numpy(values.astype(np.float64))

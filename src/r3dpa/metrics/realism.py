@@ -112,8 +112,7 @@ def _measures(s: ScanStatistics) -> Iterator[Measure]:
     yield _intensity("incidence, upright", "intensity rings", s.intensity_by_incidence[1])
     yield _number("saturated share", "1", "intensity", _ratio(saturated, intensities.sum()))
 
-    low = _ratio(s.low_points, s.num_returns)
-    yield _number("share below z = -1.4 m", "1", "points", low)
+    yield _number("share below z = -1.4 m", "1", "points", _ratio(s.low_points, s.num_returns))
     heights = BINS["ground_residual_counts"]
     shares = _ratio(s.ground_residual_counts, s.ground_residual_counts.sum())
     centres_mm = (np.arange(heights.number) + 0.5) * heights.width * 1000
@@ -208,7 +207,6 @@ def _quantile(histograms: Floats, quantile: float, at_least: float = _MIN_COUNT)
 
 
 def _known(statistic: Callable[[Floats], Any], curve: Floats) -> float:
-    """Statistic of the finite values of a curve."""
     finite = curve[np.isfinite(curve)]
     return float(statistic(finite)) if len(finite) else math.nan
 

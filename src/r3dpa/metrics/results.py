@@ -421,5 +421,4 @@ def _cells(row: MetricResult) -> tuple[str, ...]:
 
 
 def _first(column: Sequence[MetricResult | None]) -> MetricResult:
-    """A result of a column, for direction, unit and scale."""
     return next(filter(None, column))

@@ -227,8 +227,7 @@ def _count_rings(s: ScanStatistics, range_m: Floats, sweep: Sweep, incidence_deg
     across = missing[before] + missing + 2
     known = missing * (missing <= structure.MAX_GAP_SHOTS), across <= structure.MAX_GAP_SHOTS + 1
     shots = np.concatenate([missing + 1, across])
-    level = structure.level_enough(range_m[left], range_m[right], shots)
-    weight = np.concatenate(known) * level
+    weight = np.concatenate(known) * structure.level_enough(range_m[left], range_m[right], shots)
     middle_m = (range_m[left] + range_m[right]) / 2
     angle_deg = (incidence_deg[:, left] + incidence_deg[:, right]) / 2
     surface, pair = np.isfinite(angle_deg).nonzero()

@@ -169,8 +169,7 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
             voxels, inputs = voxelize(_points(scene), voxel_m, **limits)
             clouds.append((F.pad(voxels, (0, 1), value=index), inputs))
         coordinates, inputs = (torch.cat(parts).to(device) for parts in zip(*clouds, strict=True))
-        features = network(coordinates, inputs)
-        return pool_voxels(features, coordinates, len(scenes), voxel_m)
+        return pool_voxels(network(coordinates, inputs), coordinates, len(scenes), voxel_m)
 
     preprocessing = f"voxels of {voxel_m:g} m, first point, no intensity"
     card = _card(network, f"before the head, means of {NUM_BINS} rings", preprocessing)

@@ -109,8 +109,7 @@ class UNet(VelocityNetwork):
             layers: list[nn.Module] = [_TimedResBlock(inside, outside, embedding)]
             return [*layers, _HeadsAttention(outside, head_channels)] if attention else layers
 
-        first = _Layers(CircularConv2d(in_channels, channels, _KERNEL))
-        self.input_blocks = nn.ModuleList([first])
+        self.input_blocks = nn.ModuleList([_Layers(CircularConv2d(in_channels, channels, _KERNEL))])
         kept, width = [channels], channels  # widths of the skip connections
         for level, wider in enumerate(widths):
             for _ in range(num_res_blocks):

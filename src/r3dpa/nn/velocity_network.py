@@ -78,8 +78,7 @@ class VelocityNetwork(nn.Module, ABC):
     ) -> Tensor:
         """Projected features ``(B, N, F)`` alone; layers behind the aligned depth are not run."""
         self._check(latents, time)
-        activations = self._begin(latents, self._first_modulations(time, labels))
-        return self._project(activations[0])
+        return self._project(self._begin(latents, self._first_modulations(time, labels))[0])
 
     def aligned_pass(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None

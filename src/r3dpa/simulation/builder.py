@@ -165,5 +165,4 @@ def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) 
         return
     if pavement_m:
         builder.slab(whole, pavement, *paving)
-    soil = (Semantic.TERRAIN, Material.SOIL, draw.uniform(0.15, 0.22))
-    builder.slab(whole, beyond, *soil)
+    builder.slab(whole, beyond, Semantic.TERRAIN, Material.SOIL, draw.uniform(0.15, 0.22))

@@ -274,7 +274,6 @@ def _sum(waves: tuple[Wave, ...], s: float) -> float:
 
 @lru_cache(maxsize=256)
 def _sections(course: Course, table: int) -> tuple[Section, ...]:
-    """Sections of the blocks of one table; each begins where the one before ends."""
     sections: list[Section] = []
     last = _sections(course, table - 1)[-1] if table else None
     first = table * _BLOCKS_PER_TABLE

@@ -166,8 +166,7 @@ def weather_to_dict(weather: Weather) -> dict[str, Any]:
 
 def to_json(values: Any) -> bytes:
     """Plain values and NumPy scalars as the bytes of a JSON file."""
-    text = json.dumps(values, indent=1, allow_nan=False, default=np.generic.item)
-    return f"{text}\n".encode()
+    return f"{json.dumps(values, indent=1, allow_nan=False, default=np.generic.item)}\n".encode()
 
 
 def write(path: Path, content: bytes) -> None:

@@ -76,8 +76,7 @@ class SimulationReport:
         rows = []
         for name, total in self.effects.items():
             counts = [str(count) for count in (total.ran, total.not_called, total.off)]
-            rays = f"{total.rays_per_scan:.0f}"
-            rows.append([name, *counts, rays, total.why])
+            rows.append([name, *counts, f"{total.rays_per_scan:.0f}", total.why])
         table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrl", "plain")
         per_drive = ", ".join(f"{drive} {num}" for drive, num in self.scans_per_drive.items())
         num_scans = sum(self.scans_per_drive.values())
@@ -238,7 +237,6 @@ def _check_folder(out: Path, request: dict[str, Any]) -> None:
 
 
 def _differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
-    """A text for each value that differs."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         for key in stored | wanted:
             place = f"{name}.{key}" if name else key
@@ -301,7 +299,6 @@ def _end_with_parent() -> None:
 
 
 def _run(task: _Task) -> int:
-    """Simulate and write the scans of a task; their number."""
     files, simulator, numbers = task
     for number in numbers:
         files.write_scan(number, simulator.scan(number))
@@ -309,7 +306,6 @@ def _run(task: _Task) -> int:
 
 
 def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
-    """Write timestamps, poses and the report."""
     summaries = []
     for drive, count in files.items():
         of_drive = drive.summaries(count)

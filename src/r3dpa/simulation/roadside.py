@@ -149,7 +149,6 @@ def _building(
 
 
 def _behind(builder: Builder, draw: Generator, start: float, lateral: float, woods: float) -> None:
-    """Background behind the plots: a wood or a building."""
     s = start + draw.uniform(0.3, 0.7) * BLOCK_M
     if draw.random() < woods:
         _wood(builder, draw, s, lateral)

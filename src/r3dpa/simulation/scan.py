@@ -158,7 +158,6 @@ def _run(
 
 
 def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """Points, labels and origins in storage order."""
     first, second = sweep.first, sweep.second
     seen = np.flatnonzero(np.isfinite(first.range_m))
     parts = [_export(sweep, first, seen)]

@@ -206,8 +206,7 @@ def draw_weather(generator: np.random.Generator) -> Weather:
     elevation_deg = generator.uniform(-18.0, 62.0)
     azimuth_deg = generator.uniform(-180.0, 180.0)
     if air < _CLEAR_DRY:
-        sun = elevation_deg, azimuth_deg
-        return Weather(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, *sun)
+        return Weather(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, elevation_deg, azimuth_deg)
     visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
     if air >= _CLEAR_DRY + _CLEAR_WET:
         kind = int(3 * third)

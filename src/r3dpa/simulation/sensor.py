@@ -269,8 +269,7 @@ def _azimuth(lasers: Lasers, shots: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=4)
 def _time_s(lasers: Lasers, shots: int, spin_hz: float) -> NDArray[np.float32]:
-    head = _azimuth(lasers, shots) - np.array(lasers.azimuth_offset_rad)[:, None]
-    turns = head / (2 * np.pi)
+    turns = (_azimuth(lasers, shots) - np.array(lasers.azimuth_offset_rad)[:, None]) / (2 * np.pi)
     return _frozen(((turns + 0.5) % 1.0 - 0.5) / spin_hz)
 
 
@@ -284,8 +283,7 @@ def _rays(lasers: Lasers, shots: int) -> Rays:
     )
     origin = np.stack([-lateral * sine, lateral * cosine, height])
     level, up = np.cos(inclination), np.sin(inclination)
-    direction = np.stack([level * cosine, level * sine, up])
-    return Rays(_frozen(origin), _frozen(direction))
+    return Rays(_frozen(origin), _frozen(np.stack([level * cosine, level * sine, up])))
 
 
 def _frozen(values: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -164,7 +164,6 @@ class _Stream(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _streams(seed: int, drive: int) -> tuple[_Stream, ...]:
-    """Lanes, cyclists beside them and people on the pavements."""
     course = course_of(seed, drive)
     character = course.character
     draw = generator_for(seed, "streams", drive)
@@ -201,7 +200,6 @@ def _actor(seed: int, drive: int, stream: int, number: int) -> tuple[float, floa
 
 
 def _actors(course: Course, scan: int) -> Iterator[Builder]:
-    """The moving actors near the recording car."""
     own_s = course.position(scan)
     behind_m, ahead_m = (_BLOCKS_BEHIND - 0.1) * BLOCK_M, (_BLOCKS_AHEAD - 0.1) * BLOCK_M
     for index, stream in enumerate(_streams(course.seed, course.drive)):

@@ -135,8 +135,7 @@ def range_strips(scans: Mapping[str, Array], projection: Projection) -> Figure:
     """Range images of scans ``(P, 3+)`` by name, one below the other, with the range scale."""
     pictures, shares = [], []
     for name, points in scans.items():
-        xyz = torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3])
-        range_m, _ = range_image(xyz, projection)
+        range_m, _ = range_image(torch.from_numpy(as_numpy(points, ("P", "3+"))[:, :3]), projection)
         pictures.append((name, range_image_picture(range_m, projection.sensor)))
         shares.append(float((range_m > 0).double().mean()))
     figure, cells = strip_sheet(pictures, projection.sensor)
@@ -246,7 +245,6 @@ def draw_birds_eye(
 
 
 def _azimuth_ticks(axes: Axes, projection: Projection) -> None:
-    """Ticks at eighths of a turn, in degrees as the commands take them."""
     azimuth = projection.ray_angles()[1].rad2deg().numpy()
     wanted = np.arange(135, -180, -45)
     apart = (azimuth[:, None] - wanted + 180) % 360 - 180

@@ -205,7 +205,6 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
 
 
 def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) -> dict[str, Any]:
-    """Colour scale from the first to the last tick, with its 256 colours as RGB bytes."""
     rgb = colours(np.arange(256), bytes=True)[:, :3]
     return {
         "label": label,

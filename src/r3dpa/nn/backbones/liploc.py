@@ -98,8 +98,7 @@ class LIPLoc(nn.Module):
     def forward(self, range_m: Tensor) -> Tensor:
         """Features ``(B, dim)`` of range images ``(B, H, W)`` in metres, -1 without a return."""
         pictures = wrapped_picture(range_m, (self.picture_side, self.picture_side))
-        tokens = self.encoder(self.embedding(pictures))
-        return self.norm(tokens[:, 1:].mean(dim=1))
+        return self.norm(self.encoder(self.embedding(pictures))[:, 1:].mean(dim=1))
 
 
 def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tensor:
@@ -127,8 +126,7 @@ def wrapped_grey_levels(range_m: Tensor) -> Tensor:
     again. The official code leaves this to a C cast, which is undefined outside of 0..255 and gives
     the same on x86.
     """
-    levels = torch.trunc(range_m.float() * GREY_LEVELS_PER_M)
-    return torch.remainder(levels, 256).to(torch.uint8)
+    return torch.remainder(torch.trunc(range_m.float() * GREY_LEVELS_PER_M), 256).to(torch.uint8)
 
 
 def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:

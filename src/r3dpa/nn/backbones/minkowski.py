@@ -331,7 +331,6 @@ def _sizes(weights: Mapping[str, Tensor]) -> tuple[list[int], int, int]:
 
 
 def _network_weights(content: Any) -> dict[str, Tensor]:
-    """Official state dict of the only network in a checkpoint."""
     weights = content.get("state_dict", content) if isinstance(content, Mapping) else None
     keys = [key for key in weights or () if isinstance(key, str)]
     prefixes = [key.removesuffix(_STEM) for key in keys if re.search(rf"(^|\.){_STEM}$", key)]

@@ -114,8 +114,7 @@ class TokenFeatures(nn.Module):
         counts = [len(scan.features) for scan in prepared]
         tokens = torch.zeros(0, self.network.width, device=device)
         if any(counts):
-            batch = collate_scans(prepared).to(device)
-            tokens = F.normalize(self.tokens(batch), dim=1)
+            tokens = F.normalize(self.tokens(collate_scans(prepared).to(device)), dim=1)
         return [
             own[scan.upsample.to(device)]
             if len(own)
@@ -174,7 +173,6 @@ def _network_like(weights: Mapping[str, Tensor], grid: ScanGrid) -> WaffleIron:
 
 
 def _scalr_weights(content: Any) -> dict[str, Tensor]:
-    """State dict of the point network in a file of the distillation."""
     found = next((key for key in _MODEL_KEYS if isinstance(content, dict) and key in content), None)
     if found is None or not isinstance(content[found], Mapping):
         raise ValueError(f"has neither {' nor '.join(_MODEL_KEYS)}; give {_RELEASED}.")
@@ -237,7 +235,6 @@ def save_weights(path: Path, network: WaffleIron, norm: nn.BatchNorm1d, grid: Sc
 
 
 def _read_weights(path: Path) -> tuple[dict[str, Tensor], WaffleIron, ScanGrid]:
-    """State, loaded network and grid of a file of :func:`save_weights`."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()[_ABOUT])

@@ -51,8 +51,7 @@ def kernel_offsets(size: int) -> list[tuple[int, int, int]]:
     """
     if size == 2:
         return [(x, y, z) for x, y, z in product(range(2), repeat=3)]
-    around = range(-(size // 2), size // 2 + 1)
-    return [(x, y, z) for z, y, x in product(around, repeat=3)]
+    return [(x, y, z) for z, y, x in product(range(-(size // 2), size // 2 + 1), repeat=3)]
 
 
 class KernelMap(NamedTuple):
@@ -121,8 +120,7 @@ class Voxels:
     @cached_property
     def _padded(self) -> Tensor:
         # A search may end one row behind the last one, and reads up to two rows beyond it.
-        beyond = self.keys.new_full((3,), torch.iinfo(torch.int64).max)
-        return torch.cat([self.keys, beyond])
+        return torch.cat([self.keys, self.keys.new_full((3,), torch.iinfo(torch.int64).max)])
 
     @cached_property
     def neighbors(self) -> KernelMap:
@@ -189,8 +187,7 @@ def voxel_keys(coordinates: Tensor) -> Tensor:
             f"{int(outside.sum())} of {len(coordinates)} voxels are out of bounds: x, y, z must be "
             f"in [-{MAX_COORDINATE}, {MAX_COORDINATE}), batch in [0, {MAX_CLOUDS})"
         )
-    shifted = (xyz + _SHIFT) * xyz.new_tensor(_UNITS)
-    return shifted.sum(dim=1) + (batch << 3 * _BITS)
+    return ((xyz + _SHIFT) * xyz.new_tensor(_UNITS)).sum(dim=1) + (batch << 3 * _BITS)
 
 
 class SparseConv(nn.Module):
@@ -234,11 +231,7 @@ class SparseConv(nn.Module):
 
 
 def voxelize(
-    points: Tensor,
-    voxel_m: float = VOXEL_M,
-    *,
-    range_min_m: float = 1.0,
-    range_max_m: float = 56.0,
+    points: Tensor, voxel_m: float = VOXEL_M, *, range_min_m: float = 1.0, range_max_m: float = 56.0
 ) -> tuple[Tensor, Tensor]:
     """Occupied voxels of a scan, sorted by (x, y, z), and the first point in each.
 
@@ -307,5 +300,4 @@ def _means(values: Tensor, place: Tensor, num_places: int) -> Tensor:
     """Mean ``(num_places, F)`` float64 of the rows at each place, zeros where there is none."""
     values = values.double()  # float32 sums of 10^5 rows would depend on their order
     sums = values.new_zeros(num_places, values.shape[1]).index_add_(0, place, values)
-    counts = torch.bincount(place, minlength=num_places)
-    return sums / counts.clamp(min=1)[:, None]
+    return sums / torch.bincount(place, minlength=num_places).clamp(min=1)[:, None]

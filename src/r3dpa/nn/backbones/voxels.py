@@ -233,8 +233,7 @@ class Masking:
         points[:, 0] = x * math.cos(angle) - y * math.sin(angle)
         points[:, 1] = x * math.sin(angle) + y * math.cos(angle)
         scan = prepare_scan(points, self.grid)
-        kept = points[scan.kept]
-        blocks = _block(kept)
+        blocks = _block(points[scan.kept])
         share = rng.uniform(0, self.max_hidden)
         hidden = torch.from_numpy(rng.random(int(blocks.max()) + 1) < share)[blocks]
         return MaskedScan(scan, hidden, self.describe(points, scan))
@@ -271,7 +270,6 @@ class Masking:
 
 
 def _block(points: Tensor) -> Tensor:
-    """Index of the block of rays of each point."""
     x, y, z = points[:, :3].unbind(dim=1)
     row = ((torch.atan2(z, torch.hypot(x, y)) + math.pi / 2) / _BLOCK_RAD[0]).long()
     column = ((torch.atan2(y, x) + math.pi) / _BLOCK_RAD[1]).long()

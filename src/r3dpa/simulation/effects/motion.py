@@ -139,8 +139,7 @@ def _ego_mask(ego_body: tuple[Primitive, ...], sensor: SpinningLidar) -> _EgoMas
     origin, direction = sensor.rays
     range_m, surface = cast(body, origin, direction, sensor.max_range_m)
     hit = surface != NO_SURFACE
-    position = origin[:, hit] + range_m[hit] * direction[:, hit]
-    normal = normals(body, surface[hit], position, None)
+    normal = normals(body, surface[hit], origin[:, hit] + range_m[hit] * direction[:, hit], None)
     cosine = np.abs((normal * direction[:, hit]).sum(axis=0))
     reflectivity = np.array([p.reflectivity for p in ego_body], dtype=np.float32)[surface[hit]]
     material = np.array([p.material for p in ego_body], dtype=np.uint8)[surface[hit]]

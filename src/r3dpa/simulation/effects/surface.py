@@ -299,7 +299,6 @@ class WetGround(Effect):
         _offer_mirrored(sweep, struck, reflectance[standing])
 
     def _in_puddles(self, sweep: Sweep, rays: NDArray[np.int64], film: float) -> NDArray[np.int64]:
-        """Rays that end in standing water."""
         pose = sweep.scene.pose
         cosine, sine = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
         x, y, _ = sweep.position(rays)
