@@ -4,15 +4,9 @@ import torch
 from r3dpa.bench.problems import GaussianMixture, toy_mixture
 from r3dpa.flow.interpolant import Interpolant
 
-
-def pair(std=0.3):
-    means = torch.tensor([[1.0, 0.0], [-1.0, 2.0]]).double()
-    return GaussianMixture(means, std, torch.tensor([1.0, 3.0]).double())
-
-
-def some_points(num=7, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(num, 2, generator=generator, dtype=torch.float64)
+MEANS = torch.tensor([[1.0, 0.0], [-1.0, 2.0]]).double()
+MIXTURE = GaussianMixture(MEANS, 0.3, torch.tensor([1.0, 3.0]).double())
+X = torch.randn(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
 def times_of(x, time):
@@ -20,22 +14,20 @@ def times_of(x, time):
 
 
 def test_velocity_at_both_ends_by_hand():
-    x = some_points()
-    torch.testing.assert_close(pair().velocity(x, times_of(x, 0.0)), -x)
+    torch.testing.assert_close(MIXTURE.velocity(X, times_of(X, 0.0)), -X)
     mean = torch.tensor([-0.5, 1.5]).double()
-    torch.testing.assert_close(pair().velocity(x, times_of(x, 1.0)), x - mean)
+    torch.testing.assert_close(MIXTURE.velocity(X, times_of(X, 1.0)), X - mean)
 
 
 @pytest.mark.parametrize("time", [0.05, 0.5, 0.95])
 def test_velocity_gives_the_score_of_the_density(time):
     """Independent: the gradient of the log density, by autograd from the definition."""
-    mixture, x = pair(), some_points()
-    leaf = x.clone().requires_grad_()
-    variance = (1 - time) ** 2 * mixture.std**2 + time**2
-    square = (leaf[:, None] - (1 - time) * mixture.means).square().sum(2)
-    log_density = torch.logsumexp(mixture.weights.log() - square / (2 * variance), dim=1)
+    leaf = X.clone().requires_grad_()
+    variance = (1 - time) ** 2 * MIXTURE.std**2 + time**2
+    square = (leaf[:, None] - (1 - time) * MIXTURE.means).square().sum(2)
+    log_density = torch.logsumexp(MIXTURE.weights.log() - square / (2 * variance), dim=1)
     (score,) = torch.autograd.grad(log_density.sum(), leaf)
-    given = Interpolant().score(mixture.velocity(x, times_of(x, time)), x, times_of(x, time))
+    given = Interpolant().score(MIXTURE.velocity(X, times_of(X, time)), X, times_of(X, time))
     torch.testing.assert_close(given, score, rtol=1e-9, atol=1e-9)
 
 
@@ -55,10 +47,10 @@ def test_velocity_stays_finite_where_densities_underflow():
 
 
 def test_velocity_keeps_dtype_and_samples_apart():
-    x = some_points().float()
-    whole = pair().velocity(x, torch.linspace(0, 1, len(x)))
+    x = X.float()
+    whole = MIXTURE.velocity(x, torch.linspace(0, 1, len(x)))
     assert whole.dtype == torch.float32
-    one = pair().velocity(x[3:4], torch.linspace(0, 1, len(x))[3:4])
+    one = MIXTURE.velocity(x[3:4], torch.linspace(0, 1, len(x))[3:4])
     torch.testing.assert_close(one, whole[3:4])
 
 

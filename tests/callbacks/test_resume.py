@@ -9,11 +9,7 @@ from torch.utils.data import DataLoader, default_collate
 from r3dpa.callbacks import RunCheckpoint
 from r3dpa.data.loaders import training_loader
 
-pytestmark = [
-    *QUIET,
-    pytest.mark.filterwarnings("ignore:The 'train_dataloader' does not have many workers"),
-    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists"),
-]
+pytestmark = QUIET
 WHOLE = 8  # steps
 
 

@@ -29,7 +29,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork"),
 ]
 
-
+TWO_PROCESSES = {"devices": 2, "strategy": "ddp_fork", "use_distributed_sampler": False}
 FAULTS = [
     *((stage, fault) for stage in STAGES for fault in (infinite_image, constant_loss)),
     # Stage flow_matching normalises them before it computes anything.
@@ -242,14 +242,7 @@ def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_t
         torch.save(content, tmp_path / f"rank_{self.global_rank}.pt")
 
     type(module).on_fit_end = keep
-    train(
-        module,
-        NamedData(3),
-        default_root_dir=tmp_path,
-        devices=2,
-        strategy="ddp_fork",
-        use_distributed_sampler=False,
-    )
+    train(module, NamedData(3), default_root_dir=tmp_path, **TWO_PROCESSES)
     first, second = (torch.load(tmp_path / f"rank_{rank}.pt") for rank in (0, 1))
     assert first["guard"] == second["guard"] == {"skipped": 1, "in_a_row": 0}
     for key, value in first["weights"].items():
@@ -280,9 +273,7 @@ def test_a_process_that_is_asked_to_stop_tells_the_other_in_its_step(tmp_path, o
         stage_module("flow_matching"),
         NamedData(3),
         default_root_dir=tmp_path,
-        devices=2,
-        strategy="ddp_fork",
-        use_distributed_sampler=False,
+        **TWO_PROCESSES,
         callbacks=[Ask()],
     )
     for rank in (0, 1):

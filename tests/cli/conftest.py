@@ -1,12 +1,15 @@
 """A short training and a checkpoint of random weights, shared by the tests of all commands."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from tiny_networks import tiny_checkpoint
 
+from r3dpa.callbacks import scene_scoring
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.metrics import scene
 
 CSV_LOGGER = {
     "class_path": "lightning.pytorch.loggers.CSVLogger",
@@ -37,3 +40,13 @@ def tiny_file(tmp_path_factory):
     geometry = ScanGeometry(projection, RangeCodec(), (2, 8))
     path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
     return tiny_checkpoint(path, geometry, step=3, feature_source="geometric")
+
+
+@pytest.fixture(scope="module")
+def coarse_protocols():
+    """Cells of half a metre: a hundredth of the work."""
+    coarse = {p.name: replace(p, voxel_m=0.5) for p in (scene.DEFAULT, scene.PUBLISHED)}
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (scene, scene_scoring):
+            patch.setattr(module, "PROTOCOLS", coarse)
+        yield

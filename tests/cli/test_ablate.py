@@ -32,12 +32,7 @@ from r3dpa.metrics.seeds import mean_of_seeds
 CONF = Path(__file__).resolve().parents[2] / "conf"
 TABLES = CONF / "ablation"
 RECORDED = CONF.parent / "notebooks" / "results" / "ablation_demo"
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:LightningCLI's args parameter",
-    "ignore:.*does not have many workers",
-    "ignore:.*LeafSpec.*is deprecated",
-    "ignore:Attribute '.*' is an instance of `nn.Module`",
-)
+pytestmark = pytest.mark.filterwarnings("ignore:Attribute '.*' is an instance of `nn.Module`")
 
 
 def plan_of(scale, seeds=(0,), tables=TABLES, rgb_weights=None):

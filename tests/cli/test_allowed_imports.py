@@ -9,8 +9,6 @@ import yaml
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
 
-pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
-
 
 @pytest.mark.parametrize(
     ("command", "name"),

@@ -1,6 +1,5 @@
 import json
 import re
-from dataclasses import replace
 
 import pytest
 import torch
@@ -10,23 +9,16 @@ import r3dpa.cli.evaluate as command
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
-from r3dpa.metrics import scene as protocol
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import DEFAULT, PUBLISHED
 from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 from r3dpa.viz import evaluation as figures
+
+pytestmark = pytest.mark.usefixtures("coarse_protocols")
 
 SENSOR = LidarSensor(beams=16, columns=64)
 PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
 FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
-
-
-@pytest.fixture(autouse=True)
-def coarse_protocols(monkeypatch):
-    """Cells of half a metre: a hundredth of the work."""
-    coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
-    monkeypatch.setattr(protocol, "PROTOCOLS", coarse)
 
 
 def range_images(seed, count):
@@ -55,12 +47,9 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def reference_file(data, tmp_path_factory):
+def reference_file(coarse_protocols, data, tmp_path_factory):
     out = tmp_path_factory.mktemp("reference") / "reference.safetensors"
-    coarse = {DEFAULT.name: replace(DEFAULT, voxel_m=0.5)}
-    with pytest.MonkeyPatch.context() as patch:  # before the fixture of a single test
-        patch.setattr(protocol, "PROTOCOLS", coarse)
-        command.reference(data=data, out=out, spaces=("fgeo",))
+    command.reference(data=data, out=out, spaces=("fgeo",))
     return out
 
 

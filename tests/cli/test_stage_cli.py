@@ -12,8 +12,6 @@ from lightning.pytorch.demos.boring_classes import BoringModel
 from r3dpa.cli import main
 from r3dpa.nn.backbones import feature_source
 
-pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
-
 CONF = Path(__file__).resolve().parents[2] / "conf"
 BORING = "lightning.pytorch.demos.boring_classes"
 

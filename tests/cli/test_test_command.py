@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +15,8 @@ from r3dpa.cli import main
 from r3dpa.generation import SceneGenerator
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import DEFAULT, PUBLISHED
 
-pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
+pytestmark = pytest.mark.usefixtures("coarse_protocols")
 
 FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
 PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
@@ -27,15 +25,6 @@ GEOMETRIC = ["--scorer.spaces=[fgeo]"]
 WEIGHTS = ("vae_alignment", "sit_alignment")
 NO_FEATURES = [f"--model.init_args.weights.{name}=0" for name in WEIGHTS]
 NO_FEATURES += ["--data.init_args.extractor=null"]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def coarse_protocols():
-    """Cells of half a metre: a hundredth of the work."""
-    coarse = {p.name: replace(p, voxel_m=0.5) for p in (DEFAULT, PUBLISHED)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_scoring, "PROTOCOLS", coarse)
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
 from r3dpa.data import LidarDataModule
-from r3dpa.geometry import LidarSensor
+from r3dpa.geometry import LidarSensor, SphericalProjection
 
 
 def unchanged(points):
@@ -51,6 +51,11 @@ def random_points(seed, count=300):
 @pytest.fixture
 def sensor():
     return LidarSensor(beams=8, columns=32)
+
+
+@pytest.fixture
+def projection(sensor):
+    return SphericalProjection(sensor)
 
 
 @pytest.fixture

@@ -30,9 +30,6 @@ def real_scans(real_scans_dir):
     return [torch.from_numpy(read_scan(scan.path)) for scan in find_scans(real_scans_dir)[::12]]
 
 
-SOURCES = [pytest.param("simulated_scans"), pytest.param("real_scans", marks=pytest.mark.data)]
-
-
 @pytest.fixture(scope="module")
 def extractor():
     return GeometricFeatures(dim=64)
@@ -70,7 +67,9 @@ def test_images_and_grids_by_hand():
     assert View(1, True, 4).grid(grid).flatten().tolist() == [0, 3, 2, 1, 4, 7, 6, 5]
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize(
+    "source", ["simulated_scans", pytest.param("real_scans", marks=pytest.mark.data)]
+)
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 def test_reordering_equals_projecting_anew(source, view, request):
     for points in request.getfixturevalue(source):

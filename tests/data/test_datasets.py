@@ -10,12 +10,7 @@ from r3dpa.data.augmentation import View
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
 from r3dpa.data.store import CachedTensors, tensor_cache
-from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection, SphericalProjection
-
-
-@pytest.fixture
-def projection(sensor):
-    return SphericalProjection(sensor)
+from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection
 
 
 def write(folder, points):

@@ -22,12 +22,6 @@ from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
 GRID = (2, 4)
-SIZES = ("2x4", "4x4")
-
-
-@pytest.fixture
-def projection(sensor):
-    return SphericalProjection(sensor)
 
 
 @pytest.fixture
@@ -133,7 +127,9 @@ def test_a_size_is_completed_without_the_others_growing(
     assert (list(todo.missing), todo.num_kept) == (scans, 0)
     assert todo.num_bytes == 2 * 8 * 4 * 2 + 5 * 16 * 4 * 2
     assert write_feature_grids(scans, scaled_points(), projection, [GRID, (4, 4)], root) == 5
-    rows = {size: sum(p.stat().st_size for p in root.glob(f"{size}/*.rows")) for size in SIZES}
+    rows = {
+        size: sum(p.stat().st_size for p in root.glob(f"{size}/*.rows")) for size in ("2x4", "4x4")
+    }
     assert rows == {"2x4": 5 * 64, "4x4": 5 * 128}
 
 

@@ -224,16 +224,9 @@ def test_hardly_any_point(num_points):
     assert statistics.num_ground_scans == 0
 
 
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.zeros((5, 3), np.float32), r"\(P, 4\).*\(5, 3\)"),
-        (np.float32([[10, 0, 0, 255]]), r"\[0, 1\], got 255"),
-    ],
-)
-def test_unusable_points_are_refused(points, message):
-    with pytest.raises(ValueError, match=message):
-        scan_statistics(points)
+def test_points_without_intensity_are_refused():
+    with pytest.raises(ValueError, match=r"\(P, 4\).*\(5, 3\)"):
+        scan_statistics(np.zeros((5, 3), np.float32))
 
 
 @pytest.mark.data
