@@ -1,4 +1,5 @@
 import argparse
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -26,25 +27,12 @@ from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE
 
-SIT_ARGS = {
-    "input_size": (4, 8),
-    "in_channels": 4,
-    "hidden_size": 8,
-    "depth": 3,
-    "num_heads": 2,
-    "alignment_depth": 2,
-    "feature_dim": 6,
-    "projector_dim": 10,
-}
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": (1, 2, 2),
-    "strides": ((1, 2), (2, 2)),
-    "num_res_blocks": 1,
-    "attention_levels": (1,),
-    "legacy_upsample": True,
-}
+EXACT = {"atol": 0, "rtol": 0}
+SIT_ARGS = {"input_size": (4, 8), "in_channels": 4, "hidden_size": 8, "depth": 3, "num_heads": 2}
+SIT_ARGS |= {"alignment_depth": 2, "feature_dim": 6, "projector_dim": 10}
+VAE_ARGS = {"latent_channels": 4, "channels": 32, "channel_multipliers": (1, 2, 2)}
+VAE_ARGS |= {"strides": ((1, 2), (2, 2)), "num_res_blocks": 1, "attention_levels": (1,)}
+VAE_ARGS |= {"legacy_upsample": True}
 GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(8, 32)), RangeCodec("log2"), (2, 4))
 NETWORKS = {
     "vae": (VAE, VAE_ARGS),
@@ -69,14 +57,8 @@ def checkpoint():
         name: NetworkState.of(randomised(kind(**args)), args)
         for name, (kind, args) in NETWORKS.items()
     }
-    return Checkpoint(
-        Path("run.ckpt"),
-        "joint",
-        networks,
-        step=30,
-        geometry=GEOMETRY.to_dict(),
-        feature_source="geometric",
-    )
+    about = {"step": 30, "geometry": GEOMETRY.to_dict(), "feature_source": "geometric"}
+    return Checkpoint(Path("run.ckpt"), "joint", networks, **about)
 
 
 @pytest.fixture
@@ -107,10 +89,7 @@ def assert_same_networks(actual, expected):
         own = actual.network(name)
         assert own.class_path == state.class_path
         assert own.arguments == state.arguments
-        assert set(own.state_dict) == set(state.state_dict)
-        for key, value in state.state_dict.items():
-            assert own.state_dict[key].dtype == value.dtype
-            assert torch.equal(own.state_dict[key], value), (name, key)
+        torch.testing.assert_close(own.state_dict, state.state_dict, **EXACT)
 
 
 def change_description(path, change):
@@ -234,7 +213,7 @@ class TestLoadInto:
         sit = SiT(**{**SIT_ARGS, "feature_dim": 5, "depth": 2})
         targets = {"vae": VAE(**VAE_ARGS), "discriminator": PatchDiscriminator()}
         targets |= {"sit": sit, "latent_norm": LatentNorm(5)}
-        before = {k: v.clone() for k, v in targets["vae"].state_dict().items()}
+        before = copy.deepcopy(targets["vae"].state_dict())
         with pytest.raises(ValueError, match="joint cannot start") as caught:
             load_into(targets, source, stage="joint")
         text = str(caught.value)
@@ -244,8 +223,7 @@ class TestLoadInto:
         assert "sit: unknown to the network: blocks.2.attn.qkv.weight (24, 8)" in text
         assert "latent_norm: shape of running_mean: checkpoint (4,), network (5,)" in text
         assert "vae:" not in text
-        for key, value in targets["vae"].state_dict().items():
-            assert torch.equal(value, before[key])
+        torch.testing.assert_close(targets["vae"].state_dict(), before, **EXACT)
 
     def test_long_lists_are_shortened(self, checkpoint):
         deeper = SiT(**{**SIT_ARGS, "depth": 5})
@@ -362,8 +340,8 @@ class TestConvert:
         back = read_checkpoint(tmp_path / "vae.pt")
         assert set(back.networks) == set(kept)
         for name in ("vae", "discriminator"):
-            for key, value in part.network(name).state_dict.items():
-                assert torch.equal(back.network(name).state_dict[key], value)
+            states = (each.network(name).state_dict for each in (back, part))
+            torch.testing.assert_close(*states, **EXACT)
         norm_back = back.network("latent_norm").build()
         torch.testing.assert_close(norm_back.running_var, norm["running_var"])
         assert norm_back.fitted
@@ -419,8 +397,7 @@ class TestTransfer:
         source, sit, norm = self.source(), SiT(**SIT_ARGS), LatentNorm(4)
         report = transfer_rgb(source, sit, norm, keep_projector=True)
         assert set(self.results(report).values()) == {"kept"}
-        for key, value in source.network("sit").state_dict.items():
-            assert torch.equal(sit.state_dict()[key], value)
+        torch.testing.assert_close(sit.state_dict(), source.network("sit").state_dict, **EXACT)
         norm_there = source.network("latent_norm").state_dict
         assert torch.equal(norm.running_mean, norm_there["running_mean"])
 
@@ -483,10 +460,10 @@ class TestTransfer:
     )
     def test_anything_else_is_an_error_before_any_change(self, changes, message):
         sit = SiT(**SIT_ARGS | ({"num_classes": 4} if "num_classes" in changes else {}))
-        before = {key: value.clone() for key, value in sit.state_dict().items()}
+        before = copy.deepcopy(sit.state_dict())
         with pytest.raises(ValueError, match=message):
             transfer_rgb(self.source(**changes), sit, LatentNorm(4), keep_projector=True)
-        assert all(torch.equal(value, before[key]) for key, value in sit.state_dict().items())
+        torch.testing.assert_close(sit.state_dict(), before, **EXACT)
 
     def test_only_a_sit_has_rgb_weights(self):
         args = {"in_channels": 4, "input_size": (4, 8), "channels": 32, "feature_dim": 8}

@@ -11,6 +11,7 @@ import torch
 
 from r3dpa.cli import main
 
+SIT = "model.init_args.sit.init_args"
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args parameter")
 
 
@@ -89,21 +90,15 @@ def test_an_option_or_key_that_cannot_be_is_named(option, named, tmp_path, refus
     [
         ("data.init_args.extractor=null", "joint aligns with 3D features, but the data module has"),
         (
-            "model.init_args.sit.init_args.input_size=[4, 8]",
+            f"{SIT}.input_size=[4, 8]",
             "(16, 64) pixels give (4, 16) latents, but sit.input_size is (4, 8); set it to the",
         ),
         (
             "data.init_args.grid_size=[4, 16]",
             "feature grids are (4, 16), but the SiT has (2, 8) tokens",
         ),
-        (
-            "model.init_args.sit.init_args.feature_dim=20",
-            "features have width 16, but sit.feature_dim is 20",
-        ),
-        (
-            "model.init_args.sit.init_args.in_channels=8",
-            "sit.in_channels is 8, but the VAE has 4 latent channels",
-        ),
+        (f"{SIT}.feature_dim=20", "features have width 16, but sit.feature_dim is 20"),
+        (f"{SIT}.in_channels=8", "sit.in_channels is 8, but the VAE has 4 latent channels"),
     ],
 )
 def test_networks_and_data_that_do_not_fit(option, message, folder, refused):

@@ -27,7 +27,6 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.nn import LatentNorm
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -195,9 +194,6 @@ def test_options_that_do_not_fit_are_refused():
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, compile=True)
     with pytest.raises(ValueError, match="batch_size must be at least 1, got 0"):
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, batch_size=0)
-    vae, sit, _ = tiny_networks()
-    with pytest.raises(ValueError, match=r"never fitted.*joint or flow_matching"):
-        SceneGenerator(vae, sit, LatentNorm(4), GEOMETRY)
 
 
 def test_every_quality_is_a_sampler_and_better_ones_take_longer():

@@ -10,6 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "r3dpa"
 CORE = {"geometry", "flow", "losses", "nn"}
+METHOD = CORE | {"data", "checkpoints", "generation", "modules"}
 ALLOWED = {
     "io": set(),
     "geometry": set(),
@@ -24,18 +25,11 @@ ALLOWED = {
     "generation": {"geometry", "nn", "flow", "checkpoints"},
     "editing": {"geometry", "nn", "flow", "generation", "checkpoints"},
     "modules": CORE | {"data", "checkpoints", "generation", "editing"},
-    "callbacks": CORE
-    | {"data", "checkpoints", "generation", "modules", "metrics", "viz"}
-    | {"simulation"},
+    "callbacks": METHOD | {"simulation", "metrics", "viz"},
     "ablation": {"metrics", "modules", "checkpoints", "viz"},
-    "bench": CORE
-    | {"callbacks"}
-    | {"simulation", "data", "checkpoints", "generation", "metrics", "modules", "viz"}
-    | {"editing"},
+    "bench": METHOD | {"simulation", "metrics", "viz", "editing", "callbacks"},
     "__main__": {"cli"},
-    "cli": CORE
-    | {"simulation", "data", "checkpoints", "generation", "modules", "callbacks", "viz", "bench"}
-    | {"metrics", "ablation", "editing"},
+    "cli": METHOD | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"},
 }
 ANYWHERE = {"io", "__version__"}
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from r3dpa.losses import (
     alignment_loss,
@@ -61,24 +60,8 @@ def test_empty_cells_weaken_the_alignment_loss_unless_skipped():
 
 
 @pytest.mark.numerics
-def test_alignment_gradient_of_zero_vectors_is_bounded():
-    def gradient_norm(loss):
-        projected = torch.zeros(1, 1, 8, requires_grad=True)
-        loss(projected, torch.ones(1, 1, 8)).sum().backward()
-        return projected.grad.norm().item()
-
-    assert gradient_norm(alignment_loss) <= 1.001e6
-    naive = gradient_norm(lambda x, y: -(F.normalize(x, dim=-1) * F.normalize(y, dim=-1)))
-    assert naive > 1e11
-
-
-@pytest.mark.numerics
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_losses_of_half_precision_are_float32_numbers(dtype):
+def test_the_velocity_loss_of_half_precision_is_finite(dtype):
     large = (400 * torch.randn(2, 3, 768)).to(dtype)
-    torch.testing.assert_close(alignment_loss(large, large), -torch.ones(2))
     assert flow_matching_loss(large, -large).isfinite().all()
     assert large.half().square().sum(-1).isinf().all()
-    small = large.to(torch.bfloat16)
-    naive = (F.normalize(small, dim=-1) * F.normalize(small, dim=-1)).sum(-1)
-    assert (naive.float() - 1).abs().max() > 1e-4

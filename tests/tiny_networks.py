@@ -9,23 +9,10 @@ import torch
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.nn import VAE, LatentNorm, SiT
 
-VAE_ARGS = {
-    "latent_channels": 4,
-    "channels": 32,
-    "channel_multipliers": [1, 1, 1],
-    "strides": [[2, 2], [2, 2]],
-    "num_res_blocks": 1,
-}
-SIT_ARGS = {
-    "input_size": [4, 16],
-    "in_channels": 4,
-    "hidden_size": 32,
-    "depth": 2,
-    "num_heads": 2,
-    "alignment_depth": 1,
-    "feature_dim": 8,
-    "projector_dim": 8,
-}
+VAE_ARGS = {"latent_channels": 4, "channels": 32, "num_res_blocks": 1}
+VAE_ARGS |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
+SIT_ARGS = {"input_size": [4, 16], "in_channels": 4, "hidden_size": 32, "depth": 2, "num_heads": 2}
+SIT_ARGS |= {"alignment_depth": 1, "feature_dim": 8, "projector_dim": 8}
 
 
 def tiny_networks(spread=0.1, **sit_args):

@@ -7,6 +7,7 @@ import tempfile
 import lightning as L
 import pytest
 import torch
+from tiny_networks import SIT_ARGS, VAE_ARGS
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -23,6 +24,8 @@ QUIET = [
     pytest.mark.filterwarnings("ignore:.*LeafSpec.*is deprecated"),
     pytest.mark.filterwarnings("ignore:step .* was skipped"),
 ]
+SILENT = {f"enable_{part}": False for part in ("checkpointing", "progress_bar", "model_summary")}
+SILENT |= {"accelerator": "cpu", "logger": False}
 SENSOR = LidarSensor(beams=8, columns=16)
 FEATURE_DIM = 6
 
@@ -107,26 +110,9 @@ STAGES = {
     "joint": type("ObservedJoint", (Observed, JointAlignment), {}),
     "flow_matching": type("ObservedFlowMatching", (Observed, FlowMatching), {}),
 }
-
-
 ARGUMENTS = {
-    "vae": {
-        "latent_channels": 4,
-        "channels": 32,
-        "channel_multipliers": [1, 1],
-        "strides": [[2, 2]],
-        "num_res_blocks": 1,
-    },
-    "sit": {
-        "input_size": [4, 8],
-        "in_channels": 4,
-        "hidden_size": 8,
-        "depth": 2,
-        "num_heads": 2,
-        "alignment_depth": 1,
-        "feature_dim": FEATURE_DIM,
-        "projector_dim": 8,
-    },
+    "vae": VAE_ARGS | {"channel_multipliers": [1, 1], "strides": [[2, 2]]},
+    "sit": SIT_ARGS | {"input_size": [4, 8], "hidden_size": 8, "feature_dim": FEATURE_DIM},
     "discriminator": {"channels": 4, "num_layers": 1},
     "latent_norm": {"channels": 4},
 }
@@ -154,18 +140,9 @@ def train(module, data=None, guard=True, callbacks=(), ckpt_path=None, **kwargs)
     module.guard = StepGuard() if guard is True else guard
     callbacks = [*callbacks, *([module.guard] if module.guard else [])]
     with tempfile.TemporaryDirectory() as folder:
-        settings = {
-            "max_steps": len(data.batches),
-            "default_root_dir": folder,
-            "accelerator": "cpu",
-            "devices": 1,
-            "limit_val_batches": 0,
-            "logger": False,
-            "enable_checkpointing": False,
-            "enable_progress_bar": False,
-            "enable_model_summary": False,
-        }
-        trainer = L.Trainer(callbacks=callbacks, **settings | kwargs)
+        settings = SILENT | {"devices": 1, "default_root_dir": folder, "limit_val_batches": 0}
+        settings |= {"max_steps": len(data.batches), "callbacks": callbacks}
+        trainer = L.Trainer(**settings | kwargs)
         trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=False)
     return module
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
+from tiny_stages import SILENT
 
 from r3dpa.data import FeatureGrids, StoreError, find_scans, write_feature_grids
 from r3dpa.geometry import LidarSensor, SphericalProjection
@@ -38,10 +39,7 @@ def scans(tmp_path_factory):
 
 def extract(scans, out, extractor=None, sizes=SIZES, batch_size=2, **options):
     extractor = extractor or GeometricFeatures(dim=16)
-    options = {"accelerator": "cpu", "devices": 1} | options
-    trainer = Trainer(
-        **options, logger=False, enable_checkpointing=False, enable_progress_bar=False
-    )
+    trainer = Trainer(**SILENT | {"devices": 1} | options)
     extraction = FeatureExtraction(extractor, PROJECTION, sizes, out, scans, batch_size)
     assert not trainer.predict(extraction, return_predictions=False)
 

@@ -19,26 +19,13 @@ DISCRIMINATOR = {"discriminator.main"}
 ALIGNED = {"sit.x_embedder", "sit.t_embedder", "sit.y_embedder", "sit.blocks.0"}
 REST = {"sit.blocks.1", "sit.final_layer"}
 PROJECTOR = {"sit.projector"}
-
-
+VAE_LOSSES = {"reconstruction": ENCODER | DECODER, "kl": ENCODER}
+VAE_LOSSES |= {"adversarial": ENCODER | DECODER, "discriminator": DISCRIMINATOR}
+SIT_LOSSES = {"denoising": ALIGNED | REST, "sit_alignment": ALIGNED | PROJECTOR}
 REACH = {
-    "vae_alignment": {
-        "reconstruction": ENCODER | DECODER,
-        "kl": ENCODER,
-        "adversarial": ENCODER | DECODER,
-        "vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"},
-        "discriminator": DISCRIMINATOR,
-    },
-    "joint": {
-        "reconstruction": ENCODER | DECODER,
-        "kl": ENCODER,
-        "adversarial": ENCODER | DECODER,
-        "vae_alignment": ENCODER,
-        "discriminator": DISCRIMINATOR,
-        "denoising": ALIGNED | REST,
-        "sit_alignment": ALIGNED | PROJECTOR,
-    },
-    "flow_matching": {"denoising": ALIGNED | REST, "sit_alignment": ALIGNED | PROJECTOR},
+    "vae_alignment": VAE_LOSSES | {"vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"}},
+    "joint": VAE_LOSSES | SIT_LOSSES | {"vae_alignment": ENCODER},
+    "flow_matching": SIT_LOSSES,
 }
 
 

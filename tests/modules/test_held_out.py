@@ -10,7 +10,7 @@ import lightning as L
 import pytest
 import torch
 import torch.multiprocessing as mp
-from tiny_stages import QUIET, TinyData, stage_module
+from tiny_stages import QUIET, SILENT, TinyData, stage_module
 from torch.utils.data import DataLoader
 
 from r3dpa.data.loaders import LoaderModule
@@ -20,8 +20,6 @@ pytestmark = [
     *QUIET,
     pytest.mark.filterwarnings("ignore:The 'val_dataloader' does not have many workers"),
 ]
-SILENT = {f"enable_{part}": False for part in ("checkpointing", "progress_bar", "model_summary")}
-SILENT |= {"accelerator": "cpu", "logger": False}
 
 
 def validated(module, data, folder):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
+from tiny_stages import SILENT
 
 from r3dpa.data import LidarDataModule, write_bin
 from r3dpa.data.datamodules import PointDataModule
@@ -108,9 +109,7 @@ def data(tmp_path):
 def test_training_learns_and_writes_weights_that_extract_the_same(tmp_path, module, data):
     module.edges.fill_(torch.nan)
     module.warmup, module.lr = 2, 1e-2
-    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_model_summary"), False)
-    quiet |= {"enable_progress_bar": False, "num_sanity_val_steps": 0}
-    trainer = Trainer(max_steps=30, accelerator="cpu", default_root_dir=tmp_path, **quiet)
+    trainer = Trainer(max_steps=30, num_sanity_val_steps=0, default_root_dir=tmp_path, **SILENT)
     trainer.fit(module, data)
     assert module.edges.isfinite().all()
     assert (module.edges.diff(dim=1) >= 0).all()

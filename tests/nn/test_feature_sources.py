@@ -1,13 +1,7 @@
 import pytest
 import torch
 
-from r3dpa.nn.backbones import (
-    SOURCES,
-    GeometricFeatures,
-    ScaLR,
-    WaffleIron,
-    feature_source,
-)
+from r3dpa.nn.backbones import SOURCES, GeometricFeatures, ScaLR, WaffleIron, feature_source
 from r3dpa.nn.backbones.point_features import official_name
 
 

@@ -59,8 +59,7 @@ def test_synced_batch_norm_in_one_process_is_batch_norm():
     for _ in range(3):
         image = torch.randn(2, 3, 4, 5)
         assert torch.equal(ours(image), plain(image))
-    for key, value in plain.state_dict().items():
-        torch.testing.assert_close(ours.state_dict()[key], value, atol=0, rtol=1e-6)
+    torch.testing.assert_close(ours.state_dict(), plain.state_dict(), atol=0, rtol=1e-6)
     ours.load_state_dict(plain.state_dict())
     assert torch.equal(ours.eval()(image), plain.eval()(image))
 

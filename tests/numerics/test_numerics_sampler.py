@@ -8,13 +8,7 @@ import pytest
 import torch
 
 from r3dpa.bench.problems import GaussianMixture
-from r3dpa.flow import (
-    Interpolant,
-    ab2,
-    euler,
-    midpoint,
-    ode_times,
-)
+from r3dpa.flow import Interpolant, ab2, euler, midpoint, ode_times
 from r3dpa.flow.times import step_pairs
 
 DTYPES = [torch.float32, torch.bfloat16, torch.float16]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lightning as L
 import torch
+from tiny_stages import SILENT
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -88,9 +89,8 @@ def module(stage="joint", **kwargs):
 
 
 def trainer(num_steps, **kwargs):
-    options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    options |= {"accelerator": "cpu", "devices": 1, "enable_model_summary": False}
-    return L.Trainer(max_steps=num_steps, **(options | {"limit_val_batches": 0} | kwargs))
+    options = {"devices": 1, "limit_val_batches": 0, "max_steps": num_steps}
+    return L.Trainer(**SILENT | options | kwargs)
 
 
 def fit(made, batches, **kwargs):

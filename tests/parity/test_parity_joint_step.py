@@ -8,6 +8,7 @@ import lightning as L
 import pytest
 import torch
 from recorded_networks import our_name, sit_of, vae_of
+from tiny_stages import SILENT
 from torch.utils.data import DataLoader
 
 from r3dpa import losses
@@ -133,14 +134,10 @@ def run(recorded):
     module.load_state_dict({ours(key): value for key, value in recorded.weights().items()})
     module.attach(recorded)
     trainer = L.Trainer(
-        accelerator="cpu",
+        **SILENT,
         max_steps=config["steps"],
         gradient_clip_val=config["max_grad_norm"],
         limit_val_batches=0,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
     )
     with pytest.MonkeyPatch.context() as patch:
         for name in LOSSES:

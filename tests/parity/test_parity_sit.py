@@ -30,15 +30,11 @@ def embeddings(case):
 
 
 def evaluation(case):
-    latents = build_norm(case).normalise(case["in/x"])
-    path = Interpolant(case.config["path_type"])
-    return under("out/eval/", training_pass(case, build_sit(case), latents, path))
-
-
-def evaluation_on_the_cosine_path(case):
-    latents = build_norm(case).normalise(case["in/x"])
-    outputs = training_pass(case, build_sit(case), latents, Interpolant("cosine"))
-    return under("out/eval_cosine/", outputs)
+    latents, outputs = build_norm(case).normalise(case["in/x"]), {}
+    for name, path in (("eval", case.config["path_type"]), ("eval_cosine", "cosine")):
+        found = training_pass(case, build_sit(case), latents, Interpolant(path))
+        outputs |= under(f"out/{name}/", found)
+    return outputs
 
 
 def training(case):
@@ -110,8 +106,8 @@ def feature_guidance(case):
     return outputs
 
 
-GROUPS = [embeddings, evaluation, evaluation_on_the_cosine_path, training]
-GROUPS += [alignment_only, broken_latent, inference, feature_guidance]
+GROUPS = [embeddings, evaluation, training, alignment_only]
+GROUPS += [broken_latent, inference, feature_guidance]
 
 
 def test_sit_outputs(case, compare):

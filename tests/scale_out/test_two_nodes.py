@@ -90,8 +90,7 @@ def last(run_dir):
 def assert_same_training(run_dir, one):
     found, expected = last(run_dir), last(one)
     assert found["global_step"] == expected["global_step"] == STEPS
-    for key, value in expected["state_dict"].items():
-        torch.testing.assert_close(found["state_dict"][key], value, **TOLERANCE, msg=key)
+    torch.testing.assert_close(found["state_dict"], expected["state_dict"], **TOLERANCE)
 
 
 def logged(run_dir):

@@ -275,16 +275,11 @@ class TestInterrupted:
         assert not second.is_alive()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        "[" * 100_000,
-        "{}",
-        '{"scans": "ten", "drives": ["0003"]}',
-        '{"scans": 5, "drives": ["0001"]}',
-    ],
-)
+DAMAGED = ["{", "[" * 100_000, "{}", '{"scans": "ten", "drives": ["0003"]}']
+DAMAGED += ['{"scans": 5, "drives": ["0001"]}']
+
+
+@pytest.mark.parametrize("text", DAMAGED)
 def test_a_damaged_manifest_is_named(tmp_path, text):
     (tmp_path / "simulation.json").write_text(text)
     with pytest.raises(ValueError, match=r"simulation.json .*simulate the data set again"):
