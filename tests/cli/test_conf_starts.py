@@ -64,18 +64,14 @@ def test_no_file_is_left_out():
     assert not started & elsewhere
 
 
-def words_of(configs, settings, run_dir):
-    words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
-    words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
-    return ["fit", *words, f"--run_dir={run_dir}"]
-
-
 @pytest.fixture
 def start(tmp_path, caplog):
     """``start(configs, settings)`` runs ``r3dpa fit`` for one batch."""
 
     def start(configs, settings):
-        main(words_of(configs, settings, tmp_path / "run"))
+        words = [word for name in configs for word in ("--config", str(CONF / f"{name}.yaml"))]
+        words += [f"--{key}={value}" for key, value in (QUIET | settings).items()]
+        main(["fit", *words, f"--run_dir={tmp_path / 'run'}"])
         assert "`Trainer.fit` stopped: `max_steps=1` reached" in caplog.text
         weights = [
             p for p in (tmp_path / "run").rglob("*") if p.suffix in (".ckpt", ".safetensors")
@@ -85,8 +81,8 @@ def start(tmp_path, caplog):
     return start
 
 
-def vae_file(folder, vae, size):
-    """Checkpoint that flow matching starts from, of a VAE with random weights."""
+def start_flow(folder, vae, size):
+    """Setting with the checkpoint that flow matching starts from, of a VAE with random weights."""
     network, channels = VAE(**vae), vae["latent_channels"]
     norm = LatentNorm(channels)
     norm.num_batches_tracked.fill_(1)
@@ -99,15 +95,11 @@ def vae_file(folder, vae, size):
         "latent_norm": NetworkState.of(norm, {"channels": channels}),
     }
     content = Checkpoint(Path("v"), "vae_alignment", networks, geometry=geometry.to_dict())
-    return save_checkpoint(content, folder / "vae.safetensors")
+    return {"model.init_args.init_from": save_checkpoint(content, folder / "vae.safetensors")}
 
 
 def net(name):
     return yaml.safe_load((CONF / f"net/{name}.yaml").read_text())["init_args"]
-
-
-def start_flow(folder, vae, size):
-    return {"model.init_args.init_from": vae_file(folder, vae, size)}
 
 
 @pytest.mark.parametrize(("experiment", "data"), STARTS.items())

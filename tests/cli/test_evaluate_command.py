@@ -173,6 +173,7 @@ def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path
         (["--spaces", "fgeo"], "10 generated scenes for the 64 features of FGEO.*allow_few"),
         (["--spaces", "fwid"], "the reference has no features of fwid, only of fgeo"),
         (["--ckpt.frid", "x.ckpt"], r"--ckpt\.frid: frid is not among the spaces \(fgeo\)"),
+        (["--split", "val"], r"reference\.safetensors: .*the split val does not apply"),
     ],
 )
 def test_wrong_options_are_named(reference_file, samples, words, message):

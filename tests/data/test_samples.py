@@ -239,12 +239,9 @@ def encoded(array, save=np.save):
     return stream.getvalue()
 
 
-def flipped(data):
-    return data[:120] + bytes([data[120] ^ 255]) + data[121:]
-
-
 IMAGES, ONES = changed(0.0, 0, 4), np.ones((2, 5, 4, 8), np.float32)
 CLOUD = encoded(np.random.default_rng(0).random((9, 4)), np.savez_compressed)
+FLIPPED = CLOUD[:120] + bytes([CLOUD[120] ^ 255]) + CLOUD[121:]
 BAD = {
     "empty file": ("a.txt", b"", r"a\.txt: is empty"),
     "other text": ("a.txt", b"model: r3dpa\n", r"a\.txt: is not text rows"),
@@ -258,7 +255,7 @@ BAD = {
     "vector": ("a.npy", np.ones(3), r"a\.npy: has shape \(3,\); needs \(P, 3\)"),
     "cut .npy": ("a.npy", encoded(ONES)[:-300], r"a\.npy: cannot be read as an array \(mmap len"),
     "cut .npz": ("a.npz", CLOUD[:-30], r"a\.npz: "),
-    "damaged .npz": ("a.npz", flipped(CLOUD), r"a\.npz.* is damaged"),
+    "damaged .npz": ("a.npz", FLIPPED, r"a\.npz.* is damaged"),
     "no member": ("a.npz", b"PK\x05\x06" + bytes(18), r"a\.npz: "),
     "no tensor": ("a.pth", {"model": {}}, r"a\.pth: cannot be .*; needs a tensor"),
     "no .pth": ("a.pth", b"\x80\x02", r"a\.pth: cannot be read as tensors alone"),

@@ -178,14 +178,6 @@ def test_other_settings_never_find_these_rows(tmp_path, name, settings, shape):
     assert tensor_cache(tmp_path, "a", {"x": 1}, SHAPE) == cache
 
 
-def in_child(function):
-    """Exit code of a forked process that runs a function."""
-    child = multiprocessing.get_context("fork").Process(target=function)
-    child.start()
-    child.join()
-    return child.exitcode
-
-
 @pytest.mark.parametrize("part", [0, 0.5, 1])
 @pytest.mark.parametrize("moment", range(4))
 def test_killed_at_every_step_of_a_batch(halves, monkeypatch, moment, part):
@@ -206,7 +198,10 @@ def test_killed_at_every_step_of_a_batch(halves, monkeypatch, moment, part):
 
     with monkeypatch.context() as patch:
         patch.setattr(store, "append", killing)
-        assert in_child(write) == -signal.SIGKILL
+        child = multiprocessing.get_context("fork").Process(target=write)
+        child.start()
+        child.join()
+    assert child.exitcode == -signal.SIGKILL
     there = [item for item in items(0, 5) if not halves.missing([item])]
     # Half of a journal of two lines or three holds one whole line.
     expected = [0, {0: 0, 0.5: 1, 1: 2}[part], 2, {0: 2, 0.5: 3, 1: 5}[part]][moment]

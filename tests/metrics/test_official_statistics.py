@@ -209,10 +209,3 @@ class TestCommand:
         assert "left_out" in printed
         assert (out / "table.tex").exists()
         assert not (out / "birds_eye.png").exists()
-
-    def test_other_references_have_no_split(self, tmp_path):
-        write_bin(tmp_path / "made" / "0.bin", torch.ones(4, 4) * 5)
-        (tmp_path / "ref.safetensors").write_bytes(b"none")
-        words = ["evaluate", "--samples", tmp_path / "made", "--split", "val"]
-        with pytest.raises(ValueError, match=r"ref.safetensors: .*the split val does not apply"):
-            main([*map(str, words), "--reference", str(tmp_path / "ref.safetensors")])

@@ -1,11 +1,11 @@
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol, through_sensor
+from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import (
     SceneFeatures,
     lip_loc_space,
@@ -74,10 +74,6 @@ def test_images_and_their_points_take_one_way():
     # Where both are given, the image counts, whatever rays its points were made with.
     both = through_sensor(EvaluationScene("0", torch.zeros(3, 3), image(0)), CENTRE)
     assert torch.equal(both.points, scene.points)
-
-
-def test_protocols_come_back_from_plain_values():
-    assert Protocol.from_dict(asdict(CORNER)) == CORNER
 
 
 # --- spaces ---
