@@ -22,20 +22,11 @@ LAYERS = {
     "sit.blocks.1.adaLN_modulation.0",
     "sit.final_layer.adaLN_modulation.0",
 }
-FUNCTIONS = [
-    (Posterior, "sample"),
-    (Posterior, "kl"),
-    (LatentNorm, "normalise"),
-    (LatentNorm, "update"),
-    (Interpolant, "interpolate"),
-    (Interpolant, "target"),
-    (losses, "reconstruction_loss"),
-    (losses, "generator_loss"),
-    (losses, "discriminator_loss"),
-    (losses, "flow_matching_loss"),
-    (losses, "alignment_loss"),
-    (GenerativeModule, "weigh_and_log"),
-]
+LOSSES = ("reconstruction", "generator", "discriminator", "flow_matching", "alignment")
+FUNCTIONS = [(losses, f"{name}_loss") for name in LOSSES]
+FUNCTIONS += [(Posterior, "sample"), (Posterior, "kl"), (GenerativeModule, "weigh_and_log")]
+FUNCTIONS += [(LatentNorm, "normalise"), (LatentNorm, "update")]
+FUNCTIONS += [(Interpolant, "interpolate"), (Interpolant, "target")]
 
 
 @pytest.fixture(scope="module")

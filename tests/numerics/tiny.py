@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import lightning as L
+import tiny_stages
 import torch
-from tiny_stages import SILENT
+from tiny_stages import ARGUMENTS, FEATURE_DIM, SILENT, tiny_sit
 from torch import nn
 from torch.utils.data import DataLoader
 
 from r3dpa.data import LidarDataModule
-from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.modules import JointAlignment, VAEAlignment
-from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
+from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator
 
-FEATURE_DIM = 6
 LATENT_CHANNELS = 4
 STAGES = {"joint": JointAlignment, "vae_alignment": VAEAlignment}
 
@@ -36,9 +35,7 @@ class TinyData(LidarDataModule):
 
     feature_source = "random"
     feature_dim = FEATURE_DIM
-    geometry = ScanGeometry(
-        SphericalProjection(LidarSensor(beams=8, columns=16)), RangeCodec(), (2, 4)
-    )
+    geometry = tiny_stages.TinyData.geometry
 
     def __init__(self, batches):
         L.LightningDataModule.__init__(self)
@@ -62,8 +59,7 @@ class TinyData(LidarDataModule):
 
 
 def vae():
-    sizes = {"channels": 32, "channel_multipliers": (1, 1), "strides": ((2, 2),)}
-    return VAE(latent_channels=LATENT_CHANNELS, num_res_blocks=1, **sizes)
+    return VAE(**ARGUMENTS["vae"])
 
 
 def vae_losses(made, image):
@@ -76,12 +72,10 @@ def vae_losses(made, image):
 def module(stage="joint", **kwargs):
     """A training module of ``STAGES``, without a stage before it."""
     torch.manual_seed(0)
-    sizes = {"in_channels": LATENT_CHANNELS, "hidden_size": 8, "depth": 2, "num_heads": 2}
-    head = {"alignment_depth": 1, "feature_dim": FEATURE_DIM, "projector_dim": 8}
-    sit = SiT(input_size=(4, 8), **sizes, **head)
+    sit = tiny_sit()
     for parameter in sit.parameters():  # a fresh one has zero gates: no gradient would pass
         nn.init.normal_(parameter, std=0.3)
-    discriminator = PatchDiscriminator(channels=4, num_layers=1)
+    discriminator = PatchDiscriminator(**ARGUMENTS["discriminator"])
     networks = {"vae": vae(), "sit": sit, "discriminator": discriminator}
     made = STAGES[stage](**networks, latent_norm=LatentNorm(LATENT_CHANNELS), **kwargs)
     made.load_previous_stage = lambda: None

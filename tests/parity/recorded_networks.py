@@ -25,19 +25,14 @@ def weights_of(shapes, first=0):
 def sit_of(config, **options):
     """Our network of the size that ``cases.json`` gives."""
     (feature_dim,) = config["z_dims"]
+    same = ("in_channels", "patch_size", "hidden_size", "depth", "num_heads")
+    same += ("projector_dim", "num_classes", "qk_norm")
     return SiT(
         input_size=tuple(config["input_size"]),
-        in_channels=config["in_channels"],
-        patch_size=config["patch_size"],
-        hidden_size=config["hidden_size"],
-        depth=config["depth"],
-        num_heads=config["num_heads"],
         alignment_depth=config["encoder_depth"],
         feature_dim=feature_dim,
-        projector_dim=config["projector_dim"],
-        num_classes=config["num_classes"],
         class_dropout=config["class_dropout_prob"] > 0,
-        qk_norm=config["qk_norm"],
+        **{name: config[name] for name in same},
         **options,
     )
 

@@ -144,13 +144,8 @@ def test_liploc_encoder_feature(load_case, pictures, tmp_path, close):
     case = load_case("liploc_encoder")
     config, weights = case.config, case.weights()
     assert (config["num_classes"], config["global_pool"]) == (0, "avg")
-    network = LIPLoc(
-        config["img_size"],
-        config["patch_size"],
-        config["embed_dim"],
-        config["depth"],
-        config["num_heads"],
-    )
+    sizes = ("img_size", "patch_size", "embed_dim", "depth", "num_heads")
+    network = LIPLoc(*(config[size] for size in sizes))
     load_strictly(network, weights, renamed(liploc._NAMES))
     range_m = pictures["in/depth"][None]
     close(network(range_m), case["out/feature"])
