@@ -240,8 +240,7 @@ def object_library(
             cells, counts = cell[own].unique(return_counts=True)
             order = own[cell[own].argsort(stable=True)].to(values.device)
             first = (counts.cumsum(0) - counts).to(values.device)
-            means = F.embedding_bag(order, values.float(), first, mode="mean")
-            lifted = lift(means).double().cpu()
+            lifted = lift(F.embedding_bag(order, values.float(), first, mode="mean")).double().cpu()
             if not lifted.isfinite().all():
                 raise ValueError(
                     f"{scan.path}: extractor {extractor.name} gave NaN or infinite features; leave "

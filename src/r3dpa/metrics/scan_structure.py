@@ -126,8 +126,7 @@ def fit_ground(points: Floats) -> Ground | None:
         design = np.column_stack([close[:, :2], np.ones(len(close))])
         coefficients = np.linalg.lstsq(design.T @ design, design.T @ close[:, 2], rcond=None)[0]
         ground = Ground(*map(float, coefficients))
-    steep = math.hypot(ground.slope_x, ground.slope_y) > _MAX_GROUND_SLOPE
-    return None if steep else ground
+    return None if math.hypot(ground.slope_x, ground.slope_y) > _MAX_GROUND_SLOPE else ground
 
 
 class Upright(NamedTuple):

@@ -188,8 +188,7 @@ def _local_shape(xyz: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
             count += near
             first += torch.stack([x, y, z])
             second += torch.stack([x * x, y * y, z * z, x * y, x * z, y * z])
-    mean = first / count
-    mx, my, mz = mean
+    mx, my, mz = first / count
     second = second / count - torch.stack([mx * mx, my * my, mz * mz, mx * my, mx * mz, my * mz])
     values, normal = _symmetric_eigen(second.double())
     s1, s2, s3 = values.clamp_min(0).sqrt()
