@@ -271,19 +271,17 @@ class CachedTensors(Generic[Item]):
             raise self._missing([item])
         store, (shard, row) = self.store, place
         values = np.empty(store.shape, _DTYPES[store.dtype])
-        path = store.rows(shard)
         try:
             if shard not in self._files:
-                self._files[shard] = os.open(path, os.O_RDONLY)
+                self._files[shard] = os.open(store.rows(shard), os.O_RDONLY)
                 weakref.finalize(self, os.close, self._files[shard])
             # One read of the whole row: a map would be read page by page, and a page that was cut
             # off since would kill the process.
-            complete = (
-                os.preadv(self._files[shard], [values.data], row * values.nbytes) == values.nbytes
-            )
+            num_read = os.preadv(self._files[shard], [values.data], row * values.nbytes)
         except FileNotFoundError:
-            complete = False
-        if not complete:
+            num_read = 0
+        if num_read < values.nbytes:
+            path = store.rows(shard)
             what = f"{path} is gone or was cut short since its journal was read"
             raise store.damaged(path.with_suffix(".jsonl"), what)
         # Torch converts half precision eight times as fast as NumPy.
