@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from torch.distributions import Normal, kl_divergence
 
 from r3dpa.nn import PatchDiscriminator
 from r3dpa.nn.vae import VAE, Posterior
@@ -38,6 +39,17 @@ def test_impossible_layouts_and_images_are_refused(vae):
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_posterior_agrees_with_torch_distributions():
+    moments, latents = torch.randn(2, 6, 2, 4, requires_grad=True), torch.randn(2, 3, 2, 4)
+    posterior = Posterior(moments)
+    normal = Normal(moments[:, :3], (0.5 * moments[:, 3:]).exp())
+    expected = kl_divergence(normal, Normal(0.0, 1.0)).sum(dim=(1, 2, 3))
+    torch.testing.assert_close(posterior.kl(), expected)
+    gradients = [torch.autograd.grad(kl.sum(), moments)[0] for kl in (posterior.kl(), expected)]
+    torch.testing.assert_close(*gradients)
+    torch.testing.assert_close(posterior.sample(latents), normal.mean + normal.stddev * latents)
 
 
 @pytest.mark.numerics
