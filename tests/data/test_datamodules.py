@@ -86,6 +86,8 @@ def test_held_out_folders_and_limit(tmp_path, make_scans, sensor):
     assert {scan.drive for scan in train} == {"city/a", "hill"}
     assert {scan.drive for scan in val} == {"city/b"}
     limited = LidarDataModule(str(tmp_path / "scans"), sensor=sensor, val_every=None, limit=3)
+    with pytest.raises(AttributeError, match=r"no val_set; .*setup\('fit'\) first"):
+        limited.val_dataloader()
     limited.setup("fit")
     assert [scan.name[-12:] for scan in limited.train_set.scans] == [
         "a/0000000000",

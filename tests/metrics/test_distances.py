@@ -188,8 +188,10 @@ def test_a_failed_forward_leaves_the_state(name):
     metric = updated(metric_of(name), name)
     broken = data(name, True)
     broken = [torch.zeros(0, 3)] if isinstance(broken, list) else broken * torch.nan
+    updates = metric.update_count
     with pytest.raises(ValueError, match="real"):
         metric(broken, real=True)
+    assert metric.update_count == updates
     assert metric.compute() == pytest.approx(expected(name), rel=1e-6)
     assert updated(metric, name).count("real") == 2 * len(data(name, True))
 

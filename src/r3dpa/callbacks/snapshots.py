@@ -26,8 +26,8 @@ class EMASnapshots(L.Callback):
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
     Args:
-        fractions: Steps as parts of ``trainer.max_steps``.
-        steps: Optimiser steps; where given, ``fractions`` do not count.
+        fractions: Steps as parts of ``trainer.max_steps``, in [0, 1].
+        steps: Optimiser steps, 1 or greater; where given, ``fractions`` do not count.
     """
 
     def __init__(

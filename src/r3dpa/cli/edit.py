@@ -153,7 +153,7 @@ def complete(
 
     import torch
 
-    from r3dpa.cli.edit_session import EditSession
+    from r3dpa.cli.edit_session import EditSession, held_out_errors
     from r3dpa.geometry import SphericalProjection, regions
 
     session = EditSession(EditOptions(**options), num)
@@ -188,7 +188,9 @@ def complete(
     run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
     run = partial(run, start=start)
     scans = {f"scan {scan.stem}": source, "known part": known}
-    return session.write("complete", arguments, scans, run, missing, ("kept", "missing"))
+    measure = partial(held_out_errors, range_m=source.range_m, missing=missing)
+    names = ("kept", "missing")
+    return session.write("complete", arguments, scans, run, missing, names, measure=measure)
 
 
 def vary(*, scan: Path, start: float = 0.5, num: PositiveInt = 8, **options: Any) -> str:

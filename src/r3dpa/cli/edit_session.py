@@ -120,11 +120,13 @@ class EditSession:
         parts: Tensor | None = None,
         part_names: Sequence[str] = (),
         guided: bool = False,
+        measure: Callable[[Tensor], dict[str, Any]] | None = None,
     ) -> str:
         """Runs an edit and writes scenes, pictures, page and metadata; returns a summary.
 
         ``arguments`` are its own options, for the metadata; ``parts`` ``(H, W)`` says to which of
-        the named parts each pixel belongs.
+        the named parts each pixel belongs; ``measure`` takes the results ``(B, H, W)`` to their
+        errors where the scan was held out.
         """
         options, settings = self.options, asdict(self.settings)
         if not guided:
@@ -147,9 +149,8 @@ class EditSession:
             measured = ("nfe", "vae_error_m", "round_trip_m")
             request |= {name: getattr(result, name) for name in measured} | {"seconds": seconds}
             request["cosine"] = None if result.cosine is None else result.cosine.tolist()
-            if command == "complete" and parts is not None:
-                whole = next(iter(scans.values())).range_m
-                request["held_out"] = _held_out_errors(result.range_m, whole, parts)
+            if measure is not None:
+                request["held_out"] = measure(result.range_m)
             writer.finish(request)
         return (
             f"{command}: {self.num} scenes in {options.out}, {result.nfe} network evaluations each,"
@@ -204,7 +205,7 @@ class EditSession:
             temporary.write_text(page, "utf-8")
 
 
-def _held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
+def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:
     """Errors of completions ``(B, H, W)`` on the returns of the scan, beside interpolations.
 
     Ranges are compared where the scan and all methods have a return; empty without any there.

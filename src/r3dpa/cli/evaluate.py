@@ -149,8 +149,9 @@ def _made_with(samples: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or "r3dpa" not in found:
         return {}
     sampler = found.get("sampler") or {}
-    kept = "seed precision feature_source checkpoint stage step weights nfe solver steps"
-    made_with = {key: (found | sampler).get(key) for key in kept.split()}
+    kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
+    made_with = {key: found.get(key) for key in kept}
+    made_with |= {key: sampler.get(key) for key in ("solver", "steps")}
     return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
 
 

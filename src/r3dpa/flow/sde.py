@@ -42,10 +42,11 @@ def euler_maruyama(
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
         x: ``(B, ...)`` Gaussian noise, the state at t = 1.
-        times: ``(T,)`` decreasing times, see :func:`r3dpa.flow.times.sde_times`.
+        times: ``(T,)`` decreasing times, see :func:`r3dpa.flow.times.sde_times`; ``denoise`` needs
+            0 as the last one.
         noise: The T - 2 Gaussian draws ``(B, ...)`` in order, or the generator to draw them with.
             Draws that are given per sample make a sample independent of its batch.
-        eta: How much noise is added and removed again; 0 is the ODE, and then
+        eta: Strength of the noise, 0 or above; 0 is the ODE, and then
             :func:`r3dpa.flow.solvers.euler` but for ``change_drift``.
         interpolant: Path of the velocity.
         last: Noise-free last step. ``denoise`` goes to the expected data; ``mean`` takes a full

@@ -148,7 +148,7 @@ class _Array(np.ndarray):
 class _ArraysOnly(pickle._Unpickler):
     """Unpickler of NumPy arrays and plain containers; refuses everything else by name.
 
-    Written in Python: that in C reserves memory for the number of any object, damaged or not.
+    The one written in C allocates its memo by the indices in the file, which may be damaged.
     """
 
     def find_class(self, module: str, name: str) -> Any:

@@ -211,10 +211,10 @@ def compute_reference(
     out: Path,
     renew: bool = False,
 ) -> ReferenceStatistics:
-    """Statistics of the scans of an empty job as a file; reads or resumes what it finds there.
+    """Computes the statistics of a job's scans into a file; reads or resumes an existing one.
 
-    ``scans_from`` gives the scans of the job from a number on. A ``ValueError`` if another process
-    writes ``out`` or, without ``renew``, which replaces it, if the file is of another job.
+    ``job`` is empty; ``scans_from`` gives its scans from a number on. A ``ValueError`` if another
+    process writes ``out`` or, without ``renew``, which replaces it, if the file is of another job.
     """
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
@@ -247,7 +247,7 @@ def compute_reference(
 
 
 def cards_of(spaces: Iterable[SceneFeatures]) -> dict[str, dict[str, Any]]:
-    """What a reference stores of feature spaces, by name."""
+    """Cards of feature spaces by name, as a reference file stores them."""
     return {s.name: {**s.card, "dim": s.dim, "label": s.label} for s in spaces}
 
 
