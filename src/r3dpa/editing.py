@@ -132,8 +132,8 @@ class SceneEditor:
     @torch.no_grad()
     def encode(self, range_m: Tensor) -> Tensor:
         """Normalised latents ``(B, C, h, w)`` of range images ``(B, H, W)``, means of the VAE."""
-        image = self.generator.geometry.codec.encode(range_m.to(self.generator.device))
-        return self.generator.latent_norm.normalise(self.generator.vae.encode(image[:, None]).mean)
+        image = self.generator.geometry.codec.to_image(range_m.to(self.generator.device))
+        return self.generator.latent_norm.normalise(self.generator.vae.encode(image).mean)
 
     @torch.no_grad()
     def inpaint(
@@ -250,8 +250,8 @@ class SceneEditor:
         times = self.settings.times(start).tolist()
         guess = filled(range_m, missing)
         latents = self.encode(guess[None])
-        image = self.generator.geometry.codec.encode(range_m).to(latents)
-        known = (~missing).to(latents)
+        image = self.generator.geometry.codec.to_image(range_m).to(latents)
+        known = (~missing & self.generator.geometry.codec.informative(image)).to(latents)
 
         def solve(noise: Tensor, draws: Iterator[Tensor]) -> Tensor:
             x = latents.expand(len(noise), -1, -1, -1)
@@ -382,13 +382,13 @@ class SceneEditor:
         return torch.cat(parts)
 
     def _fitted(self, latents: Tensor, image: Tensor, known: Tensor) -> Tensor:
-        """Latents a few steps nearer to an encoded image ``(H, W)`` where it is known."""
+        """Latents a few steps nearer to an image ``(C, H, W)`` where it is known."""
         vae, norm = self.generator.vae, self.generator.latent_norm
         with torch.enable_grad():
             fitted = latents.detach().clone().requires_grad_()
             adam = torch.optim.Adam([fitted], lr=_FIT_RATE, eps=_FIT_EPS)
             for _ in range(_FIT_STEPS):
-                error = (vae.decode(norm.denormalise(fitted))[:, 0] - image).square()
+                error = (vae.decode(norm.denormalise(fitted)) - image).square()
                 error = (error + _FIT_SMOOTH**2).sqrt() * known  # a plain norm has a kink at 0
                 (gradient,) = torch.autograd.grad(error.sum(), fitted)
                 length = gradient.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()

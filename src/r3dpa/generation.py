@@ -259,10 +259,10 @@ class SceneGenerator:
         sensor = self.geometry.projection.sensor
         parts = []
         for part in self.latent_norm.denormalise(latents).split(size):
-            image = self._decode(_filled(part, size))[: len(part), 0]
-            range_m = self.geometry.codec.decode(image.float(), sensor)
-            finite = image.isfinite().all(dim=(1, 2), keepdim=True)
-            parts.append(torch.where(finite, range_m, torch.nan))
+            image = self._decode(_filled(part, size))[: len(part)]
+            range_m = self.geometry.codec.ranges_of(image.float(), sensor)
+            finite = image.flatten(1).isfinite().all(dim=1)
+            parts.append(torch.where(finite[:, None, None], range_m, torch.nan))
         return torch.cat(parts)
 
     @property
@@ -320,15 +320,15 @@ class SceneVAE:
         """Posterior means ``(1, C, h, w)`` of one scan ``(P, 3)`` or ``(P, 4)`` in metres."""
         xyz = torch.as_tensor(points)[:, :3].float()
         range_m = range_image(xyz, self.geometry.projection)[0]
-        image = self.geometry.codec.encode(range_m.to(next(self.vae.parameters()).device))
-        return self.vae.encode(image[None, None]).mean
+        image = self.geometry.codec.to_image(range_m.to(next(self.vae.parameters()).device))
+        return self.vae.encode(image[None]).mean
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> SceneBatch:
         """Scenes of raw latents ``(B, C, h, w)``."""
         projection = self.geometry.projection
-        image = self.vae.decode(latents)[:, 0].float()
-        range_m = self.geometry.codec.decode(image, projection.sensor)
+        image = self.vae.decode(latents).float()
+        range_m = self.geometry.codec.ranges_of(image, projection.sensor)
         return SceneBatch(range_m, latents, 0, projection)
 
 

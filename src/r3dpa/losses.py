@@ -13,10 +13,14 @@ from torch import Tensor
 
 __all__ = [
     "alignment_loss",
+    "centred_features",
     "discriminator_loss",
     "flow_matching_loss",
     "generator_loss",
+    "masked_mean",
+    "pixel_error",
     "reconstruction_loss",
+    "return_loss",
 ]
 
 
@@ -44,6 +48,24 @@ def reconstruction_loss(
     if kind == "l2":
         return F.mse_loss(reconstruction.float(), image.float())
     raise ValueError(f"reconstruction loss must be 'l1' or 'l2', got {kind!r}")
+
+
+def pixel_error(prediction: Tensor, image: Tensor, kind: Literal["l1", "l2"] = "l1") -> Tensor:
+    """Absolute (``l1``) or squared (``l2``) error of each pixel, float32."""
+    error = prediction.float() - image.float()
+    return error.abs() if kind == "l1" else error.square()
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean ``(B,)`` of values ``(B, ...)`` where the mask is True; 0 where it is nowhere."""
+    total = torch.where(mask, values, 0.0).flatten(1).sum(dim=1)
+    return total / mask.flatten(1).sum(dim=1).clamp(min=1)
+
+
+def return_loss(logits: Tensor, returns: Tensor) -> Tensor:
+    """Cross-entropy ``(B,)`` of the logits of a return, both ``(B, 1, H, W)``, in nats a pixel."""
+    each = F.binary_cross_entropy_with_logits(logits.float(), returns.float(), reduction="none")
+    return each.flatten(1).mean(dim=1)
 
 
 def generator_loss(fake_logits: Tensor) -> Tensor:
@@ -112,6 +134,14 @@ def alignment_loss(
         return -cosine.mean(dim=1)
     occupied = feature_grid.abs().amax(dim=-1) > 0
     return -(cosine * occupied).sum(dim=1) / occupied.sum(dim=1).clamp(min=1)
+
+
+def centred_features(feature_grid: Tensor) -> Tensor:
+    """Feature grids ``(B, N, D)`` minus their mean over the occupied cells; empty cells stay 0."""
+    feature_grid = feature_grid.float()
+    occupied = (feature_grid.abs().amax(dim=-1, keepdim=True) > 0).float()
+    mean = feature_grid.sum(dim=1, keepdim=True) / occupied.sum(dim=1, keepdim=True).clamp(min=1)
+    return (feature_grid - mean) * occupied
 
 
 def _unit(vectors: Tensor, eps: float = 1e-6) -> Tensor:

@@ -163,7 +163,7 @@ class ModelProblem:
             found = heun(velocity, noise.double(), ode_times(steps))
             image = generator.vae.decode(generator.latent_norm.denormalise(found.float()))
         geometry = generator.geometry
-        range_m = geometry.codec.decode(image[:, 0].float(), geometry.projection.sensor)
+        range_m = geometry.codec.ranges_of(image.float(), geometry.projection.sensor)
         return Solved(found.cpu(), range_m.cpu())
 
     def case(self, setting: Setting) -> Callable[[], float]:

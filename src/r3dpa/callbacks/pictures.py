@@ -95,8 +95,8 @@ class PictureLogger(L.Callback):
         image = image[None].to(module.device)
         geometry = module.scan_geometry
         sensor = geometry.projection.sensor
-        range_m = geometry.codec.decode(image[0, 0], sensor)
-        found_m = geometry.codec.decode(module.reconstruct(image)[0, 0].float(), sensor)
+        range_m = geometry.codec.ranges_of(image[0], sensor)
+        found_m = geometry.codec.ranges_of(module.reconstruct(image)[0].float(), sensor)
         error_m = (range_m - found_m).abs()[(range_m > 0) & (found_m > 0)].mean().item()
         agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)

@@ -27,7 +27,7 @@ _NUM_LISTED = 10
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
 _SHAPELESS_ARGS = {key: key for key in ("input_size", "num_heads", "alignment_depth", "eps")}
-_SHAPELESS_ARGS |= {"legacy_upsample": "legacy", "norm_groups": "num_groups"}
+_SHAPELESS_ARGS |= {"legacy_upsample": "legacy", "norm_groups": "num_groups", "stem": "stem"}
 
 
 def path_of(kind: type) -> str:

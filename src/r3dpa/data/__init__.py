@@ -33,6 +33,7 @@ _ON_FIRST_USE = {
     "LidarDataModule": "datamodules",
     "PointDataModule": "datamodules",
     "SimulatedDataModule": "datamodules",
+    "SimulatedImageDataModule": "range_images",
 }
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
     "Scan",
     "ScanError",
     "SimulatedDataModule",
+    "SimulatedImageDataModule",
     "StoreError",
     "TarImages",
     "check",

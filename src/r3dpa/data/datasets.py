@@ -19,7 +19,7 @@ from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
 class LidarBatch(TypedDict):
     """Batch of the training modules.
 
-    ``range_image`` ``(B, 1, H, W)`` float32 in [-1, 1] and ``valid_mask`` ``(B, 1, H, W)`` bool,
+    ``range_image`` ``(B, C, H, W)`` float32 in [-1, 1] and ``valid_mask`` ``(B, 1, H, W)`` bool,
     True where a pixel has a return; where they are cached, instead ``posterior_moments``
     ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents, see
     :class:`r3dpa.nn.Posterior`. ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
@@ -44,6 +44,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
         codec: Metres to [-1, 1].
         grids: Feature grids, if any.
         posteriors: Moments ``(2C, h, w)`` of a frozen VAE, which replace image and mask.
+        images: Cached range images ``(H, W)`` in metres, which the scans are read from.
     """
 
     scans: list[Scan]
@@ -51,6 +52,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
     codec: RangeCodec
     grids: CachedTensors[Scan] | None = None
     posteriors: CachedTensors[Scan] | None = None
+    images: CachedTensors[Any] | None = None
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -62,13 +64,15 @@ class LidarDataset(Dataset[dict[str, Any]]):
             sample = {"posterior_moments": self.posteriors.read(scan)}
         else:
             image = self._project(scan)
-            sample = {"range_image": image, "valid_mask": self.codec.valid_mask(image)}
+            sample = {"range_image": image, "valid_mask": self.codec.returns_of(image)}
         sample |= {"index": index, "name": scan.name}
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
 
     def _project(self, scan: Scan) -> Tensor:
+        if self.images is not None:
+            return self.codec.to_image(self.images.read(scan))
         points = torch.from_numpy(read_scan(scan.path))
         try:
             range_m, _ = range_image(points[:, :3], self.projection)
@@ -76,7 +80,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
             raise ScanError(f"{scan.path}: cannot be projected: {error}") from error
         if not (range_m > 0).any():
             raise out_of_range(scan.path, self.projection.sensor)
-        return self.codec.encode(range_m)[None]
+        return self.codec.to_image(range_m)
 
 
 class PointSample(NamedTuple):

@@ -160,15 +160,20 @@ def writing(what: str, folder: Path) -> Iterator[None]:
 
 
 def tensor_cache(
-    root: Path, name: str, settings: Mapping[str, Any], shape: tuple[int, ...]
+    root: Path,
+    name: str,
+    settings: Mapping[str, Any],
+    shape: tuple[int, ...],
+    dtype: Literal["float32", "float16"] = "float32",
 ) -> Store:
-    """Store of float32 tensors whose folder ``root/<name>_<hash>`` follows from its settings.
+    """Store of tensors whose folder ``root/<name>_<hash>`` follows from its settings.
 
     ``settings`` are all that the tensors depend on beside the item, as JSON values.
     """
     about = {"version": _VERSION, "shape": shape, "settings": settings}
     text = json.dumps(about, indent=1, sort_keys=True)
-    return Store(root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}", text, shape)
+    folder = root / f"{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    return Store(folder, text, shape, dtype)
 
 
 class StoreWriter:

@@ -29,7 +29,9 @@ class RangeCodec:
         linear  image = 2 * d / scale - 1
         log2    image = 2 * log2(d + 1 + 1e-4) / scale - 1
 
-    both clipped to [-1, 1]; a pixel without a return counts as d = 0.
+    both clipped to [-1, 1]; a pixel without a return counts as d = 0. With ``return_channel`` a
+    second channel tells returns (1) from empty pixels (-1), so that a decoder does not blur the
+    border between the two into ghost points.
 
     Source: the two data configurations of valeoai/R3DPA. Its inverse of the logarithm leaves
     the 1e-4 m out; ``legacy_inverse`` does so too, for published numbers.
@@ -38,6 +40,7 @@ class RangeCodec:
         encoding: ``linear`` or ``log2``.
         scale: Divisor of the formula; 56 for ``linear`` and 5.84 for ``log2`` where None.
         legacy_inverse: Return ranges that are 1e-4 m too long from a ``log2`` image.
+        return_channel: Images have a second channel, whose sign says where returns are.
 
     Raises:
         ValueError: If the encoding is unknown or the scale is not positive and finite.
@@ -46,6 +49,7 @@ class RangeCodec:
     encoding: Literal["linear", "log2"] = "linear"
     scale: float | None = None
     legacy_inverse: bool = False
+    return_channel: bool = False
 
     def __post_init__(self) -> None:
         if self.encoding not in _DEFAULT_SCALES:
@@ -102,6 +106,37 @@ class RangeCodec:
         range_m = self.to_range(image)
         inside = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
         return torch.where(inside & self.valid_mask(image), range_m, EMPTY_RANGE_M)
+
+    @property
+    def channels(self) -> int:
+        """Channels C of an image."""
+        return 2 if self.return_channel else 1
+
+    def to_image(self, range_m: Tensor) -> Tensor:
+        """Image ``(..., C, H, W)`` in [-1, 1] of ranges ``(..., H, W)`` in metres."""
+        encoded = self.encode(range_m)
+        if not self.return_channel:
+            return encoded.unsqueeze(-3)
+        returns = torch.where(range_m > 0, 1.0, -1.0)
+        return torch.stack([encoded, returns.to(encoded)], dim=-3)
+
+    def returns_of(self, image: Tensor) -> Tensor:
+        """Pixels ``(..., 1, H, W)``, bool, with a return in images ``(..., C, H, W)``."""
+        if self.return_channel:
+            return image[..., 1:, :, :] > 0
+        return self.valid_mask(image)
+
+    def informative(self, image: Tensor) -> Tensor:
+        """Values, bool ``(..., C, H, W)``, that a decoder has to match: no range without return."""
+        informative = torch.ones_like(image, dtype=torch.bool)
+        if self.return_channel:
+            informative[..., :1, :, :] = self.returns_of(image)
+        return informative
+
+    def ranges_of(self, image: Tensor, sensor: LidarSensor) -> Tensor:
+        """Ranges ``(..., H, W)`` of images ``(..., C, H, W)``, see :meth:`decode`."""
+        range_m = self.decode(image[..., 0, :, :], sensor)
+        return torch.where(self.returns_of(image)[..., 0, :, :], range_m, EMPTY_RANGE_M)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from r3dpa.modules.checks import (
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
 from r3dpa.modules.steps import PathDraws, frozen
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
+from r3dpa.nn.vae import RangeMixture
 
 
 class GenerativeModule(L.LightningModule):
@@ -203,25 +204,40 @@ class GenerativeModule(L.LightningModule):
     weigh_and_log = steps.weigh_and_log
 
     def vae_losses(
-        self, image: Tensor, posterior: Posterior, reconstruction: Tensor
+        self, image: Tensor, posterior: Posterior, prediction: Tensor
     ) -> dict[str, Tensor]:
         """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
         weights, parts = self.weights, {}
-        if weights.reconstruction != 0:
-            error = losses.reconstruction_loss(reconstruction, image, weights.reconstruction_norm)
+        if weights.reconstruction != 0 and image.shape[1] == 1:
+            error = losses.reconstruction_loss(prediction, image, weights.reconstruction_norm)
             parts["reconstruction"] = weights.reconstruction * error
+        elif weights.reconstruction != 0:
+            for name, values in self._range_losses(image, prediction).items():
+                parts[name] = getattr(weights, name) * values.mean()
         if weights.kl != 0:
             parts["kl"] = weights.kl * posterior.kl().mean()
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
             with frozen(self.discriminator):
-                logits = self.discriminator(reconstruction)
+                logits = self.discriminator(self.vae.image_of(prediction))
             parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
         if not parts.keys() & {"reconstruction", "adversarial"}:
             parts["reconstruction"] = steps.zero_loss(self.vae)
         return parts
 
-    def discriminator_losses(self, image: Tensor, reconstruction: Tensor) -> dict[str, Tensor]:
+    def _range_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
+        """Losses ``(B,)`` of images of range and return: of ranges at returns, and of returns."""
+        ranges, returns = image[:, :1], image[:, 1:] > 0
+        if self.vae.modes == 2:
+            error = RangeMixture(prediction).nll(ranges)
+        else:
+            error = losses.pixel_error(prediction[:, :1], ranges, self.weights.reconstruction_norm)
+        return {
+            "reconstruction": losses.masked_mean(error, returns),
+            "returns": losses.return_loss(prediction[:, -1:], returns),
+        }
+
+    def discriminator_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
         """Hinge loss on scans and detached reconstructions; a plain 0 before its start."""
         if self.discriminator is None:
             return {}
@@ -229,7 +245,7 @@ class GenerativeModule(L.LightningModule):
         if weights.discriminator == 0 or self.global_step < weights.adversarial_start:
             return {"discriminator": steps.zero_loss(self.discriminator)}
         real = self.discriminator(image)
-        fake = self.discriminator(reconstruction.detach())
+        fake = self.discriminator(self.vae.image_of(prediction).detach())
         loss = losses.discriminator_loss(real, fake)
         return {"discriminator": weights.discriminator * loss}
 
@@ -250,8 +266,10 @@ class GenerativeModule(L.LightningModule):
     ) -> dict[str, Tensor]:
         """L_denoise + lambda2 L_align on normalised latents without gradient."""
         denoising, alignment = self.weights.denoising, self.weights.sit_alignment
+        stop = self.weights.alignment_stop
+        aligns = alignment != 0 and (stop is None or self.global_step < stop)
         errors = steps.flow_errors(
-            self, self.sit, normalised, features, draws, denoising != 0, alignment != 0
+            self, self.sit, normalised, features, draws, denoising != 0, aligns
         )
         if "denoising" in errors:
             parts = {"denoising": denoising * errors["denoising"].mean()}
@@ -259,6 +277,8 @@ class GenerativeModule(L.LightningModule):
             parts = {"denoising": steps.zero_loss(self.sit)}
         if "alignment" in errors:
             parts["sit_alignment"] = alignment * errors["alignment"].mean()
+        elif alignment != 0:
+            parts["sit_alignment"] = steps.zero_loss(self.sit.projector)
         return parts
 
     # Optimisation
@@ -268,6 +288,7 @@ class GenerativeModule(L.LightningModule):
         return steps.adamw(self, self.trainable(), self.optimizer_config)
 
     configure_gradient_clipping = steps.clip_per_network
+    on_before_optimizer_step = steps.set_learning_rate
     on_train_start = steps.fit_optimizer
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
@@ -299,17 +320,22 @@ class GenerativeModule(L.LightningModule):
         codec = self.scan_geometry.codec
         draws = steps.draw_held_out(self, batch["index"])
         posterior = self.vae.encode(image)
-        reconstruction = self.vae.decode(posterior.mean)
-        error_m = (codec.to_range(reconstruction) - codec.to_range(image)).abs()
+        prediction = self.vae.predict(posterior.mean)
+        reconstruction = self.vae.image_of(prediction)
+        error_m = (codec.to_range(reconstruction[:, :1]) - codec.to_range(image[:, :1])).abs()
         networks, features = self.ema or self, batch.get("feature_grid")
         latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         aligns = self.needs_features()
         values = steps.flow_errors(
             self, networks.sit, latents, features, draws, self.trains_velocity, aligns
         )
+        if image.shape[1] == 1:
+            each = steps.each_reconstruction_loss(reconstruction, image, self.weights)
+            values["reconstruction"] = each
+        else:
+            values |= self._range_losses(image, prediction)
         self.held_out.update(
             batch["index"],
-            reconstruction=steps.each_reconstruction_loss(reconstruction, image, self.weights),
             range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),
             **values,
         )
@@ -321,7 +347,7 @@ class GenerativeModule(L.LightningModule):
         """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""
         geometry = self.scan_geometry
         image = self.reconstruct(batch["range_image"])
-        return geometry.codec.decode(image[:, 0], geometry.projection.sensor)
+        return geometry.codec.ranges_of(image, geometry.projection.sensor)
 
     # Checkpoints
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.datasets import LidarBatch, LidarDataset
+from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
@@ -32,6 +33,8 @@ class FlowMatching(GenerativeModule):
         cache_latents: Encode each training scan once, before the first step, and keep the posterior
             in ``<run_dir>/latents`` (131 kB a scan at 8 x 16 x 128): a step is then the same, to
             rounding, at a tenth of its cost. Scans may be rotated, but not mirrored.
+        latents_dir: Folder of the cached posteriors, which several runs may share; default:
+            ``<run_dir>/latents``.
         **kwargs: See :class:`GenerativeModule`. ``init_from`` is needed to fit; to continue from
             the VAE-alignment stage let ``init_networks`` name ``sit`` too.
     """
@@ -45,10 +48,11 @@ class FlowMatching(GenerativeModule):
         sit: VelocityNetwork,
         weights: LossWeights = LossWeights(sit_alignment=0.0),
         cache_latents: bool = False,
+        latents_dir: str | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, weights=weights, **kwargs)
-        self.cache_latents = cache_latents
+        self.cache_latents, self.latents_dir = cache_latents, latents_dir
         self.vae.requires_grad_(False)
         self.sit.projector.requires_grad_(self.weights.sit_alignment != 0)
 
@@ -95,10 +99,10 @@ class FlowMatching(GenerativeModule):
         geometry = self.scan_geometry.to_dict()
         posteriors = encoded_once(
             self,
-            Path(self.trainer.default_root_dir) / "latents",
+            Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents"),
             {"projection": geometry["projection"], "codec": geometry["codec"]},
             dataset.scans,
-            lambda scans: LidarDataset(scans, dataset.projection, dataset.codec),
+            lambda scans: replace(dataset, scans=scans, grids=None),
             "range_image",
         )
         self._datamodule.use_posteriors(posteriors)

@@ -81,6 +81,7 @@ class ImageVAETraining(L.LightningModule):
         return steps.adamw(self, {"vae": self.vae}, self.optimizer_config)
 
     configure_gradient_clipping = steps.clip_per_network
+    on_before_optimizer_step = steps.set_learning_rate
     on_train_start = steps.fit_optimizer
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -51,12 +51,12 @@ class JointAlignment(GenerativeModule):
         draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
-        reconstruction = self.vae.decode(latents)
+        prediction = self.vae.predict(latents)
 
-        losses = self.vae_losses(image, posterior, reconstruction)
+        losses = self.vae_losses(image, posterior, prediction)
         with frozen(self.sit):
             losses |= self.vae_alignment_losses(latents, features, draws)
-        losses |= self.discriminator_losses(image, reconstruction)
+        losses |= self.discriminator_losses(image, prediction)
         normalised = self.latent_norm.update(latents.detach())
         losses |= self.flow_losses(normalised, features, draws)
         return self.weigh_and_log(losses)

@@ -190,6 +190,7 @@ class RGBPretraining(L.LightningModule):
         return steps.adamw(self, {"sit": self.sit}, self.optimizer_config)
 
     configure_gradient_clipping = steps.clip_per_network
+    on_before_optimizer_step = steps.set_learning_rate
     on_train_start = steps.fit_optimizer
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 PathName = Literal["linear", "cosine"]
 TimeSampling = Literal["uniform", "lognormal"]
@@ -16,8 +16,10 @@ class LossWeights:
     A loss of weight 0 is not computed, nor an adversarial one before its start.
 
     Args:
-        reconstruction: Weight of the reconstruction error.
-        reconstruction_norm: ``l1`` (official code) or ``l2`` (paper).
+        reconstruction: Weight of the reconstruction error: of all pixels, or, where images have a
+            return channel, of those with a return (of two modes, the negative log-likelihood).
+        reconstruction_norm: ``l1`` (official code) or ``l2`` (paper); of one mode only.
+        returns: Weight of the cross-entropy of the return channel, where images have one.
         kl: Weight of the Kullback-Leibler term, summed per sample.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
         discriminator: Factor of the discriminator's hinge loss.
@@ -26,10 +28,15 @@ class LossWeights:
         denoising: Weight of the velocity error.
         sit_alignment: lambda2, weight of the alignment loss that reaches the SiT.
         skip_empty_cells: Leave empty grid cells out of the mean of the alignment loss.
+        centre_features: Align with the difference of each cell from the mean of its scan, which
+            keeps the spatial structure (iREPA).
+        alignment_stop: First step without ``sit_alignment``, which helps early and may hold back
+            later (HASTE); None: never.
     """
 
     reconstruction: float = 1.0
     reconstruction_norm: Literal["l1", "l2"] = "l1"
+    returns: float = 0.2
     kl: float = 1e-6
     adversarial: float = 3e-4
     discriminator: float = 1e-3
@@ -38,20 +45,38 @@ class LossWeights:
     denoising: float = 1.0
     sit_alignment: float = 0.5
     skip_empty_cells: bool = False
+    centre_features: bool = False
+    alignment_stop: int | None = None
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, one parameter group per network, constant rate.
+    """AdamW, one parameter group per network; constant rate, then linearly to 0 where asked for.
 
     Args:
         lr: Learning rate.
         betas: Decay of the first and second moments.
         weight_decay: Applied to every trained parameter, as officially.
         eps: Added to the root of the second moment.
+        warmup_steps: First steps, over which the rate rises linearly.
+        decay_steps: Last steps before ``trainer.max_steps``, over which the rate falls linearly to
+            0. A run that goes on to more steps starts from a checkpoint before the decay.
     """
 
     lr: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.999)
     weight_decay: float = 0.03
     eps: float = 1e-8
+    warmup_steps: int = 0
+    decay_steps: int = 0
+
+    def adamw(self) -> dict[str, Any]:
+        """Arguments of AdamW."""
+        values = asdict(self)
+        return {name: values[name] for name in ("lr", "betas", "weight_decay", "eps")}
+
+    def rate(self, step: int, max_steps: int) -> float:
+        """Learning rate of the step after ``step`` optimiser steps, out of ``max_steps``."""
+        rising = (step + 1) / max(1, self.warmup_steps + 1)
+        falling = (max_steps - step) / max(1, self.decay_steps) if self.decay_steps else 1.0
+        return self.lr * max(0.0, min(1.0, rising, falling))

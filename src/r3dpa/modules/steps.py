@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any, NamedTuple, cast
 
 import lightning as L
@@ -174,7 +173,7 @@ def adamw(
         {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
         for name, network in networks.items()
     ]
-    return torch.optim.AdamW(groups, **asdict(config), fused=uses_fused(module))
+    return torch.optim.AdamW(groups, **config.adamw(), fused=uses_fused(module))
 
 
 def uses_fused(module: L.LightningModule) -> bool:
@@ -200,6 +199,13 @@ def fit_optimizer(module: L.LightningModule) -> None:
         for name in ("exp_avg", "exp_avg_sq"):
             if state[name].stride() != parameter.stride():
                 state[name] = torch.empty_like(parameter).copy_(state[name])
+
+
+def set_learning_rate(module: Any, optimizer: torch.optim.Optimizer) -> None:
+    """Sets the rate of the coming step, a function of its number alone."""
+    rate = module.optimizer_config.rate(module.global_step, module.trainer.max_steps)
+    for group in optimizer.param_groups:
+        group["lr"] = rate
 
 
 def gradient_norms(
@@ -259,7 +265,7 @@ def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:
         )
     for state in checkpoint.get("optimizer_states", []):
         for group in state["param_groups"]:
-            group.update(asdict(module.optimizer_config))
+            group.update(module.optimizer_config.adamw())
 
 
 def flow_errors(
@@ -294,5 +300,7 @@ def align(module: Any, projected: Tensor, features: Tensor | None) -> Tensor:
         raise ValueError(
             f"stage {module.stage} aligns with 3D features, but the batch holds no feature_grid"
         )
+    if module.weights.centre_features:
+        features = losses.centred_features(features)
     skip = module.weights.skip_empty_cells
     return losses.alignment_loss(projected, features, skip_empty_cells=skip)

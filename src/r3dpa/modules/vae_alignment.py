@@ -25,7 +25,7 @@ class VAEAlignment(GenerativeModule):
     Args:
         vae: Range-image autoencoder, trained from scratch.
         sit: Velocity network, frozen but for projector and input layer (patch embedding).
-        discriminator: Patch discriminator.
+        discriminator: Patch discriminator; without it, no adversarial term.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
         **kwargs: See :class:`GenerativeModule`.
@@ -39,7 +39,7 @@ class VAEAlignment(GenerativeModule):
         self,
         vae: VAE,
         sit: VelocityNetwork,
-        discriminator: PatchDiscriminator,
+        discriminator: PatchDiscriminator | None = None,
         train_patch_embed: bool = True,
         keep_projector: bool = True,
         **kwargs: Any,
@@ -56,10 +56,9 @@ class VAEAlignment(GenerativeModule):
 
     def trainable(self) -> dict[str, nn.Module]:
         """VAE, discriminator and, when aligning, what is not frozen of the SiT."""
-        networks: dict[str, nn.Module] = {
-            "vae": self.vae,
-            "discriminator": self.get_submodule("discriminator"),
-        }
+        networks: dict[str, nn.Module] = {"vae": self.vae}
+        if self.discriminator is not None:
+            networks["discriminator"] = self.discriminator
         return networks | ({"sit": self.sit} if self.needs_features() else {})
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
@@ -68,10 +67,10 @@ class VAEAlignment(GenerativeModule):
         draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
-        reconstruction = self.vae.decode(latents)
+        prediction = self.vae.predict(latents)
 
-        losses = self.vae_losses(image, posterior, reconstruction)
+        losses = self.vae_losses(image, posterior, prediction)
         losses |= self.vae_alignment_losses(latents, features, draws)
-        losses |= self.discriminator_losses(image, reconstruction)
+        losses |= self.discriminator_losses(image, prediction)
         self.latent_norm.update(latents.detach())
         return self.weigh_and_log(losses)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Self
+from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,14 @@ from einops import rearrange
 from einops.layers.torch import Rearrange
 from torch import Tensor, nn
 
-from r3dpa.nn.layers import Mlp, SelfAttention, at_least_float32, named_layers, zeroed
+from r3dpa.nn.layers import (
+    CircularConv2d,
+    Mlp,
+    SelfAttention,
+    at_least_float32,
+    named_layers,
+    zeroed,
+)
 from r3dpa.nn.velocity_network import (
     MAX_PERIOD,
     TIME_WIDTH,
@@ -30,11 +37,14 @@ _TOKEN_NORM_EPS = 1e-6
 _TABLE_STD = 0.02
 
 
-def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
+def sincos_position_embedding(
+    width: int, grid_size: tuple[int, int], periodic_columns: bool = False
+) -> Tensor:
     """Sine-cosine code ``(1, rows * columns, width)`` of positions on a token grid, row-major.
 
     The first half of the channels encodes the column, the second half the row; each half holds
-    sines, then cosines, of ``position * 10000^(-k / (width / 4))``.
+    sines, then cosines, of ``position * 10000^(-k / (width / 4))``. Periodic columns have whole
+    numbers of periods around the scan instead, so that the first is next to the last.
     """
     if width % 4:
         raise ValueError(f"position embedding needs a width divisible by 4, got {width}")
@@ -42,12 +52,15 @@ def sincos_position_embedding(width: int, grid_size: tuple[int, int]) -> Tensor:
     exponents = torch.arange(width // 4, dtype=torch.float64) / (width // 4)
     frequencies = torch.exp(-math.log(MAX_PERIOD) * exponents)
 
-    def axis_code(positions: Tensor) -> Tensor:
+    harmonics = 1.0 + torch.arange(width // 4, dtype=torch.float64) % max(1, columns // 2)
+
+    def axis_code(positions: Tensor, frequencies: Tensor) -> Tensor:
         angles = positions.double()[:, None] * frequencies
         return torch.cat([angles.sin(), angles.cos()], dim=1)
 
-    column_code = axis_code(torch.arange(columns).repeat(rows))
-    row_code = axis_code(torch.arange(rows).repeat_interleave(columns))
+    around = 2 * math.pi / columns * harmonics if periodic_columns else frequencies
+    column_code = axis_code(torch.arange(columns).repeat(rows), around)
+    row_code = axis_code(torch.arange(rows).repeat_interleave(columns), frequencies)
     return torch.cat([column_code, row_code], dim=1)[None].float()
 
 
@@ -65,7 +78,7 @@ class SiT(VelocityNetwork):
     Args:
         input_size: Latent rows and columns ``(h, w)``.
         in_channels: Latent channels C.
-        patch_size: Side of a square patch, in latent pixels.
+        patch_size: Side of a square patch, or rows and columns of one, in latent pixels.
         hidden_size: Token width D, a multiple of 4 and of ``num_heads``.
         depth: Number of transformer blocks.
         num_heads: Attention heads per block.
@@ -78,6 +91,9 @@ class SiT(VelocityNetwork):
             models trained with label dropout have.
         qk_norm: Layer-normalise queries and keys.
         learn_pos_embed: Train the position embedding, which is otherwise a fixed buffer.
+        periodic_columns: Let the position embedding wrap around with the scan.
+        projector: ``mlp`` of three layers, or one ``conv`` over the grid of tokens (iREPA, Singh
+            et al. 2025), which takes neither ``projector_dim`` nor official weights.
     """
 
     pos_embed: Tensor
@@ -86,7 +102,7 @@ class SiT(VelocityNetwork):
         self,
         input_size: tuple[int, int] = (16, 128),
         in_channels: int = 8,
-        patch_size: int = 2,
+        patch_size: int | tuple[int, int] = 2,
         hidden_size: int = 768,
         depth: int = 12,
         num_heads: int = 12,
@@ -98,10 +114,13 @@ class SiT(VelocityNetwork):
         class_dropout: bool = False,
         qk_norm: bool = False,
         learn_pos_embed: bool = False,
+        periodic_columns: bool = False,
+        projector: Literal["mlp", "conv"] = "mlp",
     ) -> None:
         super().__init__()
         rows, columns = input_size
-        if rows % patch_size or columns % patch_size:
+        patch = (patch_size, patch_size) if isinstance(patch_size, int) else tuple(patch_size)
+        if rows % patch[0] or columns % patch[1]:
             raise ValueError(
                 f"latents of {rows} x {columns} do not divide into patches of {patch_size}; "
                 "choose a patch_size that divides both"
@@ -117,13 +136,13 @@ class SiT(VelocityNetwork):
         self.input_size = (rows, columns)
         self.in_channels = in_channels
         self.hidden_size = hidden_size
-        self.patch_size = patch_size
-        self.grid_size = (rows // patch_size, columns // patch_size)
+        self.patch = (patch[0], patch[1])
+        self.grid_size = (rows // patch[0], columns // patch[1])
         self.alignment_depth = alignment_depth
         self.feature_dim = feature_dim
         self.num_classes = num_classes
 
-        patches = nn.Conv2d(in_channels, hidden_size, patch_size, stride=patch_size)
+        patches = nn.Conv2d(in_channels, hidden_size, self.patch, stride=self.patch)
         nn.init.xavier_uniform_(patches.weight.flatten(1))
         nn.init.zeros_(patches.get_parameter("bias"))
         to_tokens = Rearrange("B D row column -> B (row column) D")
@@ -132,7 +151,7 @@ class SiT(VelocityNetwork):
         classes = nn.Embedding(num_classes + int(class_dropout), hidden_size)
         nn.init.normal_(classes.weight, std=_TABLE_STD)
         self.y_embedder = named_layers(embedding_table=classes)
-        position = sincos_position_embedding(hidden_size, self.grid_size)
+        position = sincos_position_embedding(hidden_size, self.grid_size, periodic_columns)
         if learn_pos_embed:
             self.pos_embed = nn.Parameter(position)
         else:
@@ -140,14 +159,21 @@ class SiT(VelocityNetwork):
         self.blocks = nn.ModuleList(
             _Block(hidden_size, num_heads, mlp_ratio, qk_norm) for _ in range(depth)
         )
-        self.projector = nn.Sequential(
-            _xavier_linear(hidden_size, projector_dim),
-            nn.SiLU(),
-            _xavier_linear(projector_dim, projector_dim),
-            nn.SiLU(),
-            _xavier_linear(projector_dim, feature_dim),
-        )
-        self.final_layer = _FinalLayer(hidden_size, patch_size**2 * in_channels)
+        if projector == "mlp":
+            self.projector = nn.Sequential(
+                _xavier_linear(hidden_size, projector_dim),
+                nn.SiLU(),
+                _xavier_linear(projector_dim, projector_dim),
+                nn.SiLU(),
+                _xavier_linear(projector_dim, feature_dim),
+            )
+        else:
+            self.projector = nn.Sequential(
+                Rearrange("B (row column) D -> B D row column", row=self.grid_size[0]),
+                CircularConv2d(hidden_size, feature_dim, (3, 3)),
+                Rearrange("B F row column -> B (row column) F"),
+            )
+        self.final_layer = _FinalLayer(hidden_size, math.prod(patch) * in_channels)
 
     @property
     def input_layer(self) -> nn.Module:
@@ -200,8 +226,8 @@ class SiT(VelocityNetwork):
             patches,
             "B (row column) (p q C) -> B C (row p) (column q)",
             row=self.grid_size[0],
-            p=self.patch_size,
-            q=self.patch_size,
+            p=self.patch[0],
+            q=self.patch[1],
         )
 
     def _through(self, indices: range, tokens: Tensor, modulations: Tensor) -> Tensor:

@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 import torch.nn.functional as F
+from einops import rearrange
 from torch import Tensor, nn
 
 from r3dpa.nn.layers import (
@@ -26,6 +27,7 @@ from r3dpa.nn.layers import (
 )
 
 Size = tuple[int, int]
+_LEAST_LOG_SCALE = -6.0
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
@@ -74,6 +76,40 @@ class Posterior:
         return 0.5 * terms.flatten(1).sum(dim=1)
 
 
+class RangeMixture:
+    """Two Laplacians for the encoded range of each pixel, near and far at an edge.
+
+    The scales are at least ``exp(-6)``, some millimetres at 1 m in a ``log2`` image: without a
+    limit the likelihood of a flat wall has none.
+
+    Source: Tosi et al., "SMD-Nets: stereo mixture density networks" (CVPR 2021).
+
+    Args:
+        outputs: ``(B, 5 or more, H, W)`` of a decoder: two centres, two logarithms of scales, and
+            the logit of the first centre.
+    """
+
+    num_outputs = 5
+
+    def __init__(self, outputs: Tensor) -> None:
+        outputs = at_least_float32(outputs)
+        self.centres = outputs[:, :2]
+        self.log_scales = F.softplus(outputs[:, 2:4] - _LEAST_LOG_SCALE) + _LEAST_LOG_SCALE
+        logit = outputs[:, 4:5]
+        self.log_weights = torch.cat([F.logsigmoid(logit), F.logsigmoid(-logit)], dim=1)
+
+    def mode(self) -> Tensor:
+        """Centre ``(B, 1, H, W)`` where the density is higher."""
+        first = (self.log_weights - self.log_scales).diff(dim=1) <= 0
+        return torch.where(first, self.centres[:, :1], self.centres[:, 1:])
+
+    def nll(self, image: Tensor) -> Tensor:
+        """Negative log-likelihood ``(B, 1, H, W)`` in nats of encoded ranges ``(B, 1, H, W)``."""
+        distance = (image - self.centres).abs() * torch.exp(-self.log_scales)
+        density = self.log_weights - self.log_scales - math.log(2.0) - distance
+        return -density.logsumexp(dim=1, keepdim=True)
+
+
 class Autoencoder(nn.Module):
     """Encoder to a posterior, and decoder, with 1 x 1 convolutions on both sides of the latents.
 
@@ -113,9 +149,17 @@ class Autoencoder(nn.Module):
         self.latent_size((image.shape[-2], image.shape[-1]))
         return Posterior(self.quant_conv(self.encoder(image)))
 
+    def predict(self, latents: Tensor) -> Tensor:
+        """Outputs of the decoder, those that the reconstruction loss is computed of."""
+        return self.decoder(self.post_quant_conv(latents))
+
+    def image_of(self, prediction: Tensor) -> Tensor:
+        """Images ``(B, in_channels, H, W)`` of outputs of the decoder."""
+        return prediction
+
     def decode(self, latents: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)`` of raw latents, not limited to [-1, 1]."""
-        return self.decoder(self.post_quant_conv(latents))
+        return self.image_of(self.predict(latents))
 
 
 class VAE(Autoencoder):
@@ -135,6 +179,15 @@ class VAE(Autoencoder):
     h16p2d16 1 1 2 2 2 4      1x2 four times, 2x2  4         16
     ======== ================ ==================== ========= ============
 
+    With a ``stem`` the encoder starts from blocks of pixels and the decoder ends with them: most of
+    the time of the layouts above goes into layers of few channels at full resolution. All kernels
+    are then 3 x 3.
+
+    Images of two channels, see :class:`r3dpa.geometry.RangeCodec`, are range and return: the
+    decoder predicts the logit of a return beside the range. With two ``modes`` it predicts a
+    mixture of two Laplacians for the range, which keeps edges sharp where one value would lie
+    between near and far (Tosi et al., "SMD-Nets", CVPR 2021).
+
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys are those of the official checkpoints.
 
@@ -148,6 +201,8 @@ class VAE(Autoencoder):
         num_res_blocks: Residual blocks per encoder level; decoder levels have one more.
         attention_levels: Levels with an attention block after each residual block.
         legacy_upsample: Interpolation of the official weights, see :class:`Upsample`.
+        stem: Rows and columns of a block of pixels, which the strides come on top of.
+        modes: 1 or, for images of two channels, 2.
     """
 
     def __init__(
@@ -160,7 +215,11 @@ class VAE(Autoencoder):
         num_res_blocks: int = 2,
         attention_levels: tuple[int, ...] = (),
         legacy_upsample: bool = False,
+        stem: Size = (1, 1),
+        modes: Literal[1, 2] = 1,
     ) -> None:
+        if modes == 2 and in_channels != 2:
+            raise ValueError(f"two modes need in_channels 2 (range and return), got {in_channels}")
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
             raise ValueError(
@@ -177,13 +236,22 @@ class VAE(Autoencoder):
         shallower, deeper = [widths[0], *widths[:-1]], [*widths[1:], widths[-1]]
         down = list(zip(shallower, widths, attention, [*steps, None], strict=True))
         up = list(zip(deeper, widths, attention, [None, *steps], strict=True))
+        outputs = in_channels if modes == 1 else RangeMixture.num_outputs + 1
+        strides = (stem, *strides)
         super().__init__(
-            _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks),
-            _Decoder(latent_channels, in_channels, up, num_res_blocks + 1, legacy_upsample),
+            _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks, stem),
+            _Decoder(latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem),
             in_channels,
             latent_channels,
-            (math.prod(rows for rows, _ in steps), math.prod(columns for _, columns in steps)),
+            (math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)),
         )
+        self.modes = modes
+
+    def image_of(self, prediction: Tensor) -> Tensor:
+        """Images ``(B, in_channels, H, W)``; of two modes, the one of the higher density."""
+        if self.modes == 1:
+            return prediction
+        return torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
 
     def halve_decoder_(self) -> Self:
         """Casts the convolutions of the decoder, but for the last, to bfloat16 for sampling.
@@ -198,11 +266,17 @@ class VAE(Autoencoder):
 
 class _Encoder(nn.Module):
     def __init__(
-        self, in_channels: int, out_channels: int, levels: Sequence[LevelSizes], num_blocks: int
+        self,
+        in_channels: int,
+        out_channels: int,
+        levels: Sequence[LevelSizes],
+        num_blocks: int,
+        stem: Size,
     ) -> None:
         super().__init__()
         first, last = levels[0][1], levels[-1][1]
-        self.conv_in = CircularConv2d(in_channels, first, (3, 3))
+        self.stem = (stem[0], stem[1])
+        self.conv_in = CircularConv2d(in_channels * math.prod(stem), first, (3, 3))
         self.down = nn.ModuleList(
             _Level(level, num_blocks, (3, 3), "downsample", downsample) for level in levels
         )
@@ -211,7 +285,9 @@ class _Encoder(nn.Module):
         self.conv_out = CircularConv2d(last, out_channels, (3, 3))
 
     def forward(self, image: Tensor) -> Tensor:
-        hidden = self.conv_in(image)
+        rows, columns = self.stem
+        hidden = rearrange(image, "B C (h p) (w q) -> B (C p q) h w", p=rows, q=columns)
+        hidden = self.conv_in(hidden)
         for level in self.down:
             hidden = level(hidden)
         return self.conv_out(F.silu(self.norm_out(self.mid(hidden))))
@@ -225,26 +301,32 @@ class _Decoder(nn.Module):
         levels: Sequence[LevelSizes],
         num_blocks: int,
         legacy: bool,
+        stem: Size,
     ) -> None:
         super().__init__()
-        first, last = levels[0][1], levels[-1][1]  # level 0 has the full resolution
+        first, last = levels[0][1], levels[-1][1]  # level 0 has the resolution of the stem
+        self.stem = (stem[0], stem[1])
         self.conv_in = CircularConv2d(in_channels, last, (3, 3))
         self.mid = _Middle(last)
         upsample = partial(Upsample, legacy=legacy)
         # Kernels extend over columns only, unless the rows are upsampled afterwards.
-        columns_only = [stride is None or stride[0] == 1 for *_, stride in levels]
+        by_pixel = math.prod(stem) == 1
+        columns_only = [by_pixel and (s is None or s[0] == 1) for *_, s in levels]
         self.up = nn.ModuleList(
             _Level(level, num_blocks, (1, 4) if flat else (3, 3), "upsample", upsample)
             for level, flat in zip(levels, columns_only, strict=True)
         )
         self.norm_out = GroupNorm(first)
-        self.conv_out = WideCircularConv2d(first, out_channels, (1, 4))
+        kernel = (1, 4) if by_pixel else (3, 3)
+        self.conv_out = WideCircularConv2d(first, out_channels * math.prod(stem), kernel)
 
     def forward(self, latents: Tensor) -> Tensor:
         hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))
         for level in reversed(self.up):
             hidden = level(hidden)
-        return self.conv_out(F.silu(self.norm_out(hidden)))
+        hidden = self.conv_out(F.silu(self.norm_out(hidden)))
+        rows, columns = self.stem
+        return rearrange(hidden, "B (C p q) h w -> B C (h p) (w q)", p=rows, q=columns)
 
 
 class _Level(nn.Module):

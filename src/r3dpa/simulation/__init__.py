@@ -1,7 +1,14 @@
 """Simulated lidar: seeded streets, ray casting, effects that a scene calls for, data sets."""
 
 from r3dpa.simulation.drive_files import drive_name
-from r3dpa.simulation.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate
+from r3dpa.simulation.drives import (
+    SIMULATOR_VERSION,
+    TRAIN_DRIVES,
+    VAL_DRIVES,
+    expected_scans,
+    simulate,
+    split_scans,
+)
 from r3dpa.simulation.scan import SimulatedScan, Simulator, simulate_scan
 from r3dpa.simulation.scene import (
     EgoMotion,
@@ -19,6 +26,7 @@ from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Origin, Sweep
 
 __all__ = [
+    "SIMULATOR_VERSION",
     "TRAIN_DRIVES",
     "VAL_DRIVES",
     "EgoMotion",
@@ -43,4 +51,5 @@ __all__ = [
     "load_sensor",
     "simulate",
     "simulate_scan",
+    "split_scans",
 ]

@@ -40,7 +40,7 @@ VAL_SHARE = 0.2
 
 _MANIFEST = "simulation.json"
 # Raised whenever the same request gives other scans than before.
-_SIMULATOR_VERSION = 2
+SIMULATOR_VERSION = 2
 # Neighbouring scans share their blocks of street, so a worker takes a few in a row.
 _SCANS_PER_TASK = 8
 _Task = tuple[DriveFiles, Simulator, list[int]]  # numbers of the scans of one drive
@@ -139,7 +139,7 @@ def simulate(
     counts = split_scans(scans, names)
     simulators = {drive: Simulator(seed, int(drive), weather, sensor, effects) for drive in counts}
     request = {
-        "simulator_version": _SIMULATOR_VERSION,
+        "simulator_version": SIMULATOR_VERSION,
         "seed": seed,
         "scans": scans,
         "drives": list(names),

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from r3dpa.data import SimulatedImageDataModule
+from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection, range_image
+from r3dpa.simulation import Simulator
+
+SMALL = LidarSensor(beams=16, columns=64)
+CODEC = RangeCodec("log2", return_channel=True)
+
+
+def module(root, **settings):
+    given = {"sensor": SMALL, "codec": CODEC, "grid_size": (4, 8), "num_scans": 10, "every": 3}
+    return SimulatedImageDataModule(str(root), **(given | settings))
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    module(folder).prepare_data()
+    return folder
+
+
+def test_cached_images_are_those_of_the_simulated_scans(root):
+    data = module(root)
+    data.setup("fit")
+    assert (len(data.train_set), len(data.val_set)) == (8, 2)
+    index = next(i for i, item in enumerate(data.train_set.scans) if item.number == 3)
+    item = data.train_set.scans[index]
+    points = torch.from_numpy(Simulator(0, int(item.drive)).scan(3).points)
+    range_m, _ = range_image(points[:, :3], SphericalProjection(SMALL))
+    sample = data.train_set[index]
+    found = CODEC.ranges_of(sample["range_image"], SMALL)
+    torch.testing.assert_close(found, range_m, rtol=2**-11, atol=1e-4)
+    assert torch.equal(sample["valid_mask"][0], range_m > 0)
+
+
+def test_only_what_is_missing_is_simulated(root, monkeypatch):
+    made = []
+    scan = Simulator.scan
+    monkeypatch.setattr(Simulator, "scan", lambda *a: (made.append(a[1]), scan(*a))[1])
+    module(root).prepare_data()
+    assert made == []
+    module(root, num_scans=11).prepare_data()
+    assert len(made) == 1
+    module(root, simulation_seed=1, num_scans=2).prepare_data()  # another cache beside it
+    assert len(made) == 3
+
+
+def test_images_of_another_request_are_not_mixed_up(root):
+    one, other = module(root), module(root, simulation_seed=1)
+    keys = [{item.cache_key for part in data.split() for item in part} for data in (one, other)]
+    assert not keys[0] & keys[1]
+
+
+def test_rings_need_points(tmp_path):
+    with pytest.raises(ValueError, match="projection must be spherical"):
+        module(tmp_path, projection="rings")

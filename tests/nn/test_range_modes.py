@@ -1,0 +1,78 @@
+"""Stem, return channel and range mixture of the VAE."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.geometry import LidarSensor, RangeCodec
+from r3dpa.nn import VAE
+from r3dpa.nn.vae import RangeMixture
+
+STEM = {"in_channels": 2, "latent_channels": 4, "stem": (4, 8), "channels": 32}
+STEM |= {"channel_multipliers": (1, 2), "strides": ((2, 2),), "num_res_blocks": 1, "modes": 2}
+
+
+def test_a_stem_multiplies_the_stride_and_keeps_the_size():
+    vae = VAE(**STEM)
+    image = torch.randn(2, 2, 16, 64)
+    latents = vae.encode(image).mean
+    assert latents.shape == (2, 4, *vae.latent_size((16, 64))) == (2, 4, 2, 4)
+    assert vae.predict(latents).shape == (2, 6, 16, 64)
+    assert vae.decode(latents).shape == image.shape
+    with pytest.raises(ValueError, match=r"multiple of \(8, 16\)"):
+        vae.encode(image[..., :60])
+
+
+def test_rotation_by_a_latent_column_rotates_the_result():
+    torch.manual_seed(0)
+    vae = VAE(**STEM).double().eval()
+    image = torch.randn(1, 2, 16, 128, dtype=torch.float64)
+    plain, rotated = (vae.decode(vae.encode(x).mean) for x in (image, image.roll(16, -1)))
+    torch.testing.assert_close(rotated, plain.roll(16, -1))
+
+
+def test_two_modes_need_a_return_channel():
+    with pytest.raises(ValueError, match="in_channels 2"):
+        VAE(modes=2)
+
+
+def mixture(first, second, scale_1, scale_2, logit):
+    raw = [math.log(math.expm1(math.log(scale) + 6)) - 6 for scale in (scale_1, scale_2)]
+    return RangeMixture(torch.tensor([first, second, *raw, logit]).view(1, 5, 1, 1))
+
+
+def test_likelihood_of_a_mixture_by_hand():
+    found = mixture(-0.5, 0.5, 0.1, 0.2, 0.0).nll(torch.full((1, 1, 1, 1), -0.4))
+    density = 0.5 * math.exp(-1) / 0.2 + 0.5 * math.exp(-4.5) / 0.4
+    torch.testing.assert_close(found.item(), -math.log(density), rtol=1e-5, atol=0)
+
+
+def test_the_mode_of_the_higher_density_is_decoded_never_a_mean():
+    assert mixture(-0.5, 0.5, 0.1, 0.1, 0.1).mode().item() == -0.5
+    assert mixture(-0.5, 0.5, 0.1, 0.1, -0.1).mode().item() == 0.5
+    assert mixture(-0.5, 0.5, 0.3, 0.1, 0.1).mode().item() == 0.5  # narrower
+
+
+def test_likelihood_is_finite_for_any_output():
+    outputs = torch.tensor([0.0, 0.0, -1e4, 1e4, 1e4]).view(1, 5, 1, 1).requires_grad_()
+    loss = RangeMixture(outputs).nll(torch.zeros(1, 1, 1, 1)).sum()
+    loss.backward()
+    assert loss.isfinite()
+    assert outputs.grad.isfinite().all()
+
+
+def test_a_return_channel_survives_the_round_trip():
+    sensor, codec = LidarSensor(beams=2, columns=4), RangeCodec("log2", return_channel=True)
+    range_m = torch.tensor([[2.0, -1.0, 30.0, 5.5], [-1.0, 1.5, 55.0, -1.0]])
+    image = codec.to_image(range_m)
+    assert image.shape == (codec.channels, 2, 4)
+    assert torch.equal(codec.returns_of(image)[0], range_m > 0)
+    torch.testing.assert_close(codec.ranges_of(image, sensor), range_m)
+    image[1] = -0.01  # the second channel decides, whatever the first holds
+    assert (codec.ranges_of(image, sensor) == -1).all()
+    informative = codec.informative(image)
+    assert not informative[0].any()
+    assert informative[1].all()
