@@ -129,6 +129,8 @@ class SceneEditor:
         )
         return cls(generator, settings, batch_size)
 
+    from_pretrained = from_checkpoint  # names of `r3dpa models`
+
     @torch.no_grad()
     def encode(self, range_m: Tensor) -> Tensor:
         """Normalised latents ``(B, C, h, w)`` of range images ``(B, H, W)``, means of the VAE."""

@@ -157,7 +157,8 @@ class SceneGenerator:
         """Rebuilds the networks of a checkpoint, on the path and geometry they were trained with.
 
         Args:
-            checkpoint: File of stage joint or flow_matching in any layout, or its content.
+            checkpoint: File of stage joint or flow_matching in any layout, or its content; name of
+                weights in this package, such as ``r3dpa-s``, or ``hf://owner/name``.
             sampler: Solver and steps, or a quality that selects them.
             weights: Averaged or last weights of the SiT.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
@@ -201,6 +202,8 @@ class SceneGenerator:
             batch_size=batch_size,
             compile=compile,
         )
+
+    from_pretrained = from_checkpoint  # names of `r3dpa models`
 
     @property
     def device(self) -> torch.device:
@@ -314,6 +317,8 @@ class SceneVAE:
                 f"{checkpoint.path} holds a {type(vae).__name__} for a range-image VAE"
             )
         return cls(vae, _geometry_of(checkpoint))
+
+    from_pretrained = from_checkpoint  # names of `r3dpa models`
 
     @torch.no_grad()
     def encode(self, points: Tensor | np.ndarray) -> Tensor:

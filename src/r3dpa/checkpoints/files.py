@@ -9,8 +9,9 @@ import pickle
 import re
 import reprlib
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,7 @@ from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
 from r3dpa.nn.image_vae import ImageVAE
+from r3dpa.pretrained import weights_file
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
@@ -51,7 +53,7 @@ def read_checkpoint(
     a file without ``args`` an ``args.json`` in its folder, or above a folder ``checkpoints``.
 
     Args:
-        path: File to read.
+        path: File to read, name of weights in this package, or ``hf://owner/name``.
         sit_args: Official files only: arguments of SiT that the file does not hold.
         encoding: Official files only: range encoding, if the options do not name it.
 
@@ -59,9 +61,7 @@ def read_checkpoint(
         ValueError: If the file is damaged, of no known layout, or names a class not allowed; a
             ``FileNotFoundError`` if there is none.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no checkpoint file {path}; give an existing file")
+    path = weights_file(path)
     if path.suffix == ".safetensors":
         with _naming(path):
             described = path.with_suffix(".yaml").is_file()
@@ -114,17 +114,21 @@ def convert(
     overwrite: bool = False,
     sit_args: Mapping[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
+    networks: Sequence[str] | None = None,
+    half: bool = False,
 ) -> str:
     """Rewrites a checkpoint of any layout in ours, or in the official one.
 
-    Weights stay equal bit for bit; optimisers are left out. Official training checkpoints keep all
-    facts for the way back. A checkpoint without SiT becomes the official VAE file with its
-    neighbours for discriminator and latent statistics, which lose some. Arguments are those of
-    ``r3dpa convert``, errors those of :func:`read_checkpoint` and :func:`save_checkpoint`. Returns
-    files, networks and what was not converted, as text.
+    Weights stay equal bit for bit, unless ``half`` rounds them; optimisers are left out. Official
+    training checkpoints keep all facts for the way back. A checkpoint without SiT becomes the
+    official VAE file with its neighbours for discriminator and latent statistics, which lose some.
+    Arguments are those of ``r3dpa convert``. Returns files, networks and what was not converted,
+    as text. What has no counterpart in the other layout, and existing files, are a ``ValueError``.
     """
     source, out = Path(source), Path(out)
     checkpoint = read_checkpoint(source, sit_args=sit_args, encoding=encoding)
+    if networks is not None or half:
+        checkpoint = replace(checkpoint, networks=_reduced(checkpoint, networks, half))
     left_out = dict(checkpoint.left_out)
     if to == "r3dpa":
         outputs = [save_checkpoint(checkpoint, out, overwrite=overwrite), out.with_suffix(".yaml")]
@@ -160,6 +164,22 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
         with atomic_path(path) as temporary:
             torch.save(weights, temporary)
     return list(files)
+
+
+def _reduced(
+    checkpoint: Checkpoint, names: Sequence[str] | None, half: bool
+) -> dict[str, NetworkState]:
+    """Networks of these names, in float16 but for latent statistics, where ``half`` is set."""
+    chosen = {name: checkpoint.network(name) for name in names or checkpoint.networks}
+    if half:
+        for name, state in chosen.items():
+            if not name.endswith("latent_norm"):
+                weights = {
+                    key: value.half() if value.is_floating_point() else value
+                    for key, value in state.state_dict.items()
+                }
+                chosen[name] = replace(state, state_dict=weights)
+    return chosen
 
 
 def _refuse_existing(paths: list[Path], overwrite: bool) -> None:

@@ -26,6 +26,8 @@ def convert(
     overwrite: bool = False,
     sit_args: dict[str, Any] | None = None,
     encoding: Literal["linear", "log2"] | None = None,
+    networks: list[str] | None = None,
+    half: bool = False,
 ) -> str:
     """Convert official checkpoints into ours, or ours into official ones.
 
@@ -37,6 +39,8 @@ def convert(
         sit_args: Official files only: SiT arguments that the file lacks, such as
             ``{alignment_depth: 4}``.
         encoding: Official files only: range encoding, if the file lacks it.
+        networks: Write these alone; sampling needs ``vae ema ema_latent_norm``.
+        half: Write weights in float16, half as large.
     """
     arguments = dict(locals())
     from r3dpa.checkpoints import convert as convert_checkpoint

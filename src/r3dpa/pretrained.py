@@ -1,0 +1,90 @@
+"""Trained weights by name: those of this package, files, and repositories of Hugging Face."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from r3dpa.io import first_line, text_table
+
+_FOLDER = Path(__file__).parent / "weights"
+_HUB = "hf:/"  # a Path joins the two slashes of hf://
+
+
+class Weights(NamedTuple):
+    """Weights in this package: ``.safetensors`` with its ``.yaml``, and a card in Markdown."""
+
+    name: str
+    path: Path
+    card: Path
+
+
+def shipped() -> dict[str, Weights]:
+    """Weights of this package by name."""
+    files = sorted(_FOLDER.glob("*.safetensors"))
+    return {file.stem: Weights(file.stem, file, file.with_suffix(".md")) for file in files}
+
+
+def weights_file(source: str | Path) -> Path:
+    """File of a checkpoint given by name, as a file, or as ``hf://owner/name``.
+
+    A repository of Hugging Face holds one ``.safetensors`` with its ``.yaml`` of the same name, or
+    ``hf://owner/name/file.safetensors`` names one of several.
+
+    Raises:
+        FileNotFoundError: If there is neither such a file nor such a name.
+        ValueError: If a repository cannot be read.
+    """
+    text = str(source)
+    if text.startswith(_HUB):
+        return _from_hub(text.removeprefix(_HUB).lstrip("/"))
+    path, known = Path(source), shipped()
+    if path.is_file():
+        return path
+    if text in known:
+        return known[text].path
+    names = ", ".join(known) or "none"
+    raise FileNotFoundError(
+        f"no checkpoint file {path}; give an existing file, hf://owner/name, or a name of "
+        f"`r3dpa models` ({names})"
+    )
+
+
+def models(name: str | None = None) -> str:
+    """List the trained weights of this package, or show the card of one.
+
+    Args:
+        name: Weights whose card to show: data, recipe, scores and known failures.
+    """
+    known = shipped()
+    if name is None:
+        rows = [
+            [w.name, f"{w.path.stat().st_size / 1e6:.1f} MB", str(w.card)] for w in known.values()
+        ]
+        return text_table(rows, ["name", "size", "card"], "lrl", "plain")
+    if name not in known:
+        raise ValueError(f"there are no weights {name!r}; there are {', '.join(known) or 'none'}")
+    return known[name].card.read_text()
+
+
+def _from_hub(place: str) -> Path:
+    owner, _, rest = place.partition("/")
+    name, _, file = rest.partition("/")
+    if not owner or not name:
+        raise ValueError(f"hf://{place}: give hf://owner/name or hf://owner/name/file.safetensors")
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError:
+        raise ValueError(
+            f"hf://{place}: downloads need huggingface_hub: pip install 'r3dpa[hub]'"
+        ) from None
+    patterns = [file, f"{Path(file).stem}.yaml"] if file else ["*.safetensors", "*.yaml"]
+    try:
+        folder = Path(snapshot_download(f"{owner}/{name}", allow_patterns=patterns))
+    except (OSError, ValueError) as error:  # requests' errors are OSErrors
+        raise ValueError(f"hf://{place} cannot be read: {first_line(error)}") from error
+    found = sorted(folder.rglob(file or "*.safetensors"))
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found) or "none"
+        raise ValueError(f"hf://{place}: expected one .safetensors file, found {names}; name one")
+    return found[0]
