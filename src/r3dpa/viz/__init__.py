@@ -21,7 +21,7 @@ from r3dpa.viz.figures import (
     reconstruction_figure,
     scenes_sheet,
 )
-from r3dpa.viz.page import Category, PageScan, edit_page, scan_page
+from r3dpa.viz.page import Category, PageScan, Tile, edit_page, scan_page
 from r3dpa.viz.pictures import (
     birds_eye_picture,
     encoded_picture,
@@ -37,6 +37,7 @@ __all__ = [
     "PageScan",
     "ParetoPoint",
     "Series",
+    "Tile",
     "birds_eye_picture",
     "birds_eye_sheet",
     "birds_eye_view",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import json
 import re
 import zlib
@@ -31,8 +32,10 @@ from r3dpa.viz.pictures import (
     HEIGHT_MAP,
     PALETTE,
     Array,
+    Pixels,
     as_numpy,
     bright_part,
+    palette_image,
     range_ticks,
 )
 
@@ -43,6 +46,14 @@ GROUND_M = -1.73  # KITTI's Velodyne stands 1.73 m above the road
 PAGE_RANGE_MAP = bright_part("plasma", 0.15).reversed()
 INTENSITY_MAP = bright_part("inferno", 0.25)
 _SCRIPTS = ("page_cloud.js", "page_viewer.js")
+
+
+class Tile(NamedTuple):
+    """Strip of a gallery: number of the scan that a click shows, note, and pictures by name."""
+
+    scan: int
+    note: str
+    pictures: Mapping[str, Pixels]
 
 
 class Category(NamedTuple):
@@ -76,6 +87,8 @@ def scan_page(
     origins: Mapping[int, Category],
     reference: PageScan | None = None,
     sensor: LidarSensor | None = None,
+    gallery: Mapping[str, Sequence[Tile]] | None = None,
+    about: Sequence[str] = (),
 ) -> str:
     """HTML page with one scan at a time, turned, moved and coloured by the reader.
 
@@ -88,6 +101,8 @@ def scan_page(
         origins: Categories of the origins by number, likewise.
         reference: Scan that stays beside the others, seen by the same camera.
         sensor: Gives the limits of the range colours; the default sensor if None.
+        gallery: Tiles by heading, shown in a column beside the cloud; none if None.
+        about: Lines on top of that column.
 
     Raises:
         ValueError: If there is no scan, or one is empty, of another shape than above or not finite.
@@ -116,6 +131,7 @@ def scan_page(
         },
         "scans": [header for header, _ in packed],
         "reference": None if reference is None else len(scans),
+        "film": None if gallery is None else {"about": list(about), "groups": _groups(gallery)},
     }
     # JSON may hold "<" within strings only, where its escape means the same: no name ends a script.
     text = json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -202,6 +218,30 @@ def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:
     header = {"name": scan.name, "count": count, "step_m": step_m}
     header |= {"intensity_max": intensity_max, "columns": columns}
     return header, base64.b64encode(zlib.compress(b"".join(data), 9)).decode("ascii")
+
+
+def _groups(gallery: Mapping[str, Sequence[Tile]]) -> list[dict[str, Any]]:
+    """Tiles with their pictures as PNG in data addresses."""
+    return [
+        {
+            "title": title,
+            "tiles": [
+                {
+                    "scan": tile.scan,
+                    "note": tile.note,
+                    "pictures": [(name, _png(pixels)) for name, pixels in tile.pictures.items()],
+                }
+                for tile in tiles
+            ],
+        }
+        for title, tiles in gallery.items()
+    ]
+
+
+def _png(pixels: Pixels) -> str:
+    data = io.BytesIO()
+    palette_image(pixels).save(data, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
 def _scale(label: str, colours: Colormap, power: float, ticks: Sequence[float]) -> dict[str, Any]:

@@ -198,6 +198,9 @@
     if (ticket !== wanted) return;
     state.scan = scan;
     element("scans").value = String(scan);
+    for (const tile of element("film").querySelectorAll("button")) {
+      tile.setAttribute("aria-pressed", String(tile.dataset.scan === String(scan)));
+    }
     choose(null);
     panes[0].show(page.scans[scan], cloud);
     const known = Object.keys(MODES).filter((mode) => mode === "height" || cloud[mode]);
@@ -435,7 +438,33 @@
       "It needs a browser of 2023 or newer.";
   }
 
+  /** Strips of range images, grouped under headings; a click shows the cloud. */
+  function showFilm() {
+    const film = element("film");
+    const add = (parent, tag, text) => {
+      const made = parent.appendChild(document.createElement(tag));
+      if (text) made.textContent = text;
+      return made;
+    };
+    add(film, "h1", document.title);
+    for (const line of page.film.about) add(film, "p", line);
+    for (const { title, tiles } of page.film.groups) {
+      add(film, "h2", title);
+      for (const { scan, note, pictures } of tiles) {
+        const tile = add(film, "button");
+        tile.dataset.scan = scan;
+        add(tile, "span", page.scans[scan].name);
+        add(tile, "small", note && ` · ${note}`);
+        for (const [name, data] of pictures) Object.assign(add(tile, "img"), { src: data, alt: name, title: name });
+        tile.onclick = () => showScan(scan);
+      }
+    }
+    film.hidden = false;
+    document.body.classList.add("film");
+  }
+
   async function begin() {
+    if (page.film) showFilm();
     const scans = page.scans.map((header, number) => [header, number])
       .filter(([, number]) => number !== page.reference);
     element("scans").replaceChildren(
