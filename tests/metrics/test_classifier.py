@@ -1,0 +1,29 @@
+import pytest
+import torch
+
+from r3dpa.metrics.classifier import classifier_accuracy
+
+
+def scenes(count, seed, speckle=0.0):
+    """Smooth walls of random depth; with ``speckle`` a share of pixels is somewhere else."""
+    generator = torch.Generator().manual_seed(seed)
+    depth = 5 + 40 * torch.rand(count, 1, 1, generator=generator)
+    image = depth.expand(count, 16, 64).clone()
+    noise = torch.rand(image.shape, generator=generator)
+    return torch.where(noise < speckle, 50 * noise / max(speckle, 1e-6) + 2, image)
+
+
+def test_equal_sets_cannot_be_told_apart_and_speckled_ones_can():
+    equal = classifier_accuracy(scenes(60, 0), scenes(60, 1), epochs=3)
+    assert abs(equal.value - 0.5) < 4 * 0.083
+    assert equal.standard_error == pytest.approx((equal.value * (1 - equal.value) / 36) ** 0.5)
+    speckled = classifier_accuracy(scenes(60, 0), scenes(60, 1, 0.05), epochs=3)
+    assert speckled.value > 0.9
+    assert speckled == classifier_accuracy(scenes(60, 0), scenes(60, 1, 0.05), epochs=3)
+
+
+def test_sets_that_cannot_be_compared_are_refused():
+    with pytest.raises(ValueError, match="one size"):
+        classifier_accuracy(scenes(8, 0), scenes(8, 1)[:, :8])
+    with pytest.raises(ValueError, match="at least 4"):
+        classifier_accuracy(scenes(8, 0), scenes(3, 1))
