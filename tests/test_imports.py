@@ -26,9 +26,10 @@ ALLOWED = {
     "generation": {"geometry", "nn", "flow", "checkpoints"},
     "editing": {"geometry", "nn", "flow", "generation", "checkpoints"},
     "modules": CORE | {"data", "checkpoints", "generation", "editing"},
-    "callbacks": METHOD | {"simulation", "metrics", "viz"},
+    "baselines": METHOD,
+    "callbacks": METHOD | {"baselines"} | {"simulation", "metrics", "viz"},
     "ablation": {"metrics", "modules", "checkpoints", "viz"},
-    "bench": METHOD | {"simulation", "metrics", "viz", "editing", "callbacks"},
+    "bench": METHOD | {"baselines", "simulation", "metrics", "viz", "editing", "callbacks"},
     "__main__": {"cli"},
     "cli": METHOD | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"},
 }

@@ -12,6 +12,8 @@ import torch
 REPOSITORY = Path(__file__).resolve().parents[2]
 SYNTHETIC = REPOSITORY / "tests" / "parity" / "data"
 SHARED = REPOSITORY.parent / "shared" / "parity"
+BASELINES = REPOSITORY / "tests" / "parity" / "data_baselines"
+SHARED_BASELINES = REPOSITORY.parent / "shared" / "parity_baselines"
 
 
 class Case:
@@ -47,19 +49,49 @@ def parity_dir(pytestconfig) -> Path:
     return SHARED if (SHARED / "cases.json").is_file() else SYNTHETIC
 
 
-@pytest.fixture(scope="session")
-def load_case(parity_dir):
-    """``load_case(name)``; skips a case that ``cases.json`` does not list, and no other."""
-    listed = json.loads((parity_dir / "cases.json").read_text())
+def case_loader(folder: Path):
+    """``load(name)``; skips a case that ``cases.json`` does not list, and no other."""
+    listed = json.loads((folder / "cases.json").read_text())
 
     def load(name: str) -> Case:
         if name not in listed:
-            pytest.skip(f"{name} is no case of {parity_dir} (KITTI-derived: not redistributed)")
-        if not (parity_dir / f"{name}.npz").is_file():
-            pytest.fail(f"{parity_dir} lists {name} in cases.json, but holds no {name}.npz")
-        return Case(parity_dir, name)
+            pytest.skip(f"{name} is no case of {folder}")
+        if not (folder / f"{name}.npz").is_file():
+            pytest.fail(f"{folder} lists {name} in cases.json, but holds no {name}.npz")
+        return Case(folder, name)
 
     return load
+
+
+@pytest.fixture(scope="session")
+def load_case(parity_dir):
+    """``load_case(name)`` of the official R3DPA code; some are KITTI-derived and not here."""
+    return case_loader(parity_dir)
+
+
+@pytest.fixture(scope="session")
+def baseline_case(baseline_dir):
+    """``baseline_case(name)`` of R2DM, R2Flow or LiDM."""
+    return case_loader(baseline_dir)
+
+
+@pytest.fixture(scope="session")
+def baseline_listing(baseline_dir):
+    """``baseline_listing(name)``: a recorded state-dict listing of a baseline."""
+
+    def load(name: str):
+        folder = baseline_dir if (baseline_dir / f"{name}.json").is_file() else BASELINES
+        return json.loads((folder / f"{name}.json").read_text())
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def baseline_dir(pytestconfig, parity_dir) -> Path:
+    """Golden numbers of R2DM, R2Flow and LiDM: the ``--parity-dir`` where one is given."""
+    if pytestconfig.getoption("--parity-dir") is not None:
+        return parity_dir
+    return SHARED_BASELINES if (SHARED_BASELINES / "cases.json").is_file() else BASELINES
 
 
 @pytest.fixture(scope="session")
