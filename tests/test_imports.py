@@ -20,7 +20,8 @@ ALLOWED = {
     "nn": {"geometry"},
     "viz": {"geometry"},
     "metrics": {"geometry", "nn"},
-    "data": {"geometry", "simulation"},
+    "data": {"geometry", "simulation", "weather"},
+    "weather": {"geometry", "simulation", "data"},
     "pretrained": set(),
     "checkpoints": {"nn", "pretrained"},
     "generation": {"geometry", "nn", "flow", "checkpoints"},
@@ -31,7 +32,9 @@ ALLOWED = {
     "ablation": {"metrics", "modules", "checkpoints", "viz"},
     "bench": METHOD | {"baselines", "simulation", "metrics", "viz", "editing", "callbacks"},
     "__main__": {"cli"},
-    "cli": METHOD | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"},
+    "cli": METHOD
+    | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"}
+    | {"weather"},
 }
 ANYWHERE = {"io", "__version__"}
 
