@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import load_file
-from tiny_networks import tiny_checkpoint
+from tiny_networks import tiny_checkpoint, tiny_networks
 
 from r3dpa import SceneGenerator, SceneVAE, pretrained
-from r3dpa.checkpoints import convert, read_checkpoint
+from r3dpa.checkpoints import convert, load_into, read_checkpoint
+from r3dpa.cli import main
+from r3dpa.cli.scene_files import written
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 
 GEOMETRY = ScanGeometry(SphericalProjection(LidarSensor(16, 64)), RangeCodec(), (2, 8))
@@ -43,6 +47,29 @@ def test_a_name_a_file_and_a_repository_are_taken_alike(shipped, monkeypatch):
     assert asked == [("owner/name", ["*.safetensors", "*.yaml"])]
     assert SceneVAE.from_pretrained("tiny", "cpu").vae.latent_channels == first.sit.in_channels
     assert read_checkpoint("hf://owner/name/tiny.safetensors").path == sources[1]
+
+
+def test_commands_use_the_weights_of_the_package(shipped, tmp_path, monkeypatch):
+    out = tmp_path / "scenes"
+    words = ["sample", "--out", str(out), "--num", "1", "--steps", "2", "--pictures", "0"]
+    with pytest.raises(FileNotFoundError, match=r"^the weights r3dpa-s are not in .*\(tiny\)$"):
+        main(words)
+    for name in ("tiny.yaml", "tiny.safetensors"):
+        shutil.copy(shipped / name, shipped / name.replace("tiny", pretrained.DEFAULT_WEIGHTS))
+    main(words)
+    about = json.loads((out / "metadata.json").read_text())
+    assert about["checkpoint"] == "r3dpa-s"
+    assert about["checkpoint_written"] == written(shipped / "r3dpa-s.safetensors")
+
+
+def test_a_stage_starts_from_averages_where_a_file_has_nothing_else(shipped):
+    vae, sit, norm = tiny_networks(spread=0.3)
+    load_into({"sit": sit, "latent_norm": norm, "vae": vae}, read_checkpoint("tiny"), stage="joint")
+    saved = load_file(shipped / "tiny.safetensors")
+    weights = {f"ema.{name}": value for name, value in sit.state_dict().items()}
+    weights |= {f"ema_latent_norm.{name}": value for name, value in norm.state_dict().items()}
+    for name, value in weights.items():
+        torch.testing.assert_close(value, saved[name])
 
 
 def test_unknown_names_are_answered_with_the_known_ones(shipped):

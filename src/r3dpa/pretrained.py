@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from r3dpa.io import first_line, text_table
 
+DEFAULT_WEIGHTS = "r3dpa-s"
+"""Name of the weights that commands use without ``--ckpt``."""
 _FOLDER = Path(__file__).parent / "weights"
 _HUB = "hf:/"  # a Path joins the two slashes of hf://
 
@@ -44,9 +46,11 @@ def weights_file(source: str | Path) -> Path:
     if text in known:
         return known[text].path
     names = ", ".join(known) or "none"
+    missing = f"no checkpoint file {path}"
+    if text == DEFAULT_WEIGHTS:
+        missing = f"the weights {text} are not in this package ({_FOLDER})"
     raise FileNotFoundError(
-        f"no checkpoint file {path}; give an existing file, hf://owner/name, or a name of "
-        f"`r3dpa models` ({names})"
+        f"{missing}; give an existing file, hf://owner/name, or a name of `r3dpa models` ({names})"
     )
 
 

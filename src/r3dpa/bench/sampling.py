@@ -111,9 +111,10 @@ def sampling(
     }
     if ckpt is not None:
         checkpoint = read_checkpoint(ckpt)
-        about = {"file": ckpt.name, "stage": checkpoint.stage, "step": checkpoint.step}
+        about = {"file": checkpoint.path.name, "stage": checkpoint.stage, "step": checkpoint.step}
         model = ModelProblem(checkpoint, device, chosen.batch)
-        work = Work(out / "work", [about, ckpt.stat().st_mtime_ns, str(chosen), device, quick])
+        request = [about, checkpoint.path.stat().st_mtime_ns, str(chosen), device, quick]
+        work = Work(out / "work", request)
         ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
         problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}

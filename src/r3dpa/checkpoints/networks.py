@@ -24,6 +24,7 @@ FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "
 
 _ALLOWED_PACKAGE = "r3dpa.nn."
 _NUM_LISTED = 10
+_AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
 # in which a network, or one of its layers, keeps each.
 _SHAPELESS_ARGS = {key: key for key in ("input_size", "num_heads", "alignment_depth", "eps")}
@@ -195,13 +196,16 @@ class Checkpoint:
 def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: str) -> None:
     """Copies the weights of a checkpoint into the networks of those names, all of them or none.
 
+    Exported files hold averages alone, which ``sit`` and ``latent_norm`` then start from.
+
     Raises:
         ValueError: Listing for ``stage`` what is absent or does not fit; nothing is changed then.
     """
     problems: list[str] = []
+    sources = {n: n if n in checkpoint.networks else _AVERAGES.get(n, n) for n in networks}
     for name, network in networks.items():
         try:
-            state = checkpoint.network(name)
+            state = checkpoint.network(sources[name])
         except ValueError as error:
             problems.append(f"{error}; {stage} needs: {', '.join(networks)}")
             continue
@@ -214,7 +218,7 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
             + "\nGive the networks of this run the arguments of the checkpoint, or another file"
         )
     for name, network in networks.items():
-        network.load_state_dict(checkpoint.network(name).state_dict, strict=True)
+        network.load_state_dict(checkpoint.network(sources[name]).state_dict, strict=True)
 
 
 def weights_sha256(state: Mapping[str, Tensor]) -> str:

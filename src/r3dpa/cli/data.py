@@ -9,6 +9,7 @@ from typing import Any
 from jsonargparse.typing import PositiveInt
 
 from r3dpa.cli.parser import check_file, check_folder
+from r3dpa.pretrained import DEFAULT_WEIGHTS
 
 
 def check(path: Path) -> None:
@@ -57,8 +58,8 @@ def view(source: Path, *, out: Path | None = None, num: PositiveInt = 8) -> str:
 def objects(
     *,
     data: str,
-    ckpt: Path,
     out: Path,
+    ckpt: Path = Path(DEFAULT_WEIGHTS),
     features_ckpt: Path | None = None,
     limit: PositiveInt = 200,
     device: str = "auto",

@@ -16,6 +16,8 @@ from typing import Any, Literal, NoReturn, Union, cast, get_args, get_origin
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
+from r3dpa.pretrained import DEFAULT_WEIGHTS
+
 # jsonargparse denies os.system and its like already when a YAML file names them.
 set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
 
@@ -131,7 +133,8 @@ class SceneOptions:
     """Checkpoint that makes scenes, and files that they are written to.
 
     Args:
-        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``.
+        ckpt: Checkpoint of stage joint or flow_matching, ``.ckpt`` or exported ``.safetensors``, a
+            name of ``r3dpa models``, or ``hf://owner/name``.
         out: Folder for scenes, pictures, page and metadata; must not hold other scenes.
         seed: Scene i depends on (seed, i) alone, not on the batch size.
         batch_size: Scenes made together.
@@ -142,8 +145,8 @@ class SceneOptions:
         overwrite: Write into a folder that holds scenes already, and start anew.
     """
 
-    ckpt: Path
     out: Path
+    ckpt: Path = Path(DEFAULT_WEIGHTS)
     seed: NonNegativeInt = 0
     batch_size: PositiveInt = 8
     device: str = "auto"

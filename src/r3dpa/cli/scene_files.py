@@ -85,7 +85,7 @@ def provenance(
     about |= {name: getattr(options, name) for name in ("weights", "seed", "batch_size")}
     return about | {
         "checkpoint": str(options.ckpt),
-        "checkpoint_written": written(options.ckpt),
+        "checkpoint_written": written(checkpoint.path),
         "num": num,
         "device": device,
         "formats": list(options.formats),
