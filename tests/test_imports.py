@@ -34,7 +34,7 @@ ALLOWED = {
     "__main__": {"cli"},
     "cli": METHOD
     | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"}
-    | {"weather"},
+    | {"weather", "pretrained"},
 }
 ANYWHERE = {"io", "__version__"}
 
