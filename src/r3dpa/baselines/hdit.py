@@ -102,10 +102,10 @@ class HDiT(nn.Module):
                 _Block, width, time_channels, heads, window, harmonics, int(width * mlp_ratio)
             )
             if level == levels:
-                self.mid_levels = nn.ModuleList(block() for _ in range(depth))
+                self.mid_levels = _Blocks(block() for _ in range(depth))
                 break
             for part in (self.down_levels, self.up_levels):
-                part[f"level_{level}"] = nn.ModuleList(block() for _ in range(depth))
+                part[f"level_{level}"] = _Blocks(block() for _ in range(depth))
             self.down_levels[f"merge_{level}"] = nn.Sequential(
                 Rearrange("B (h p) (w q) D -> B h w (p q D)", p=2, q=2),
                 _linear(4 * width, 2 * width),
@@ -126,17 +126,14 @@ class HDiT(nn.Module):
         hidden = hidden + self.spatial_pe(angles[0])
         skipped = []
         for level in range(len(self.down_levels) // 2):
-            for block in self.down_levels[f"level_{level}"]:
-                hidden = block(hidden, angles[-1], embedding)
+            hidden = self.down_levels[f"level_{level}"](hidden, angles[-1], embedding)
             skipped.append(hidden)
             angles.append(F.avg_pool2d(angles[-1], 2))
             hidden = self.down_levels[f"merge_{level}"](hidden)
-        for block in self.mid_levels:
-            hidden = block(hidden, angles[-1], embedding)
+        hidden = self.mid_levels(hidden, angles[-1], embedding)
         for level in reversed(range(len(skipped))):
             hidden = self.up_levels[f"expand_{level}"](hidden, skipped[level])
-            for block in self.up_levels[f"level_{level}"]:
-                hidden = block(hidden, angles[level], embedding)
+            hidden = self.up_levels[f"level_{level}"](hidden, angles[level], embedding)
         return self.detokenizer(hidden)
 
 
@@ -274,8 +271,10 @@ class _Attention(nn.Module):
             for x in (query, key)
         )
         if self.window is None:
-            flat = (rearrange(x, "B h w head d -> B head (h w) d") for x in (query, key, value))
-            mixed = F.scaled_dot_product_attention(*flat, scale=1.0)
+            query, key, value = (
+                rearrange(x, "B h w head d -> B head (h w) d") for x in (query, key, value)
+            )
+            mixed = F.scaled_dot_product_attention(query, key, value, scale=1.0)
             mixed = rearrange(mixed, "B head (h w) d -> B h w (head d)", h=tokens.shape[1])
         else:
             mixed = neighbourhood_attention(query, key, value, self.window, wrap_columns=True)
@@ -299,6 +298,13 @@ class _Block(nn.Module):
 
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         return self.residual_ffn(self.residual_attn(tokens, angles, embedding), embedding)
+
+
+class _Blocks(nn.ModuleList):
+    def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
+        for block in self:
+            tokens = block(tokens, angles, embedding)
+        return tokens
 
 
 class _Expand(nn.Module):
