@@ -1,31 +1,37 @@
-"""Atomic writes, locks, provenance of results, and checks of names and files from elsewhere."""
+"""Atomic writes, locks, worker processes, provenance, and checks of names and files."""
 
 from __future__ import annotations
 
 import errno
 import functools
 import logging
+import multiprocessing
 import os
 import pickle
 import platform
 import re
 import shlex
+import signal
 import struct
 import subprocess
 import sys
+import threading
 import tokenize
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from filelock import FileLock, Timeout
 
 from r3dpa import __version__
 
+T, R = TypeVar("T"), TypeVar("R")
 _log = logging.getLogger(__name__)
 _DAMAGED = (pickle.UnpicklingError, struct.error, tokenize.TokenError, zipfile.BadZipFile, EOFError)
 _BAD_VALUES = (ArithmeticError, AttributeError, LookupError, SyntaxError, TypeError, ValueError)
@@ -110,6 +116,47 @@ def only_writer(lock: Path, what: str, wait: bool = False) -> Iterator[None]:
             yield
         finally:
             lock.unlink(missing_ok=True)
+
+
+def in_processes(function: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[R]:
+    """Results of a function, as they are ready and in any order; in this process if one is enough.
+
+    Workers ignore interrupts and end when this process is killed. ``ChildProcessError`` if one of
+    them was killed.
+    """
+    if workers == 1 or len(tasks) < 2:
+        yield from map(function, tasks)
+        return
+    # spawn: forking a process that runs threads (torch, CUDA) can deadlock.
+    pool = ProcessPoolExecutor(
+        min(workers, len(tasks)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+    )
+    try:
+        for future in as_completed([pool.submit(function, task) for task in tasks]):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise ChildProcessError(
+            "a worker process ended before its work: it was killed, as happens when memory runs "
+            "out, or could not start. The same request goes on where this one stopped; use fewer "
+            "workers, or one to see the error itself"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker() -> None:
+    """Ignore interrupts, which the parent handles, and end when the parent is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _error_number(error: BaseException | None, temporary: str) -> int | None:

@@ -146,9 +146,12 @@ def test_ply_of_other_programs(tmp_path):
         read_ply(tmp_path / "l.ply")
     with pytest.raises(ScanError, match=r"gone\.ply: cannot be read"):
         read_ply(tmp_path / "gone.ply")
-    (tmp_path / "c.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(ScanError, match=r"c\.ply: is not a binary little-endian"):
+    (tmp_path / "c.ply").write_text("ply\nformat ascii 2.0\nend_header\n")
+    with pytest.raises(ScanError, match=r"c\.ply: is no \.ply file of one of ascii 1\.0, "):
         read_ply(tmp_path / "c.ply")
+    text = header.replace("binary_little_endian", "ascii")
+    (tmp_path / "t.ply").write_text(f"{text}1 2 3 255\n")
+    assert read_ply(tmp_path / "t.ply").tolist() == [[1, 2, 3]]
 
 
 def test_killed_writer_leaves_no_scan(tmp_path, make_scans):

@@ -40,6 +40,7 @@ _PLY_NAMES += ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32",
 _PLY_TYPES = dict(
     zip(_PLY_NAMES, ["i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"] * 2, strict=True)
 )
+_PLY_KINDS = {"ascii 1.0": "", "binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">"}
 
 
 class ScanError(DataError):
@@ -207,29 +208,53 @@ def write_ply(path: str | Path, points: np.ndarray | torch.Tensor) -> None:
 
 
 def read_ply(path: str | Path) -> np.ndarray:
-    """Points ``(P, 3)``, or ``(P, 4)`` with intensity, of a binary little-endian ``.ply`` file.
+    """Points ``(P, 3)``, or ``(P, 4)`` with intensity, of a ``.ply`` file of vertices.
 
-    ``ScanError`` for another format, other elements than ``vertex``, or no x, y or z.
+    ``ScanError`` for other elements than ``vertex``, or no x, y or z.
     """
-    path = Path(path)
-    head, separator, body = read_bytes(path).partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not separator or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
-        raise ScanError(f"{path}: is not a binary little-endian .ply file")
-    elements = [words[1:] for words in lines if words[:1] == ["element"]]
-    properties = [words[1:] for words in lines if words[:1] == ["property"]]
+    table, _ = ply_table(Path(path))
+    wanted = ["x", "y", "z"] + ["intensity"] * ("intensity" in (table.dtype.names or ()))
     try:
-        ((_, count),) = elements
-        layout = np.dtype([(name, _PLY_TYPES[kind]) for kind, name in properties])
-        if len(body) != int(count) * layout.itemsize:
-            raise ValueError(f"{len(body)} bytes for {count:.20} points of {layout.itemsize}")
-        table = np.frombuffer(body, layout)
-        wanted = ["x", "y", "z"] + ["intensity"] * ("intensity" in (layout.names or ()))
         return np.stack([table[name].astype(np.float32) for name in wanted], axis=1)
-    except (KeyError, ValueError) as error:
+    except ValueError as error:
+        raise ScanError(f"{path}: has no x, y or z ({error})") from error
+
+
+def ply_table(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Vertices ``(P,)`` of an ASCII or binary ``.ply`` file as named columns, and its header."""
+    head, mark, body = read_bytes(path).partition(b"end_header")
+    header = (head + mark).decode("ascii", errors="replace").splitlines()
+    words = [line.split() for line in header]
+    kind = " ".join(words[1][1:]) if mark and words[0] == ["ply"] and words[1:] else ""
+    if kind not in _PLY_KINDS:
+        raise ScanError(f"{path}: is no .ply file of one of {', '.join(_PLY_KINDS)}")
+    try:
+        ((_, count),) = (line[1:] for line in words if line[0] == "element" and line[2] != "0")
+        fields = [
+            (line[2], _PLY_TYPES[line[1]])
+            for line in words
+            if line[0] == "property" and line[1] != "list"
+        ]
+        layout = np.dtype(fields).newbyteorder(_PLY_KINDS[kind] or "<")
+        return parse_table(body.partition(b"\n")[2], layout, int(count), kind[0] == "a"), header
+    except (KeyError, ValueError, IndexError) as error:
         raise ScanError(
             f"{path}: must hold points alone, with x, y, z and other single numbers ({error})"
         ) from error
+
+
+def parse_table(data: bytes, layout: np.dtype, count: int, is_text: bool) -> np.ndarray:
+    """Rows ``(count,)`` of named columns from binary data, or from lines of numbers."""
+    if is_text:
+        lines = data.decode("ascii").splitlines()
+        table = np.loadtxt(lines, layout, ndmin=1) if count else np.empty(0, layout)
+    elif len(data) == count * layout.itemsize:
+        return np.frombuffer(data, layout)
+    else:
+        raise ValueError(f"{len(data)} bytes for {count} points of {layout.itemsize}")
+    if len(table) != count:
+        raise ValueError(f"{len(table)} lines for {count} points")
+    return table
 
 
 def write_npz(path: str | Path, scans: Iterable[tuple[str, np.ndarray | torch.Tensor]]) -> None:

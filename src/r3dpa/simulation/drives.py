@@ -13,22 +13,17 @@ interruptions.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
 import statistics
-import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tqdm import tqdm
 
-from r3dpa.io import only_writer, text_table
+from r3dpa.io import in_processes, only_writer, text_table
 from r3dpa.simulation.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
 from r3dpa.simulation.scan import Simulator, check_switches
 from r3dpa.simulation.scene import Weather
@@ -165,7 +160,7 @@ def simulate(
         complete = scans - num_missing
         # disable=None: no bar without a terminal.
         with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
-            for num_written in _run_all(tasks, workers):
+            for num_written in in_processes(_run, tasks, workers):
                 bar.update(num_written)
         return _finish(out, files, num_missing)
 
@@ -229,18 +224,19 @@ def _check_folder(out: Path, request: dict[str, Any]) -> None:
     stored = _read_json(manifest)
     if isinstance(stored.get("scans"), int) and stored["scans"] < request["scans"]:
         stored["scans"] = request["scans"]  # scans are added
-    if different := list(_differences(stored, request)):
+    if different := list(differences(stored, request)):
         raise ValueError(
             f"{out} holds a data set of another request ({'; '.join(different)}); give another "
             f"folder, or delete it"
         )
 
 
-def _differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
+def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
+    """Each value of a stored request that differs from the wanted one, as text."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         for key in stored | wanted:
             place = f"{name}.{key}" if name else key
-            yield from _differences(stored.get(key), wanted.get(key), place)
+            yield from differences(stored.get(key), wanted.get(key), place)
     elif stored != wanted:
         yield f"{name} {_short(stored)} there, {_short(wanted)} now"
 
@@ -259,43 +255,6 @@ def _read_json(path: Path) -> dict[str, Any]:
             f"{path} is damaged ({error}); simulate the data set again into an empty folder"
         ) from error
     return values
-
-
-def _run_all(tasks: list[_Task], workers: int) -> Iterator[int]:
-    """Number of scans of each task, as it ends, in any order."""
-    if workers == 1 or len(tasks) < 2:
-        yield from map(_run, tasks)
-        return
-    # spawn: forking a process that runs threads (torch, CUDA) can deadlock.
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-    )
-    try:
-        for future in as_completed([pool.submit(_run, task) for task in tasks]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise ChildProcessError(
-            "a worker process ended before its work: it was killed, as happens when memory runs "
-            "out, or could not start. The same request goes on where this one stopped; use fewer "
-            "workers, or one to see the error itself"
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _start_worker() -> None:
-    """Ignore interrupts, which the parent handles, and end when the parent is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _run(task: _Task) -> int:

@@ -1,0 +1,328 @@
+"""Scans of any lidar from files, and back, with every column as it was.
+
+``.bin`` holds float32 rows x, y, z, intensity (KITTI), the ring as fifth (nuScenes, ``.pcd.bin``),
+or other columns that are named; ``.pcd`` is ASCII, binary or compressed, and written uncompressed
+if so; ``.ply`` is ASCII or binary, of vertices alone; ``.npy`` and ``.npz`` hold such rows, or
+columns with names. Labels lie in a ``.label`` of SemanticKITTI, beside the scan or in ``labels``
+beside its folder.
+
+Sources: PCL's description of PCD 0.7; Turk, "The PLY Polygon File Format" (1994); liblzf 3.6.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
+from numpy.typing import NDArray
+
+from r3dpa.data.scans import (
+    ScanError,
+    files_below,
+    npz_arrays,
+    parse_table,
+    ply_table,
+    read_bytes,
+)
+from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
+from r3dpa.weather.recorded import RecordedScan
+
+Table = NDArray[np.void]  # (P,) rows of named columns, in the order of the file
+_Read = tuple[str, Table, Callable[[Table], bytes]]  # format, rows, and file of other rows
+_ROWS = ("x", "y", "z", "intensity", "ring")  # of rows without names
+_NAMES = {
+    **{axis: axis for axis in "xyz"},
+    "intensity": "intensity i reflectivity reflectance remission scalar_intensity",
+    "ring": "ring line channel laser laser_id beam scalar_ring",
+    "time_s": "time_s time t timestamp time_stamp time_offset scalar_time",
+}
+# No lidar's ranges in metres have a greater median, or end before.
+_FAR_MEDIAN_M, _NEAR_MAX_M = 250.0, 1.5
+_FEWEST_POINTS = 16
+
+
+@dataclass(frozen=True)
+class ScanFile:
+    """A scan and what is needed to write it again.
+
+    Args:
+        path: File that was read.
+        kind: Format in words.
+        table: Rows ``(P,)`` with all columns of the file.
+        columns: Name in the table of x, y, z and, where known, intensity, ring, time_s.
+        pack: Bytes of the file for other rows of this table.
+        labels: ``(P,)`` uint32 from ``label_path``, or None.
+        label_path: File of the labels.
+    """
+
+    path: Path
+    kind: str
+    table: Table
+    columns: dict[str, str]
+    pack: Callable[[Table], bytes]
+    labels: NDArray[np.uint32] | None = None
+    label_path: Path | None = None
+
+    @property
+    def scan(self) -> RecordedScan:
+        """The points as float32, and the columns that are understood."""
+        given = {key: self.table[name] for key, name in self.columns.items()}
+        points = np.stack([given.pop(axis).astype(np.float32) for axis in "xyz"], axis=1)
+        table = {name: self.table[name] for name in self.table.dtype.names or ()}
+        try:
+            return RecordedScan(points, **given, labels=self.labels, table=table)
+        except ValueError as error:
+            raise ScanError(f"{self.path}: {error}") from error
+
+    def describe(self) -> str:
+        """Format, columns, number of points, ranges and intensities in one line."""
+        names = ", ".join(self.table.dtype.names or ())
+        parts = [f"{self.kind} ({names})", f"{len(self.table)} points"]
+        range_m = np.linalg.norm(self.scan.points, axis=1)
+        for name, values in (("range", range_m), ("intensity", self.scan.intensity)):
+            if values is not None:
+                parts.append(f"{name} {values.min():.3g}..{values.max():.4g}")
+        if self.labels is not None:
+            parts.append(f"labels of {len(np.unique(self.labels & 0xFFFF))} classes")
+        return ", ".join(parts)
+
+
+def find_files(source: Path) -> tuple[Path, list[Path]]:
+    """Folder that names are relative to, and the scans of a file or folder, sorted."""
+    if source.is_file():
+        return source.parent, [source]
+    files = sorted(file for file in files_below(source) if file.suffix.lower() in _READERS)
+    if not files:
+        readable = ", ".join(_READERS)
+        raise ScanError(f"{source}: is no folder with scans and no scan; can be read: {readable}")
+    return source, files
+
+
+def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -> ScanFile:
+    """Scan of a file, checked.
+
+    Args:
+        path: File of a format above.
+        columns: Names of the columns of rows without names; default: as the values show.
+        drop_nan: Leave out points with NaN or infinite numbers, which organised clouds hold for
+            shots without return.
+
+    Raises:
+        ScanError: If the file is damaged, its columns are ambiguous, or its values are no scan in
+            metres.
+    """
+    data, read = read_bytes(path), _READERS.get(path.suffix.lower())
+    if read is None or not data:
+        reason = "is of no known format; can be read: " + ", ".join(_READERS)
+        raise ScanError(f"{path}: {'is empty' if not data else reason}")
+    try:
+        kind, table, pack = read(path, data, tuple(columns))
+    except ScanError:
+        raise
+    except UNPICKLING_ERRORS as error:
+        raise ScanError(f"{path}: is damaged or of another layout ({first_line(error)})") from error
+    known = _known_columns(path, table)
+    labels, label_path = _labels(path, len(table))
+    values = [table[name].astype(np.float64) for name in known.values()]
+    finite = np.isfinite(values).all(axis=0)
+    if num_bad := np.count_nonzero(~finite):
+        if not drop_nan:
+            raise ScanError(
+                f"{path}: has NaN or infinite values in {num_bad} of {len(table)} points; "
+                "--drop_nan leaves them out"
+            )
+        table, labels = table[finite], None if labels is None else labels[finite]
+    if len(table) < _FEWEST_POINTS:
+        number = f"{len(table)} point{'s' * (len(table) != 1)}"
+        raise ScanError(f"{path}: holds {number}, too few for a sweep; take it out of the folder")
+    range_m = np.sqrt(np.square(values[:3]).sum(axis=0))[finite]
+    median, largest = float(np.median(range_m)), float(range_m.max())
+    if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
+        advice = "divide the coordinates, by 100 or 1000" if median > 1 else "multiply them"
+        raise ScanError(
+            f"{path}: ranges have the median {median:.3g} and reach {largest:.4g}, which are no "
+            f"metres: {advice}"
+        )
+    return ScanFile(path, kind, table, known, pack, labels, label_path)
+
+
+def write_file(file: ScanFile, root: Path, out: Path) -> None:
+    """Write a scan, its labels first, to the place below ``out`` that it has below ``root``.
+
+    Labels from outside ``root`` are written beside the scan.
+    """
+    path = out / file.path.relative_to(root)
+    if file.labels is not None and file.label_path is not None:
+        place = Path(os.path.relpath(file.label_path.absolute(), root.absolute()))
+        inside = place.parts[0] != ".."
+        with atomic_path(out / place if inside else path.with_name(place.name)) as temporary:
+            temporary.write_bytes(file.labels.astype("<u4").tobytes())
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(file.pack(file.table))
+
+
+def _known_columns(path: Path, table: Table) -> dict[str, str]:
+    names = {name.lower(): name for name in table.dtype.names or ()}
+    known = {}
+    for key, others in _NAMES.items():
+        name = next((names[other] for other in others.split() if other in names), None)
+        if name is None and key in "xyz":
+            raise ScanError(f"{path}: has no column {key}, only {', '.join(names.values())}")
+        if name is not None:
+            kind = table.dtype[name]
+            if kind.shape or kind.kind not in ("f" if key in "xyz" else "fiu"):
+                raise ScanError(f"{path}: column {name} is of {kind}; {key} must be one float")
+            known[key] = name
+    return known
+
+
+def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
+    name = f"{path.name.split('.')[0]}.label"
+    for place in (path.with_name(name), path.absolute().parents[1] / "labels" / name):
+        if place.is_file():
+            data = read_bytes(place)
+            if len(data) != 4 * num_points:
+                raise ScanError(
+                    f"{place}: holds {len(data) / 4:g} labels but {path} {num_points} points: "
+                    "delete the one that does not belong"
+                )
+            return np.frombuffer(data, "<u4"), place
+    return None, None
+
+
+def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
+    """Rows ``(P, C)`` of floats as a table."""
+    columns = columns or _ROWS[: rows.shape[-1]]
+    if rows.ndim != 2 or rows.dtype.kind != "f" or rows.shape[1] != len(columns):
+        raise ScanError(
+            f"{path}: holds {rows.dtype} of shape {rows.shape}, not rows of {len(columns)} floats: "
+            "name all columns with --columns, such as x,y,z,intensity,ring,time"
+        )
+    return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in columns])[:, 0]
+
+
+def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
+    counts = [len(columns)] if columns else [5] if path.stem.endswith(".pcd") else [4, 5]
+    fitting = [count for count in counts if len(data) % (4 * count) == 0]
+    values = np.frombuffer(data, "<f4") if fitting else np.empty(0, "<f4")
+    likely = [c for c in fitting if columns or _plausible(values.reshape(-1, c))]
+    if len(likely) != 1:
+        raise ScanError(
+            f"{path}: its {len(data)} bytes are no rows of {' or '.join(map(str, counts))} float32 "
+            "numbers that can be x, y, z, intensity, ring: name the columns with --columns, such "
+            "as x,y,z,intensity,time"
+        )
+    table = _with_names(path, values.reshape(-1, likely[0]), columns)
+    return f"{likely[0]} columns of float32", table, np.ndarray.tobytes
+
+
+def _plausible(rows: NDArray) -> bool:
+    """Whether intensities and rings can be such; NaN is for a later message."""
+    ring = rows[:, 4:5]
+    return not ((rows[:, 3:] < 0).any() or (ring > 255).any() or (ring % 1 > 0).any())
+
+
+def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
+    arrays = dict(npz_arrays(path)) if data[:2] == b"PK" else {}
+    array, *others = arrays.values() or [np.load(io.BytesIO(data), allow_pickle=False)]
+    named = bool(array.dtype.names or others)
+    if {one.shape for one in (array, *others)} != {array.shape[:1] if named else array.shape}:
+        raise ScanError(f"{path}: must hold one scan: one array of rows, or columns of one length")
+
+    def pack(table: Table) -> bytes:
+        rows, stream = table if named else structured_to_unstructured(table), io.BytesIO()
+        if others:
+            np.savez_compressed(stream, **{name: table[name] for name in arrays})
+        elif arrays:
+            np.savez_compressed(stream, **dict.fromkeys(arrays, rows))
+        else:
+            np.save(stream, rows)
+        return stream.getvalue()
+
+    if others:
+        array = np.rec.fromarrays([array, *others], names=list(arrays)).view(np.ndarray)
+    return path.suffix, array if named else _with_names(path, array, columns), pack
+
+
+def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
+    table, header = ply_table(path)
+
+    def pack(table: Table) -> bytes:
+        text = re.sub(r"(?m)^element vertex .*", f"element vertex {len(table)}", "\n".join(header))
+        rows = _text(table) if "ascii" in header[1] else table.tobytes()
+        return f"{text}\n".encode("ascii") + rows
+
+    return f".ply, {header[1].split()[1]}", table, pack
+
+
+def _read_pcd(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
+    found = re.match(rb"((?:[^\n]*\n)*?DATA +(ascii|binary|binary_compressed)\s*?\n)", data)
+    if found is None:
+        raise ScanError(f"{path}: is no .pcd file: its header ends with no DATA")
+    head, mode, body = found[1].decode(), found[2].decode(), data[found.end() :]
+    header = {line.split()[0]: line.split()[1:] for line in head.splitlines() if line.strip()}
+    names = [f"_{n}" if name == "_" else name for n, name in enumerate(header["FIELDS"])]
+    kinds, sizes, repeats = (header.get(key, ["1"] * len(names)) for key in _PCD_FIELDS)
+    fields = zip(names, kinds, sizes, map(int, repeats), strict=True)
+    layout = np.dtype([(n, f"<{k.lower()}{s}", (r,) if r > 1 else ()) for n, k, s, r in fields])
+    count = int(header["POINTS"][0])
+    size = count * layout.itemsize
+    if mode == "binary_compressed":  # column after column
+        lengths = np.frombuffer(body[:8], "<u4")
+        whole = io.BytesIO(_decompress(body[8 : 8 + lengths[0]], size))
+        table = np.empty(count, layout)
+        for name in names:
+            part = table[name]
+            part[...] = np.frombuffer(whole.read(part.nbytes), part.dtype).reshape(part.shape)
+    else:
+        rows = body if mode == "ascii" else body[:size]
+        table = parse_table(rows, layout, count, mode == "ascii")
+
+    def pack(table: Table) -> bytes:
+        text = re.sub(r"(?m)^(WIDTH|POINTS) .*", rf"\g<1> {len(table)}", head)
+        text = re.sub(r"(?m)^HEIGHT .*", "HEIGHT 1", text).replace("binary_compressed", "binary")
+        return text.encode() + (_text(table) if mode == "ascii" else table.tobytes())
+
+    return f".pcd, {mode}", table, pack
+
+
+def _text(table: Table) -> bytes:
+    """Rows of numbers, each with the fewest digits that give it again."""
+    parts = [table[name].reshape(len(table), -1).astype(str) for name in table.dtype.names or ()]
+    return "".join(f"{' '.join(row)}\n" for row in np.concatenate(parts, axis=1)).encode()
+
+
+def _decompress(data: bytes, size: int) -> bytes:
+    """Data of liblzf: runs of literals, and copies of earlier parts."""
+    out, place = bytearray(), 0
+    while place < len(data) and len(out) <= size:
+        control, place = data[place], place + 1
+        if control < 32:
+            out += data[place : place + control + 1]
+            place += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length, place = length + data[place], place + 1
+        start, place = len(out) - ((control & 31) << 8) - data[place] - 1, place + 1
+        part = out[max(start, 0) :][: length + 2]  # shorter than the copy where they overlap
+        out += (part * (length + 2))[: length + 2]
+    if len(out) != size:
+        raise ValueError(f"{len(out)} bytes, not {size}, after decompression")
+    return bytes(out)
+
+
+_PCD_FIELDS = ("TYPE", "SIZE", "COUNT")
+_READERS: dict[str, Callable[[Path, bytes, tuple[str, ...]], _Read]] = {
+    ".bin": _read_bin,
+    ".npy": _read_numpy,
+    ".npz": _read_numpy,
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
+}
