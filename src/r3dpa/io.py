@@ -31,7 +31,8 @@ from filelock import FileLock, Timeout
 
 from r3dpa import __version__
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 _log = logging.getLogger(__name__)
 _DAMAGED = (pickle.UnpicklingError, struct.error, tokenize.TokenError, zipfile.BadZipFile, EOFError)
 _BAD_VALUES = (ArithmeticError, AttributeError, LookupError, SyntaxError, TypeError, ValueError)

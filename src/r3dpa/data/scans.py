@@ -40,7 +40,11 @@ _PLY_NAMES += ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32",
 _PLY_TYPES = dict(
     zip(_PLY_NAMES, ["i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"] * 2, strict=True)
 )
-_PLY_KINDS = {"ascii 1.0": "", "binary_little_endian 1.0": "<", "binary_big_endian 1.0": ">"}
+_PLY_KINDS: dict[str, Literal["<", ">"]] = {
+    "ascii 1.0": "<",
+    "binary_little_endian 1.0": "<",
+    "binary_big_endian 1.0": ">",
+}
 
 
 class ScanError(DataError):
@@ -235,7 +239,7 @@ def ply_table(path: Path) -> tuple[np.ndarray, list[str]]:
             for line in words
             if line[0] == "property" and line[1] != "list"
         ]
-        layout = np.dtype(fields).newbyteorder(_PLY_KINDS[kind] or "<")
+        layout = np.dtype(fields).newbyteorder(_PLY_KINDS[kind])
         return parse_table(body.partition(b"\n")[2], layout, int(count), kind[0] == "a"), header
     except (KeyError, ValueError, IndexError) as error:
         raise ScanError(

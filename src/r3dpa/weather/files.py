@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
@@ -235,19 +236,19 @@ def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     if {one.shape for one in (array, *others)} != {array.shape[:1] if named else array.shape}:
         raise ScanError(f"{path}: must hold one scan: one array of rows, or columns of one length")
 
+    if others:
+        layout = [(name, one.dtype) for name, one in arrays.items()]
+        table = np.array(list(zip(*arrays.values(), strict=True)), layout)
+    else:
+        table = array if named else _with_names(path, array, columns)
+
     def pack(table: Table) -> bytes:
         rows, stream = table if named else structured_to_unstructured(table), io.BytesIO()
-        if others:
-            np.savez_compressed(stream, **{name: table[name] for name in arrays})
-        elif arrays:
-            np.savez_compressed(stream, **dict.fromkeys(arrays, rows))
-        else:
-            np.save(stream, rows)
+        packed: dict[str, Any] = {name: table[name] if others else rows for name in arrays}
+        np.savez_compressed(stream, **packed) if arrays else np.save(stream, rows)
         return stream.getvalue()
 
-    if others:
-        array = np.rec.fromarrays([array, *others], names=list(arrays)).view(np.ndarray)
-    return path.suffix, array if named else _with_names(path, array, columns), pack
+    return path.suffix, table, pack
 
 
 def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
