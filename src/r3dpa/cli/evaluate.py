@@ -77,6 +77,7 @@ def evaluate(
     ckpt: dict[str, Path] | None = None,
     skip_bad: bool = False,
     allow_few: bool = False,
+    baseline_metrics: bool = False,
     label: str | None = None,
     device: str = "auto",
     out: Path | None = None,
@@ -96,6 +97,7 @@ def evaluate(
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         skip_bad: Leave out samples that cannot be used, and list them.
         allow_few: Accept fewer samples than features: only to try it.
+        baseline_metrics: Also JSD and MMD as R2DM, R2Flow and LiDM define them, by other names.
         label: Name of the generator in tables; default: that of ``samples``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
@@ -126,6 +128,7 @@ def evaluate(
         made_with=made_with,
         allow_few=allow_few,
         skip_bad=skip_bad,
+        baseline_metrics=baseline_metrics,
     )
     evaluation = comparison.evaluation
     if files.bad:  # the reader refused these, so that they never became scenes

@@ -22,8 +22,10 @@ from r3dpa.metrics.functional_bev import (
     BEVGrid,
     Matching,
     chamfer_squared,
+    gaussian_kernel,
     histogram_distance,
     minimum_matching,
+    point_histogram,
 )
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene import Protocol
@@ -343,6 +345,54 @@ class MinimumMatchingDistance(SceneMetric):
             strict=True,
         )
         return torch.tensor([chamfer_squared(*pair) for pair in pairs], dtype=torch.float64)
+
+
+class BaselineDistances(MinimumMatchingDistance):
+    """JSD and MMD as R2DM, R2Flow and LiDM define them, of the range images that are kept.
+
+    ==============  ======================================================================
+    ``JSD points``  R2DM, R2Flow: of numbers of points, see :func:`point_histogram`
+    ``MMD kernel``  R2DM, R2Flow: of the same histograms, see :func:`kernel_mmd`
+    ``MMD 0.5 m``   LiDM: as ``MMD``, on cells of 0.5 m
+    ==============  ======================================================================
+
+    LiDM's JSD is that of :class:`BEVHistogramDistance`. Intervals of the first two are over the
+    generated scenes, that of the third is over the real scans.
+    """
+
+    def results(
+        self, resampling: Resampling, matching: Matching | None = None
+    ) -> list[MetricResult]:
+        """The three distances."""
+        real, made = (self.clouds(self.kept(side)[1]) for side in SIDES)
+        counts = (len(made), len(real))
+        real_points, points = (
+            torch.stack([point_histogram(cloud).flatten() for cloud in clouds]).double()
+            for clouds in (real, made)
+        )
+        sums = real_points.sum(dim=0)
+        shares = [p / p.sum(dim=1, keepdim=True).clamp(min=1) for p in (real_points, points)]
+        own = gaussian_kernel(shares[0], shares[0]).mean()
+        across = gaussian_kernel(*shares).mean(dim=0)
+        within = gaussian_kernel(shares[1], shares[1])
+
+        def jsd(drawn: Tensor) -> float:
+            return histogram_distance(sums, points[drawn].sum(dim=0)).jsd_distance
+
+        def mmd(drawn: Tensor) -> float:
+            between = across[drawn].mean()
+            return (own + within[drawn][:, drawn].mean() - 2 * between).item()
+
+        rows = []
+        for name, distance in (("JSD points", jsd), ("MMD kernel", mmd)):
+            ends = resampling.interval(distance, len(made))
+            value = distance(torch.arange(len(made)))
+            rows.append(self._row(name, value, counts, interval=ends))
+        coarse = BEVGrid(cell_m=0.5)
+        cells = ([coarse.cells(cloud) for cloud in clouds] for clouds in (real, made))
+        matched = minimum_matching(*cells, coarse).squared_normalised
+        ends = resampling.of_mean(matched)
+        return [*rows, self._row("MMD 0.5 m", matched.mean().item(), counts, interval=ends)]
 
 
 def _rank(name: str) -> int:

@@ -32,6 +32,7 @@ _NEAR, _POOR = 1.5, 0.5  # times the floor; times the share that real scans reac
 _ALIKE = 0.6  # ratio of the numbers of returns below which scenes are of another sensor
 _ROWS = {"JSD": "cells", "TV": "cells", "W1 range": "ranges"}
 _ROWS |= {"MMD": "matching", "CD 3D": "matching"}
+_ROWS |= dict.fromkeys(("JSD points", "MMD kernel", "MMD 0.5 m"), "baselines")
 _KINDS = {"": "frechet", "inf": "inf", "KID": "kid"}  # of a feature space; others are shares
 _SKIP_BAD = ". --skip_bad leaves such scenes out, and lists them (`r3dpa test`: --scorer.skip_bad)"
 
@@ -57,6 +58,7 @@ def evaluate(
     made_with: Mapping[str, Any] | None = None,
     allow_few: bool = False,
     skip_bad: bool = False,
+    baseline_metrics: bool = False,
     resampling: Resampling | None = None,
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
@@ -75,6 +77,7 @@ def evaluate(
         made_with: Provenance for JSON: ``solver``, ``steps``, ``seed`` and anything else.
         allow_few: Accept fewer scenes than features.
         skip_bad: Leave out scenes that are empty, hold NaN or have another size, and list them.
+        baseline_metrics: Also JSD and MMD as R2DM, R2Flow and LiDM define them.
         resampling: Seed, and cost of the intervals.
 
     Raises:
@@ -102,6 +105,8 @@ def evaluate(
 
     reference.fill(metrics, spaces)
     by_name = metrics_of(metrics)
+    if not baseline_metrics:
+        by_name.pop("baselines")
     match = by_name["matching"]
     known = match.matching() if match.has_reference else None
     rows: list[MetricResult] = []
@@ -120,7 +125,8 @@ def evaluate(
         extra["scenes"] = f"{len(names)}, where the protocol asks for {protocol.num_samples}"
     floors: dict[str, MetricResult] = {}
     if isinstance(reference, ReferenceStatistics):
-        floors = _floors(reference, spaces, len(names), len(match.kept("generated")[0]), resampling)
+        num_images = len(match.kept("generated")[0])
+        floors = _floors(reference, spaces, len(names), num_images, list(by_name), resampling)
         extra["verdict"] = _verdict(rows, floors)
     else:
         extra["left_out"] = reference.left_out
@@ -155,8 +161,9 @@ def scene_distance(
     """One metric between two sets of scenes, without a reference file, intervals and floors.
 
     Args:
-        name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; a feature space,
-            such as ``FWID``, for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
+        name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; those of the
+            baselines, ``JSD points``, ``MMD kernel`` and ``MMD 0.5 m``; a feature space, such as
+            ``FWID``, for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
         real: Scenes as ``(name, points)``, or what :func:`r3dpa.data.samples.read_samples` gives.
         generated: The same.
         protocol: Preparation of the scenes.
@@ -254,6 +261,7 @@ def _floors(
     spaces: Sequence[SceneFeatures],
     num_samples: int,
     num_images: int,
+    metric_names: Sequence[str],
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
     """Rows of the first half of the reference as if it were generated, against the second."""
@@ -280,7 +288,8 @@ def _floors(
         chosen = torch.randperm(len(rows), generator=resampling.generator())[:num_samples]
         own[f"{name}_frechet"].update(rows[chosen], real=False)
     without = replace(resampling, num_resamples=0)
-    found = [row for metric in metrics_of(metrics).values() for row in metric.results(without)]
+    filled = metrics_of(metrics)
+    found = [row for name in metric_names for row in filled[name].results(without)]
     return {row.name: row for row in found}
 
 

@@ -14,6 +14,7 @@ from torchmetrics import MetricCollection
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     SIDES,
+    BaselineDistances,
     BEVHistogramDistance,
     MinimumMatchingDistance,
     RangeHistogramDistance,
@@ -200,7 +201,7 @@ def scene_metrics(
     max_rows: int | None = None,
     max_images: tuple[int | None, int | None] = (None, None),
 ) -> MetricCollection:
-    """All metrics of scenes: ``cells``, ``ranges``, ``matching`` and four for each feature space.
+    """All metrics of scenes: ``cells``, ``ranges``, ``matching``, ``baselines``, four a space.
 
     ``spaces`` has the widths by name. ``update`` takes ``clouds``, ``range_m``, ``features`` by
     space, ``names`` and ``real``; see :func:`update_with`.
@@ -209,8 +210,9 @@ def scene_metrics(
         "cells": BEVHistogramDistance(protocol.grid, num_groups),
         "ranges": RangeHistogramDistance(protocol.sensor.range_max_m, num_groups),
         "matching": MinimumMatchingDistance(protocol, *max_images),
+        "baselines": BaselineDistances(protocol, *max_images),
     }
-    groups = [[name] for name in metrics]
+    groups = [["cells"], ["ranges"], ["matching", "baselines"]]
     for name, width in spaces.items():
         for kind, metric in _OF_SPACE.items():
             metrics[f"{name}_{kind}"] = metric(width, name.upper(), max_rows)

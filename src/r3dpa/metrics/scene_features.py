@@ -1,15 +1,19 @@
 """Feature spaces in which sets of scenes are compared, one vector per scene.
 
-========  ==============================================  ========  ==========================
-name      features                                        width     weights
-========  ==============================================  ========  ==========================
-``frid``  decoder of RangeViT, means of bands of rows     1024      official file
-``fld``   mean patch token of LIP-Loc's range encoder     384       official file
-``fsvd``  MinkowskiNet before its head, means of rings    768       official file
-``fpvd``  SPVCNN before its head, means of rings          768       official file
-``fwid``  tokens of ``waffleiron-s``, mean over points    128       in the package
-``fgeo``  ``geometric``, mean over points                 64        needs none
-========  ==============================================  ========  ==========================
+===============  =======================================  =====  ===============
+name             features                                 width  weights
+===============  =======================================  =====  ===============
+``frid``         decoder of RangeViT, bands of rows       1024   official file
+``fld``          mean patch token of LIP-Loc              384    official file
+``fsvd``         MinkowskiNet before its head, rings      768    official file
+``fpvd``         SPVCNN before its head, rings            768    official file
+``frd``          4096 values of RangeNet-53 (R2DM)        4096   official file
+``frid_r2flow``  decoder of RangeNet-21, bands of rows    512    official file
+``frid_lidm``    the same without standardised input      512    official file
+``fpd``          last four layers of PointNet (R2DM)      1808   official file
+``fwid``         tokens of ``waffleiron-s``, over points  128    in the package
+``fgeo``         ``geometric``, mean over points          64     needs none
+===============  =======================================  =====  ===============
 
 Distances in the last two have no published numbers.
 """
@@ -25,6 +29,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r3dpa.geometry import unproject
 from r3dpa.io import usable_device
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
@@ -32,11 +37,14 @@ from r3dpa.nn.backbones.geometric import CENTRES
 from r3dpa.nn.backbones.liploc import GREY_LEVELS_PER_M, LIPLoc
 from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
 from r3dpa.nn.backbones.point_features import sha256
-from r3dpa.nn.backbones.rangevit import RangeViT
+from r3dpa.nn.backbones.pointnet import POINTS_SCALE_M, PointNet
+from r3dpa.nn.backbones.rangenet import NUM_BANDS, NUM_PICKED, RangeNet, banded, picked
+from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
 from r3dpa.nn.backbones.sparse import NUM_BINS, pool_voxels, voxelize
 
 #: Names that :func:`scene_features` knows.
 SPACES = ("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo")
+SPACES += ("frd", "frid_r2flow", "frid_lidm", "fpd")
 #: Of these, the ones that need no file.
 FREE_SPACES = ("fwid", "fgeo")
 # Generated scenes have no intensity: all points get the mean of real scans.
@@ -99,6 +107,10 @@ def scene_features(
         return range_vit_space(RangeViT.from_checkpoint(ckpt, protocol.sensor).to(device))
     if name == "fld":
         return lip_loc_space(LIPLoc.from_checkpoint(ckpt).to(device), protocol)
+    if name == "fpd":
+        return point_net_space(PointNet.from_checkpoint(ckpt).to(device), protocol)
+    if name in ("frd", "frid_r2flow", "frid_lidm"):
+        return range_net_space(name, RangeNet.from_checkpoint(ckpt).to(device), protocol)
     network = (SPVCNN if name == "fpvd" else MinkowskiNet).from_checkpoint(ckpt)
     return voxel_space(network.to(device), protocol)
 
@@ -125,17 +137,56 @@ def range_vit_space(network: RangeViT) -> SceneFeatures:
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
         if network.in_channels < 5:
             return network(_stack(scenes, "range_m", device), None)
-        for scene in scenes:
-            if scene.intensity is None:
-                raise ValueError(
-                    f"{scene.name}: has no intensity, which these weights of RangeViT read; give "
-                    "those of rangevit_wo_i"
-                )
-        return network(_stack(scenes, "range_m", device), _stack(scenes, "intensity", device))
+        intensity = _intensities(scenes, "RangeViT", device, "; give those of rangevit_wo_i")
+        return network(_stack(scenes, "range_m", device), intensity)
 
     card = _card(network, "decoder, means of bands of rows", "pixel corners, -1 where empty")
     card["in_channels"] = network.in_channels
     return SceneFeatures("frid", network.dim, card, extract)
+
+
+def range_net_space(name: str, network: RangeNet, protocol: Protocol) -> SceneFeatures:
+    """Features of RangeNet++ for ``frd``, ``frid_r2flow`` or ``frid_lidm``.
+
+    LiDM feeds metres, -1 where a pixel is empty, on the corners of pixels; the others standardise
+    the channels, 0 where empty, with constants that differ between archives.
+    """
+    device, raw = network.image_mean.device, name == "frid_lidm"
+    corner = raw or protocol.unprojection == "corner"
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        range_m = _stack(scenes, "range_m", device)
+        if raw:
+            channels = range_channels(range_m, protocol.sensor)
+        else:
+            xyz = unproject(range_m, protocol.projection, corner).movedim(-1, 1)
+            channels = torch.cat([range_m.clamp(min=0)[:, None], xyz], dim=1)
+        if network.in_channels == 5:
+            intensity = _intensities(scenes, "RangeNet", device)[:, None]
+            channels = torch.cat([channels, intensity], dim=1)
+        features = network.feature_map(channels if raw else network.normalise(channels))
+        return picked(features) if name == "frd" else banded(features)
+
+    layer = "decoder, values at fixed places" if name == "frd" else "decoder, means of bands"
+    where = f"pixel {'corners' if corner else 'centres'}"
+    card = _card(network, layer, f"{where}, -1 where empty" if raw else f"{where}, standardised")
+    if not raw:
+        card["mean"] = network.image_mean.flatten().tolist()
+        card["deviation"] = network.image_std.flatten().tolist()
+    dim = NUM_PICKED if name == "frd" else network.stem[0].out_channels * NUM_BANDS
+    return SceneFeatures(name, dim, card, extract)
+
+
+def point_net_space(network: PointNet, protocol: Protocol) -> SceneFeatures:
+    """FPD's features, of the points of all pixels; those without a return are at the origin."""
+    corner, device = protocol.unprojection == "corner", network.fc3.weight.device
+
+    def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
+        points = unproject(_stack(scenes, "range_m", device), protocol.projection, corner)
+        return network(points.flatten(1, 2).transpose(1, 2) / POINTS_SCALE_M)
+
+    where = f"pixel {protocol.unprojection}s, origin where empty, {POINTS_SCALE_M:g} m are 1"
+    return SceneFeatures("fpd", network.dim, _card(network, "last four layers", where), extract)
 
 
 def lip_loc_space(network: LIPLoc, protocol: Protocol) -> SceneFeatures:
@@ -206,6 +257,17 @@ def _card(network: nn.Module, layer: str, preprocessing: str) -> dict[str, Any]:
 
 def _stack(scenes: Sequence[EvaluationScene], field: str, device: torch.device) -> Tensor:
     return torch.stack([getattr(scene, field) for scene in scenes]).to(device)
+
+
+def _intensities(
+    scenes: Sequence[EvaluationScene], network: str, device: torch.device, advice: str = ""
+) -> Tensor:
+    for scene in scenes:
+        if scene.intensity is None:
+            raise ValueError(
+                f"{scene.name}: has no intensity, which these weights of {network} read{advice}"
+            )
+    return _stack(scenes, "intensity", device)
 
 
 def _points(scene: EvaluationScene) -> Tensor:

@@ -23,8 +23,8 @@ from r3dpa.nn.backbones.official import load_strictly, read_released
 
 _BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}
 _WIDTH = 32
-_BANDS = 16
-_NUM_PICKED = 4096
+NUM_BANDS = 16
+NUM_PICKED = 4096
 # Mean and deviation of range, x, y, z in metres and remission where the weights come without.
 _MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
 _DEVIATION = (12.32, 11.47, 6.91, 0.86, 0.16)
@@ -142,10 +142,10 @@ class RangeNet(nn.Module):
 
 def banded(features: Tensor) -> Tensor:
     """Means ``(B, C * 16)`` of 16 bands of rows of each channel of ``(B, C, H, W)``: FRID."""
-    return reduce(features, "B C (band row) W -> B (C band)", "mean", band=_BANDS)
+    return reduce(features, "B C (band row) W -> B (C band)", "mean", band=NUM_BANDS)
 
 
-def picked(features: Tensor, num: int = _NUM_PICKED) -> Tensor:
+def picked(features: Tensor, num: int = NUM_PICKED) -> Tensor:
     """``num`` values of ``(B, C, H, W)`` at fixed places ``(B, num)``: FRD.
 
     Source: LiDARGen (Zyrianov et al. 2022), as R2DM and R2Flow use it.
@@ -153,7 +153,7 @@ def picked(features: Tensor, num: int = _NUM_PICKED) -> Tensor:
     return features.flatten(1)[:, picked_places(features[0].numel(), num)]
 
 
-def picked_places(size: int, num: int = _NUM_PICKED) -> list[int]:
+def picked_places(size: int, num: int = NUM_PICKED) -> list[int]:
     """Places of :func:`picked` among ``size`` values: Python's sample after seed 0."""
     return Random(0).sample(range(size), num)
 
