@@ -12,6 +12,7 @@ from r3dpa.geometry import LidarSensor, points_of
 from r3dpa.metrics import functional
 from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
+    BaselineDistances,
     BEVHistogramDistance,
     MinimumMatchingDistance,
     RangeHistogramDistance,
@@ -25,12 +26,19 @@ from r3dpa.metrics.feature_distances import (
     scene_metrics,
 )
 from r3dpa.metrics.functional import fd_infinity, frechet_distance_of, polynomial_mmd, shared_balls
-from r3dpa.metrics.functional_bev import chamfer_squared, histogram_distance, minimum_matching
+from r3dpa.metrics.functional_bev import (
+    BEVGrid,
+    chamfer_squared,
+    histogram_distance,
+    kernel_mmd,
+    minimum_matching,
+    point_histogram,
+)
 from r3dpa.metrics.scene import DEFAULT
 
 PROTOCOL = replace(DEFAULT, sensor=LidarSensor(beams=8, columns=32), voxel_m=1.0)
 GRID = PROTOCOL.grid
-NAMES = ["bev", "ranges", "mmd", "frechet", "inf", "kid", "prdc"]
+NAMES = ["bev", "ranges", "mmd", "baselines", "frechet", "inf", "kid", "prdc"]
 
 
 def draw(*shape, seed=0):
@@ -52,6 +60,8 @@ def metric_of(name, **options):
         return RangeHistogramDistance(56.0, **options)
     if name == "mmd":
         return MinimumMatchingDistance(PROTOCOL, **options)
+    if name == "baselines":
+        return BaselineDistances(PROTOCOL, **options)
     return KINDS[name](4, "X", **options)
 
 
@@ -72,7 +82,7 @@ def clouds(real):
 
 
 def data(name, real):
-    if name in ("ranges", "mmd"):
+    if name in ("ranges", "mmd", "baselines"):
         return images(real)
     if name == "bev":
         return clouds(real)
@@ -96,6 +106,15 @@ def expected(name):
         found = histogram_distance(GRID.histogram(real), GRID.histogram(made))
         return {"JSD": found.jsd_distance, "TV": found.total_variation}
     parts = [clouds(real) for real in (True, False)]
+    if name == "baselines":
+        a, b = (torch.stack([point_histogram(c).flatten() for c in part]) for part in parts)
+        grid = BEVGrid(cell_m=0.5)
+        found = minimum_matching(*([grid.cells(c) for c in part] for part in parts), grid)
+        return {
+            "JSD points": histogram_distance(a.sum(dim=0), b.sum(dim=0)).jsd_distance,
+            "MMD kernel": kernel_mmd(*(p.double() / p.sum(dim=1, keepdim=True) for p in (a, b))),
+            "MMD 0.5 m": found.squared_normalised.mean().item(),
+        }
     found = minimum_matching(*([GRID.cells(c) for c in part] for part in parts), GRID)
     pairs = zip(parts[0], found.nearest, strict=True)
     chamfer = torch.tensor([chamfer_squared(c, parts[1][i]) for c, i in pairs])
@@ -269,7 +288,9 @@ def test_metrics_of_a_space_share_one_state():
             real=real,
         )
     found = metrics_of(metrics)
-    assert list(found) == ["cells", "ranges", "matching", "x_frechet", "x_inf", "x_kid", "x_shares"]
+    of_scenes = ["cells", "ranges", "matching", "baselines"]
+    assert list(found) == [*of_scenes, "x_frechet", "x_inf", "x_kid", "x_shares"]
+    assert found["baselines"].compute() == pytest.approx(expected("baselines"))
     assert found["x_kid"].real_moments is found["x_frechet"].real_moments
     assert found["x_shares"].count("real") == 7
     assert found["cells"].compute() == pytest.approx(expected("bev"))

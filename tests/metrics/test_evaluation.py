@@ -91,6 +91,19 @@ def test_the_same_scenes_have_no_distance(reference):
         assert rows[f"TOY {name}"].value == 1.0
 
 
+def test_distances_of_the_baselines_are_there_on_request(reference):
+    """They need nothing that references of R3DPA do not hold."""
+    rows = rows_of(scenes(1), reference, baseline_metrics=True)
+    others = {"JSD points", "MMD kernel", "MMD 0.5 m"}
+    assert set(rows) == DISTANCES | SHARES | others
+    for name in others:
+        low, high = rows[name].interval
+        assert low < rows[name].value < high, name
+        assert rows[name].floor is not None, name
+        assert scene_distance(name, scenes(0), scenes(1), PROTOCOL) == rows[name].value, name
+    assert rows_of(scenes(1), reference)["JSD"] == rows["JSD"]
+
+
 def test_floors_are_between_the_drives():
     rows = found(1)
     drives = [

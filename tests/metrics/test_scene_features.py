@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from r3dpa.geometry import LidarSensor
+from r3dpa.geometry import LidarSensor, unproject
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import (
     SceneFeatures,
@@ -16,7 +16,9 @@ from r3dpa.metrics.scene_features import (
 from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
 from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet, official_name
-from r3dpa.nn.backbones.rangevit import _NAMES, RangeViT
+from r3dpa.nn.backbones.pointnet import PointNet
+from r3dpa.nn.backbones.rangenet import RangeNet, picked
+from r3dpa.nn.backbones.rangevit import _NAMES, RangeViT, range_channels
 from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
 
 SENSOR = LidarSensor(beams=16, columns=64)
@@ -147,6 +149,48 @@ def test_voxel_spaces_pool_rings(network_class):
     with torch.no_grad():
         expected = pool_voxels(network(coordinates, inputs), coordinates, 1, voxel_m=0.5)
     torch.testing.assert_close(features[2:], expected, **FLOAT32)
+
+
+@pytest.mark.parametrize("name", ["frd", "frid_r2flow", "frid_lidm"])
+def test_range_net_spaces_standardise_their_input_but_for_lidm(name, tmp_path):
+    torch.manual_seed(0)
+    network = RangeNet(21, 4, 3, mean=(5.0,) * 4, deviation=(2.0,) * 4)
+    torch.save(network.state_dict(), tmp_path / "weights.pt")
+    space, scene = scene_features(name, tmp_path / "weights.pt", CENTRE), seen(1)[0]
+    range_m = scene.range_m[None]
+    if name == "frid_lidm":
+        channels = range_channels(range_m, SENSOR)
+    else:
+        xyz = unproject(range_m, CENTRE.projection).movedim(-1, 1)
+        channels = RangeNet(21, 4, 0).normalise(torch.cat([range_m[:, None], xyz], dim=1))
+        assert space.card["mean"] == pytest.approx([12.12, 10.88, 0.23, -1.04])
+    expected = network.feature_map(channels)
+    expected = picked(expected) if name == "frd" else expected.unflatten(2, (16, -1)).mean((3, 4))
+    assert space.dim == expected.flatten(1).shape[1]
+    torch.testing.assert_close(space([scene]), expected.flatten(1), **FLOAT32)
+
+
+def test_remission_is_read_by_networks_of_five_channels(tmp_path):
+    torch.manual_seed(0)
+    torch.save(RangeNet(21, 5, 0).state_dict(), tmp_path / "weights.pt")
+    space = scene_features("frd", tmp_path / "weights.pt", CENTRE)
+    bright, dark = (
+        through_sensor(EvaluationScene("a", None, image(), torch.full((16, 64), value)), CENTRE)
+        for value in (1.0, 0.0)
+    )
+    assert not torch.equal(space([bright]), space([dark]))
+    with pytest.raises(ValueError, match="0: has no intensity, which these weights of RangeNet"):
+        space(seen(1))
+
+
+def test_point_net_space_reads_empty_pixels_as_the_origin(tmp_path):
+    torch.manual_seed(0)
+    network = PointNet()
+    torch.save(network.state_dict(), tmp_path / "weights.pth")
+    (scene,) = seen(1)
+    points = torch.cat([scene.points, torch.zeros(1, 3)]) / 80
+    space = scene_features("fpd", tmp_path / "weights.pth", CENTRE)
+    torch.testing.assert_close(space([scene]), network(points.T[None]), **FLOAT32)
 
 
 def test_official_files_become_spaces(tmp_path):

@@ -32,7 +32,8 @@ def reference(
         data: Folder of scans, in the KITTI-360 layout or any other, or a data YAML.
         out: File to write, ``.safetensors``.
         spaces: Feature spaces: ``fwid`` and ``fgeo`` need no file; ``frid``, ``fld``, ``fsvd`` and
-            ``fpvd`` need the weights of the official networks.
+            ``fpvd``, and ``frd``, ``frid_r2flow``, ``frid_lidm`` and ``fpd`` of the baselines, need
+            the weights of the official networks.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         split: Which scans of the data.
         limit: Number of scans at most, spread evenly.

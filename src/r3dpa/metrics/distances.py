@@ -371,10 +371,13 @@ class BaselineDistances(MinimumMatchingDistance):
             for clouds in (real, made)
         )
         sums = real_points.sum(dim=0)
-        shares = [p / p.sum(dim=1, keepdim=True).clamp(min=1) for p in (real_points, points)]
-        own = gaussian_kernel(shares[0], shares[0]).mean()
-        across = gaussian_kernel(*shares).mean(dim=0)
-        within = gaussian_kernel(shares[1], shares[1])
+        real_shares, shares = (
+            counted / counted.sum(dim=1, keepdim=True).clamp(min=1)
+            for counted in (real_points, points)
+        )
+        own = gaussian_kernel(real_shares, real_shares).mean()
+        across = gaussian_kernel(real_shares, shares).mean(dim=0)
+        within = gaussian_kernel(shares, shares)
 
         def jsd(drawn: Tensor) -> float:
             return histogram_distance(sums, points[drawn].sum(dim=0)).jsd_distance
@@ -389,8 +392,8 @@ class BaselineDistances(MinimumMatchingDistance):
             value = distance(torch.arange(len(made)))
             rows.append(self._row(name, value, counts, interval=ends))
         coarse = BEVGrid(cell_m=0.5)
-        cells = ([coarse.cells(cloud) for cloud in clouds] for clouds in (real, made))
-        matched = minimum_matching(*cells, coarse).squared_normalised
+        real_cells, cells = ([coarse.cells(cloud) for cloud in clouds] for clouds in (real, made))
+        matched = minimum_matching(real_cells, cells, coarse).squared_normalised
         ends = resampling.of_mean(matched)
         return [*rows, self._row("MMD 0.5 m", matched.mean().item(), counts, interval=ends)]
 

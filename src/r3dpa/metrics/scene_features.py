@@ -43,8 +43,10 @@ from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
 from r3dpa.nn.backbones.sparse import NUM_BINS, pool_voxels, voxelize
 
 #: Names that :func:`scene_features` knows.
-SPACES = ("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo")
-SPACES += ("frd", "frid_r2flow", "frid_lidm", "fpd")
+SPACES = (
+    *("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo"),
+    *("frd", "frid_r2flow", "frid_lidm", "fpd"),
+)
 #: Of these, the ones that need no file.
 FREE_SPACES = ("fwid", "fgeo")
 # Generated scenes have no intensity: all points get the mean of real scans.
@@ -173,7 +175,7 @@ def range_net_space(name: str, network: RangeNet, protocol: Protocol) -> SceneFe
     if not raw:
         card["mean"] = network.image_mean.flatten().tolist()
         card["deviation"] = network.image_std.flatten().tolist()
-    dim = NUM_PICKED if name == "frd" else network.stem[0].out_channels * NUM_BANDS
+    dim = NUM_PICKED if name == "frd" else network.width * NUM_BANDS
     return SceneFeatures(name, dim, card, extract)
 
 

@@ -47,6 +47,10 @@ class RangeNet(nn.Module):
         deviation: Of each channel.
     """
 
+    image_mean: Tensor
+    image_std: Tensor
+    width = _WIDTH
+
     def __init__(
         self,
         layers: Literal[21, 53] = 53,
