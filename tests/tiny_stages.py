@@ -1,4 +1,4 @@
-"""The three stages with tiny networks, trained in this process on a few random batches."""
+"""The stages with tiny networks, trained in this process on a few random batches."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torch.utils.data import DataLoader
 
 from r3dpa.callbacks import StepGuard
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
+from r3dpa.modules import FewStep, FlowMatching, JointAlignment, VAEAlignment
 from r3dpa.modules.steps import batch_number
-from r3dpa.nn import VAE, PatchDiscriminator, SiT
+from r3dpa.nn import VAE, PatchDiscriminator, SiT, ThinDecoder
 
 # Only `r3dpa fit` saves plain arguments in place of networks; nothing is saved here.
 QUIET = [
@@ -109,24 +109,35 @@ STAGES = {
     "vae_alignment": type("ObservedVAEAlignment", (Observed, VAEAlignment), {}),
     "joint": type("ObservedJoint", (Observed, JointAlignment), {}),
     "flow_matching": type("ObservedFlowMatching", (Observed, FlowMatching), {}),
+    "few_step": type("ObservedFewStep", (Observed, FewStep), {}),
 }
 ARGUMENTS = {
     "vae": VAE_ARGS | {"channel_multipliers": [1, 1], "strides": [[2, 2]]},
     "sit": SIT_ARGS | {"input_size": [4, 8], "hidden_size": 8, "feature_dim": FEATURE_DIM},
+    "thin_decoder": {
+        "latent_channels": 4,
+        "channels": 32,
+        "channel_multipliers": [1, 1],
+        "strides": [[2, 2]],
+        "num_res_blocks": 0,
+    },
     "discriminator": {"channels": 4, "num_layers": 1},
     "latent_norm": {"channels": 4},
 }
 
 
-def tiny_sit():
-    return SiT(**ARGUMENTS["sit"])
+def tiny_sit(**more):
+    return SiT(**ARGUMENTS["sit"] | more)
 
 
 def stage_module(stage, sit=tiny_sit, **kwargs):
     """A stage with networks for :class:`TinyData`: latents of 4 x 8, grids of 2 x 4."""
     torch.manual_seed(0)
-    networks = {"vae": VAE(**ARGUMENTS["vae"]), "sit": sit()}
-    if stage != "flow_matching":
+    few = {"average_blocks": 1} if stage == "few_step" else {}
+    networks = {"vae": VAE(**ARGUMENTS["vae"]), "sit": sit(**few)}
+    if stage == "few_step":
+        networks["thin_decoder"] = ThinDecoder(**ARGUMENTS["thin_decoder"])
+    elif stage != "flow_matching":
         networks["discriminator"] = PatchDiscriminator(**ARGUMENTS["discriminator"])
     # A fresh SiT has zero gates and output: no gradient would get past them.
     for parameter in networks["sit"].parameters():

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
 from r3dpa.io import usable_device
-from r3dpa.nn import VAE, LatentNorm, VelocityNetwork
+from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
 _GRAPH_BATCH = 8  # up to this many scenes, starting kernels takes as long as running them
 
@@ -74,7 +74,7 @@ class SceneGenerator:
     times are computed once, so weights must not change after the first scene.
 
     Args:
-        vae: Decoder of the latents.
+        vae: Decoder of the latents, which may be a :class:`r3dpa.nn.ThinDecoder`.
         sit: Velocity network, averaged weights as a rule.
         latent_norm: Statistics of the latents the SiT was trained on.
         geometry: Projection and range encoding of the training data.
@@ -89,8 +89,8 @@ class SceneGenerator:
             GPU batches of at most 8 scenes are replayed as CUDA graphs.
 
     Raises:
-        ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1, or
-            ``compile`` comes without it.
+        ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1,
+            ``compile`` comes without it, or the network or autoguidance does not fit the sampler.
     """
 
     def __init__(
@@ -116,6 +116,7 @@ class SceneGenerator:
             raise ValueError(f"batch_size must be at least 1, got {batch_size}")
         if compile and batch_size is None:
             raise ValueError("compiled networks have one shape: give SceneGenerator a batch_size")
+        _check_average(sampler, sit, autoguidance)
         self.vae = vae.eval()
         self.sit = sit.eval()
         weak = None if autoguidance is None else autoguidance.weak.eval()
@@ -148,6 +149,7 @@ class SceneGenerator:
         sampler: SamplerConfig | Quality = "good",
         *,
         weights: Literal["ema", "last"] = "ema",
+        decoder: Literal["full", "thin"] | None = None,
         device: str = "auto",
         precision: Literal["fp32", "bf16"] = "fp32",
         autoguidance: Autoguidance | None = None,
@@ -161,6 +163,8 @@ class SceneGenerator:
                 weights in this package, such as ``r3dpa-s``, or ``hf://owner/name``.
             sampler: Solver and steps, or a quality that selects them.
             weights: Averaged or last weights of the SiT.
+            decoder: That of the VAE or the thin one of stage few_step; default: thin for the
+                quality ``instant``, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
             precision: As for the constructor, like all other arguments.
             autoguidance: Weak model, on the same device.
@@ -179,9 +183,13 @@ class SceneGenerator:
                 "from a checkpoint of stage joint or flow_matching"
             )
         geometry = _geometry_of(checkpoint)
-        names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
+        names: tuple[str, ...] = ("ema", "ema_latent_norm")
+        if weights == "last":
+            names = ("sit", "latent_norm")
         device = usable_device(device)
-        vae, sit, norm = (checkpoint.network(name).build().to(device) for name in ("vae", *names))
+        thin = decoder == "thin" or (decoder is None and sampler == "instant")
+        names = ("thin_decoder" if thin else "vae", *names)
+        vae, sit, norm = (checkpoint.network(name).build().to(device) for name in names)
         if not (
             isinstance(vae, VAE)
             and isinstance(sit, VelocityNetwork)
@@ -212,6 +220,7 @@ class SceneGenerator:
 
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
+        _check_average(sampler, self.sit, self._autoguidance)
         other = copy.copy(self)
         other._strong, other._weak = copy.copy(self._strong), copy.copy(self._weak)
         other._velocity = other._guided()
@@ -227,7 +236,7 @@ class SceneGenerator:
         if self._scheduled == self.sampler:
             return
         for network in self._networks:
-            network.times, network.table = [], None
+            network.times, network.targets, network.table = [], [], None
         noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
         self._solve(noise, iter(lambda: noise, None))
         for network in self._networks:
@@ -350,6 +359,23 @@ def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
     return ScanGeometry.from_dict(dict(checkpoint.geometry))
 
 
+def _check_average(
+    sampler: SamplerConfig, sit: VelocityNetwork, autoguidance: Autoguidance | None
+) -> None:
+    if sampler.solver != "average_velocity":
+        return
+    if not isinstance(sit, SiT) or sit.average is None:
+        raise ValueError(
+            "solver average_velocity needs a network that predicts average velocities: sample from "
+            "a checkpoint of stage few_step, or take another solver or quality"
+        )
+    if autoguidance is not None:
+        raise ValueError(
+            "autoguidance extrapolates velocities at one time, and average_velocity makes whole "
+            "steps: drop autoguidance, or take another solver"
+        )
+
+
 class _ScheduledNetwork:
     """A network as the velocity function of a solver.
 
@@ -358,6 +384,7 @@ class _ScheduledNetwork:
 
     Attributes:
         times: Those of the trial run, each ``(1,)``.
+        targets: Target times of average velocities, likewise.
         table: ``(T, M)`` their modulations, after the trial run.
         calls: Evaluations since it was set to 0.
     """
@@ -365,27 +392,38 @@ class _ScheduledNetwork:
     def __init__(self, sit: VelocityNetwork, compile: bool, graphs: bool) -> None:
         self.sit = sit
         self.times: list[Tensor] = []
+        self.targets: list[Tensor] = []
         self.table: Tensor | None = None
         self.calls = 0
         self._graphs = graphs
-        self._compiled: Callable[[Tensor, Tensor], Tensor] | None = None
+        networks: list[Callable[[Tensor, Tensor], Tensor]] = [sit.velocity_at]
+        if isinstance(sit, SiT):
+            networks.append(sit.average_velocity_at)
         if compile:
             mode = "reduce-overhead" if graphs else None
-            self._compiled = torch.compile(sit.velocity_at, dynamic=False, mode=mode)
+            networks = [torch.compile(network, dynamic=False, mode=mode) for network in networks]
+        self._networks = networks
 
     def fill_table(self) -> None:
         """Ends the trial run."""
-        if self.times:  # a weak model may be unused
+        if self.targets:
+            sit = cast(SiT, self.sit)
+            self.table = sit.modulations(torch.cat(self.times), target=torch.cat(self.targets))
+        elif self.times:  # a weak model may be unused
             self.table = self.sit.modulations(torch.cat(self.times))
 
-    def __call__(self, latents: Tensor, time: Tensor) -> Tensor:
-        """Velocity ``(B, C, h, w)`` float32 at a time ``(B,)`` that all samples share."""
+    def __call__(self, latents: Tensor, time: Tensor, target: Tensor | None = None) -> Tensor:
+        """Velocity ``(B, C, h, w)`` float32 at a time ``(B,)`` that all samples share.
+
+        With a target time, the average velocity until then.
+        """
         if self.table is None:
             self.times.append(time[:1])
+            self.targets += [] if target is None else [target[:1]]
             return torch.zeros_like(latents)
         row = self.table[self.calls : self.calls + 1]
         self.calls += 1
-        velocity = (self._compiled or self.sit.velocity_at)(latents, row)
+        velocity = self._networks[target is not None](latents, row)
         return velocity.clone() if self._graphs else velocity  # a replay writes to one place
 
 

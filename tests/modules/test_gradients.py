@@ -26,6 +26,10 @@ REACH = {
     "vae_alignment": VAE_LOSSES | {"vae_alignment": ENCODER | PROJECTOR | {"sit.x_embedder"}},
     "joint": VAE_LOSSES | SIT_LOSSES | {"vae_alignment": ENCODER},
     "flow_matching": SIT_LOSSES,
+    "few_step": {
+        "denoising": {"sit.average"},
+        "reconstruction": {"thin_decoder.decoder", "thin_decoder.post_quant_conv"},
+    },
 }
 
 

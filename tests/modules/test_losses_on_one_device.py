@@ -23,7 +23,8 @@ def step(module, **more):
         return torch.empty(shape, device="meta")
 
     latents = (2, 4, 4, 8)
-    draws, logged = PathDraws(values(*latents), values(2), values(*latents)), {}
+    noise = (2, 9, 4, 4, 8) if module.stage == "few_step" else latents
+    draws, logged = PathDraws(values(*latents), values(2), values(*noise)), {}
     module.draw_path, module.log_dict = lambda *_: draws, logged.update
     batch = {"range_image": values(2, 1, 8, 16), "feature_grid": values(2, 8, 6)}
     batch |= {name: values(*shape) for name, shape in more.items()}

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from r3dpa.bench.measure import flop_of, timed
 from r3dpa.checkpoints import Checkpoint
-from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, heun
+from r3dpa.flow.solvers import ODE_SOLVERS, heun
 from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_noise
 
@@ -74,22 +74,24 @@ def toy_mixture(seed: int = 0) -> GaussianMixture:
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to sample: ODE solver, steps and shift, precision, scenes computed together."""
+    """One way to sample: solver, steps and shift, precision, scenes computed together, decoder."""
 
     sampler: SamplerConfig
     precision: Precision = "fp32"
     batch: int = 1
+    decoder: Literal["full", "thin"] = "full"
 
     @property
     def name(self) -> str:
-        """Solver with its shift, without the number of steps."""
+        """Solver with its shift and a thin decoder, without the number of steps."""
         solver, shift = self.sampler.solver, self.sampler.shift
-        return solver if shift == 1 else f"{solver} shift {shift:g}"
+        name: str = solver if shift == 1 else f"{solver} shift {shift:g}"
+        return name if self.decoder == "full" else f"{name} thin"
 
     @property
     def nfe(self) -> int:
         """Network evaluations per scene."""
-        return evaluations(self.sampler.solver, self.sampler.steps)
+        return self.sampler.nfe
 
 
 class Solved(NamedTuple):
@@ -138,11 +140,16 @@ class ModelProblem:
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
         read = partial(SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device)
         self.batch = batch
-        self._generators = {"fp32": read(), "bf16": read(precision="bf16")}
-        self.device = self._generators["fp32"].device
+        decoders = ["full", *(["thin"] if "thin_decoder" in checkpoint.networks else [])]
+        self._generators = {
+            (precision, decoder): read(precision=precision, decoder=decoder)
+            for precision in ("fp32", "bf16")
+            for decoder in decoders
+        }
+        self.device = self._generators["fp32", "full"].device
 
     def _generator(self, setting: Setting) -> SceneGenerator:
-        return self._generators[setting.precision].with_sampler(setting.sampler)
+        return self._generators[setting.precision, setting.decoder].with_sampler(setting.sampler)
 
     def solve(self, setting: Setting, indices: range) -> Solved:
         """Scenes of these indices as the generator draws them."""
@@ -153,7 +160,7 @@ class ModelProblem:
     @torch.inference_mode()
     def converged(self, steps: int, indices: range) -> Solved:
         """The same scenes by Heun's method: network in float32 without TF32, state in float64."""
-        generator = self._generators["fp32"]
+        generator = self._generators["fp32", "full"]
         noise = next(scene_noise(generator.sit, indices, _SEED)).to(self.device)
 
         def velocity(x: Tensor, time: Tensor) -> Tensor:

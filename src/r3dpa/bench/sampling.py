@@ -27,8 +27,9 @@ from r3dpa.bench.problems import (
 )
 from r3dpa.bench.report import Errors, Finding, Row, write_report
 from r3dpa.checkpoints import read_checkpoint
+from r3dpa.flow.average_velocity import AVERAGE_STEPS
 from r3dpa.flow.sampler import SamplerConfig, Solver
-from r3dpa.flow.solvers import evaluations, steps_for
+from r3dpa.flow.solvers import steps_for
 from r3dpa.io import atomic_path, command, machine, usable_device, versions
 
 #: Solvers with the shift of their grids.
@@ -116,6 +117,8 @@ def sampling(
         request = [about, checkpoint.path.stat().st_mtime_ns, str(chosen), device, quick]
         work = Work(out / "work", request)
         ways = settings_of(chosen, ("bf16", "fp32") if kind == "cuda" else ("fp32", "bf16"))
+        if checkpoint.stage == "few_step":
+            ways += few_step_settings(ways[0], "thin_decoder" in checkpoint.networks)
         problems["model"] = lambda: run_problem(model, ways, chosen, work)
     found = {name: run() for name, run in problems.items()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
@@ -149,13 +152,20 @@ def settings_of(effort: Effort, precisions: Sequence[Precision] = ()) -> list[Se
     return sorted(dict.fromkeys(ways), key=lambda way: samplers.index(way.sampler))
 
 
+def few_step_settings(usual: Setting, thin: bool) -> list[Setting]:
+    """Average velocities in all numbers of steps, by the decoder of the VAE and the thin one."""
+    samplers = [SamplerConfig("average_velocity", steps) for steps in AVERAGE_STEPS]
+    ways = [replace(usual, sampler=sampler) for sampler in samplers]
+    return ways + [replace(way, decoder="thin") for way in ways] * thin
+
+
 def run_problem(
     problem: Problem, ways: Sequence[Setting], effort: Effort, work: Work | None = None
 ) -> Finding:
     """Error and time of each way to sample, with a progress bar of all network evaluations."""
     work, num, steps = work or Work(), effort.samples, effort.reference_steps
-    solved = {(way.sampler, precision) for way in ways for precision in (way.precision, "fp32")}
-    solving = sum(evaluations(sampler.solver, sampler.steps) for sampler, _ in solved)
+    solved = {replace(way, precision=p, batch=1) for way in ways for p in (way.precision, "fp32")}
+    solving = sum(way.nfe for way in solved)
     timing = sum(way.nfe * way.batch for way in ways) * (effort.rounds + 1)
     total = num * (3 * steps - 2 + solving) + timing
     # Without a terminal there is no bar.
@@ -216,14 +226,14 @@ def errors_of(
     """Errors of each setting, and from the same sampler in fp32."""
 
     @lru_cache(maxsize=2)  # settings of one sampler follow each other
-    def solve(sampler: SamplerConfig, precision: Precision) -> Solved:
-        way = Setting(sampler, precision)
+    def solve(way: Setting) -> Solved:
         return _solved(
             len(exact.latents), problem.batch, partial(problem.solve, way), way.nfe, advance
         )
 
     def errors(way: Setting) -> tuple[Any, ...]:
-        solved, plain = solve(way.sampler, way.precision), solve(way.sampler, "fp32")
+        way = replace(way, batch=1)
+        solved, plain = solve(way), solve(replace(way, precision="fp32"))
         return (
             _squared(solved.latents, exact.latents).tolist(),
             _rmse(solved.latents, plain.latents),

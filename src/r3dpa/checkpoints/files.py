@@ -30,7 +30,8 @@ from r3dpa.pretrained import weights_file
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
-_LIGHTNING = {name: (f"{name}.", name) for name in ("vae", "discriminator", "sit", "latent_norm")}
+_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder")
+_LIGHTNING = {name: (f"{name}.", name) for name in _PLAIN}
 _LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"

@@ -157,8 +157,9 @@ class NetworkState:
 class Checkpoint:
     """Everything a checkpoint file says about its networks, whatever its format.
 
-    Networks are called ``vae``, ``discriminator``, ``sit``, ``latent_norm``, and the averaged
-    copies ``ema`` and ``ema_latent_norm``. A field is None if the file does not state it.
+    Networks are called ``vae``, ``discriminator``, ``sit``, ``latent_norm``, ``thin_decoder``, and
+    the averaged copies ``ema`` and ``ema_latent_norm``. A field is None if the file does not state
+    it.
     """
 
     path: Path  #: file it was read from

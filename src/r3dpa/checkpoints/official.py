@@ -141,6 +141,11 @@ def to_official(checkpoint: Checkpoint) -> dict[str, Any]:
     the options of an official run, ``args`` is made from the arguments of the networks.
     """
     content: dict[str, Any] = {}
+    if checkpoint.stage == "few_step":
+        raise ValueError(
+            f"{checkpoint.path} is of stage few_step, whose average velocities and thin decoder "
+            "have no official counterpart; convert the flow that it started from"
+        )
     for key, (sit_name, norm_name) in _SIT_NETWORKS.items():
         if sit_name in checkpoint.networks:
             sit = _official_part(checkpoint, sit_name, SiT, UNet)

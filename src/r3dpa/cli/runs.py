@@ -162,11 +162,13 @@ class _Observer:
 
 
 def _module(saved: BadBatch, weights: Checkpoint) -> GenerativeModule:
-    from r3dpa.modules import FlowMatching, JointAlignment, VAEAlignment
+    from r3dpa.modules import FewStep, FlowMatching, JointAlignment, VAEAlignment
 
-    stages = {stage.stage: stage for stage in (VAEAlignment, JointAlignment, FlowMatching)}
+    stages = {s.stage: s for s in (VAEAlignment, JointAlignment, FlowMatching, FewStep)}
     stage = stages[saved.about["stage"]]
-    names = ["vae", "sit", "latent_norm", *(["discriminator"] if stage is not FlowMatching else [])]
+    more = [] if issubclass(stage, FlowMatching) else ["discriminator"]
+    more += ["thin_decoder"] if "thin_decoder" in weights.networks else []
+    names = ["vae", "sit", "latent_norm", *more]
     networks: dict[str, Any] = {name: weights.network(name).build() for name in names}
     settings = saved.weights
     if saved.about["step"] >= settings.adversarial_start:

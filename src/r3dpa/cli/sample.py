@@ -13,8 +13,8 @@ from r3dpa.cli.parser import ODESolver, SceneOptions
 def sample(
     *,
     num: PositiveInt = 16,
-    quality: Literal["draft", "good", "best"] | None = None,
-    solver: Literal[ODESolver, "euler_maruyama"] | None = None,
+    quality: Literal["instant", "draft", "good", "best"] | None = None,
+    solver: Literal[ODESolver, "euler_maruyama", "average_velocity"] | None = None,
     steps: PositiveInt | None = None,
     shift: float | None = None,
     eta: float | None = None,
@@ -24,6 +24,7 @@ def sample(
     guidance_scale: float | None = None,
     guidance_interval: tuple[float, float] | None = None,
     allow_other_latents: bool = False,
+    decoder: Literal["full", "thin"] | None = None,
     precision: Literal["fp32", "bf16"] = "fp32",
     compile: bool = False,
     **options: Any,
@@ -36,7 +37,9 @@ def sample(
     Args:
         num: Number of scenes.
         quality: Measured solver, steps and shift; default: good, unless one of these is given.
-        solver: ODE solver, or ``euler_maruyama`` for the SDE; default: the latter.
+            ``instant`` needs a checkpoint of stage few_step, as does ``average_velocity``.
+        solver: ODE solver, ``euler_maruyama`` for the SDE, or ``average_velocity`` for 1, 2, 4 or 8
+            steps of any length; default: the SDE.
         steps: Solver steps; default: 256.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
         eta: Noise strength of the SDE; default: 1, as published.
@@ -46,6 +49,8 @@ def sample(
         guidance_scale: Strength of autoguidance, 1 for none; default: 2.
         guidance_interval: Guided times, such as ``0.2 0.8``; 0 is data, 1 noise; default: all.
         allow_other_latents: Accept a snapshot whose latents are only about the same.
+        decoder: Decoder of the VAE or the thin one of stage few_step; default: thin for
+            ``--quality instant``, else full.
         precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
         compile: Compile the networks: a minute or more at first, then faster.
         **options: See :class:`SceneOptions`.
@@ -65,6 +70,7 @@ def sample(
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
     chosen = quality or "good"
     sampler = SamplerConfig(**given) if given else SamplerConfig.of_quality(chosen)
+    decoder = decoder or ("thin" if chosen == "instant" else "full")
     if autoguidance is None and (guidance_scale or guidance_interval or allow_other_latents):
         raise ValueError(
             "--guidance_scale, --guidance_interval and --allow_other_latents need --autoguidance"
@@ -90,6 +96,7 @@ def sample(
         checkpoint,
         sampler,
         weights=files.weights,
+        decoder=decoder,
         precision=precision,
         device=device,
         autoguidance=guidance,
@@ -98,7 +105,7 @@ def sample(
     )
     generator.prepare()
     request = provenance(checkpoint, files, num, device, generator.geometry)
-    request |= {"precision": precision, "compile": compile}
+    request |= {"precision": precision, "compile": compile, "decoder": decoder}
     request |= {"sampler": asdict(sampler), "autoguidance": about_guide}
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:

@@ -4,6 +4,7 @@ Arguments outside the ranges and shapes that the docstrings state are a ``ValueE
 """
 
 from r3dpa.flow.autoguidance import autoguided, renormalised
+from r3dpa.flow.average_velocity import average_times, average_velocity_steps
 from r3dpa.flow.editing import invert, kept, pnp_flow_feature, renoised, spherical_mean
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.flow.interpolant import Interpolant, sample_time
@@ -33,6 +34,8 @@ __all__ = [
     "ab2",
     "ab3",
     "autoguided",
+    "average_times",
+    "average_velocity_steps",
     "dpm_solver_pp_2m",
     "euler",
     "euler_maruyama",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal, Self, get_args
@@ -11,13 +11,25 @@ from typing import Any, Literal, Self, get_args
 import torch
 from torch import Tensor
 
+from r3dpa.flow.average_velocity import AVERAGE_STEPS, average_times, average_velocity_steps
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sde import euler_maruyama
-from r3dpa.flow.solvers import ODE_SOLVERS, Velocity, ode_solver
+from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
-Solver = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc", "euler_maruyama"]
-Quality = Literal["draft", "good", "best"]
+Solver = Literal[
+    "euler",
+    "heun",
+    "midpoint",
+    "ab2",
+    "ab3",
+    "dpmpp_2m",
+    "unipc",
+    "euler_maruyama",
+    "average_velocity",
+]
+Quality = Literal["instant", "draft", "good", "best"]
+_INSTANT = {"solver": "average_velocity", "steps": 2, "shift": 1.0}
 
 
 @dataclass(frozen=True)
@@ -25,7 +37,8 @@ class SamplerConfig:
     """Solver, steps and schedule that turn noise into latents.
 
     Args:
-        solver: ``euler_maruyama`` solves the SDE, the others the ODE.
+        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``average_velocity`` needs a
+            network of stage few_step and takes 1, 2, 4 or 8 steps.
         steps: Solver steps.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
@@ -54,24 +67,41 @@ class SamplerConfig:
                 "a sampler needs steps >= 1, shift > 0 and eta >= 0, got "
                 f"{self.steps}, {self.shift} and {self.eta}"
             )
-        of_sde = ("eta", "sde_last", "sde_last_time")
-        for name in ("shift",) if self.solver == "euler_maruyama" else of_sde:
+        averages = self.solver == "average_velocity"
+        if averages and self.steps not in AVERAGE_STEPS:
+            raise ValueError(
+                f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, those that "
+                f"stage few_step trains, got {self.steps}"
+            )
+        unread = [] if self.solver in ODE_SOLVERS else ["shift"]
+        if self.solver != "euler_maruyama":
+            unread += ["eta", "sde_last", "sde_last_time"]
+        for name in unread:
             if getattr(self, name) != getattr(type(self), name):
                 readers = ", ".join(ODE_SOLVERS) if name == "shift" else "euler_maruyama"
                 raise ValueError(
                     f"solver {self.solver} does not read {name}, which is for {readers}; drop one"
                 )
 
+    @property
+    def nfe(self) -> int:
+        """Network evaluations per sample."""
+        return evaluations(self.solver, self.steps) if self.solver in ODE_SOLVERS else self.steps
+
     @classmethod
     def of_quality(cls, quality: Quality) -> Self:
         """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
-        level = _qualities()["levels"][quality]
+        level = _qualities()["levels"].get(quality, _INSTANT)
         return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
 
     @staticmethod
     def quality_line(quality: Quality) -> str:
         """One line of text about the sampler of :meth:`of_quality`."""
         table = _qualities()
+        if quality not in table["levels"]:
+            return (
+                f"quality {quality}: {_INSTANT['solver']}, {_INSTANT['steps']} steps: not measured"
+            )
         level = table["levels"][quality]
         return (
             f"quality {quality}: {level['solver']}, {level['steps']} steps, "
@@ -82,12 +112,17 @@ class SamplerConfig:
 
     def solve(
         self,
-        velocity: Velocity,
+        velocity: Callable[..., Tensor],
         noise: Tensor,
         draws: torch.Generator | Iterable[Tensor],
         interpolant: Interpolant,
     ) -> Tensor:
-        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``."""
+        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``.
+
+        ``average_velocity`` calls ``velocity(x, time, target)``, the others ``velocity(x, time)``.
+        """
+        if self.solver == "average_velocity":
+            return average_velocity_steps(velocity, noise, average_times(self.steps))
         if self.solver == "euler_maruyama":
             return euler_maruyama(
                 velocity,

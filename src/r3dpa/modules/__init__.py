@@ -2,6 +2,7 @@
 
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.feature_extraction import FeatureExtraction
+from r3dpa.modules.few_step import FewStep
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.image_vae import ImageVAETraining
 from r3dpa.modules.joint_alignment import JointAlignment
@@ -12,6 +13,7 @@ from r3dpa.modules.vae_alignment import VAEAlignment
 
 __all__ = [
     "FeatureExtraction",
+    "FewStep",
     "FlowMatching",
     "GenerativeModule",
     "ImageVAETraining",

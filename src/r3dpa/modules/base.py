@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor, nn
 
 from r3dpa import losses
-from r3dpa.checkpoints import load_into, read_checkpoint, transfer_rgb
+from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
@@ -182,13 +182,17 @@ class GenerativeModule(L.LightningModule):
             table = text_table([tuple(map(str, row)) for row in found], heads)
             rank_zero_info(f"RGB weights from {self.rgb_weights}\n{table}")
         if self.init_from is not None:
-            before = read_checkpoint(self.init_from)
+            before = self.previous_networks(read_checkpoint(self.init_from))
             networks = {name: self.get_submodule(name) for name in self.init_networks}
             load_into(networks, before, stage=self.stage)
             self._previous_geometry = before.geometry
         if self.ema is not None:
             self.ema.reset(self.sit, self.latent_norm)
         self._has_weights = True
+
+    def previous_networks(self, before: Checkpoint) -> Checkpoint:
+        """Checkpoint of the stage before, with its networks by the names of this stage."""
+        return before
 
     # Training
 
@@ -207,13 +211,7 @@ class GenerativeModule(L.LightningModule):
         self, image: Tensor, posterior: Posterior, prediction: Tensor
     ) -> dict[str, Tensor]:
         """L_AE: reconstruction, KL and the adversarial term; the discriminator stays untouched."""
-        weights, parts = self.weights, {}
-        if weights.reconstruction != 0 and image.shape[1] == 1:
-            error = losses.reconstruction_loss(prediction, image, weights.reconstruction_norm)
-            parts["reconstruction"] = weights.reconstruction * error
-        elif weights.reconstruction != 0:
-            for name, values in self._range_losses(image, prediction).items():
-                parts[name] = getattr(weights, name) * values.mean()
+        weights, parts = self.weights, self.reconstruction_losses(image, prediction)
         if weights.kl != 0:
             parts["kl"] = weights.kl * posterior.kl().mean()
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
@@ -224,6 +222,17 @@ class GenerativeModule(L.LightningModule):
         if not parts.keys() & {"reconstruction", "adversarial"}:
             parts["reconstruction"] = steps.zero_loss(self.vae)
         return parts
+
+    def reconstruction_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
+        """Weighted errors of outputs of a decoder, none if their weight is 0."""
+        weights = self.weights
+        if weights.reconstruction == 0:
+            return {}
+        if image.shape[1] == 1:
+            error = losses.reconstruction_loss(prediction, image, weights.reconstruction_norm)
+            return {"reconstruction": weights.reconstruction * error}
+        each = self._range_losses(image, prediction)
+        return {name: getattr(weights, name) * values.mean() for name, values in each.items()}
 
     def _range_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
         """Losses ``(B,)`` of images of range and return: of ranges at returns, and of returns."""
@@ -338,7 +347,14 @@ class GenerativeModule(L.LightningModule):
             batch["index"],
             range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),
             **values,
+            **self.held_out_errors(reconstruction, posterior.mean, draws),
         )
+
+    def held_out_errors(
+        self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
+    ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
+        """Further values of held-out scans ``(B,)``, by the reconstruction and its raw latents."""
+        return {}
 
     test_step = validation_step
     on_validation_epoch_end = on_test_epoch_end = steps.log_held_out

@@ -1,17 +1,18 @@
-"""Cache of VAE posteriors of the training set."""
+"""Caches that the processes of a training fill together: VAE posteriors of the training set."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from lightning.pytorch.utilities import rank_zero_info
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from r3dpa.checkpoints import weights_sha256
-from r3dpa.data.store import Cacheable, CachedTensors, tensor_cache
+from r3dpa.data.store import Cacheable, CachedTensors, Store, tensor_cache
 
 Item = TypeVar("Item", bound=Cacheable)
 
@@ -40,30 +41,49 @@ def encoded_once(
     Raises:
         StoreError: If the cache cannot be written or is damaged, or moments are not finite.
     """
-    trainer, datamodule = module.trainer, module.trainer.datamodule
+    datamodule = module.trainer.datamodule
     channels, *size = module.latent_shape
     about = {**settings, "vae": weights_sha256(module.vae.state_dict())}
     cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
-    missing = cache.missing(items)
-    trainer.strategy.barrier("cached latents: all have looked")
-    # Where each node has a disk of its own, its processes encode everything.
-    if datamodule.prepare_data_per_node:
-        own = missing[trainer.local_rank :: trainer.num_devices]
-    else:
-        own = missing[trainer.global_rank :: trainer.world_size]
-    if own:
-        rank_zero_info(f"encoding {len(missing)} of {len(items)} once, into {cache.folder}")
+
+    def moments(own: list[Item]) -> Iterator[Tensor]:
         loader = DataLoader(
             dataset_of(own),
             batch_size=datamodule.batch_size,
             num_workers=datamodule.num_workers,
             generator=torch.Generator(),  # the default draws from the global random state
         )
+        for batch in loader:
+            posterior = module.vae.encode(batch[image].to(module.device))
+            yield torch.cat([posterior.mean, posterior.logvar], dim=1)
+
+    return filled(module.trainer, cache, items, moments)
+
+
+def filled(
+    trainer: Any,
+    cache: Store,
+    items: Sequence[Item],
+    rows_of: Callable[[list[Item]], Iterator[Tensor]],
+) -> CachedTensors[Item]:
+    """The cache with a row for each item; ``rows_of`` yields rows ``(B, ...)`` of some in order.
+
+    All processes of a training call it with the same items, and share the work.
+    """
+    missing = cache.missing(items)
+    trainer.strategy.barrier("cached tensors: all have looked")
+    # Where each node has a disk of its own, its processes make everything.
+    if trainer.datamodule.prepare_data_per_node:
+        own = missing[trainer.local_rank :: trainer.num_devices]
+    else:
+        own = missing[trainer.global_rank :: trainer.world_size]
+    if own:
+        rank_zero_info(f"making {len(missing)} of {len(items)} once, into {cache.folder}")
         keys = [item.cache_key for item in own]
+        done = 0
         with cache.writer(trainer.global_rank) as writer:
-            for batch in loader:
-                posterior = module.vae.encode(batch[image].to(module.device))
-                moments = torch.cat([posterior.mean, posterior.logvar], dim=1)
-                writer.add([keys[index] for index in batch["index"]], moments)
-    trainer.strategy.barrier("cached latents: all are written")
+            for rows in rows_of(own):
+                writer.add(keys[done : done + len(rows)], rows)
+                done += len(rows)
+    trainer.strategy.barrier("cached tensors: all are written")
     return CachedTensors(cache, items)

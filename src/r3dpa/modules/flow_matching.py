@@ -14,6 +14,7 @@ from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
+from r3dpa.modules.steps import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork
 
 
@@ -40,7 +41,8 @@ class FlowMatching(GenerativeModule):
     """
 
     stage = "flow_matching"
-    default_init = ("vae", "latent_norm")
+    default_init: tuple[str, ...] = ("vae", "latent_norm")
+    starts_from = "vae_alignment or joint"
 
     def __init__(
         self,
@@ -64,13 +66,13 @@ class FlowMatching(GenerativeModule):
         """Loads the trained VAE and its latent statistics; refuses to start without them."""
         if self.init_from is None:
             raise ValueError(
-                "stage flow_matching trains on the latents of a trained VAE: give "
-                "model.init_from a checkpoint of stage vae_alignment or joint"
+                f"stage {self.stage} trains on the latents of a trained VAE: give model.init_from "
+                f"a checkpoint of stage {self.starts_from}"
             )
         super().load_previous_stage()
         if not self.latent_norm.fitted:
             raise ValueError(
-                f"stage flow_matching trains with fixed latent statistics, and {self.init_from} "
+                f"stage {self.stage} trains with fixed latent statistics, and {self.init_from} "
                 "gave none: let model.init_networks name latent_norm beside vae"
             )
 
@@ -117,13 +119,16 @@ class FlowMatching(GenerativeModule):
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on range images or posteriors, and feature grids ``(B, N, D)``."""
-        with torch.no_grad():
-            if "posterior_moments" in batch:
-                posterior = Posterior(batch["posterior_moments"])
-            else:
-                posterior = self.vae.encode(batch["range_image"])
-            draws = self.draw_path(len(posterior.mean))
-            latents = posterior.sample(draws.posterior_noise)
-            normalised = self.latent_norm.normalise(latents)
-
+        latents, draws = self.draw_latents(batch)
+        normalised = self.latent_norm.normalise(latents)
         return self.weigh_and_log(self.flow_losses(normalised, batch.get("feature_grid"), draws))
+
+    @torch.no_grad()
+    def draw_latents(self, batch: LidarBatch) -> tuple[Tensor, PathDraws]:
+        """Raw latents ``(B, C, h, w)`` of range images or posteriors, and the draws of the step."""
+        if "posterior_moments" in batch:
+            posterior = Posterior(batch["posterior_moments"])
+        else:
+            posterior = self.vae.encode(batch["range_image"])
+        draws = self.draw_path(len(posterior.mean))
+        return posterior.sample(draws.posterior_noise), draws

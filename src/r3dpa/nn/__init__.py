@@ -5,7 +5,7 @@ from r3dpa.nn.image_vae import ImageVAE
 from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.sit import SiT
 from r3dpa.nn.unet import UNet
-from r3dpa.nn.vae import VAE, Posterior
+from r3dpa.nn.vae import VAE, Posterior, ThinDecoder
 from r3dpa.nn.velocity_network import EMA, VelocityNetwork, VelocityOutput
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "PatchDiscriminator",
     "Posterior",
     "SiT",
+    "ThinDecoder",
     "UNet",
     "VelocityNetwork",
     "VelocityOutput",

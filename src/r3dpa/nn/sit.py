@@ -7,8 +7,9 @@ the latent batch norm is a network of its own (:class:`r3dpa.nn.latent_norm.Late
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal, Self
 
 import torch
@@ -94,6 +95,8 @@ class SiT(VelocityNetwork):
         periodic_columns: Let the position embedding wrap around with the scan.
         projector: ``mlp`` of three layers, or one ``conv`` over the grid of tokens (iREPA, Singh
             et al. 2025), which takes neither ``projector_dim`` nor official weights.
+        average_blocks: Number of last blocks with a second copy, which predicts average velocities,
+            see :meth:`average_velocity`; 0 for none.
     """
 
     pos_embed: Tensor
@@ -116,6 +119,7 @@ class SiT(VelocityNetwork):
         learn_pos_embed: bool = False,
         periodic_columns: bool = False,
         projector: Literal["mlp", "conv"] = "mlp",
+        average_blocks: int = 0,
     ) -> None:
         super().__init__()
         rows, columns = input_size
@@ -132,6 +136,10 @@ class SiT(VelocityNetwork):
         if not 1 <= alignment_depth <= depth:
             raise ValueError(
                 f"alignment_depth must lie in 1..depth = 1..{depth}, got {alignment_depth}"
+            )
+        if not 0 <= average_blocks <= depth:
+            raise ValueError(
+                f"average_blocks must lie in 0..depth = 0..{depth}, got {average_blocks}"
             )
         self.input_size = (rows, columns)
         self.in_channels = in_channels
@@ -174,6 +182,10 @@ class SiT(VelocityNetwork):
                 Rearrange("B F row column -> B (row column) F"),
             )
         self.final_layer = _FinalLayer(hidden_size, math.prod(patch) * in_channels)
+        self.average: _AverageHead | None = None
+        if average_blocks:
+            last = copy.deepcopy(self.blocks[depth - average_blocks :])
+            self.average = _AverageHead(hidden_size, last, copy.deepcopy(self.final_layer))
 
     @property
     def input_layer(self) -> nn.Module:
@@ -183,11 +195,78 @@ class SiT(VelocityNetwork):
     @property
     def compiled_parts(self) -> list[nn.Module]:
         """The blocks, which share a graph."""
-        return [*self.blocks]
+        return [*self.blocks, *([] if self.average is None else self.average.blocks)]
 
-    def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
-        """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output."""
-        return _rows([*self.blocks, self.final_layer], self._conditioning(time, labels))
+    def modulations(
+        self, time: Tensor, labels: Tensor | None = None, target: Tensor | None = None
+    ) -> Tensor:
+        """Shifts, scales and gates ``(T, M)``: six vectors per block, then two for the output.
+
+        With target times ``(T,)`` they are those of :meth:`average_velocity_at`.
+        """
+        conditioning = self._conditioning(time, labels)
+        if target is None:
+            return _rows([*self.blocks, self.final_layer], conditioning)
+        head = self._average_head()
+        late = conditioning + head.embedder(time - target).to(conditioning.dtype)
+        shared = self.blocks[: -len(head.blocks)]
+        return torch.cat(
+            [
+                _rows(layers, c)
+                for layers, c in ((shared, conditioning), (head.layers, late))
+                if layers
+            ],
+            dim=1,
+        )
+
+    def average_velocity(
+        self, latents: Tensor, time: Tensor, target: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
+        """Mean ``(B, C, h, w)`` of the velocity along the path from ``time`` to ``target``.
+
+        ``(x_t - x_r) / (t - r)`` of the points at ``time`` t and ``target`` r, both ``(B,)``: one
+        evaluation makes a step of any length. The first blocks are those of :meth:`velocity`, the
+        last ones and the output layer have a copy that is also modulated by ``t - r``. Its new
+        weights start at 0, where it equals :meth:`velocity` bit for bit once the other weights do,
+        see :meth:`with_average`.
+
+        Source: MeanFlow (Geng et al. 2025); layout of Decoupled MeanFlow (Lee et al. 2025), where
+        early blocks see one time and late blocks the other.
+
+        Raises:
+            ValueError: Without ``average_blocks``, and as for :meth:`velocity`.
+        """
+        self._check(latents, time)
+        return self.average_velocity_at(latents, self.modulations(time, labels, target))
+
+    def average_velocity_at(self, latents: Tensor, modulations: Tensor) -> Tensor:
+        """Average velocity ``(B, C, h, w)`` from precomputed modulations of both times."""
+        head = self._average_head()
+        blocks = [*self.blocks[: -len(head.blocks)], *head.blocks]
+        tokens = self._through(blocks, self.x_embedder(latents) + self.pos_embed, modulations)
+        return self._output(head.final_layer, tokens, modulations)
+
+    def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Weights of a network without ``average_blocks``, completed to those of this one."""
+        head, own = self._average_head(), self.state_dict()
+        first = len(self.blocks) - len(head.blocks)
+        added = {key: own[key] for key in own if key.startswith("average.embedder.")}
+        for key, value in weights.items():
+            kind, _, rest = key.partition(".")
+            index, _, name = rest.partition(".")
+            if kind == "final_layer":
+                added[f"average.{key}"] = value
+            elif kind == "blocks" and int(index) >= first:
+                added[f"average.blocks.{int(index) - first}.{name}"] = value
+        return {**weights, **added}
+
+    def _average_head(self) -> _AverageHead:
+        if self.average is None:
+            raise ValueError(
+                "the network predicts no average velocities (average_blocks 0): take a checkpoint "
+                "of stage few_step, or another solver than average_velocity"
+            )
+        return self.average
 
     def halve_(self) -> Self:
         """Casts the weights of attention and MLPs to bfloat16 in place, for sampling.
@@ -195,7 +274,7 @@ class SiT(VelocityNetwork):
         Time embedding, modulations, the token stream between the blocks, statistics of the norms
         and the output layer stay float32.
         """
-        for block in self.blocks:
+        for block in self.compiled_parts:
             block.attn.bfloat16()
             block.mlp.bfloat16()
         return self
@@ -212,28 +291,30 @@ class SiT(VelocityNetwork):
     def _begin(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, ...]:
         """Tokens ``(B, N, D)`` after block ``alignment_depth``."""
         tokens = self.x_embedder(latents) + self.pos_embed
-        return (self._through(range(self.alignment_depth), tokens, modulations),)
+        return (self._through(self.blocks[: self.alignment_depth], tokens, modulations),)
 
     def _project(self, activations: Tensor) -> Tensor:
         return self.projector(activations)
 
     def _finish(self, activations: tuple[Tensor, ...], modulations: Tensor) -> Tensor:
         (tokens,) = activations
-        later = range(self.alignment_depth, len(self.blocks))
-        tokens = self._through(later, tokens, modulations)
-        patches = self.final_layer(tokens, modulations[:, -2 * self.hidden_size :])
+        width = 6 * self.hidden_size * self.alignment_depth
+        later = self.blocks[self.alignment_depth :]
+        tokens = self._through(later, tokens, modulations[:, width:])
+        return self._output(self.final_layer, tokens, modulations)
+
+    def _output(self, layer: nn.Module, tokens: Tensor, modulations: Tensor) -> Tensor:
         return rearrange(
-            patches,
+            layer(tokens, modulations[:, -2 * self.hidden_size :]),
             "B (row column) (p q C) -> B C (row p) (column q)",
             row=self.grid_size[0],
             p=self.patch[0],
             q=self.patch[1],
         )
 
-    def _through(self, indices: range, tokens: Tensor, modulations: Tensor) -> Tensor:
+    def _through(self, blocks: Iterable[nn.Module], tokens: Tensor, modulations: Tensor) -> Tensor:
         width = 6 * self.hidden_size
-        for index in indices:
-            block = self.blocks[index]
+        for index, block in enumerate(blocks):
             tokens = block(tokens, modulations[:, index * width : (index + 1) * width])
         return tokens
 
@@ -291,6 +372,21 @@ class _Block(nn.Module):
         tokens = tokens + gate_attn[:, None] * attended
         hidden = self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp).to(narrow))
         return tokens + gate_mlp[:, None] * hidden
+
+
+class _AverageHead(nn.Module):
+    """Embedding of the length of a step, and copies of the last blocks and the output layer."""
+
+    def __init__(self, hidden_size: int, blocks: nn.ModuleList, final_layer: nn.Module) -> None:
+        super().__init__()
+        self.embedder = _TimeEmbedding(hidden_size)
+        zeroed(self.embedder.mlp[2])
+        self.blocks, self.final_layer = blocks, final_layer
+
+    @property
+    def layers(self) -> list[nn.Module]:
+        """All layers that are modulated."""
+        return [*self.blocks, self.final_layer]
 
 
 class _FinalLayer(nn.Module):

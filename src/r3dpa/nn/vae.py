@@ -132,7 +132,7 @@ class Autoencoder(nn.Module):
         self.latent_channels = latent_channels
         self.stride = stride
         self.encoder, self.decoder = encoder, decoder
-        self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        self.quant_conv: nn.Module = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
         self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
 
     def latent_size(self, image_size: Size) -> Size:
@@ -262,6 +262,41 @@ class VAE(Autoencoder):
             if isinstance(layer, nn.Conv2d) and layer is not self.decoder.conv_out:
                 layer.bfloat16()
         return self
+
+
+class ThinDecoder(VAE):
+    """Decoder alone for the latents of a VAE, of a fraction of its work.
+
+    ``channels``, ``channel_multipliers`` and ``num_res_blocks`` may differ from those of the VAE:
+    half the channels are a quarter of the work.
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 1,
+        latent_channels: int = 8,
+        channels: int = 64,
+        channel_multipliers: tuple[int, ...] = (1, 2, 2, 4),
+        strides: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 2)),
+        num_res_blocks: int = 1,
+        stem: Size = (1, 1),
+        modes: Literal[1, 2] = 1,
+    ) -> None:
+        super().__init__(
+            in_channels,
+            latent_channels,
+            channels,
+            channel_multipliers,
+            strides,
+            num_res_blocks,
+            stem=stem,
+            modes=modes,
+        )
+        self.encoder, self.quant_conv = nn.Identity(), nn.Identity()
+
+    def encode(self, image: Tensor) -> Posterior:
+        """Raises a ``ValueError``: there is no encoder."""
+        raise ValueError("a ThinDecoder has no encoder: encode with the VAE of the checkpoint")
 
 
 class _Encoder(nn.Module):

@@ -1,0 +1,227 @@
+"""Few evaluations: average velocities of a trained flow, and a thin decoder for its latents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from r3dpa import losses
+from r3dpa.checkpoints import Checkpoint, weights_sha256
+from r3dpa.data.datasets import LidarBatch
+from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
+from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
+from r3dpa.flow.average_velocity import TIME_SHIFT
+from r3dpa.flow.times import per_sample
+from r3dpa.modules import steps
+from r3dpa.modules.encoding import filled
+from r3dpa.modules.flow_matching import FlowMatching
+from r3dpa.modules.settings import TimeSampling
+from r3dpa.modules.steps import PathDraws, batch_number
+from r3dpa.nn import VAE, SiT, ThinDecoder
+from r3dpa.nn.layers import num_processes
+
+_POINTS = 8  # of a trajectory after the noise, see average_times
+_EVERY = 2  # AB3 steps between two points
+_DECODED = 4  # every 4th latents are decoded: two decoders cost more than the SiT
+_PAIRS = torch.tensor(list(combinations(range(_POINTS + 1), 2)))
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Noise that a trajectory starts from, as an item of a cache."""
+
+    index: int
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return f"trajectory_{self.index:07d}"
+
+    @property
+    def cache_key(self) -> ItemKey:
+        return self.name, 0, 0
+
+
+class FewStep(FlowMatching):
+    """Average velocities of a frozen flow, learned from its own trajectories, and a thin decoder.
+
+    The copied blocks of the SiT (``average_blocks``) learn the average velocity between points of
+    AB3 trajectories of the flow, whose own weights stay as they are: one checkpoint samples with
+    any solver. The trajectories are computed once, into the folder of the cached posteriors, and an
+    interrupted run goes on with those that are there. The thin decoder learns the images that the
+    VAE decodes from the latents of training scans.
+
+    Source: trajectory regression as in consistency mid-training (Hu et al. 2025).
+
+    Args:
+        vae: Range-image autoencoder; fixed.
+        sit: SiT with ``average_blocks``, a third of its blocks as a rule. The flow in ``init_from``
+            has none.
+        thin_decoder: Decoder to distil; None trains none.
+        trajectories: Number of trajectories, 16 evaluations each.
+        **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching or
+            joint, whose averaged SiT is taken; its loss weights ``denoising`` (average velocity),
+            ``reconstruction`` and ``returns`` (thin decoder) count here.
+    """
+
+    stage = "few_step"
+    default_init = ("vae", "latent_norm", "sit")
+    starts_from = "flow_matching or joint"
+
+    def __init__(
+        self,
+        vae: VAE,
+        sit: SiT,
+        thin_decoder: ThinDecoder | None = None,
+        trajectories: int = 4096,
+        **kwargs: Any,
+    ) -> None:
+        if sit.average is None:
+            raise ValueError(
+                "stage few_step trains a copy of the last blocks of the SiT: set "
+                "model.sit.init_args.average_blocks, to a third of its depth as a rule"
+            )
+        if trajectories < 1:
+            raise ValueError(f"model.trajectories must be at least 1, got {trajectories}")
+        super().__init__(vae, sit, **kwargs)
+        if thin_decoder is not None:
+            for name in ("in_channels", "latent_channels", "stride", "modes"):
+                theirs, own = getattr(vae, name), getattr(thin_decoder, name)
+                if theirs != own:
+                    raise ValueError(
+                        f"model.thin_decoder: {name} is {own}, but {theirs} of the VAE"
+                    )
+        self.thin_decoder, self.trajectories = thin_decoder, trajectories
+        self.time_sampling: TimeSampling = "uniform"
+        self.sit.requires_grad_(False)
+        sit.average.requires_grad_(True)
+        self._cached: CachedTensors[_Noise] | None = None
+
+    def previous_networks(self, before: Checkpoint) -> Checkpoint:
+        """The averaged flow as the networks of this stage, its last blocks copied."""
+        if before.interpolant != self.interpolant.path:
+            raise ValueError(
+                f"{before.path} was trained on the {before.interpolant} path: set model.path to it"
+            )
+        flow = before.network("ema")
+        networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
+        weights = cast(SiT, self.sit).with_average(flow.state_dict)
+        networks["sit"] = replace(flow, state_dict=weights)
+        return replace(before, networks=networks)
+
+    def on_fit_start(self) -> None:
+        """Loads the flow, and computes the trajectories that are not there yet."""
+        super().on_fit_start()
+        if cast(Any, self.trainer).fast_dev_run:
+            return
+        flow = {k: v for k, v in self.sit.state_dict().items() if not k.startswith("average.")}
+        settings = {"sit": weights_sha256(flow), "seed": self.seed, "every": _EVERY}
+        shape = (_POINTS + 1, *self.latent_shape)
+        root = Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents")
+        cache = tensor_cache(root, "trajectory", settings, shape, "float16")
+        items = [_Noise(index, cache.folder) for index in range(self.trajectories)]
+        size = cast(Any, self.trainer).datamodule.batch_size
+
+        def points(own: list[_Noise]) -> Iterator[Tensor]:
+            for first in range(0, len(own), size):
+                yield self.solve([item.index for item in own[first : first + size]])
+
+        self._cached = filled(self.trainer, cache, items, points)
+
+    @torch.no_grad()
+    def solve(self, indices: list[int]) -> Tensor:
+        """Points ``(B, 9, C, h, w)`` of trajectories, at the times of 8 average steps."""
+        keys = [np.random.SeedSequence([self.seed, 2, index]) for index in indices]
+        generators = [torch.Generator().manual_seed(int(k.generate_state(1)[0])) for k in keys]
+        noise = torch.stack([torch.randn(self.latent_shape, generator=g) for g in generators])
+        points = [noise.to(self.device)]
+
+        def keep(x: Tensor, time: float, index: int) -> Tensor:
+            if index % _EVERY == 0:
+                points.append(x)
+            return x
+
+        times = ode_times(_POINTS * _EVERY, shift=TIME_SHIFT)
+        ab3(self.sit.velocity, points[0], times, after_step=keep)
+        return torch.stack(points, dim=1)
+
+    def trainable(self) -> dict[str, nn.Module]:
+        """The copied blocks of the SiT, and the thin decoder."""
+        networks: dict[str, nn.Module] = {"sit": self.sit}
+        return networks | ({} if self.thin_decoder is None else {"thin_decoder": self.thin_decoder})
+
+    def draw_path(self, num_samples: int, number: int | None = None) -> PathDraws:
+        """Draws of a step; ``noise`` are points of trajectories, which batches take in turn.
+
+        ``time``, uniform in [0, 1), selects two of the points.
+        """
+        draws = super().draw_path(num_samples, number)
+        number = batch_number(self) if number is None else number
+        world = self.trainer.world_size
+        first = number * num_samples * world + self.global_rank
+        indices = [(first + i * world) % self.trajectories for i in range(num_samples)]
+        if self._cached is None:  # of a fast_dev_run
+            points = self.solve(indices)
+        else:
+            items = self._cached.items
+            points = torch.stack([self._cached.read(items[index]) for index in indices])
+        return draws._replace(noise=points.to(draws.noise))
+
+    def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
+        """One step on points of trajectories, and on range images or their posteriors."""
+        latents, draws = self.draw_latents(batch)
+        points = draws.noise
+        pair = _PAIRS.to(points.device)[(draws.time * len(_PAIRS)).long()]
+        time, target = average_times(_POINTS).to(draws.time)[pair].unbind(dim=1)
+        each = torch.arange(len(pair), device=points.device)
+        x, end = points[each, pair[:, 0]], points[each, pair[:, 1]]
+        average = (x - end) / per_sample(time - target, x)
+
+        found = cast(SiT, self.sit).average_velocity(x, time, target)
+        error = losses.flow_matching_loss(found, average)
+        parts = {"denoising": self.weights.denoising * error.mean()}
+        return self.weigh_and_log(parts | self._decoder_losses(latents))
+
+    def held_out_errors(
+        self, reconstruction: Tensor, latents: Tensor, draws: PathDraws
+    ) -> dict[str, Tensor | tuple[Tensor, Tensor]]:
+        """Squared distance of 1 and 4 average steps from the end of AB3; errors of the decoder."""
+        sit = cast(SiT, (self.ema or self).sit)
+        errors: dict[str, Tensor | tuple[Tensor, Tensor]] = {}
+        end = ab3(sit.velocity, draws.noise, ode_times(16, shift=TIME_SHIFT))
+        for num in (1, 4):
+            found = average_velocity_steps(sit.average_velocity, draws.noise, average_times(num))
+            errors[f"endpoint_{num}"] = losses.flow_matching_loss(found, end)
+        if self.thin_decoder is not None:
+            geometry, image = self.scan_geometry, self.thin_decoder.decode(latents)
+            full, thin = (
+                geometry.codec.ranges_of(i, geometry.projection.sensor)
+                for i in (reconstruction, image)
+            )
+            both, either = (full > 0) & (thin > 0), (full > 0) | (thin > 0)
+            count = both.flatten(1).sum(dim=1)
+            error = torch.where(both, (full - thin).abs(), 0.0).flatten(1).sum(dim=1)
+            errors["thin_range_error_m"] = error, count
+            errors["thin_return_iou"] = count, either.flatten(1).sum(dim=1)
+        return errors
+
+    def _decoder_losses(self, latents: Tensor) -> dict[str, Tensor]:
+        """Errors of a part of the global batch, of which this process may have nothing."""
+        if self.thin_decoder is None:
+            return {}
+        world = num_processes()
+        part = [z for i, z in enumerate(latents) if (self.global_rank + i * world) % _DECODED == 0]
+        if not part:
+            return {"reconstruction": steps.zero_loss(self.thin_decoder)}
+        with torch.no_grad():
+            image = self.vae.decode(torch.stack(part))
+        found = self.reconstruction_losses(image, self.thin_decoder.predict(torch.stack(part)))
+        weight = _DECODED * len(part) / len(latents)  # the mean over processes is one over the part
+        return {name: weight * loss for name, loss in found.items()}
