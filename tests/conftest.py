@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,13 @@ def pytest_ignore_collect(collection_path, config):
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
+THIN_DECODER = {
+    "latent_channels": 4,
+    "channels": 32,
+    "channel_multipliers": [1, 1, 1],
+    "strides": [[2, 2], [2, 2]],
+    "num_res_blocks": 0,
+}
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +64,10 @@ def smoke_args(smoke_root):
         configs = [CONF / "trainer.yaml", CONF / "experiment" / f"{stage}.yaml"]
         words = [word for path in [*configs, CONF / "smoke.yaml"] for word in ("--config", path)]
         words += ["--data.init_args.root", smoke_root, "--run_dir", run_dir]
+        if stage == "few_step":
+            words += ["--model.init_args.sit.init_args.average_blocks=1"]
+            words += [f"--model.init_args.thin_decoder.init_args={json.dumps(THIN_DECODER)}"]
+            words += ["--model.init_args.trajectories=6"]
         return ["fit", *map(str, words), *more]
 
     return arguments
@@ -66,6 +78,16 @@ def vae_checkpoint(smoke_args, tmp_path_factory) -> Path:
     """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
     run_dir = tmp_path_factory.mktemp("vae_alignment")
     main(smoke_args("vae_alignment", run_dir, "--trainer.logger=false"))
+    return run_dir / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="session")
+def flow_checkpoint(smoke_args, vae_checkpoint, tmp_path_factory) -> Path:
+    """Checkpoint of the flow-matching stage at smoke size, trained for three steps."""
+    run_dir = tmp_path_factory.mktemp("flow_matching")
+    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
+    more += ["--model.init_args.init_from", str(vae_checkpoint)]
+    main(smoke_args("flow_matching", run_dir, *more))
     return run_dir / "checkpoints" / "last.ckpt"
 
 

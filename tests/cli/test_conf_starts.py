@@ -28,14 +28,16 @@ ELSEWHERE = {  # by the test that starts them
         p.relative_to(CONF).with_suffix("").as_posix() for p in CONF.glob("ablation/**/*.yaml")
     ),
 }
-EXPERIMENTS = ("vae_alignment", "joint", "flow_matching")
+EXPERIMENTS = ("vae_alignment", "joint", "flow_matching", "few_step")
 STARTS = {
     "vae_alignment": "kitti360",
     "joint": "folder",
     "flow_matching": "simulated",
+    "few_step": "simulated",
     "vae_alignment_demo": "demo",
     "joint_demo": "demo_folder",
     "flow_matching_demo": "demo",
+    "few_step_demo": "demo",
 }
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {

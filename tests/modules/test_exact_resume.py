@@ -8,7 +8,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from test_stages import QUICK, STAGES, assert_equal_runs, from_previous
+from test_stages import QUICK, STAGES, assert_equal_runs
+from test_stages import from_previous as from_previous  # a fixture
 
 from r3dpa.data import kitti360_scans
 
@@ -30,10 +31,10 @@ def seen(run_dir):
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 def test_three_steps_a_resume_and_three_more(
-    stage, smoke_args, resume_root, vae_checkpoint, tmp_path
+    stage, smoke_args, resume_root, from_previous, tmp_path
 ):
     """Bit for bit, within the first epoch, of which each scan is seen once and none twice."""
-    more = [*QUICK, *from_previous(stage, vae_checkpoint)]
+    more = [*QUICK, *from_previous(stage)]
     more += ["--trainer.devices=2", "--trainer.strategy=ddp", "--trainer.accumulate_grad_batches=2"]
     more += ["--data.init_args.batch_size=1", "--data.init_args.num_workers=2"]
     more += ["--data.init_args.num_scans=24", "--data.init_args.root", str(resume_root)]

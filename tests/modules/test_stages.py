@@ -1,4 +1,4 @@
-"""The three stages through the real command line, at the size of conf/smoke.yaml."""
+"""The stages through the real command line, at the size of conf/smoke.yaml."""
 
 from __future__ import annotations
 
@@ -18,12 +18,22 @@ from r3dpa.data import read_scan
 from r3dpa.nn import LatentNorm, SiT
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-STAGES = ("vae_alignment", "joint", "flow_matching")
+STAGES = ("vae_alignment", "joint", "flow_matching", "few_step")
 QUICK = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
 
 
-def from_previous(stage, vae_checkpoint):
-    return [] if stage == "vae_alignment" else ["--model.init_args.init_from", str(vae_checkpoint)]
+@pytest.fixture
+def from_previous(request, vae_checkpoint):
+    """``from_previous(stage)``: words that name the checkpoint of the stage before, if any."""
+
+    def words(stage):
+        if stage == "vae_alignment":
+            return []
+        few = stage == "few_step"
+        before = request.getfixturevalue("flow_checkpoint") if few else vae_checkpoint
+        return ["--model.init_args.init_from", str(before)]
+
+    return words
 
 
 def load(run_dir):
@@ -39,9 +49,11 @@ def assert_equal_runs(run_dir, other_dir, num_steps):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_stage_trains_logs_and_draws(stage, smoke_args, vae_checkpoint, tmp_path, monkeypatch):
+def test_stage_trains_logs_and_draws(
+    stage, smoke_args, vae_checkpoint, from_previous, tmp_path, monkeypatch
+):
     monkeypatch.setenv("WANDB_MODE", "offline")
-    main(smoke_args(stage, tmp_path, *from_previous(stage, vae_checkpoint)))
+    main(smoke_args(stage, tmp_path, *from_previous(stage)))
     wandb.finish()  # or the next logger of this process would join the run
     content = load(tmp_path)
     assert content["global_step"] == 3
@@ -52,16 +64,19 @@ def test_stage_trains_logs_and_draws(stage, smoke_args, vae_checkpoint, tmp_path
         "vae_alignment": {"reconstruction", "kl", "adversarial", "discriminator", "vae_alignment"},
         "joint": {"reconstruction", "vae_alignment", "discriminator", "denoising", "sit_alignment"},
         "flow_matching": {"denoising"},
+        "few_step": {"denoising", "reconstruction"},
     }[stage]
     assert {f"train/{name}" for name in expected} <= columns
-    networks = {"vae_alignment": 3, "joint": 3, "flow_matching": 1}[stage]
+    networks = {"vae_alignment": 3, "joint": 3, "flow_matching": 1, "few_step": 2}[stage]
     assert sum(column.startswith("grad_norm/") for column in columns) == networks
     assert "val/range_error_m" in columns
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert "val_reconstruction_0000003.png" in pictures
     assert ("val_samples_0000003.png" in pictures) == (stage != "vae_alignment")
     assert list(tmp_path.glob("wandb/offline-run-*"))
-    if stage == "flow_matching":  # VAE and latent statistics stay
+    if stage == "few_step":
+        assert {"val/endpoint_1", "val/endpoint_4", "val/thin_return_iou"} <= columns
+    elif stage == "flow_matching":  # VAE and latent statistics stay
         before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
         kept = [key for key in before if key.startswith(("vae.", "latent_norm."))]
         assert kept
@@ -71,16 +86,16 @@ def test_stage_trains_logs_and_draws(stage, smoke_args, vae_checkpoint, tmp_path
         assert content["state_dict"]["latent_norm.num_batches_tracked"] == 3
 
 
-def test_flow_matching_without_latent_statistics_is_refused(smoke_args, vae_checkpoint, tmp_path):
-    more = ["--trainer.logger=false", *from_previous("flow_matching", vae_checkpoint)]
+def test_flow_matching_without_latent_statistics_is_refused(smoke_args, from_previous, tmp_path):
+    more = ["--trainer.logger=false", *from_previous("flow_matching")]
     with pytest.raises(ValueError, match="init_networks name latent_norm"):
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.init_networks=[vae]"))
 
 
-def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, tmp_path):
+def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_previous, tmp_path):
     """At learning rate 0 the loaded weights are still there after three steps."""
     still = ["--model.init_args.optimizer.lr", "0", "--trainer.logger=false"]
-    main(smoke_args("joint", tmp_path, *from_previous("joint", vae_checkpoint), *still))
+    main(smoke_args("joint", tmp_path, *from_previous("joint"), *still))
     before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
     after = load(tmp_path)["state_dict"]
     for prefix in ("vae.", "sit."):
@@ -117,9 +132,9 @@ def test_rgb_weights_keep_the_blocks_and_leave_the_patch_embedding_fresh(
 
 
 @pytest.mark.slow
-def test_resume_at_the_end_of_an_epoch_is_exact(smoke_args, vae_checkpoint, tmp_path):
+def test_resume_at_the_end_of_an_epoch_is_exact(smoke_args, from_previous, tmp_path):
     """An epoch has five batches. Other stops: callbacks/test_resume.py."""
-    more = [*QUICK, *from_previous("joint", vae_checkpoint)]
+    more = [*QUICK, *from_previous("joint")]
     main(smoke_args("joint", tmp_path / "whole", *more, "--trainer.max_steps", "8"))
     main(smoke_args("joint", tmp_path / "parts", *more, "--trainer.max_steps", "5"))
     last = str(tmp_path / "parts" / "checkpoints" / "last.ckpt")
@@ -131,7 +146,7 @@ def test_resume_at_the_end_of_an_epoch_is_exact(smoke_args, vae_checkpoint, tmp_
 @pytest.mark.ddp
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
-def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_checkpoint, tmp_path):
+def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, from_previous, tmp_path):
     """Same data, same draws, synchronised batch statistics: only the order of sums differs.
 
     A sum in another order changes a float32 gradient by about 1e-7 of its terms. AdamW divides by
@@ -145,7 +160,7 @@ def test_two_processes_equal_one_with_the_global_batch(stage, smoke_args, vae_ch
     contents = {}
     for name, (devices, batch_size, strategy) in runs.items():
         more = ["--trainer.devices", str(devices), "--data.init_args.batch_size", batch_size]
-        more += ["--trainer.strategy", strategy, *QUICK, *from_previous(stage, vae_checkpoint)]
+        more += ["--trainer.strategy", strategy, *QUICK, *from_previous(stage)]
         more += ["--model.init_args.optimizer", "{lr: 1.0e-2, eps: 1.0e-3}"]
         command = [sys.executable, "-m", "r3dpa", *smoke_args(stage, tmp_path / name, *more)]
         subprocess.run(command, check=True, timeout=300, capture_output=True)
