@@ -9,15 +9,22 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from tiny_networks import SIT_ARGS, VAE_ARGS, tiny_networks
+from tiny_networks import SIT_ARGS, VAE_ARGS, tiny_checkpoint, tiny_networks
 
 import r3dpa
-from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
-from r3dpa.flow import Interpolant, euler_maruyama, ode_solver, ode_times, sde_times
+from r3dpa.checkpoints import (
+    Checkpoint,
+    NetworkState,
+    convert,
+    read_checkpoint,
+    save_checkpoint,
+)
+from r3dpa.flow import Interpolant, average_times, euler_maruyama, ode_solver, ode_times, sde_times
 from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
 from r3dpa.geometry import (
     LidarSensor,
@@ -342,3 +349,68 @@ def test_importing_the_package_imports_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="has no attribute 'SceneMaker'"):
         r3dpa.SceneMaker  # noqa: B018
+
+
+class TestFewSteps:
+    @pytest.fixture(scope="class")
+    def few_step(self, tmp_path_factory):
+        path = tmp_path_factory.mktemp("few_step") / "few.safetensors"
+        return read_checkpoint(tiny_checkpoint(path, GEOMETRY, stage="few_step"))
+
+    def test_scenes_are_those_of_the_average_velocity(self, few_step):
+        """Written out step by step, and the decoder by hand."""
+        made = SceneGenerator.from_checkpoint(few_step, "instant", device="cpu")
+        scenes = made.generate([3], seed=1)
+        sit, steps = made.sit, made.sampler.steps
+        x = torch.randn(LATENT_SHAPE, generator=scene_random(1, 3))[None]
+        times = average_times(steps).tolist()
+        with torch.no_grad():
+            for now, then in pairwise(times):
+                time, target = torch.tensor([now]), torch.tensor([then])
+                x = x + (then - now) * sit.average_velocity(x, time, target)
+            image = (
+                few_step.network("thin_decoder")
+                .build()
+                .eval()
+                .decode(made.latent_norm.denormalise(x))
+            )
+        assert scenes.nfe == steps
+        torch.testing.assert_close(scenes.latents, x, atol=1e-5, rtol=1e-5)
+        ranges = GEOMETRY.codec.ranges_of(image, SENSOR)
+        torch.testing.assert_close(scenes.range_m, ranges, atol=1e-3, rtol=0)
+        assert few_step.network("ema").arguments["average_blocks"] == 1
+
+    def test_other_qualities_do_not_see_the_copied_blocks(self, few_step):
+        made = SceneGenerator.from_checkpoint(few_step, ODE, device="cpu")
+        first = made.generate([0]).latents
+        for parameter in made.sit.average.parameters():
+            torch.nn.init.normal_(parameter)
+        assert torch.equal(made.with_sampler(ODE).generate([0]).latents, first)
+        few = made.with_sampler(SamplerConfig("average_velocity", 4))
+        assert not torch.allclose(few.generate([0]).latents, first)
+        assert few.generate([0]).nfe == 4
+
+    def test_what_makes_no_sense_is_refused_by_name(self, few_step):
+        sampler = SamplerConfig("average_velocity", 2)
+        with pytest.raises(ValueError, match="a checkpoint of stage few_step"):
+            generator(sampler)
+        with pytest.raises(ValueError, match="a checkpoint of stage few_step"):
+            generator().with_sampler(sampler)
+        weak = Autoguidance(few_step.network("ema").build(), 2.0)
+        with pytest.raises(ValueError, match="drop autoguidance"):
+            SceneGenerator.from_checkpoint(few_step, sampler, device="cpu", autoguidance=weak)
+        with pytest.raises(ValueError, match=r"takes 1, 2, 4, 8 steps.*got 3"):
+            SamplerConfig("average_velocity", 3)
+        with pytest.raises(ValueError, match="average_velocity does not read shift"):
+            SamplerConfig("average_velocity", 4, shift=2.0)
+        with pytest.raises(ValueError, match=r"the ODE solvers are.*got 'average_velocity'"):
+            ode_solver("average_velocity")  # of edits too
+
+    def test_the_official_layout_has_no_place_for_it(self, few_step, tmp_path):
+        with pytest.raises(ValueError, match=r"stage few_step.*no official counterpart"):
+            convert(few_step.path, tmp_path / "few.pt", to="official")
+        convert(few_step.path, tmp_path / "half.safetensors", half=True)
+        half = SceneGenerator.from_checkpoint(
+            tmp_path / "half.safetensors", "instant", device="cpu"
+        )
+        assert half.generate([0]).range_m.isfinite().all()

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
-from r3dpa.nn import VAE, LatentNorm, SiT
+from r3dpa.nn import VAE, LatentNorm, SiT, ThinDecoder
 
 VAE_ARGS = {"latent_channels": 4, "channels": 32, "num_res_blocks": 1}
 VAE_ARGS |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
@@ -27,15 +27,23 @@ def tiny_networks(spread=0.1, **sit_args):
     return vae, sit, norm
 
 
-def tiny_checkpoint(path, geometry, spread=0.1, sit_args=None, **fields):
-    """Checkpoint of the joint stage for inference, of :func:`tiny_networks`."""
+def tiny_checkpoint(path, geometry, spread=0.1, sit_args=None, stage="joint", **fields):
+    """Checkpoint of a stage for inference, of :func:`tiny_networks`."""
+    if stage == "few_step":
+        sit_args = {"average_blocks": 1, **(sit_args or {})}
     vae, sit, norm = tiny_networks(spread, **sit_args or {})
     networks = {
         "vae": NetworkState.of(vae, VAE_ARGS),
         "ema": NetworkState.of(sit, SIT_ARGS | (sit_args or {})),
         "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
     }
-    content = Checkpoint(Path("tiny"), "joint", networks, geometry=geometry.to_dict(), **fields)
+    if stage == "few_step":
+        arguments = VAE_ARGS | {"num_res_blocks": 0}
+        thin = ThinDecoder(**arguments)
+        with torch.no_grad():
+            thin.decoder.conv_out.weight.mul_(3)
+        networks["thin_decoder"] = NetworkState.of(thin, arguments)
+    content = Checkpoint(Path("tiny"), stage, networks, geometry=geometry.to_dict(), **fields)
     return save_checkpoint(content, path)
 
 

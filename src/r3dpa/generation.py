@@ -183,13 +183,11 @@ class SceneGenerator:
                 "from a checkpoint of stage joint or flow_matching"
             )
         geometry = _geometry_of(checkpoint)
-        names: tuple[str, ...] = ("ema", "ema_latent_norm")
-        if weights == "last":
-            names = ("sit", "latent_norm")
+        names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
         device = usable_device(device)
         thin = decoder == "thin" or (decoder is None and sampler == "instant")
-        names = ("thin_decoder" if thin else "vae", *names)
-        vae, sit, norm = (checkpoint.network(name).build().to(device) for name in names)
+        decoding = "thin_decoder" if thin else "vae"
+        vae, sit, norm = (checkpoint.network(n).build().to(device) for n in (decoding, *names))
         if not (
             isinstance(vae, VAE)
             and isinstance(sit, VelocityNetwork)

@@ -52,7 +52,8 @@ def row(label, seconds, error, precision="fp32", batch=4, precision_error=0.0):
 
 @pytest.fixture(scope="module")
 def ckpt(tmp_path_factory):
-    return tiny_checkpoint(tmp_path_factory.mktemp("ckpt") / "tiny.safetensors", GEOMETRY, step=7)
+    path = tmp_path_factory.mktemp("ckpt") / "tiny.safetensors"
+    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7)
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +134,19 @@ class TestQuality:
             "best": 32,
         }
 
+    def test_instant_is_the_best_thin_row_in_a_fifth_of_the_time_of_good(self):
+        few = [
+            row("average_velocity 2", 0.6, 0.07, decoder="thin"),
+            row("average_velocity 4", 0.8, 0.05, decoder="thin"),
+            row("average_velocity 8", 1.2, 0.04, decoder="thin"),
+            row("average_velocity 8", 0.7, 0.01),
+        ]
+        levels = quality_levels([*self.ROWS, *few])
+        assert levels["instant"]["steps"] == 4
+        assert levels["good"] == quality_levels(self.ROWS)["good"]
+        slow = [row("average_velocity 8", 1.2, 0.04, decoder="thin")]
+        assert quality_levels([*self.ROWS, *slow])["instant"]["steps"] == 8
+
     def test_a_best_row_above_bf16_sets_the_limits(self):
         levels = quality_levels(self.ROWS[:3])
         errors = {level: choice["error"] for level, choice in levels.items()}
@@ -207,7 +221,7 @@ class TestFiles:
         content = json.loads((out / "sampling.json").read_text())
         assert content["command"] == "r3dpa bench --ckpt last.ckpt"
         assert "/home/me" not in (out / "sampling.json").read_text()
-        assert content["model"] == {"file": "tiny.safetensors", "stage": "joint", "step": 7}
+        assert content["model"] == {"file": "tiny.safetensors", "stage": "few_step", "step": 7}
         assert content["problems"].keys() == {"mixture", "model"}
         for problem in content["problems"].values():
             labels = [line["label"] for line in problem["rows"]]
@@ -217,16 +231,24 @@ class TestFiles:
             for line in problem["rows"]:
                 assert line["flop_s"] == pytest.approx(line["flop"] / line["seconds"])
                 work = line["nfe"] * problem["flop"]["evaluation"] + problem["flop"]["rest"]
-                assert line["flop"] == pytest.approx(work)
+                if line["decoder"] == "full":
+                    assert line["flop"] == pytest.approx(work)
+                else:
+                    assert line["flop"] < work
         assert any("bf16" in line["label"] for line in content["problems"]["model"]["rows"])
-        assert any("batch 1" in line["label"] for line in content["problems"]["model"]["rows"])
+        labels = [line["label"] for line in content["problems"]["model"]["rows"]]
+        assert any("batch 1" in label for label in labels)
+        few = [label for label in labels if label.startswith("average_velocity")]
+        names = ("average_velocity", "average_velocity thin")
+        assert few == [f"{name} {steps}" for name in names for steps in (1, 2, 4, 8)]
 
     def test_pictures_and_levels(self, folder):
         out, text = folder
         names = {path.name for path in out.iterdir()}
         assert names == {*("sampling.json", "summary.md", "quality.json", "pareto.png")}
         levels = json.loads((out / "quality.json").read_text())["levels"]
-        assert list(levels) == ["draft", "good", "best"]
+        assert list(levels) == ["instant", "draft", "good", "best"]
+        assert levels["instant"]["solver"] == "average_velocity"
         summary = (out / "summary.md").read_text()
         assert "(pareto.png)" in summary
         assert "- quality good: " in summary

@@ -3,6 +3,7 @@
 Networks and images are tiny here; the slow tests start them at their own sizes.
 """
 
+import json
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProje
 from r3dpa.nn import VAE, LatentNorm, SiT, UNet
 from r3dpa.simulation import simulate
 
+THIN_DECODER = {"latent_channels": 4, "channels": 32, "num_res_blocks": 0}
+THIN_DECODER |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
 CONF = Path(__file__).resolve().parents[2] / "conf"
 ELSEWHERE = {  # by the test that starts them
     "test_rgb_stages": "data/dead_leaves data/images experiment/image_vae net/image_vae_demo "
@@ -83,8 +86,8 @@ def start(tmp_path, caplog):
     return start
 
 
-def start_flow(folder, vae, size):
-    """Setting with the checkpoint that flow matching starts from, of a VAE with random weights."""
+def start_flow(folder, vae, size, sit=None):
+    """Setting with the checkpoint that a flow or, with a SiT, few steps start from."""
     network, channels = VAE(**vae), vae["latent_channels"]
     norm = LatentNorm(channels)
     norm.num_batches_tracked.fill_(1)
@@ -96,6 +99,9 @@ def start_flow(folder, vae, size):
         "vae": NetworkState.of(network, vae),
         "latent_norm": NetworkState.of(norm, {"channels": channels}),
     }
+    if sit is not None:
+        networks["ema"] = NetworkState.of(SiT(**sit), sit)
+        networks["ema_latent_norm"] = networks["latent_norm"]
     content = Checkpoint(Path("v"), "vae_alignment", networks, geometry=geometry.to_dict())
     return {"model.init_args.init_from": save_checkpoint(content, folder / "vae.safetensors")}
 
@@ -120,9 +126,15 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     }
     if data in ("demo", "simulated"):
         settings |= SIMULATED
-    if stage == "flow_matching":
-        vae = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["vae"]
-        settings |= start_flow(tmp_path, vae["init_args"], (16, 64))
+    if stage in ("flow_matching", "few_step"):
+        smoke = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]
+        sit = smoke["sit"]["init_args"] if stage == "few_step" else None
+        settings |= start_flow(tmp_path, smoke["vae"]["init_args"], (16, 64), sit)
+    if stage == "few_step":
+        settings |= {
+            "model.init_args.sit.init_args.average_blocks": 1,
+            "model.init_args.thin_decoder.init_args": json.dumps(THIN_DECODER),
+        }
     start(configs, settings)
 
 
@@ -155,8 +167,9 @@ def test_experiments_at_their_own_size(stage, start, smoke_root, tmp_path):
         "trainer.callbacks": [],
         "trainer.limit_val_batches": 0,
     }
-    if stage == "flow_matching":
-        settings |= start_flow(tmp_path, net("vae_h2p4d8"), (64, 1024))
+    if stage in ("flow_matching", "few_step"):
+        sit = net("sit_b2") if stage == "few_step" else None
+        settings |= start_flow(tmp_path, net("vae_h2p4d8"), (64, 1024), sit)
     start(("trainer", "data/simulated", f"experiment/{stage}"), settings)
 
 

@@ -20,6 +20,7 @@ from r3dpa.flow.times import ode_times
 from r3dpa.generation import SamplerConfig, SceneGenerator, scene_noise
 
 Precision = Literal["fp32", "bf16"]
+Decoder = Literal["full", "thin"]
 _SEED = 0
 #: Convolutions in float32, as matrix products are by default.
 _EXACT_PRODUCTS = partial(torch.backends.cudnn.flags, enabled=True, allow_tf32=False)
@@ -79,7 +80,7 @@ class Setting:
     sampler: SamplerConfig
     precision: Precision = "fp32"
     batch: int = 1
-    decoder: Literal["full", "thin"] = "full"
+    decoder: Decoder = "full"
 
     @property
     def name(self) -> str:
@@ -128,7 +129,7 @@ class MixtureProblem:
         run = timed(lambda: self.solve(setting, range(self._timed_batch)))
         return lambda: run() / self._timed_batch
 
-    def flop(self) -> tuple[float, float]:
+    def flop(self, decoder: Decoder = "full") -> tuple[float, float]:
         """FLOP of a sample: of each evaluation, and of everything else."""
         x = self.mixture.means[:1]
         return flop_of(lambda: self.mixture.velocity(x, torch.ones(1))), 0.0
@@ -179,11 +180,11 @@ class ModelProblem:
         run = timed(lambda: generator.generate(indices, _SEED), self.device)
         return lambda: run() / setting.batch
 
-    def flop(self) -> tuple[float, float]:
+    def flop(self, decoder: Decoder = "full") -> tuple[float, float]:
         """Counted with one and with two Euler steps of one scene."""
         counts = []
         for steps in (1, 2):
-            generator = self._generator(Setting(SamplerConfig("euler", steps)))
+            generator = self._generator(Setting(SamplerConfig("euler", steps), decoder=decoder))
             generator.generate([0], _SEED)  # what is computed once for a schedule does not count
             counts.append(flop_of(partial(generator.generate, [0], _SEED)))
         each = float(counts[1] - counts[0])

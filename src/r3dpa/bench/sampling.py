@@ -182,12 +182,13 @@ def run_problem(
         cases = {name: partial(case, way, problem.case(way)) for name, way in labelled.items()}
         # Complete rounds are kept.
         measured = compare(cases, effort.rounds, lambda n, run: work.piece(f"round_{n}", run))
-    each, rest = problem.flop()
-    rows = [
-        Row(label, way, error, measured.seconds[label], way.nfe * each + rest, self_error)
-        for (label, way), error in zip(labelled.items(), errors, strict=True)
-    ]
-    return Finding(rows, steps, num, self_error, measured, (each, rest))
+    flop = {decoder: problem.flop(decoder) for decoder in {way.decoder for way in ways}}
+    rows = []
+    for (label, way), error in zip(labelled.items(), errors, strict=True):
+        each, rest = flop[way.decoder]
+        work_of = way.nfe * each + rest
+        rows.append(Row(label, way, error, measured.seconds[label], work_of, self_error))
+    return Finding(rows, steps, num, self_error, measured, flop["full"])
 
 
 def _solved(

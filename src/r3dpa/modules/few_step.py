@@ -38,15 +38,9 @@ class _Noise:
     """Noise that a trajectory starts from, as an item of a cache."""
 
     index: int
+    name: str
     path: Path
-
-    @property
-    def name(self) -> str:
-        return f"trajectory_{self.index:07d}"
-
-    @property
-    def cache_key(self) -> ItemKey:
-        return self.name, 0, 0
+    cache_key: ItemKey
 
 
 class FewStep(FlowMatching):
@@ -126,7 +120,8 @@ class FewStep(FlowMatching):
         shape = (_POINTS + 1, *self.latent_shape)
         root = Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents")
         cache = tensor_cache(root, "trajectory", settings, shape, "float16")
-        items = [_Noise(index, cache.folder) for index in range(self.trajectories)]
+        names = [f"trajectory_{index:07d}" for index in range(self.trajectories)]
+        items = [_Noise(i, name, cache.folder, (name, 0, 0)) for i, name in enumerate(names)]
         size = cast(Any, self.trainer).datamodule.batch_size
 
         def points(own: list[_Noise]) -> Iterator[Tensor]:

@@ -224,17 +224,11 @@ class SiT(VelocityNetwork):
     ) -> Tensor:
         """Mean ``(B, C, h, w)`` of the velocity along the path from ``time`` to ``target``.
 
-        ``(x_t - x_r) / (t - r)`` of the points at ``time`` t and ``target`` r, both ``(B,)``: one
-        evaluation makes a step of any length. The first blocks are those of :meth:`velocity`, the
-        last ones and the output layer have a copy that is also modulated by ``t - r``. Its new
-        weights start at 0, where it equals :meth:`velocity` bit for bit once the other weights do,
-        see :meth:`with_average`.
+        ``(x_t - x_r) / (t - r)`` of the points at ``time`` t and ``target`` r, both ``(B,)``. The
+        first blocks are those of :meth:`velocity`; a copy of the others is also modulated by
+        ``t - r``, by weights that start at 0: it equals :meth:`velocity` bit for bit then.
 
-        Source: MeanFlow (Geng et al. 2025); layout of Decoupled MeanFlow (Lee et al. 2025), where
-        early blocks see one time and late blocks the other.
-
-        Raises:
-            ValueError: Without ``average_blocks``, and as for :meth:`velocity`.
+        Source: MeanFlow (Geng et al. 2025); layout of Decoupled MeanFlow (Lee et al. 2025).
         """
         self._check(latents, time)
         return self.average_velocity_at(latents, self.modulations(time, labels, target))

@@ -265,38 +265,17 @@ class VAE(Autoencoder):
 
 
 class ThinDecoder(VAE):
-    """Decoder alone for the latents of a VAE, of a fraction of its work.
+    """Decoder alone, for the latents of a VAE.
 
-    ``channels``, ``channel_multipliers`` and ``num_res_blocks`` may differ from those of the VAE:
-    half the channels are a quarter of the work.
+    With half its channels it has a quarter of the work, and less with fewer blocks.
+
+    Args:
+        **kwargs: See :class:`VAE`.
     """
 
-    def __init__(
-        self,
-        in_channels: int = 1,
-        latent_channels: int = 8,
-        channels: int = 64,
-        channel_multipliers: tuple[int, ...] = (1, 2, 2, 4),
-        strides: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 2)),
-        num_res_blocks: int = 1,
-        stem: Size = (1, 1),
-        modes: Literal[1, 2] = 1,
-    ) -> None:
-        super().__init__(
-            in_channels,
-            latent_channels,
-            channels,
-            channel_multipliers,
-            strides,
-            num_res_blocks,
-            stem=stem,
-            modes=modes,
-        )
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.encoder, self.quant_conv = nn.Identity(), nn.Identity()
-
-    def encode(self, image: Tensor) -> Posterior:
-        """Raises a ``ValueError``: there is no encoder."""
-        raise ValueError("a ThinDecoder has no encoder: encode with the VAE of the checkpoint")
 
 
 class _Encoder(nn.Module):
