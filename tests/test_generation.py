@@ -351,12 +351,13 @@ def test_importing_the_package_imports_no_torch():
         r3dpa.SceneMaker  # noqa: B018
 
 
-class TestFewSteps:
-    @pytest.fixture(scope="class")
-    def few_step(self, tmp_path_factory):
-        path = tmp_path_factory.mktemp("few_step") / "few.safetensors"
-        return read_checkpoint(tiny_checkpoint(path, GEOMETRY, stage="few_step"))
+@pytest.fixture(scope="module")
+def few_step(tmp_path_factory):
+    path = tmp_path_factory.mktemp("few_step") / "few.safetensors"
+    return read_checkpoint(tiny_checkpoint(path, GEOMETRY, stage="few_step"))
 
+
+class TestFewSteps:
     def test_scenes_are_those_of_the_average_velocity(self, few_step):
         """Written out step by step, and the decoder by hand."""
         made = SceneGenerator.from_checkpoint(few_step, "instant", device="cpu")

@@ -43,9 +43,9 @@ TINY = Effort(samples=4, reference_steps=16, evaluations=(2, 4), rounds=2, batch
 MIXTURE = GaussianMixture(torch.eye(3, dtype=torch.float64), 0.5, torch.ones(3))
 
 
-def row(label, seconds, error, precision="fp32", batch=4, precision_error=0.0):
+def row(label, seconds, error, precision="fp32", batch=4, precision_error=0.0, decoder="full"):
     solver, steps = label.rsplit(" ", 1)
-    way = Setting(SamplerConfig(solver, int(steps)), precision, batch=batch)
+    way = Setting(SamplerConfig(solver, int(steps)), precision, batch, decoder)
     errors = Errors([error**2] * 4, precision_error, None, None)
     return Row(label, way, errors, [seconds], 1.0, 0.0)
 
