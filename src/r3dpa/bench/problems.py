@@ -141,7 +141,8 @@ class ModelProblem:
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
         read = partial(SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device)
         self.batch = batch
-        decoders = ["full", *(["thin"] if "thin_decoder" in checkpoint.networks else [])]
+        has_thin = "thin_decoder" in checkpoint.networks
+        decoders: tuple[Decoder, ...] = ("full", "thin") if has_thin else ("full",)
         self._generators = {
             (precision, decoder): read(precision=precision, decoder=decoder)
             for precision in ("fp32", "bf16")
