@@ -229,11 +229,14 @@ def test_exact_velocity_leads_to_the_data():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solver": "rk45"}, r"euler, heun, .*, euler_maruyama, got 'rk45'"),
+        ({"solver": "rk45"}, r"euler, heun, .*, euler_maruyama, ddpm, ddim, got 'rk45'"),
         ({"steps": 0}, r"steps >= 1, .* got 0, 1.0 and 1.0"),
         ({"shift": 0.0}, r"shift > 0 .* got 256, 0.0 and 1.0"),
         ({"eta": -1.0}, r"eta >= 0, got 256, 1.0 and -1.0"),
-        ({"solver": "heun", "eta": 0.5}, r"solver heun does not read eta.* for euler_maruyama;"),
+        (
+            {"solver": "heun", "eta": 0.5},
+            r"solver heun does not read eta.* for euler_maruyama, ddpm;",
+        ),
         ({"solver": "ab2", "sde_last": "mean"}, r"solver ab2 does not read sde_last,"),
         ({"solver": "ab2", "sde_last_time": 0.1}, r"solver ab2 does not read sde_last_time"),
         ({"shift": 2.0}, r"solver euler_maruyama does not read shift, which is for euler, heun"),

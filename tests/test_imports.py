@@ -33,7 +33,7 @@ ALLOWED = {
     "bench": METHOD | {"baselines", "simulation", "metrics", "viz", "editing", "callbacks"},
     "__main__": {"cli"},
     "cli": METHOD
-    | {"simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"}
+    | {"baselines", "simulation", "metrics", "viz", "editing", "callbacks", "bench", "ablation"}
     | {"weather", "pretrained"},
 }
 ANYWHERE = {"io", "__version__"}

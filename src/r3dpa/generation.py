@@ -256,7 +256,7 @@ class SceneGenerator:
         self.prepare()
         for network in self._networks:
             network.calls = 0
-        draws = (_filled(x, size).to(self.device) for x in scene_noise(self.sit, indices, seed))
+        draws = (filled(x, size).to(self.device) for x in scene_noise(self.sit, indices, seed))
         latents = self._solve(next(draws), draws)[: len(indices)]
         range_m = self.decode(latents)
         nfe = sum(network.calls for network in self._networks)
@@ -269,11 +269,19 @@ class SceneGenerator:
         sensor = self.geometry.projection.sensor
         parts = []
         for part in self.latent_norm.denormalise(latents).split(size):
-            image = self._decode(_filled(part, size))[: len(part)]
+            image = self._decode(filled(part, size))[: len(part)]
             range_m = self.geometry.codec.ranges_of(image.float(), sensor)
             finite = image.flatten(1).isfinite().all(dim=1)
             parts.append(torch.where(finite[:, None, None], range_m, torch.nan))
         return torch.cat(parts)
+
+    def velocity(self, latents: Tensor, time: Tensor) -> Tensor:
+        """Unguided velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of the latents."""
+        return self.sit.velocity(latents.float(), time.float()).to(latents.dtype)
+
+    def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
+        """First noise ``(B, C, h, w)`` of scenes, on the device of the networks."""
+        return next(scene_noise(self.sit, indices, seed)).to(self.device)
 
     @property
     def _networks(self) -> list[_ScheduledNetwork]:
@@ -425,7 +433,7 @@ class _ScheduledNetwork:
         return velocity.clone() if self._graphs else velocity  # a replay writes to one place
 
 
-def _filled(values: Tensor, size: int) -> Tensor:
+def filled(values: Tensor, size: int) -> Tensor:
     """``(B, C, h, w)`` with zeros up to ``size`` samples."""
     return F.pad(values, (0, 0, 0, 0, 0, 0, 0, size - len(values)))
 
@@ -437,8 +445,12 @@ def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
 
 def scene_noise(sit: VelocityNetwork, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
     """Noise after noise ``(B, C, h, w)`` for latents of scenes, each scene's own, on the CPU."""
+    return noise_of((sit.in_channels, *sit.input_size), indices, seed)
+
+
+def noise_of(shape: tuple[int, int, int], indices: Sequence[int], seed: int) -> Iterator[Tensor]:
+    """The same for samples of any shape ``(C, h, w)``."""
     generators = [scene_random(seed, index) for index in indices]
-    shape = (sit.in_channels, *sit.input_size)
     while True:
         yield torch.stack([torch.randn(shape, generator=g) for g in generators])
 

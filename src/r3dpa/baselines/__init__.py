@@ -1,1 +1,16 @@
 """The paper's competitors, R2DM, R2Flow and LiDM, on the data, solvers and commands of r3dpa."""
+
+from r3dpa.baselines.base import AveragedNetwork, Baseline
+from r3dpa.baselines.generator import BaselineGenerator
+from r3dpa.baselines.r2dm import R2DM
+from r3dpa.baselines.stages import BASELINES, baseline_of, scene_generator
+
+__all__ = [
+    "BASELINES",
+    "R2DM",
+    "AveragedNetwork",
+    "Baseline",
+    "BaselineGenerator",
+    "baseline_of",
+    "scene_generator",
+]

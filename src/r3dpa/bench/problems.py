@@ -13,11 +13,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from r3dpa.baselines import BaselineGenerator, scene_generator
 from r3dpa.bench.measure import flop_of, timed
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.solvers import ODE_SOLVERS, heun
 from r3dpa.flow.times import ode_times
-from r3dpa.generation import SamplerConfig, SceneGenerator, scene_noise
+from r3dpa.generation import SamplerConfig, SceneGenerator
 
 Precision = Literal["fp32", "bf16"]
 Decoder = Literal["full", "thin"]
@@ -139,7 +140,7 @@ class ModelProblem:
     """Networks of a checkpoint; where nothing is timed ``batch`` scenes are solved together."""
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
-        read = partial(SceneGenerator.from_checkpoint, checkpoint, SamplerConfig(), device=device)
+        read = partial(scene_generator, checkpoint, SamplerConfig(), device=device)
         self.batch = batch
         has_thin = "thin_decoder" in checkpoint.networks
         decoders: tuple[Decoder, ...] = ("full", "thin") if has_thin else ("full",)
@@ -150,7 +151,7 @@ class ModelProblem:
         }
         self.device = self._generators["fp32", "full"].device
 
-    def _generator(self, setting: Setting) -> SceneGenerator:
+    def _generator(self, setting: Setting) -> SceneGenerator | BaselineGenerator:
         return self._generators[setting.precision, setting.decoder].with_sampler(setting.sampler)
 
     def solve(self, setting: Setting, indices: range) -> Solved:
@@ -163,16 +164,10 @@ class ModelProblem:
     def converged(self, steps: int, indices: range) -> Solved:
         """The same scenes by Heun's method: network in float32 without TF32, state in float64."""
         generator = self._generators["fp32", "full"]
-        noise = next(scene_noise(generator.sit, indices, _SEED)).to(self.device)
-
-        def velocity(x: Tensor, time: Tensor) -> Tensor:
-            return generator.sit.velocity(x.float(), time.float()).double()
-
+        noise = generator.noise(indices, _SEED)
         with _EXACT_PRODUCTS():
-            found = heun(velocity, noise.double(), ode_times(steps))
-            image = generator.vae.decode(generator.latent_norm.denormalise(found.float()))
-        geometry = generator.geometry
-        range_m = geometry.codec.ranges_of(image.float(), geometry.projection.sensor)
+            found = heun(generator.velocity, noise.double(), ode_times(steps))
+            range_m = generator.decode(found.float())
         return Solved(found.cpu(), range_m.cpu())
 
     def case(self, setting: Setting) -> Callable[[], float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import lightning as L
 import torch
@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r3dpa import viz
+from r3dpa.baselines import Baseline
 from r3dpa.data import write_bin
-from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import first_line
 from r3dpa.modules import GenerativeModule
-from r3dpa.nn import EMA
 
 
 class ReconstructionWriter(L.Callback):
@@ -69,16 +69,16 @@ class PictureLogger(L.Callback):
         """Draws after a test run."""
         self._draw(trainer, pl_module, "test")
 
-    def _draw(self, trainer: L.Trainer, module: GenerativeModule, split: str) -> None:
+    def _draw(self, trainer: L.Trainer, module: GenerativeModule | Baseline, split: str) -> None:
         if not trainer.is_global_zero:
             return
         pictures = {}
         val_set = getattr(cast(Any, trainer).datamodule, "val_set", None)
-        if val_set:
+        if val_set and isinstance(module, GenerativeModule):
             image = val_set[len(val_set) // 2]["range_image"]
             pictures["reconstruction"] = self._reconstruction(module, image)
         if self.num_scenes and module.ema is not None:
-            generator = averaged_generator(module, module.ema, self.sampler)
+            generator = module.scene_generator(self.sampler)
             scenes = generator.generate(range(self.num_scenes), self.seed)
             projection = generator.geometry.projection
             pictures["samples"] = viz.scenes_sheet(list(scenes.range_m.cpu()), projection)
@@ -100,16 +100,3 @@ class PictureLogger(L.Callback):
         error_m = (range_m - found_m).abs()[(range_m > 0) & (found_m > 0)].mean().item()
         agreement = ((range_m > 0) == (found_m > 0)).float().mean().item()
         return viz.reconstruction_figure(range_m, found_m, sensor, error_m, agreement)
-
-
-def averaged_generator(
-    module: GenerativeModule,
-    average: EMA,
-    sampler: SamplerConfig,
-    precision: Literal["fp32", "bf16"] = "fp32",
-) -> SceneGenerator:
-    """Samples from the averaged weights of a module."""
-    geometry, path = module.scan_geometry, module.interpolant.path
-    return SceneGenerator(
-        module.vae, average.sit, average.latent_norm, geometry, sampler, path, precision
-    )

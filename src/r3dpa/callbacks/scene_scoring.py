@@ -16,7 +16,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
-from r3dpa.callbacks.pictures import averaged_generator
+from r3dpa.baselines import Baseline
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.scans import read_scan
@@ -94,7 +94,7 @@ class SceneScorer(L.Callback):
     def on_test_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Checks all that can be checked before scenes are sampled."""
         self._job = None
-        if not isinstance(pl_module, GenerativeModule) or not self.num_scenes:
+        if not isinstance(pl_module, GenerativeModule | Baseline) or not self.num_scenes:
             return
         if pl_module.ema is None:
             rank_zero_info(f"stage {pl_module.stage} has nothing to sample: no scenes are scored")
@@ -129,7 +129,7 @@ class SceneScorer(L.Callback):
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Samples and compares."""
-        if self._job is None or not isinstance(pl_module, GenerativeModule):
+        if self._job is None or not isinstance(pl_module, GenerativeModule | Baseline):
             return
         statistics, spaces, scans = self._job
         self._job = None
@@ -176,10 +176,10 @@ class SceneScorer(L.Callback):
             logger.log_metrics(values, trainer.global_step or pl_module.loaded_step)
             logger.save()
 
-    def _sample(self, trainer: L.Trainer, module: GenerativeModule, folder: Path) -> int:
+    def _sample(self, trainer: L.Trainer, module: GenerativeModule | Baseline, folder: Path) -> int:
         """Writes the batches of this process; network evaluations per scene, 0 without any."""
         assert module.ema is not None
-        generator = averaged_generator(module, module.ema, self.sampler, self.precision)
+        generator = module.scene_generator(self.sampler, self.precision)
         own = range(0, self.num_scenes, self.batch_size)[trainer.global_rank :: trainer.world_size]
         quiet, nfe = None if trainer.is_global_zero else True, 0
         for first in tqdm(own, "sampling", unit="batch", disable=quiet):
@@ -190,7 +190,9 @@ class SceneScorer(L.Callback):
                 save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
         return nfe
 
-    def _made_with(self, trainer: L.Trainer, module: GenerativeModule, nfe: int) -> dict[str, Any]:
+    def _made_with(
+        self, trainer: L.Trainer, module: GenerativeModule | Baseline, nfe: int
+    ) -> dict[str, Any]:
         return {
             "solver": self.sampler.solver,
             "steps": self.sampler.steps,
@@ -206,7 +208,7 @@ class SceneScorer(L.Callback):
         }
 
     def _sampled(
-        self, module: GenerativeModule, folder: Path, statistics: AnyReference
+        self, module: GenerativeModule | Baseline, folder: Path, statistics: AnyReference
     ) -> Iterator[EvaluationScene]:
         """Scenes of all processes, in order; as points where the reference has other pixels."""
         projection = module.scan_geometry.projection

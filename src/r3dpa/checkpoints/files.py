@@ -22,6 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from r3dpa import __version__
+from r3dpa.checkpoints.baselines import READERS
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
@@ -33,6 +34,11 @@ _FORMAT = "r3dpa-checkpoint-1"
 _PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder")
 _LIGHTNING = {name: (f"{name}.", name) for name in _PLAIN}
 _LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
+_LIGHTNING |= {
+    "network": ("network.", "network"),
+    "ema_network": ("ema.network.", "network"),
+    "first_stage": ("first_stage.", "first_stage"),
+}
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
 # Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
@@ -49,9 +55,10 @@ def read_checkpoint(
     """Reads a checkpoint of any layout without running code from it.
 
     Known are ours (``.safetensors`` with its ``.yaml``), those of Lightning (``.ckpt``), official
-    ones (``.pt``), and image VAEs of diffusers (``.safetensors``). With an official VAE
-    ``<name>.pt`` come its ``<name>-latents-stats.pt`` and ``<name>-discriminator-ckpt.pt``, and for
-    a file without ``args`` an ``args.json`` in its folder, or above a folder ``checkpoints``.
+    ones (``.pt``), released ones of the baselines, and image VAEs of diffusers
+    (``.safetensors``). With an official VAE ``<name>.pt`` come its ``<name>-latents-stats.pt`` and
+    ``<name>-discriminator-ckpt.pt``, and for a file without ``args`` an ``args.json`` in its
+    folder, or above a folder ``checkpoints``.
 
     Args:
         path: File to read, name of weights in this package, or ``hf://owner/name``.
@@ -74,10 +81,13 @@ def read_checkpoint(
         if is_official(content):
             content, args = _with_neighbours(content, path)
             return from_official(content, path, args=args, sit_args=sit_args, encoding=encoding)
+        for recognised, from_baseline in READERS:
+            if recognised(content):
+                return from_baseline(content, path)
         found = list(content)[:10] if isinstance(content, Mapping) else type(content).__name__
         raise ValueError(
             f"it holds {found}; expected a Lightning checkpoint of r3dpa, an official R3DPA "
-            "checkpoint, or a .safetensors file with its .yaml"
+            "checkpoint, one of a baseline, or a .safetensors file with its .yaml"
         )
 
 

@@ -20,9 +20,12 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 from r3dpa.io import UNPICKLING_ERRORS
 
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
-FACTS = ("stage", "geometry", "augmentation", "feature_source", "interpolant", "version", "commit")
+FACTS = (
+    *("stage", "geometry", "augmentation", "feature_source", "interpolant", "settings"),
+    *("version", "commit"),
+)
 
-_ALLOWED_PACKAGE = "r3dpa.nn."
+_ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.baselines.")
 _NUM_LISTED = 10
 _AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
@@ -64,7 +67,7 @@ def _at_most(count: int) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class NetworkState:
-    """One network as data: class inside ``r3dpa.nn``, plain constructor arguments, weights."""
+    """One network as data: class of this package, plain constructor arguments, weights."""
 
     class_path: str
     init_args: Mapping[str, Any]
@@ -82,20 +85,20 @@ class NetworkState:
 
     @property
     def kind(self) -> type[nn.Module]:
-        """The class; raises a ``ValueError`` if it is not one of ``r3dpa.nn``."""
+        """The class; raises a ``ValueError`` if it is no network of this package."""
         module_path, _, name = str(self.class_path).rpartition(".")
-        if f"{module_path}.".startswith(_ALLOWED_PACKAGE):
+        if f"{module_path}.".startswith(_ALLOWED_PACKAGES):
             try:
                 found = getattr(importlib.import_module(module_path), name)
             except (ImportError, AttributeError) as error:
                 raise ValueError(f"class {self.class_path!r} does not exist ({error})") from None
             is_network = isinstance(found, type) and issubclass(found, nn.Module)
-            if is_network and found.__module__.startswith(_ALLOWED_PACKAGE):
+            if is_network and found.__module__.startswith(_ALLOWED_PACKAGES):
                 return found
         raise ValueError(
             f"class {self.class_path!r} is not allowed: a checkpoint may only name networks "
-            "defined in r3dpa.nn. Edit the class_path if the class was moved; otherwise do not "
-            "trust the file"
+            "defined in r3dpa.nn or r3dpa.baselines. Edit the class_path if the class was moved; "
+            "otherwise do not trust the file"
         )
 
     @property
@@ -158,8 +161,8 @@ class Checkpoint:
     """Everything a checkpoint file says about its networks, whatever its format.
 
     Networks are called ``vae``, ``discriminator``, ``sit``, ``latent_norm``, ``thin_decoder``, and
-    the averaged copies ``ema`` and ``ema_latent_norm``. A field is None if the file does not state
-    it.
+    the averaged copies ``ema`` and ``ema_latent_norm``; those of a baseline ``network``,
+    ``ema_network`` and ``first_stage``. A field is None if the file does not state it.
     """
 
     path: Path  #: file it was read from
@@ -170,6 +173,7 @@ class Checkpoint:
     augmentation: Mapping[str, Any] | None = None  #: plain values of its ``Augmentation``
     feature_source: str | None = None  #: feature source of its last training stage
     interpolant: Literal["linear", "cosine"] = "linear"  #: path from latents to noise of its SiT
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: arguments of a baseline
     version: str | None = None  #: version of r3dpa that wrote it
     commit: str | None = None  #: commit of r3dpa that wrote it
     official_args: Mapping[str, Any] = field(default_factory=dict)  #: official training options

@@ -14,7 +14,7 @@ def sample(
     *,
     num: PositiveInt = 16,
     quality: Literal["instant", "draft", "good", "best"] | None = None,
-    solver: Literal[ODESolver, "euler_maruyama", "average_velocity"] | None = None,
+    solver: Literal[ODESolver, "euler_maruyama", "average_velocity", "ddpm", "ddim"] | None = None,
     steps: PositiveInt | None = None,
     shift: float | None = None,
     eta: float | None = None,
@@ -36,10 +36,11 @@ def sample(
 
     Args:
         num: Number of scenes.
-        quality: Measured solver, steps and shift; default: good, unless one of these is given.
-            ``instant`` needs a checkpoint of stage few_step, as does ``average_velocity``.
-        solver: ODE solver, ``euler_maruyama`` for the SDE, or ``average_velocity`` for 1, 2, 4 or 8
-            steps of any length; default: the SDE.
+        quality: Measured solver, steps and shift; default: good, unless one of these is given; of
+            a baseline, its published sampler. ``instant`` needs a checkpoint of stage few_step, as
+            does ``average_velocity``.
+        solver: ODE solver, ``euler_maruyama`` for the SDE, ``ddpm``, or ``average_velocity`` for 1,
+            2, 4 or 8 steps of any length; default: the SDE.
         steps: Solver steps; default: 256.
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
         eta: Noise strength of the SDE; default: 1, as published.
@@ -58,19 +59,19 @@ def sample(
     arguments = dict(locals())
     from dataclasses import asdict
 
+    from r3dpa.baselines import scene_generator
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
-    from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
+    from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last", "sde_last_time")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
-    chosen = quality or "good"
-    sampler = SamplerConfig(**given) if given else SamplerConfig.of_quality(chosen)
-    decoder = decoder or ("thin" if chosen == "instant" else "full")
+    sampler = SamplerConfig(**given) if given else quality
+    decoder = decoder or ("thin" if quality == "instant" else "full")
     if autoguidance is None and (guidance_scale or guidance_interval or allow_other_latents):
         raise ValueError(
             "--guidance_scale, --guidance_interval and --allow_other_latents need --autoguidance"
@@ -92,7 +93,7 @@ def sample(
             "scale": scale,
             "interval": list(interval),
         }
-    generator = SceneGenerator.from_checkpoint(
+    generator = scene_generator(
         checkpoint,
         sampler,
         weights=files.weights,
@@ -106,7 +107,7 @@ def sample(
     generator.prepare()
     request = provenance(checkpoint, files, num, device, generator.geometry)
     request |= {"precision": precision, "compile": compile, "decoder": decoder}
-    request |= {"sampler": asdict(sampler), "autoguidance": about_guide}
+    request |= {"sampler": asdict(generator.sampler), "autoguidance": about_guide}
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
         measured = generate_all(generator, writer, files.batch_size, files.seed)
@@ -115,5 +116,7 @@ def sample(
     line = f"{num} scenes in {files.out}: {measured['nfe']:.5g} network evaluations each"
     if measured["drawn_by_last_run"]:
         line += f", {measured['seconds_per_scene']:.3g} s a scene"
-    note = "" if given else SamplerConfig.quality_line(chosen)
+    chosen = quality or "good"
+    measured_here = generator.sampler == SamplerConfig.of_quality(chosen)  # not a baseline's
+    note = SamplerConfig.quality_line(chosen) if measured_here and not given else ""
     return "\n".join(filter(None, (note, line, opened)))

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 import r3dpa
 from r3dpa import viz
+from r3dpa.baselines import BaselineGenerator
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.cli.parser import SceneOptions
 from r3dpa.data.scans import ScanError, find_scans, read_beside, read_npz, read_ply, read_scan
@@ -97,7 +98,7 @@ def provenance(
 
 
 def generate_all(
-    generator: SceneGenerator, writer: SceneWriter, batch_size: int, seed: int
+    generator: SceneGenerator | BaselineGenerator, writer: SceneWriter, batch_size: int, seed: int
 ) -> dict[str, Any]:
     """Generates and writes the missing scenes; returns evaluations and time."""
     first_index, start = writer.num_done, time.perf_counter()

@@ -75,12 +75,13 @@ class LidarDataset(Dataset[dict[str, Any]]):
             return self.codec.to_image(self.images.read(scan))
         points = torch.from_numpy(read_scan(scan.path))
         try:
-            range_m, _ = range_image(points[:, :3], self.projection)
+            values = points[:, 3:4] if self.codec.reflectance else None
+            range_m, values = range_image(points[:, :3], self.projection, values)
         except ValueError as error:
             raise ScanError(f"{scan.path}: cannot be projected: {error}") from error
         if not (range_m > 0).any():
             raise out_of_range(scan.path, self.projection.sensor)
-        return self.codec.to_image(range_m)
+        return self.codec.to_image(range_m, None if values is None else values[0])
 
 
 class PointSample(NamedTuple):

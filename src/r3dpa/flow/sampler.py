@@ -13,23 +13,19 @@ from torch import Tensor
 
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, average_times, average_velocity_steps
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.sde import euler_maruyama
+from r3dpa.flow.sde import ancestral, euler_maruyama
 from r3dpa.flow.solvers import ODE_SOLVERS, evaluations, ode_solver
 from r3dpa.flow.times import ode_times, sde_times
 
-Solver = Literal[
-    "euler",
-    "heun",
-    "midpoint",
-    "ab2",
-    "ab3",
-    "dpmpp_2m",
-    "unipc",
-    "euler_maruyama",
-    "average_velocity",
-]
+OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
+Solver = Literal[OdeSolverName, "euler_maruyama", "ddpm", "ddim", "average_velocity"]
 Quality = Literal["instant", "draft", "good", "best"]
 _INSTANT = {"solver": "average_velocity", "steps": 2, "shift": 1.0}
+_READS = {
+    "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
+    "ddpm": ("shift", "eta"),
+    "average_velocity": (),
+}
 
 
 @dataclass(frozen=True)
@@ -37,13 +33,14 @@ class SamplerConfig:
     """Solver, steps and schedule that turn noise into latents.
 
     Args:
-        solver: ``euler_maruyama`` solves the SDE, the others the ODE; ``average_velocity`` needs a
+        solver: ``euler_maruyama`` solves the SDE, ``ddpm`` takes ancestral steps, the others solve
+            the ODE; ``ddim`` are ancestral steps without noise, ``average_velocity`` needs a
             network of stage few_step and takes 1, 2, 4 or 8 steps.
         steps: Solver steps.
         sde_last_time: Time from which the SDE takes its last, noise-free step.
         sde_last: ``denoise``, or ``mean`` as in the official sampler.
         shift: Finer steps near noise (above 1) or data (below 1); not of the SDE.
-        eta: Strength of the noise of the SDE; 1 as published, 0 for none.
+        eta: Strength of the noise of the SDE or of ancestral steps; 1 as published, 0 for none.
 
     Raises:
         ValueError: If the solver is unknown, a number out of its range, or a setting other than its
@@ -73,14 +70,13 @@ class SamplerConfig:
                 f"average_velocity takes {', '.join(map(str, AVERAGE_STEPS))} steps, those that "
                 f"stage few_step trains, got {self.steps}"
             )
-        unread = [] if self.solver in ODE_SOLVERS else ["shift"]
-        if self.solver != "euler_maruyama":
-            unread += ["eta", "sde_last", "sde_last_time"]
-        for name in unread:
-            if getattr(self, name) != getattr(type(self), name):
-                readers = ", ".join(ODE_SOLVERS) if name == "shift" else "euler_maruyama"
+        read = _READS.get(self.solver, ("shift",))
+        for name in ("shift", "eta", "sde_last", "sde_last_time"):
+            if name not in read and getattr(self, name) != getattr(type(self), name):
+                readers = [k for k in get_args(Solver) if name in _READS.get(k, ("shift",))]
                 raise ValueError(
-                    f"solver {self.solver} does not read {name}, which is for {readers}; drop one"
+                    f"solver {self.solver} does not read {name}, which is for "
+                    f"{', '.join(readers)}; drop one"
                 )
 
     @property
@@ -117,7 +113,7 @@ class SamplerConfig:
         draws: torch.Generator | Iterable[Tensor],
         interpolant: Interpolant,
     ) -> Tensor:
-        """Carry noise ``(B, ...)`` at t = 1 to data; the SDE takes further noise from ``draws``.
+        """Carry noise ``(B, ...)`` at t = 1 to data; further noise comes from ``draws``.
 
         ``average_velocity`` calls ``velocity(x, time, target)``, the others ``velocity(x, time)``.
         """
@@ -134,6 +130,9 @@ class SamplerConfig:
                 eta=self.eta,
             )
         times = ode_times(self.steps, shift=self.shift)
+        if self.solver in ("ddpm", "ddim"):
+            eta = self.eta if self.solver == "ddpm" else 0.0
+            return ancestral(velocity, noise, times, draws, eta=eta, interpolant=interpolant)
         return ode_solver(self.solver, interpolant)(velocity, noise, times)
 
 

@@ -1,4 +1,4 @@
-"""SDE sampler from t = 1 (noise) to t = 0 (data), with the conventions of the ODE solvers."""
+"""Samplers with noise from t = 1 to t = 0 (data), with the conventions of the ODE solvers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.solvers import Velocity
-from r3dpa.flow.times import batch_time, step_pairs
+from r3dpa.flow.times import batch_time, per_sample, step_pairs
 
 DriftChange = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -83,6 +83,70 @@ def euler_maruyama(
     if last == "denoise":
         return interpolant.denoise(final_velocity, x, time).to(x.dtype)
     return x + (then - now) * drift_of(final_velocity, time).to(x.dtype)
+
+
+@torch.no_grad()
+def ancestral(
+    velocity: Velocity,
+    x: Tensor,
+    times: Tensor,
+    noise: torch.Generator | Iterable[Tensor],
+    *,
+    eta: float = 1.0,
+    interpolant: Interpolant = LINEAR,
+) -> Tensor:
+    """DDPM (``eta`` 1) or DDIM (``eta`` 0) steps, see :func:`ancestral_step`.
+
+    Source: Ho et al. 2020, Song et al. 2021 (eq. 12), for a path with any coefficients.
+
+    Args:
+        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
+        x: ``(B, ...)`` Gaussian noise, the state at t = 1.
+        times: ``(T,)`` decreasing times.
+        noise: The T - 1 Gaussian draws ``(B, ...)`` in order, none for ``eta`` 0, or the generator
+            to draw them with.
+        eta: Strength of the noise, 0 to 1.
+        interpolant: Path of the velocity.
+    """
+    if not 0 <= eta <= 1:
+        raise ValueError(f"eta of ancestral steps must be in [0, 1], got {eta}")
+    steps = step_pairs(times)
+    draws = _draws(noise, x, len(steps) if eta else 0)
+    for now, then in steps:
+        here, there = batch_time(now, x), batch_time(then, x)
+        data = interpolant.denoise(velocity(x, here), x, here)
+        draw = next(draws) if eta else None
+        x = ancestral_step(data, x, here, there, draw, eta=eta, interpolant=interpolant).to(x.dtype)
+    return x
+
+
+def ancestral_step(
+    data: Tensor,
+    x: Tensor,
+    here: Tensor,
+    there: Tensor,
+    draw: Tensor | None,
+    *,
+    eta: float = 1.0,
+    interpolant: Interpolant = LINEAR,
+) -> Tensor:
+    """State at times ``there`` ``(B,)`` given the state at later times ``here`` and its clean data.
+
+    With ``k = 1 - (alpha_t sigma_s / (alpha_s sigma_t))^2``, the share of the variance that the
+    step renews, and the noise ``e = (x_t - alpha_t data) / sigma_t`` of the state::
+
+        x_s = alpha_s data + sigma_s (sqrt(1 - eta^2 k) e + eta sqrt(k) draw)
+
+    For ``eta`` 1 this is the posterior ``q(x_s | x_t, data)`` of any path ``alpha, sigma``.
+    """
+    alpha_t, sigma_t, *_ = interpolant.coefficients(per_sample(here, x))
+    alpha_s, sigma_s, *_ = interpolant.coefficients(per_sample(there, x))
+    error = (x - alpha_t * data) / sigma_t
+    if draw is None or eta == 0:
+        return alpha_s * data + sigma_s * error
+    renewed = (1 - (alpha_t * sigma_s / (alpha_s * sigma_t)).square()).clamp(min=0)
+    kept = (1 - eta**2 * renewed).sqrt()
+    return alpha_s * data + sigma_s * (kept * error + eta * renewed.sqrt() * draw)
 
 
 def _draws(

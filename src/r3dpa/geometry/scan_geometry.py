@@ -14,7 +14,7 @@ from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
 _ROUNDING_M = 1e-3
-_DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84}
+_DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
 _LOG_OFFSET_M = 1e-4
 _LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
 _THRESHOLD_MARGIN = 1e-6
@@ -27,33 +27,44 @@ class RangeCodec:
     Formulas, with range d in metres::
 
         linear  image = 2 * d / scale - 1
-        log2    image = 2 * log2(d + 1 + 1e-4) / scale - 1
+        log2    image = 2 * log2(d + 1 + offset) / scale - 1
+        inverse image = 2 * scale / d - 1
 
-    both clipped to [-1, 1]; a pixel without a return counts as d = 0. With ``return_channel`` a
-    second channel tells returns (1) from empty pixels (-1), so that a decoder does not blur the
-    border between the two into ghost points.
+    all clipped to [-1, 1]; a pixel without a return is -1 or counts as d = 0. With
+    ``return_channel`` a second channel tells returns (1) from empty pixels (-1), so that a decoder
+    does not blur the border between the two into ghost points. With ``reflectance`` the second
+    channel is that of the returns instead, from [0, 1] to [-1, 1], and -1 without a return.
 
     Source: the two data configurations of valeoai/R3DPA. Its inverse of the logarithm leaves
-    the 1e-4 m out; ``legacy_inverse`` does so too, for published numbers.
+    the 1e-4 m out; ``legacy_inverse`` does so too, for published numbers. R2DM and R2Flow: ``log2``
+    with scale ``log2(81)`` and offset 0, or ``inverse``, both with ``reflectance``.
 
     Args:
-        encoding: ``linear`` or ``log2``.
-        scale: Divisor of the formula; 56 for ``linear`` and 5.84 for ``log2`` where None.
+        encoding: ``linear``, ``log2`` or ``inverse``.
+        scale: Number in the formula; 56, 5.84 or 1.45 where None.
         legacy_inverse: Return ranges that are 1e-4 m too long from a ``log2`` image.
         return_channel: Images have a second channel, whose sign says where returns are.
+        reflectance: Images have a second channel of reflectance.
+        offset_m: Offset of ``log2``, metres.
 
     Raises:
-        ValueError: If the encoding is unknown or the scale is not positive and finite.
+        ValueError: If the encoding is unknown, the scale is not positive and finite, or two second
+            channels are asked for.
     """
 
-    encoding: Literal["linear", "log2"] = "linear"
+    encoding: Literal["linear", "log2", "inverse"] = "linear"
     scale: float | None = None
     legacy_inverse: bool = False
     return_channel: bool = False
+    reflectance: bool = False
+    offset_m: float = _LOG_OFFSET_M
 
     def __post_init__(self) -> None:
         if self.encoding not in _DEFAULT_SCALES:
-            raise ValueError(f"range encoding must be 'linear' or 'log2', got {self.encoding!r}")
+            known = ", ".join(_DEFAULT_SCALES)
+            raise ValueError(f"range encoding must be one of {known}, got {self.encoding!r}")
+        if self.return_channel and self.reflectance:
+            raise ValueError("codec.return_channel and codec.reflectance exclude each other")
         if self.scale is None:  # so that a codec equals the same one written out
             object.__setattr__(self, "scale", _DEFAULT_SCALES[self.encoding])
         if not 0.0 < self._divisor < math.inf:
@@ -65,7 +76,12 @@ class RangeCodec:
 
     @property
     def threshold(self) -> float:
-        """Image value in [-1, 1] above which a pixel holds a return: about 4 mm of range."""
+        """Image value in [-1, 1] above which a pixel holds a return: about 4 mm of range.
+
+        Of ``inverse``, where no return is infinitely far, 4 mm of 1 / range.
+        """
+        if self.encoding == "inverse":
+            return 2 * _LEAST_VALID_M * self._divisor - 1
         if self.encoding == "linear":
             fraction = _LEAST_VALID_M / self._divisor
         else:
@@ -77,8 +93,11 @@ class RangeCodec:
         # Clamped first: log2 of a range below -1 m is NaN, which would survive the last clamp.
         # float64: float32 logarithms alone would move a range of 50 m by 2e-5 m.
         metres = range_m.double().clamp(min=0)
+        if self.encoding == "inverse":
+            near = torch.where(metres > 0, self._divisor / metres, 0.0)
+            return (2 * near - 1).clamp(-1, 1).float()
         if self.encoding == "log2":
-            metres = torch.log1p(metres + _LOG_OFFSET_M) / math.log(2)
+            metres = torch.log1p(metres + self.offset_m) / math.log(2)
         return (2 * metres / self._divisor - 1).clamp(-1, 1).float()
 
     def valid_mask(self, image: Tensor) -> Tensor:
@@ -87,9 +106,11 @@ class RangeCodec:
 
     def to_range(self, image: Tensor) -> Tensor:
         """Inverse of the formula for every pixel, float32 metres; negative below an image of -1."""
+        if self.encoding == "inverse":
+            return (2 * self._divisor / (image.double() + 1)).float()
         metres = (image.double() + 1) / 2 * self._divisor
         if self.encoding == "log2":
-            offset = 0.0 if self.legacy_inverse else _LOG_OFFSET_M
+            offset = 0.0 if self.legacy_inverse else self.offset_m
             metres = torch.expm1(metres * math.log(2)) - offset
         return metres.float()
 
@@ -110,11 +131,19 @@ class RangeCodec:
     @property
     def channels(self) -> int:
         """Channels C of an image."""
-        return 2 if self.return_channel else 1
+        return 2 if self.return_channel or self.reflectance else 1
 
-    def to_image(self, range_m: Tensor) -> Tensor:
-        """Image ``(..., C, H, W)`` in [-1, 1] of ranges ``(..., H, W)`` in metres."""
+    def to_image(self, range_m: Tensor, reflectance: Tensor | None = None) -> Tensor:
+        """Image ``(..., C, H, W)`` in [-1, 1] of ranges ``(..., H, W)`` in metres.
+
+        Reflectances ``(..., H, W)`` in [0, 1] are needed where they are the second channel.
+        """
         encoded = self.encode(range_m)
+        if self.reflectance:
+            if reflectance is None:
+                raise ValueError("codec.reflectance needs scans with a reflectance; set it false")
+            second = torch.where(range_m > 0, 2 * reflectance - 1, -1.0)
+            return torch.stack([encoded, second.clamp(-1, 1).to(encoded)], dim=-3)
         if not self.return_channel:
             return encoded.unsqueeze(-3)
         returns = torch.where(range_m > 0, 1.0, -1.0)
@@ -124,7 +153,7 @@ class RangeCodec:
         """Pixels ``(..., 1, H, W)``, bool, with a return in images ``(..., C, H, W)``."""
         if self.return_channel:
             return image[..., 1:, :, :] > 0
-        return self.valid_mask(image)
+        return self.valid_mask(image[..., :1, :, :] if self.reflectance else image)
 
     def informative(self, image: Tensor) -> Tensor:
         """Values, bool ``(..., C, H, W)``, that a decoder has to match: no range without return."""

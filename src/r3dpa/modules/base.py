@@ -16,6 +16,8 @@ from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_r
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
+from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import text_table
 from r3dpa.modules import steps
@@ -364,6 +366,15 @@ class GenerativeModule(L.LightningModule):
         geometry = self.scan_geometry
         image = self.reconstruct(batch["range_image"])
         return geometry.codec.ranges_of(image, geometry.projection.sensor)
+
+    def scene_generator(
+        self, sampler: SamplerConfig, precision: Literal["fp32", "bf16"] = "fp32"
+    ) -> SceneGenerator:
+        """Samples from the averaged weights."""
+        assert self.ema is not None
+        networks = self.vae, self.ema.sit, self.ema.latent_norm
+        geometry, path = self.scan_geometry, self.interpolant.path
+        return SceneGenerator(*networks, geometry, sampler, path, precision)
 
     # Checkpoints
 

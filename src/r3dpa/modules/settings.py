@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -51,7 +52,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, one parameter group per network; constant rate, then linearly to 0 where asked for.
+    """AdamW, one parameter group per network; constant rate, then falling to 0 where asked for.
 
     Args:
         lr: Learning rate.
@@ -61,6 +62,8 @@ class OptimizerConfig:
         warmup_steps: First steps, over which the rate rises linearly.
         decay_steps: Last steps before ``trainer.max_steps``, over which the rate falls linearly to
             0. A run that goes on to more steps starts from a checkpoint before the decay.
+        cosine: Let the rate fall by a half cosine from the end of the warm-up to
+            ``trainer.max_steps`` instead.
     """
 
     lr: float = 1e-4
@@ -69,6 +72,7 @@ class OptimizerConfig:
     eps: float = 1e-8
     warmup_steps: int = 0
     decay_steps: int = 0
+    cosine: bool = False
 
     def adamw(self) -> dict[str, Any]:
         """Arguments of AdamW."""
@@ -79,4 +83,7 @@ class OptimizerConfig:
         """Learning rate of the step after ``step`` optimiser steps, out of ``max_steps``."""
         rising = (step + 1) / max(1, self.warmup_steps + 1)
         falling = (max_steps - step) / max(1, self.decay_steps) if self.decay_steps else 1.0
+        if self.cosine:
+            done = (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)
+            falling = (1 + math.cos(math.pi * min(1.0, max(0.0, done)))) / 2
         return self.lr * max(0.0, min(1.0, rising, falling))

@@ -1,0 +1,334 @@
+"""Efficient U-Net on range images of R2DM and R2Flow, with the angles of the rays as an input.
+
+Letters: B batch, C channels, H x W image size, D width of the time embedding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+
+from r3dpa.nn.layers import CircularConv2d, SelfAttention, Size, zeroed
+
+Encoding = Literal["spherical_harmonics", "polar_coordinates", "fourier_features"]
+_HALF = 1 / math.sqrt(2)  # keeps the variance of a sum of two branches
+_LEVELS = 4
+
+
+class EfficientUNet(nn.Module):
+    """U-Net of R2DM; that of R2Flow is the same with times of a flow.
+
+    Four levels, each half the size of the one before, with attention at the lowest. Columns wrap
+    around, rows are padded with zeros.
+
+    Source: Nakashima and Kurazume, R2DM (ICRA 2024), after Imagen (Saharia et al. 2022).
+
+    Args:
+        in_channels: Channels C of image and output.
+        resolution: Rows and columns of the image.
+        base_channels: Channels at full size.
+        temb_channels: Width D of the time embedding; four times ``base_channels`` where None.
+        channel_multiplier: Channels of the levels, over ``base_channels``.
+        num_residual_blocks: Residual blocks of the levels, on each way.
+        gn_num_groups: Groups of the group norms.
+        gn_eps: Added to their variances.
+        attn_num_heads: Heads of the attention.
+        coords_encoding: How the ray angles enter, see :func:`encode_angles`; None: not at all.
+        ring: Wrap columns around; else they are padded with zeros as well.
+
+    Attributes:
+        coords: ``(1, 2, H, W)`` inclination and azimuth of the rays, radians; those of the upper
+            left pixel corners of an HDL-64E, until other weights or data set them.
+    """
+
+    coords: Tensor
+
+    def __init__(
+        self,
+        in_channels: int,
+        resolution: Size,
+        base_channels: int = 64,
+        temb_channels: int | None = None,
+        channel_multiplier: Sequence[int] = (1, 2, 4, 8),
+        num_residual_blocks: Sequence[int] = (3, 3, 3, 3),
+        gn_num_groups: int = 8,
+        gn_eps: float = 1e-6,
+        attn_num_heads: int = 8,
+        coords_encoding: Encoding | None = "fourier_features",
+        ring: bool = True,
+    ) -> None:
+        super().__init__()
+        counts = len(channel_multiplier), len(num_residual_blocks)
+        if counts != (_LEVELS, _LEVELS) or any(side % 8 for side in resolution):
+            raise ValueError(
+                f"the U-Net has {_LEVELS} levels, and images divisible by 8, got {counts} "
+                f"multipliers and numbers of blocks, and {tuple(resolution)} pixels"
+            )
+        self.in_channels, self.resolution = in_channels, (resolution[0], resolution[1])
+        self.coords_encoding, self.base_channels = coords_encoding, base_channels
+        self.register_buffer("coords", hdl64e_angles(self.resolution))
+        with torch.device("cpu"):
+            known = encode_angles(torch.zeros(1, 2, 1, 1), coords_encoding, self.resolution)
+        width = temb_channels or 4 * base_channels
+        self.time_embedding = nn.Sequential(
+            nn.Linear(base_channels, width), nn.SiLU(), nn.Linear(width, width)
+        )
+        c = [base_channels, *(base_channels * factor for factor in channel_multiplier)]
+        n = num_residual_blocks
+        norm = gn_num_groups, gn_eps
+
+        def block(level: int, ins: int, outs: int, **options: int) -> Block:
+            heads = attn_num_heads if level == _LEVELS - 1 else 0
+            return Block(ins, outs, n[level], width, norm, heads, ring, **options)
+
+        self.in_conv = conv3x3(in_channels + known.shape[1], c[0], ring)
+        self.down = nn.ModuleList(
+            block(level, c[level], c[level + 1], down=2 if level else 1) for level in range(_LEVELS)
+        )
+        # Deepest first; the skip of its own level joins every block but that.
+        self.up = nn.ModuleList(
+            block(
+                level,
+                c[level + 1] * (1 if level == _LEVELS - 1 else 2),
+                c[level],
+                up=2 if level else 1,
+            )
+            for level in reversed(range(_LEVELS))
+        )
+        self.out_conv = zeroed(conv3x3(c[0], in_channels, ring))
+
+    def forward(self, image: Tensor, time: Tensor) -> Tensor:
+        """Prediction ``(B, C, H, W)`` for images at times ``(B,)`` or ``()``, unscaled."""
+        embedding = self.time_embedding(sinusoid(time.expand(len(image)), self.base_channels))
+        angles = encode_angles(self.coords, self.coords_encoding, self.resolution)
+        hidden = torch.cat([image, angles.to(image).expand(len(image), -1, -1, -1)], dim=1)
+        hidden = self.in_conv(hidden)
+        skips: list[Tensor] = []
+        for block in self.down:
+            hidden = block(hidden, embedding)
+            skips.append(hidden)
+        skips.pop()
+        hidden = self.up[0](hidden, embedding)
+        for block in self.up[1:]:
+            hidden = block(torch.cat([hidden, skips.pop()], dim=1), embedding)
+        return self.out_conv(hidden)
+
+
+class Block(nn.Module):
+    """A level: step down, residual blocks, attention, step up; those that it has."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        num_blocks: int,
+        width: int,
+        norm: tuple[int, float],
+        heads: int,
+        ring: bool,
+        down: int = 1,
+        up: int = 1,
+    ) -> None:
+        super().__init__()
+        first = in_channels
+        self.downsample = self.upsample = None
+        if down > 1:
+            conv = conv3x3(in_channels, out_channels, ring)
+            self.downsample = nn.Sequential(conv, Resample(down=(down, down), ring=ring))
+            first = out_channels
+        self.blocks = nn.ModuleList(
+            ResidualBlock(first if i == 0 else out_channels, out_channels, width, norm, ring)
+            for i in range(num_blocks)
+        )
+        self.attention = ImageAttention(out_channels, heads, norm) if heads else None
+        if up > 1:
+            conv = conv3x3(out_channels, out_channels, ring)
+            self.upsample = nn.Sequential(Resample(up=(up, up), ring=ring), conv)
+
+    def forward(self, image: Tensor, embedding: Tensor) -> Tensor:
+        """``(B, C, H, W)`` and ``(B, D)`` to the size after the step."""
+        if self.downsample is not None:
+            image = self.downsample(image)
+        for block in self.blocks:
+            image = block(image, embedding)
+        if self.attention is not None:
+            image = self.attention(image)
+        return image if self.upsample is None else self.upsample(image)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions after group norm and SiLU, the second norm modulated by the time."""
+
+    def __init__(
+        self, in_channels: int, out_channels: int, width: int, norm: tuple[int, float], ring: bool
+    ) -> None:
+        super().__init__()
+        groups, eps = norm
+        self.norm1 = nn.GroupNorm(groups, in_channels, eps)
+        self.conv1 = conv3x3(in_channels, out_channels, ring)
+        self.norm2 = nn.GroupNorm(groups, out_channels, eps, affine=False)
+        self.modulation = nn.Linear(width, 2 * out_channels)
+        self.conv2 = zeroed(conv3x3(out_channels, out_channels, ring))
+        same = in_channels == out_channels
+        self.skip = nn.Identity() if same else nn.Conv2d(in_channels, out_channels, 1)
+
+    def forward(self, image: Tensor, embedding: Tensor) -> Tensor:
+        """``(B, in_channels, H, W)`` and ``(B, D)`` to ``(B, out_channels, H, W)``."""
+        hidden = self.norm2(self.conv1(F.silu(self.norm1(image))))
+        scale, shift = self.modulation(F.silu(embedding))[..., None, None].chunk(2, dim=1)
+        hidden = self.conv2(F.silu(hidden * (1 + scale) + shift))
+        return (self.skip(image) + hidden) * _HALF
+
+
+class ImageAttention(nn.Module):
+    """Multi-head attention between all pixels, added to the image."""
+
+    def __init__(self, channels: int, heads: int, norm: tuple[int, float]) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(norm[0], channels, norm[1])
+        self.mix = SelfAttention(channels, heads)
+        zeroed(self.mix.proj)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to the same shape."""
+        mixed = self.mix(rearrange(self.norm(image), "b c h w -> b (h w) c"))
+        return (image + rearrange(mixed, "b (h w) c -> b c h w", h=image.shape[2])) * _HALF
+
+
+def conv3x3(in_channels: int, out_channels: int, ring: bool) -> nn.Conv2d:
+    """Convolution that keeps the size; with ``ring`` columns wrap around."""
+    if ring:
+        return CircularConv2d(in_channels, out_channels, (3, 3))
+    return nn.Conv2d(in_channels, out_channels, 3, padding=1)
+
+
+class Resample(nn.Module):
+    """Filters rows and columns; keeps every ``down``-th pixel, or inserts zeros first for ``up``.
+
+    The window is symmetric; it is divided by its sum and, for ``up``, multiplied by the factor.
+    """
+
+    def __init__(
+        self,
+        up: Size = (1, 1),
+        down: Size = (1, 1),
+        window: Sequence[float] = (1, 3, 3, 1),
+        ring: bool = True,
+    ) -> None:
+        super().__init__()
+        self.up, self.down, self.ring = up, down, ring
+        self.window = tuple(value / sum(window) for value in window)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to ``(B, C, H up / down, W up / down)``."""
+        for axis in (3, 2):
+            image = self._along(image, axis, self.up[axis - 2], self.down[axis - 2])
+        return image
+
+    def _along(self, image: Tensor, axis: int, up: int, down: int) -> Tensor:
+        size, channels, length = len(self.window), image.shape[1], image.shape[axis]
+        shape = (channels, 1, 1, size) if axis == 3 else (channels, 1, size, 1)
+        kernel = image.new_tensor(self.window).view(1, 1, *shape[2:]).expand(shape)
+        steps = (1, down) if axis == 3 else (down, 1)
+        mode = "circular" if self.ring and axis == 3 else "constant"
+        if up == 1:
+            before, after = (size - down + 1) // 2, (size - down) // 2
+            pads = (before, after, 0, 0) if axis == 3 else (0, 0, before, after)
+            return F.conv2d(F.pad(image, pads, mode=mode), kernel, stride=steps, groups=channels)
+        border = -(-size // up)
+        pads = (border, border, 0, 0) if axis == 3 else (0, 0, border, border)
+        steps = (1, up) if axis == 3 else (up, 1)
+        spread = F.conv_transpose2d(
+            F.pad(image, pads, mode=mode), kernel * up, stride=steps, groups=channels
+        )
+        first = border * up + (size - 1) - (size - up + 1) // 2 - up + 1
+        return spread.narrow(axis, first, length * up)
+
+
+def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
+    """Features ``(B, width)`` of times ``(B,)``: sines, then cosines.
+
+    Frequencies fall from 1 to exactly ``1 / max_period``, unlike those of
+    :func:`r3dpa.nn.velocity_network.time_frequencies`.
+    """
+    half = width // 2
+    exponents = torch.arange(half, device=time.device) / (half - 1)
+    angles = time[:, None] * torch.exp(-math.log(max_period) * exponents)
+    return torch.cat([angles.sin(), angles.cos()], dim=1)
+
+
+def hdl64e_angles(size: Size) -> Tensor:
+    """Angles ``(1, 2, H, W)`` of the upper left pixel corners, +3 to -25 and 180 to -180 degrees.
+
+    Inclination and azimuth in radians, float32.
+    """
+    rows, columns = size
+    inclination = (3 - 28 * torch.arange(rows) / rows).deg2rad()
+    azimuth = (180 - 360 * torch.arange(columns) / columns).deg2rad()
+    return torch.stack(torch.meshgrid(inclination, azimuth, indexing="ij"))[None]
+
+
+def encode_angles(angles: Tensor, encoding: Encoding | None, size: Size) -> Tensor:
+    """Encoded ray angles ``(1, E, H, W)`` of angles ``(1, 2, H, W)``.
+
+    ``fourier_features``: sines, then cosines of the inclination times ``2^k`` for
+    ``k < log2(rows)`` and of the azimuth for ``k < log2(columns)`` of the image of this ``size``;
+    ``spherical_harmonics``: the 25 of degree 4 and less; ``polar_coordinates``: the angles.
+    """
+    if encoding is None:
+        return angles[:, :0]
+    if encoding == "polar_coordinates":
+        return angles
+    if encoding == "spherical_harmonics":
+        return spherical_harmonics(angles)
+    powers = (
+        2.0 ** torch.arange(math.ceil(math.log2(side)), device=angles.device) for side in size
+    )
+    each = [angles[:, i : i + 1] * power[:, None, None] for i, power in enumerate(powers)]
+    phases = torch.cat(each, dim=1)
+    return torch.cat([phases.sin(), phases.cos()], dim=1)
+
+
+def spherical_harmonics(angles: Tensor) -> Tensor:
+    """Real spherical harmonics ``(1, 25, H, W)`` of degrees 0 to 4 in the direction of the rays.
+
+    Orders of a degree run from -l to l. The y axis is that of the official code, to the right.
+    """
+    inclination, azimuth = angles[:, 0], angles[:, 1]
+    x = azimuth.cos() * inclination.cos()
+    y = -azimuth.sin() * inclination.cos()
+    z = inclination.sin()
+    xx, yy, zz = x * x, y * y, z * z
+    pi = math.pi
+    one, two = math.sqrt(3 / (4 * pi)), math.sqrt(15 / (4 * pi))
+    three = [math.sqrt(value / pi) for value in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)]
+    four = [math.sqrt(value / pi) for value in (315 / 16, 315 / 32, 45 / 16, 45 / 32, 9 / 256)]
+    harmonics = [
+        torch.full_like(x, math.sqrt(1 / (4 * pi))),
+        *(one * y, one * z, one * x),
+        *(two * x * y, two * y * z, math.sqrt(5 / (16 * pi)) * (3 * zz - 1), two * x * z),
+        two / 2 * (xx - yy),
+        three[0] * y * (3 * xx - yy),
+        three[1] * x * y * z,
+        three[2] * y * (5 * zz - 1),
+        three[3] * z * (5 * zz - 3),
+        three[2] * x * (5 * zz - 1),
+        three[4] * z * (xx - yy),
+        three[0] * x * (xx - 3 * yy),
+        four[0] * x * y * (xx - yy),
+        four[1] * y * z * (3 * xx - yy),
+        four[2] * x * y * (7 * zz - 1),
+        four[3] * y * z * (7 * zz - 3),
+        four[4] * (35 * zz * zz - 30 * zz + 3),
+        four[3] * x * z * (7 * zz - 3),
+        four[2] / 2 * (xx - yy) * (7 * zz - 1),
+        four[1] * x * z * (xx - 3 * yy),
+        four[0] / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+    ]
+    return torch.stack(harmonics, dim=1)

@@ -1,0 +1,99 @@
+"""From noise to scenes with a baseline, with the interface of :class:`r3dpa.SceneGenerator`."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.generation import SceneBatch, filled, noise_of, scene_indices
+from r3dpa.geometry import ScanGeometry
+
+
+class BaselineGenerator:
+    """Draws scenes from a baseline.
+
+    The random numbers of a scene are a function of (seed, index) alone and are drawn on the CPU,
+    as those of :class:`r3dpa.SceneGenerator` are.
+
+    Args:
+        baseline: Module that knows path, velocity and decoder, see
+            :class:`r3dpa.baselines.base.Baseline`.
+        network: Its network with the weights to sample from, averaged ones as a rule.
+        geometry: Projection and range encoding of the training data.
+        sampler: Solver and steps.
+        precision: ``bf16`` runs the network under autocast; state and solver stay float32.
+        batch_size: Pad smaller batches with zeros, so that the network sees a single shape.
+        compile: Compile the network. Needs ``batch_size``.
+    """
+
+    def __init__(
+        self,
+        baseline: Any,
+        network: nn.Module,
+        geometry: ScanGeometry,
+        sampler: SamplerConfig,
+        precision: Literal["fp32", "bf16"] = "fp32",
+        *,
+        batch_size: int | None = None,
+        compile: bool = False,
+    ) -> None:
+        if compile and batch_size is None:
+            raise ValueError("compiled networks have one shape: give the generator a batch_size")
+        self.baseline, self.network = baseline, network.eval()
+        self.geometry, self.sampler, self.precision = geometry, sampler, precision
+        self.batch_size, self.calls = batch_size, 0
+        self._called: Any = torch.compile(network, dynamic=False) if compile else network
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the network."""
+        return next(self.network.parameters()).device
+
+    def with_sampler(self, sampler: SamplerConfig) -> BaselineGenerator:
+        """The same network with another solver; both may be used."""
+        other = copy.copy(self)
+        other.sampler = sampler
+        return other
+
+    def prepare(self) -> None:
+        """Nothing: the first scene costs what the others do."""
+
+    def velocity(self, x: Tensor, time: Tensor) -> Tensor:
+        """Velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of ``x``."""
+        self.calls += 1
+        half = self.precision == "bf16"
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=half):
+            found = self.baseline.velocity(self._called, x.float(), time.float())
+        return found.to(x.dtype)
+
+    @torch.inference_mode()
+    def generate(self, indices: int | Sequence[int], seed: int = 0) -> SceneBatch:
+        """Draws one scene per index; arguments as of :meth:`r3dpa.SceneGenerator.generate`."""
+        indices = scene_indices(indices)
+        size = self.batch_size or len(indices)
+        if len(indices) > size:
+            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
+        self.calls = 0
+        noises = noise_of(self.baseline.latent_shape, indices, seed)
+        draws = (filled(noise, size).to(self.device) for noise in noises)
+        path = self.baseline.interpolant
+        latents = self.sampler.solve(self.velocity, next(draws), draws, path)[: len(indices)]
+        nfe = self.calls
+        return SceneBatch(self.decode(latents), latents, nfe, self.geometry.projection)
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """Range images ``(B, H, W)``, metres, as in :class:`r3dpa.SceneBatch`, of samples."""
+        image = self.baseline.decode(latents).float().clamp(-1, 1)
+        range_m = self.geometry.codec.ranges_of(image, self.geometry.projection.sensor)
+        finite = image.flatten(1).isfinite().all(dim=1)
+        return torch.where(finite[:, None, None], range_m, torch.nan)
+
+    def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
+        """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""
+        return next(noise_of(self.baseline.latent_shape, indices, seed)).to(self.device)

@@ -1,0 +1,90 @@
+"""Scenes from a checkpoint of any stage: R3DPA's own, or those of the baselines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from r3dpa.baselines.base import Baseline
+from r3dpa.baselines.generator import BaselineGenerator
+from r3dpa.baselines.r2dm import R2DM
+from r3dpa.checkpoints import Checkpoint, read_checkpoint
+from r3dpa.flow.sampler import Quality, SamplerConfig
+from r3dpa.generation import SceneGenerator
+from r3dpa.geometry import ScanGeometry
+from r3dpa.io import usable_device
+
+BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM,)}
+
+
+def scene_generator(
+    checkpoint: str | Path | Checkpoint,
+    sampler: SamplerConfig | Quality | None = None,
+    *,
+    weights: Literal["ema", "last"] = "ema",
+    device: str = "auto",
+    precision: Literal["fp32", "bf16"] = "fp32",
+    batch_size: int | None = None,
+    compile: bool = False,
+    **options: Any,
+) -> SceneGenerator | BaselineGenerator:
+    """Generator of a checkpoint, by the stage that it names.
+
+    Args:
+        checkpoint: File or its content.
+        sampler: Solver and steps, or a quality, which was measured for R3DPA alone. None: ``good``,
+            or the published sampler of a baseline.
+        weights: Averaged or last weights.
+        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        precision: As of both generators, like the next two.
+        batch_size: See there.
+        compile: See there.
+        **options: Further ones of :meth:`r3dpa.SceneGenerator.from_checkpoint`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it cannot be read, or lacks something to sample from.
+    """
+    if not isinstance(checkpoint, Checkpoint):
+        checkpoint = read_checkpoint(checkpoint)
+    shared: dict[str, Any] = {
+        "precision": precision,
+        "batch_size": batch_size,
+        "compile": compile,
+    }
+    if checkpoint.stage not in BASELINES:
+        chosen = sampler or "good"
+        options |= shared
+        return SceneGenerator.from_checkpoint(
+            checkpoint, chosen, weights=weights, device=device, **options
+        )
+    if isinstance(sampler, str):
+        raise ValueError(
+            f"quality {sampler} is not measured for stage {checkpoint.stage}: give --solver and "
+            "--steps, or neither for its published sampler"
+        )
+    if options.get("autoguidance") is not None:
+        raise ValueError(f"autoguidance is not for stage {checkpoint.stage}; leave it out")
+    if checkpoint.geometry is None:
+        raise ValueError(f"{checkpoint.path} does not record which sensor it was trained for")
+    baseline = baseline_of(checkpoint, weights).to(usable_device(device))
+    return BaselineGenerator(
+        baseline,
+        baseline.network,
+        ScanGeometry.from_dict(dict(checkpoint.geometry)),
+        sampler or baseline.published,
+        **shared,
+    )
+
+
+def baseline_of(checkpoint: Checkpoint, weights: Literal["ema", "last"] = "ema") -> Baseline:
+    """Module of a checkpoint of a baseline, with the averaged or the last weights as its network.
+
+    Every other network of the checkpoint goes to the argument of its name.
+    """
+    kind = BASELINES[checkpoint.stage]
+    chosen = "ema_network" if weights == "ema" else "network"
+    networks = {"network": checkpoint.network(chosen).build()}
+    for name in set(checkpoint.networks) - {"network", "ema_network"}:
+        networks[name] = checkpoint.network(name).build()
+    return kind(**networks, **dict(checkpoint.settings)).eval()  # type: ignore[arg-type]
