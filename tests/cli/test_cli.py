@@ -91,7 +91,7 @@ def test_usage_errors_name_the_word(words, message, capsys):
         (["sample", "--ckpt", "no.ckpt", "--out", "x"], "r3dpa sample: no checkpoint file no"),
         (["convert", "no.pt", "x.pt"], "r3dpa convert: no checkpoint file no.pt"),
         (["edit", "vary", "--ckpt", "a", "--scan", "b", "--out", "f"], "r3dpa edit vary: f is a f"),
-        (["fit", "jointly"], "r3dpa fit: there is no experiment 'jointly'; give one of "),
+        (["fit", "jointly"], "r3dpa fit: there is no stage 'jointly'; give one of "),
     ],
 )
 def test_an_error_of_the_process_is_one_line(words, message, monkeypatch, tmp_path):

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 
 import pytest
 import torch
 import torch.nn.functional as F
 
+from r3dpa.baselines.base import AveragedNetwork
+from r3dpa.baselines.diffusion import (
+    DiffusionPath,
+    betas,
+    data_of,
+    forward_step,
+    loss_weight,
+    repaint,
+    sample_errors,
+    target_of,
+    weighted_mean,
+)
 from r3dpa.baselines.efficient_unet import (
     EfficientUNet,
     Resample,
@@ -16,7 +29,19 @@ from r3dpa.baselines.efficient_unet import (
     hdl64e_angles,
     sinusoid,
 )
+from r3dpa.baselines.r2dm import R2DM, ema_decay_at
+from r3dpa.checkpoints import read_checkpoint
 from r3dpa.checkpoints.baselines import efficient_unet_weights
+from r3dpa.flow.sde import ancestral, ancestral_step
+from r3dpa.geometry import (
+    LidarSensor,
+    RangeCodec,
+    RingProjection,
+    SphericalProjection,
+    in_range,
+    range_image,
+    unproject,
+)
 
 PREDICTIONS = ("eps", "v", "x_0")
 
@@ -53,9 +78,13 @@ def activations(network, image, time) -> dict[str, torch.Tensor]:
         "u_block1": network.up[3],
     }
     found = {}
-    for name, module in places.items():
+    hooks = [
         module.register_forward_hook(lambda _, __, out, name=name: found.update({name: out}))
+        for name, module in places.items()
+    ]
     found["y"] = network(image, time)
+    for hook in hooks:
+        hook.remove()
     found["time_embedding.0"] = sinusoid(time, network.base_channels)
     found["coords_encoding"] = encode_angles(
         network.coords, network.coords_encoding, network.resolution
@@ -144,3 +173,371 @@ def roll_error(network, image, time, columns) -> float:
 def size_of(want) -> float:
     """Scale of the README's tolerances: the largest value where that exceeds 1."""
     return max(1.0, want.abs().max().item()) if want.numel() else 1.0
+
+
+# Diffusion
+
+
+@pytest.fixture(scope="module")
+def diffusion(baseline_case, unet):
+    """The case, its network, and noise as the draws of a case's array."""
+    return baseline_case("r2dm_diffusion"), unet.eval()
+
+
+def denoiser(network, path, kind="eps", clip=True):
+    module = R2DM(network, kind, path.schedule, path.shift, clip)
+    return lambda x, time: module.denoise(network, x, time)
+
+
+def velocity_of(network, path, kind="eps"):
+    denoise = denoiser(network, path, kind)
+    return lambda x, time: path.velocity(denoise(x, time), x, time)
+
+
+def check(case, key, found, atol=1e-5):
+    compare_recorded(case, {key: found}, atol, set(case.keys("out/")) - {key})
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "linear", "cosine_shifted"])
+def test_r2dm_diffusion_schedules(diffusion, schedule):
+    case, _ = diffusion
+    shift = 2 * torch.tensor(32 / 64).log().item() if schedule == "cosine_shifted" else 0.0
+    path = DiffusionPath(schedule=schedule.removesuffix("_shifted"), shift=shift)
+    time = case["in/schedule_t"]
+    alpha, sigma, *_ = path.coefficients(time)
+    check(case, f"out/log_snr_{schedule}", path.log_snr(time))
+    check(case, f"out/alpha_{schedule}", alpha)
+    check(case, f"out/sigma_{schedule}", sigma)
+
+
+@pytest.mark.parametrize("kind", PREDICTIONS)
+@torch.no_grad()
+def test_r2dm_diffusion_losses(diffusion, kind):
+    case, network = diffusion
+    path, time = DiffusionPath(), case["in/t"]
+    data, noise, mask = case["in/x_0"], case["in/noise"], case["in/loss_mask"]
+    log_snr = path.log_snr(time)
+    alpha, sigma = (c.view(-1, 1, 1, 1) for c in path.coefficients(time)[:2])
+    noisy = path.interpolate(data, noise, time)
+    prediction, target = network(noisy, log_snr), target_of(kind, data, noise, alpha, sigma)
+    weight = loss_weight(log_snr, kind)
+    check(case, "out/x_t", noisy)
+    check(case, "out/network_condition", log_snr)
+    check(case, "out/prediction", prediction)
+    check(case, f"out/target_{kind}", target)
+    check(case, f"out/loss_weight_{kind}", weight)
+    for norm in ("l2", "l1", "huber"):
+        errors = sample_errors(prediction, target, norm)
+        loss = weighted_mean(errors, weight, official=True)
+        check(case, f"out/loss_{kind}_{norm}", loss)
+    masked = sample_errors(prediction, target, mask=mask)
+    check(case, f"out/loss_{kind}_l2_masked", weighted_mean(masked, weight, official=True))
+    if kind == "eps":
+        errors = sample_errors(prediction, target)
+        check(case, "out/per_sample_mse", errors)
+        plain = loss_weight(log_snr, kind, gamma=None)
+        check(case, "out/loss_eps_l2_no_min_snr", weighted_mean(errors, plain, official=True))
+        check(case, "out/loss_if_weighted_per_sample", weighted_mean(errors, weight))
+
+
+def test_r2dm_diffusion_training_gradients(diffusion):
+    case, network = diffusion
+    module = R2DM(copy.deepcopy(network))
+    data, time = case["in/x_0"], case["in/t"]
+    errors = module.errors(module.network, data, time, case["in/noise"])
+    weights = loss_weight(module.interpolant.log_snr(time), "eps")
+    loss = weighted_mean(errors, weights, official=True)
+    loss.backward()
+    check(case, "out/train/loss", loss)
+    for key in case.keys("out/train/grad/"):
+        found = gradient(module.network, key.removeprefix("out/train/grad/"))
+        check(case, key, found)
+    norms = [p.grad for p in module.network.parameters()]
+    check(case, "out/train/grad_norm", torch.nn.utils.get_total_norm(norms))
+
+
+@pytest.mark.parametrize("kind", PREDICTIONS)
+@torch.no_grad()
+def test_r2dm_diffusion_single_steps(diffusion, kind):
+    case, network = diffusion
+    path, x = DiffusionPath(), case["in/step_x_t"]
+    here, there, draw = case["in/step_t"], case["in/step_s"], case["in/step_noise"]
+
+    def step(eta, clip=True):
+        data = denoiser(network, path, kind, clip)(x, here)
+        return ancestral_step(data, x, here, there, draw, eta=eta, interpolant=path)
+
+    check(case, f"out/step_ddpm_{kind}", step(1.0), 1e-4)
+    check(case, f"out/step_ddim_{kind}", step(0.0), 1e-4)
+    if kind == "eps":
+        check(case, "out/step_ddim_eps_eta0.6", step(0.6), 1e-4)
+        check(case, "out/step_ddpm_eps_noclip", step(1.0, clip=False), 1e-4)
+        moved = forward_step(case["in/x_0"], there, here, draw, path)
+        check(case, "out/q_step", moved, 1e-4)
+
+
+def mostly_equal(found, want):
+    """The README's tolerance where float noise grows 1800 times at t = 1."""
+    error = (found.double() - want.double()).abs()
+    assert error.max() < 1e-2
+    assert (error > 1e-4).double().mean() <= 0.05
+
+
+def states_of(solve, network, path, kind, draws, steps, eta):
+    """States of a sampler, by running its first k steps for each k."""
+    times = torch.linspace(1, 0, steps + 1, dtype=torch.float64)
+    velocity = velocity_of(network, path, kind)
+    states = [draws[0]]
+    for step, end in enumerate(range(1, steps + 1)):
+        rest = draws[1 + step : 2 + step]
+        pair = times[step : end + 1]
+        states.append(solve(velocity, states[-1], pair, rest, eta=eta, interpolant=path))
+    return torch.stack(states)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "eta"),
+    [
+        ("ddpm_v", "v", 1.0),
+        ("ddpm", "eps", 1.0),
+        ("ddim", "eps", 0.0),
+        ("ddim_eta0.5", "eps", 0.5),
+    ],
+)
+def test_r2dm_diffusion_samplers(diffusion, name, kind, eta):
+    case, network = diffusion
+    path, draws = DiffusionPath(), case["in/sample4_draws"]
+    times = torch.linspace(1, 0, len(draws), dtype=torch.float64)
+    velocity = velocity_of(network, path, kind)
+    found = ancestral(velocity, draws[0], times, draws[1:], eta=eta, interpolant=path)
+    if kind == "v":
+        check(case, f"out/sample4_{name}", found, 1e-4)
+    else:
+        mostly_equal(found, case[f"out/sample4_{name}"])
+    if name == "ddpm":
+        states = states_of(ancestral, network, path, kind, draws, len(draws) - 1, eta)
+        assert torch.equal(states[-1], found)
+        mostly_equal(states, case["out/sample4_ddpm_states"])
+
+
+def test_r2dm_diffusion_repaint(diffusion):
+    case, network = diffusion
+    path = DiffusionPath()
+    velocity = velocity_of(network, path)
+    for key in case.keys("out/repaint_T"):
+        name = key.removeprefix("out/repaint_")
+        steps, resamplings, jump = (int(part[1:]) for part in name.split("_"))
+        draws = iter(case[f"in/repaint_draws_{name}"])
+        known, mask = case["in/repaint_known"], case["in/repaint_mask"]
+        found = repaint(velocity, known, mask, draws, path, steps, resamplings, jump)
+        assert next(draws, None) is None  # the number of draws is that of the official code
+        mostly_equal(found, case[key])
+        count = 1 + (steps - 1) * resamplings + 1
+        assert case[f"out/repaint_n_states_{name}"] == count
+
+
+@torch.no_grad()
+def test_r2dm_diffusion_discrete(diffusion):
+    case, network = diffusion
+    steps = case.config["num_training_steps_discrete"]
+    for schedule in ("linear", "cosine", "sigmoid"):
+        beta = betas(schedule, steps)
+        check(case, f"out/discrete100_beta_{schedule}", beta.float())
+        kept = (1 - beta).cumprod(0)
+        check(case, f"out/discrete100_alpha_bar_{schedule}", kept.float())
+    kept = (1 - betas("linear", steps)).cumprod(0)
+    path, number = Discrete(kept), case["in/discrete_steps"]
+    data, noise = case["in/x_0"], case["in/noise"]
+    noisy = path.interpolate(data, noise, number + 1.0)
+    prediction = network(noisy, number.float())
+    weight = loss_weight(torch.logit(kept[number]).float(), "eps")
+    errors = sample_errors(prediction, noise)
+    loss = weighted_mean(errors, weight, official=True)
+    check(case, "out/discrete_loss_eps", loss)
+    x, draw = case["in/step_x_t"], case["in/step_noise"]
+    draw = draw * (number > 0).view(-1, 1, 1, 1)
+    alpha, sigma = (c.view(-1, 1, 1, 1) for c in path.coefficients(number + 1.0)[:2])
+    clean = data_of(network(x, number.float()), "eps", x, alpha, sigma).clamp(-1, 1)
+    for name, eta in (("ddpm", 1.0), ("ddim", 0.0)):
+        found = ancestral_step(
+            clean, x, number + 1.0, number + 0.0, draw, eta=eta, interpolant=path
+        )
+        check(case, f"out/discrete_step_{name}", found, 1e-4)
+
+
+class Discrete(DiffusionPath):
+    """The 100 levels of a table, at times 1 to 100; 0 is data."""
+
+    def __init__(self, kept):
+        super().__init__()
+        object.__setattr__(self, "kept", torch.cat([torch.ones(1), kept.float()]))
+
+    def coefficients(self, time):
+        kept = self.kept[time.long()]
+        return kept.sqrt(), (1 - kept).sqrt(), kept * 0, kept * 0
+
+
+def test_r2dm_diffusion_every_array_is_compared(diffusion, unet_case):
+    """So that a new array of the case is not overlooked."""
+    case, _ = diffusion
+    text = Path(__file__).read_text()
+    stems = ("schedule", "sample4", "repaint", "discrete", "step", "train", "loss", "target")
+    stems += ("log_snr", "alpha", "sigma")
+    rest = [key for key in case.keys("out/") if not key[4:].startswith(stems)]
+    unnamed = [key for key in rest if f'"{key}"' not in text]
+    assert not unnamed
+    count = sum("scale" not in key for key in unet_case.keys("w/"))
+    assert case["out/state_dict_key_count"] > count  # its constants are no weights here
+
+
+# Points and images
+
+
+@pytest.fixture(scope="module")
+def lidar(baseline_case):
+    case = baseline_case("r2dm_r2flow_lidar")
+    config = case.config
+    limits = config["min_depth"], config["max_depth"]
+    return case, LidarSensor(config["H"], config["W"], 3.0, -25.0, *limits)
+
+
+def test_r2dm_r2flow_lidar_projections(lidar):
+    case, sensor = lidar
+    points = case["in/points"]
+    distance = points[:, :3].norm(dim=1, keepdim=True)
+    inside = in_range(points[:, :3], sensor)[:, None].float()
+    values = torch.cat([points, distance, inside], dim=1)
+    rings = RingProjection(sensor, (0.0,) * sensor.beams, legacy_rows=True, legacy_hiding=True)
+    spherical = SphericalProjection(sensor, legacy_hiding=True)
+    for name, projection in (("spherical", spherical), ("unfolding", rings)):
+        range_m, image = range_image(points[:, :3], projection, values)
+        check(case, f"out/{name}_raw", image.permute(1, 2, 0))
+        check(case, f"out/{name}", image * image[5])
+        assert torch.equal(range_m > 0, image[5] == 1)
+
+
+def codecs(sensor):
+    """By names in R2DM and R2Flow."""
+    farthest = torch.tensor(sensor.range_max_m + 1.0).double().log2().item()
+    return {
+        ("log_depth", "logscale"): RangeCodec("log2", farthest, offset_m=0.0),
+        ("inverse_depth", "inverse"): RangeCodec("inverse", sensor.range_min_m),
+        ("depth", "metric"): RangeCodec("linear", sensor.range_max_m),
+    }
+
+
+def test_r2dm_r2flow_lidar_codecs(lidar):
+    """Values in [0, 1] of R2DM and in [-1, 1] of R2Flow, at all pixels and at the limits."""
+    case, sensor = lidar
+    scan = case["out/spherical"][None, 4:5]
+
+    def valid(metric):
+        inside = (metric > sensor.range_min_m) & (metric < sensor.range_max_m)
+        return torch.where(inside, metric, -1.0)
+
+    for (r2dm, r2flow), codec in codecs(sensor).items():
+        for edge, metric, images in (
+            ("", scan, None),
+            ("edge_", case["in/edge_metric"], 2 * case["in/edge_normalized"] - 1),
+        ):
+            encoded = codec.encode(valid(metric))
+            check(case, f"out/r2dm_{edge}convert_{r2dm}", (encoded + 1) / 2)
+            check(case, f"out/r2flow_{edge}convert_{r2flow}", encoded)
+            image = encoded if images is None else images
+            back = codec.decode(image, sensor).clamp(min=0)
+            check(case, f"out/r2dm_{edge}revert_{r2dm}", back)
+            check(case, f"out/r2flow_{edge}restore_{r2flow}", back)
+    check(case, "out/r2dm_mask", (valid(scan) > 0).float())
+
+
+def test_r2dm_r2flow_lidar_rays(lidar):
+    case, sensor = lidar
+    projection = SphericalProjection(sensor)
+    angles = torch.stack(torch.meshgrid(*projection.ray_angles(corner=True), indexing="ij"))
+    check(case, "out/r2dm_ray_angles", angles[None])
+    check(case, "out/r2dm_ray_angles", hdl64e_angles((sensor.beams, sensor.columns)))
+    fine = hdl64e_angles((64, 2048))
+    size = sensor.beams, sensor.columns
+    resized = F.interpolate(fine, size=size, mode="nearest-exact")
+    check(case, "out/ray_angles_resized_from_64x2048", resized)
+    full = hdl64e_angles((64, 1024))[0][:, [0, 1, 63]][..., [0, 1, 512, 1023]]
+    check(case, "out/hdl64e_angles_64x1024_rows0_1_63_cols0_1_512_1023", full)
+    scan = case["out/spherical"][4]
+    inside = (scan > sensor.range_min_m) & (scan < sensor.range_max_m)
+    xyz = unproject(torch.where(inside, scan, -1.0), projection, corner=True).permute(2, 0, 1)
+    check(case, "out/r2dm_to_xyz", xyz[None])
+    check(case, "out/r2flow_convert_cartesian", xyz[None])
+    check(case, "out/r2flow_restore_cartesian", xyz.norm(dim=0)[None, None] * inside)
+
+
+# Checkpoints, average
+
+
+def test_ema(baseline_case):
+    case = baseline_case("ema")
+    config = case.config
+    network = torch.nn.Linear(*case["in/initial_weight"].shape[::-1], bias=False)
+    network.weight.data.copy_(case["in/initial_weight"])
+    network.register_buffer("seen", torch.zeros(case["out/ema_buffer"].shape[1:]))
+    beta, after = config["beta"], config["update_after_step"]
+    average = AveragedNetwork(
+        network, lambda step: ema_decay_at(step, beta, config["update_every"], after)
+    )
+    for step, weight in enumerate(case["in/online_weights"]):
+        network.weight.data.copy_(weight)
+        decay = ema_decay_at(step, beta, 1, after)
+        assert decay == pytest.approx(case["out/decay"][step].item(), abs=1e-6)
+        average.update(network, step)
+        expected = case["out/ema_weights"][step]
+        torch.testing.assert_close(average.network.weight, expected, atol=1e-6, rtol=0)
+
+
+def official_checkpoint(listing, path):
+    """A file in the layout of the released one, with weights of the listed shapes."""
+    weights = {key: torch.zeros(shape) for key, shape in listing["state_dict"].items()}
+    for key in weights:
+        if key.endswith(".scale"):
+            weights[key].fill_(0.5**0.5)
+    rows, columns = weights["model.coords"].shape[2:]
+    weights["model.coords"] = hdl64e_angles((rows, columns))
+    cfg = {
+        "data": {
+            "depth_format": "log_depth",
+            "train_depth": True,
+            "train_reflectance": True,
+            "resolution": (rows, columns),
+        },
+        "model": {
+            "architecture": "efficient_unet",
+            "base_channels": 64,
+            "temb_channels": None,
+            "channel_multiplier": (1, 2, 4, 8),
+            "num_residual_blocks": (3, 3, 3, 3),
+            "gn_num_groups": 8,
+            "gn_eps": 1e-6,
+            "attn_num_heads": 8,
+            "coords_encoding": "fourier_features",
+            "dropout": 0.0,
+        },
+        "diffusion": {
+            "prediction_type": "eps",
+            "noise_schedule": "cosine",
+            "timestep_type": "continuous",
+        },
+    }
+    content = {"cfg": cfg, "weights": weights, "ema_weights": weights, "global_step": 300_000}
+    torch.save(content | {"optimizer": {}, "lr_scheduler": {}}, path)
+    return path
+
+
+def test_r2dm_released_layout_loads_strictly(baseline_listing, tmp_path):
+    listing = baseline_listing("r2dm_state_dicts")["config_h"]
+    path = official_checkpoint(listing, tmp_path / "r2dm-h-kitti360-300k.pth")
+    checkpoint = read_checkpoint(path)
+    with torch.device("meta"):
+        network = checkpoint.network("ema_network").new()
+    assert sum(p.numel() for p in network.parameters()) == listing["param_count"] == 31_099_650
+    assert (checkpoint.stage, checkpoint.step) == ("r2dm", 300_000)
+    codec = checkpoint.geometry["codec"]
+    assert codec["encoding"] == "log2"
+    assert checkpoint.geometry["projection"]["kind"] == "spherical"

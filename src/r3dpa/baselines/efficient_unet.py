@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from einops import rearrange
+from scipy.special import lpmv
 from torch import Tensor, nn
 
 from r3dpa.nn.layers import CircularConv2d, SelfAttention, Size, zeroed
@@ -258,8 +259,8 @@ def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
     :func:`r3dpa.nn.velocity_network.time_frequencies`.
     """
     half = width // 2
-    exponents = torch.arange(half, device=time.device) / (half - 1)
-    angles = time[:, None] * torch.exp(-math.log(max_period) * exponents)
+    step = -math.log(max_period) / (half - 1)
+    angles = time[:, None] * torch.exp(step * torch.arange(half, device=time.device))
     return torch.cat([angles.sin(), angles.cos()], dim=1)
 
 
@@ -300,35 +301,14 @@ def spherical_harmonics(angles: Tensor) -> Tensor:
 
     Orders of a degree run from -l to l. The y axis is that of the official code, to the right.
     """
-    inclination, azimuth = angles[:, 0], angles[:, 1]
-    x = azimuth.cos() * inclination.cos()
-    y = -azimuth.sin() * inclination.cos()
-    z = inclination.sin()
-    xx, yy, zz = x * x, y * y, z * z
-    pi = math.pi
-    one, two = math.sqrt(3 / (4 * pi)), math.sqrt(15 / (4 * pi))
-    three = [math.sqrt(value / pi) for value in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)]
-    four = [math.sqrt(value / pi) for value in (315 / 16, 315 / 32, 45 / 16, 45 / 32, 9 / 256)]
-    harmonics = [
-        torch.full_like(x, math.sqrt(1 / (4 * pi))),
-        *(one * y, one * z, one * x),
-        *(two * x * y, two * y * z, math.sqrt(5 / (16 * pi)) * (3 * zz - 1), two * x * z),
-        two / 2 * (xx - yy),
-        three[0] * y * (3 * xx - yy),
-        three[1] * x * y * z,
-        three[2] * y * (5 * zz - 1),
-        three[3] * z * (5 * zz - 3),
-        three[2] * x * (5 * zz - 1),
-        three[4] * z * (xx - yy),
-        three[0] * x * (xx - 3 * yy),
-        four[0] * x * y * (xx - yy),
-        four[1] * y * z * (3 * xx - yy),
-        four[2] * x * y * (7 * zz - 1),
-        four[3] * y * z * (7 * zz - 3),
-        four[4] * (35 * zz * zz - 30 * zz + 3),
-        four[3] * x * z * (7 * zz - 3),
-        four[2] / 2 * (xx - yy) * (7 * zz - 1),
-        four[1] * x * z * (xx - 3 * yy),
-        four[0] / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
-    ]
-    return torch.stack(harmonics, dim=1)
+    sine, azimuth = angles[:, 0].double().sin().cpu().numpy(), -angles[:, 1].double()
+    found = []
+    for degree in range(5):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            factor = (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m)
+            factor = math.sqrt(factor / math.factorial(degree + m)) * (-1) ** m
+            wave = (m * azimuth).sin() if order < 0 else (m * azimuth).cos()
+            legendre = torch.from_numpy(lpmv(m, degree, sine)).to(azimuth.device)
+            found.append(factor * (math.sqrt(2) if m else 1) * legendre * wave)
+    return torch.stack(found, dim=1).to(angles.dtype)

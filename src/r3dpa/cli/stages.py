@@ -22,6 +22,7 @@ from r3dpa.cli.parser import Parser
 from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
 from r3dpa.modules import GenerativeModule
 
+_STAGES = ("experiment", "baseline")  # folders of their configurations
 # Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, and
 # a process may have no scan.
 _HARMLESS = (
@@ -210,14 +211,15 @@ def _with_preset(words: list[str]) -> list[str]:
         preset = rest[place + 1]
         del rest[place : place + 2]
     conf, demo = conf_folder(), preset == "demo"
-    for folder, name in (("experiment", stage), ("data", preset)):
-        known = [path.stem for path in sorted((conf / folder).glob("*.yaml"))]
+    stages = {p.stem: f"{k}/{p.stem}" for k in _STAGES for p in sorted((conf / k).glob("*.yaml"))}
+    presets = [path.stem for path in sorted((conf / "data").glob("*.yaml"))]
+    for kind, name, known in (("stage", stage, stages), ("data", preset, presets)):
         if name not in known:
-            raise ValueError(f"there is no {folder} {name!r}; give one of {', '.join(known)}")
+            raise ValueError(f"there is no {kind} {name!r}; give one of {', '.join(known)}")
     data = "dead_leaves" if demo and stage in ("image_vae", "rgb_pretraining") else preset
-    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", f"experiment/{stage}"]
-    if demo and (conf / f"experiment/{stage}_demo.yaml").is_file():
-        names.append(f"experiment/{stage}_demo")
+    names = ["trainer", *(["trainer_demo"] if demo else []), f"data/{data}", stages[stage]]
+    if demo and f"{stage}_demo" in stages:
+        names.append(stages[f"{stage}_demo"])
     configs = [word for name in names for word in ("--config", str(conf / f"{name}.yaml"))]
     return [*configs, "--run_dir", f"runs/{preset}/{stage}", *rest]
 

@@ -46,10 +46,12 @@ class SphericalProjection:
         sensor: Image size and field of view.
         legacy_seam: Put points with an azimuth of exactly -pi (y = -0.0 behind the sensor) into
             the last column, as the official code does, and not beside those with +pi.
+        legacy_hiding: Let points outside the range limits hide those behind them, as R2DM does.
     """
 
     sensor: LidarSensor
     legacy_seam: bool = False
+    legacy_hiding: bool = False
 
     def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Row and column ``(...)`` int64 of the range-image pixel of points ``(..., 3)``.
@@ -117,7 +119,9 @@ def range_image(
     """Range image of the nearest return in each pixel.
 
     Points outside the range limits or not finite are dropped, so NaN rows can pad scans to one
-    length. Of points at equal distance the first one wins: the result is deterministic.
+    length; with ``legacy_hiding`` of the projection, points outside the limits win pixels as well,
+    which then have values but no range. Of points at equal distance the first one wins: the result
+    is deterministic.
 
     Args:
         points: ``(P, 3)`` or ``(B, P, 3)`` metres.
@@ -138,14 +142,15 @@ def range_image(
     beams, columns = projection.sensor.beams, projection.sensor.columns
     leading = points.shape[:-2]
     distance = range_of(points)
-    kept = _inside_limits(distance, projection.sensor)
+    inside = _inside_limits(distance, projection.sensor)
+    kept = distance.isfinite() if projection.legacy_hiding else inside
     row, column = projection.pixel_of(points)
     pixel = row * columns + column
     distance = torch.where(kept, distance, math.inf)
 
     nearest = distance.new_full((*leading, beams * columns), math.inf)
     nearest = nearest.scatter_reduce(-1, pixel, distance, "amin")
-    empty = nearest.isinf()
+    empty = ~_inside_limits(nearest, projection.sensor)
     range_m = nearest.masked_fill(empty, EMPTY_RANGE_M).unflatten(-1, (beams, columns))
     if values is None:
         return range_m, None

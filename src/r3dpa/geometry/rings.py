@@ -44,6 +44,9 @@ class RingProjection:
         sensor: Image size and range limits.
         ring_inclinations_deg: H inclinations, first row first, degrees above the horizon; see
             :meth:`fit`.
+        legacy_rows: Count rings from the bottom row, each from where the quadrant falls from the
+            last to the first, as R2DM and R2Flow do; see :func:`unfolded_rows`.
+        legacy_hiding: See :class:`r3dpa.geometry.SphericalProjection`.
 
     Raises:
         ValueError: If there are not H inclinations, or one is outside [-90, 90].
@@ -51,6 +54,8 @@ class RingProjection:
 
     sensor: LidarSensor
     ring_inclinations_deg: tuple[float, ...]
+    legacy_rows: bool = False
+    legacy_hiding: bool = False
 
     def __post_init__(self) -> None:
         # A list, as YAML gives it, would not be hashable.
@@ -114,6 +119,9 @@ class RingProjection:
         if points.ndim == 3:
             rows, columns = zip(*map(self.pixel_of, points), strict=True)
             return torch.stack(rows), torch.stack(columns)
+        if self.legacy_rows:
+            column = column_of(angles_of(points)[1], self.sensor.columns)
+            return unfolded_rows(points, self.sensor.beams), column
         is_return = _is_return(points, self.sensor)
         inclination, azimuth = angles_of(points[is_return])
         row = torch.zeros(len(points), dtype=torch.int64, device=points.device)
@@ -183,6 +191,21 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
         found = f"inclinations within one turn have a deviation of {spread.rad2deg():.1f} degrees"
         raise _not_in_ring_order(found, sensor)
     return ring, num_rings
+
+
+def unfolded_rows(points: Tensor, beams: int) -> Tensor:
+    """Row ``(P,)`` int64 of points ``(P, 3)`` in the released code of R2DM and R2Flow.
+
+    A ring starts where the quadrant falls from the fourth to the first, the point before the first
+    being the last. The last ring has row H - 1, those before it the rows above; one ring too many
+    wraps to the bottom, further ones and points before the first start are in row 0.
+    """
+    x, y = points[:, 0], points[:, 1]
+    quadrant = torch.where(y >= 0, (x < 0).long(), 3 - (x < 0).long())
+    ring = (quadrant.roll(1) - quadrant == 3).long().cumsum(0)
+    row = ring - ring[-1:] + beams - 1
+    wraps = (row == -1) & (ring > 0)
+    return torch.where(wraps, beams - 1, row.clamp(min=0).where(ring > 0, 0))
 
 
 def match_in_order(measured: Tensor, known: Tensor) -> Tensor:
