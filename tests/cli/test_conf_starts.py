@@ -26,6 +26,7 @@ ELSEWHERE = {  # by the test that starts them
     "net/vae_demo",
     "test_stage_cli": "data/points experiment/waffleiron_s",
     "test_documented_commands": "launch/nodes",
+    "test_baselines": " ".join(f"baseline/{path.stem}" for path in CONF.glob("baseline/*.yaml")),
     "part of experiments here": "net/discriminator net/discriminator_demo",
     "test_ablate": " ".join(
         p.relative_to(CONF).with_suffix("").as_posix() for p in CONF.glob("ablation/**/*.yaml")

@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from r3dpa.baselines.base import AveragedNetwork
 from r3dpa.baselines.diffusion import (
     DiffusionPath,
-    betas,
     data_of,
     forward_step,
     loss_weight,
@@ -283,6 +282,18 @@ def mostly_equal(found, want):
     assert (error > 1e-4).double().mean() <= 0.05
 
 
+class RoundedSigma(DiffusionPath):
+    """Sigma as the DDIM step of the released code rounds it.
+
+    There ``1 - alpha^2`` cancels: in float32 the last sigma is a tenth off, which moves one value
+    in twenty by more than 1e-4.
+    """
+
+    def coefficients(self, time):
+        path = super().coefficients(time)
+        return path._replace(sigma=(1 - path.alpha.square()).sqrt())
+
+
 def states_of(solve, network, path, kind, draws, steps, eta):
     """States of a sampler, by running its first k steps for each k."""
     times = torch.linspace(1, 0, steps + 1, dtype=torch.float64)
@@ -306,7 +317,8 @@ def states_of(solve, network, path, kind, draws, steps, eta):
 )
 def test_r2dm_diffusion_samplers(diffusion, name, kind, eta):
     case, network = diffusion
-    path, draws = DiffusionPath(), case["in/sample4_draws"]
+    path = DiffusionPath() if eta == 1 else RoundedSigma()
+    draws = case["in/sample4_draws"]
     times = torch.linspace(1, 0, len(draws), dtype=torch.float64)
     velocity = velocity_of(network, path, kind)
     found = ancestral(velocity, draws[0], times, draws[1:], eta=eta, interpolant=path)
@@ -363,6 +375,18 @@ def test_r2dm_diffusion_discrete(diffusion):
             clean, x, number + 1.0, number + 0.0, draw, eta=eta, interpolant=path
         )
         check(case, f"out/discrete_step_{name}", found, 1e-4)
+
+
+def betas(schedule, steps):
+    """Variances ``(steps,)`` of the discrete schedules, of which none was released."""
+    if schedule == "linear":
+        return torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64)
+    time = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
+    if schedule == "cosine":
+        signal = torch.cos((time + 0.008) / 1.008 * torch.pi / 2).square()
+    else:
+        signal = torch.sigmoid(torch.tensor(3.0)) - torch.sigmoid(6 * time - 3)
+    return (1 - signal[1:] / signal[:-1]).clamp(0, 0.999)
 
 
 class Discrete(DiffusionPath):

@@ -79,7 +79,6 @@ class Baseline(L.LightningModule):
     interpolant: Interpolant
     published: SamplerConfig  #: sampler of the paper or of the released script
     feature_source = None
-    trains_velocity = True
 
     def __init__(
         self,
@@ -133,12 +132,10 @@ class Baseline(L.LightningModule):
         self.augmentation = getattr(datamodule, "augmentation", None)
         sensor = geometry.projection.sensor
         wanted = (geometry.codec.channels, sensor.beams, sensor.columns)
-        with torch.device("meta"):
-            found = self.image_shape()
-        if found != wanted:
+        if self.image_shape() != wanted:
             raise ValueError(
-                f"stage {self.stage} is built for images {found} (channels, rows, columns), but "
-                f"sensor and codec of the data give {wanted}; give both the same"
+                f"stage {self.stage} is built for images {self.image_shape()} (channels, rows, "
+                f"columns), but sensor and codec of the data give {wanted}; give both the same"
             )
 
     def image_shape(self) -> tuple[int, ...]:

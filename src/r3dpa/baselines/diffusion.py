@@ -24,7 +24,6 @@ from r3dpa.flow.times import batch_time, per_sample
 
 Prediction = Literal["eps", "v", "x_0"]
 Schedule = Literal["cosine", "linear"]
-Betas = Literal["linear", "cosine", "sigmoid"]
 _LOG_SNR = 15.0  # of the cosine schedule at both ends
 _LEAST_TIME = 1e-4  # where the rate of the linear schedule vanishes
 
@@ -210,24 +209,3 @@ def forward_step(x: Tensor, here: Tensor, there: Tensor, draw: Tensor, path: Int
     alpha_t, sigma_t, *_ = path.coefficients(per_sample(there, x))
     ratio = alpha_t / alpha_s
     return ratio * x + (sigma_t.square() - (ratio * sigma_s).square()).sqrt() * draw
-
-
-def betas(schedule: Betas, steps: int) -> Tensor:
-    """Variances ``(steps,)`` float64 of the steps of a diffusion in discrete time.
-
-    ``linear`` from 0.1 / steps to 20 / steps (Ho et al. 2020), ``cosine`` (Nichol and Dhariwal
-    2021), ``sigmoid`` (Jabri et al. 2022).
-
-    Raises:
-        ValueError: If the linear schedule has too few steps, so that a variance reaches 1.
-    """
-    if schedule == "linear":
-        if steps <= 20:
-            raise ValueError(f"a linear schedule needs more than 20 steps, got {steps}")
-        return torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64)
-    time = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
-    if schedule == "cosine":
-        signal = torch.cos((time + 0.008) / 1.008 * math.pi / 2).square()
-    else:
-        signal = torch.sigmoid(torch.tensor(3.0)) - torch.sigmoid(6 * time - 3)
-    return (1 - signal[1:] / signal[:-1]).clamp(0, 0.999)

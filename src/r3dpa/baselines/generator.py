@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from r3dpa.baselines.diffusion import repaint
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneBatch, filled, noise_of, scene_indices
 from r3dpa.geometry import ScanGeometry
@@ -93,6 +94,34 @@ class BaselineGenerator:
         range_m = self.geometry.codec.ranges_of(image, self.geometry.projection.sensor)
         finite = image.flatten(1).isfinite().all(dim=1)
         return torch.where(finite[:, None, None], range_m, torch.nan)
+
+    @torch.inference_mode()
+    def complete(
+        self,
+        image: Tensor,
+        known: Tensor,
+        seed: int = 0,
+        *,
+        resamplings: int = 10,
+        jump: int = 1,
+    ) -> SceneBatch:
+        """Completes scenes by RePaint, see :func:`r3dpa.baselines.diffusion.repaint`.
+
+        Args:
+            image: ``(B, C, H, W)`` encoded range images of a baseline whose samples are images.
+            known: ``(B, 1, H, W)`` bool, pixels that are kept.
+            seed: Of the random numbers.
+            resamplings: How often each of the sampler's steps is taken.
+            jump: Ancestral steps within each.
+        """
+        self.calls, baseline = 0, self.baseline
+        noises = noise_of(baseline.latent_shape, range(len(image)), seed)
+        draws = (noise.to(self.device) for noise in noises)
+        image, mask = image.to(self.device), known.to(self.device).float()
+        steps, path = self.sampler.steps, baseline.interpolant
+        found = repaint(self.velocity, image, mask, draws, path, steps, resamplings, jump)
+        nfe = self.calls
+        return SceneBatch(self.decode(found), found, nfe, self.geometry.projection)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""

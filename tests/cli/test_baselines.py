@@ -1,0 +1,148 @@
+"""Every baseline under the commands of r3dpa: fit, sample, test, convert, bench sampling."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from r3dpa.baselines import BASELINES, baseline_of, scene_generator
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.cli import main
+from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.simulation import simulate
+
+#: Settings that make a stage tiny, on 16 x 64 images.
+TINY = {
+    "r2dm": {
+        "network.init_args": {
+            "in_channels": 2,
+            "resolution": [16, 64],
+            "base_channels": 8,
+            "channel_multiplier": [1, 1, 1, 2],
+            "num_residual_blocks": [1, 1, 1, 1],
+            "gn_num_groups": 4,
+            "attn_num_heads": 2,
+        },
+        "ema_after": 0,
+        "ema_every": 1,
+        "optimizer.warmup_steps": 0,
+    },
+}
+SETTINGS = {
+    "data.init_args.num_scans": 12,
+    "data.init_args.sensor.beams": 16,
+    "data.init_args.sensor.columns": 64,
+    "data.init_args.grid_size": "[2, 8]",
+    "data.init_args.batch_size": 2,
+    "data.init_args.num_workers": 0,
+    "trainer.accelerator": "cpu",
+    "trainer.devices": 1,
+    "trainer.precision": "32-true",
+    "trainer.max_steps": 3,
+    "trainer.val_check_interval": 3,
+    "trainer.limit_val_batches": 1,
+    "trainer.logger": "false",
+    "trainer.enable_progress_bar": "false",
+    "trainer.enable_model_summary": "false",
+    "trainer.callbacks": "[{class_path: r3dpa.callbacks.StepGuard}]",
+}
+
+
+def fit_words(command, stage, root, run_dir, *more):
+    settings = SETTINGS | {"data.init_args.root": root, "run_dir": run_dir}
+    for key, value in TINY[stage].items():
+        inner = value if isinstance(value, dict) else {None: value}
+        for name, number in inner.items():
+            dotted = ".".join(filter(None, ("model.init_args", key, name)))
+            settings[dotted] = json.dumps(number)
+    words = [command, stage, "--preset", "demo"]
+    return [*words, *(f"--{key}={value}" for key, value in settings.items()), *more]
+
+
+@pytest.fixture(scope="module", params=TINY)
+def trained(request, smoke_root, tmp_path_factory):
+    """Stage and checkpoint of three steps."""
+    simulate(smoke_root, 12)
+    run_dir = tmp_path_factory.mktemp(request.param)
+    main(fit_words("fit", request.param, smoke_root, run_dir))
+    return request.param, run_dir / "checkpoints" / "last.ckpt"
+
+
+def test_every_baseline_is_tested_here():
+    assert set(TINY) == set(BASELINES)
+
+
+def test_a_checkpoint_is_rebuilt_from_what_it_says(trained):
+    stage, path = trained
+    checkpoint = read_checkpoint(path)
+    assert checkpoint.stage == stage
+    module = baseline_of(checkpoint)
+    assert isinstance(module, BASELINES[stage])
+    assert module.settings() == dict(checkpoint.settings)
+    last = baseline_of(checkpoint, "last")
+    differ = [
+        not torch.equal(a, b)
+        for a, b in zip(module.network.parameters(), last.network.parameters(), strict=True)
+    ]
+    assert any(differ)  # the average lags behind
+
+
+def test_scenes_do_not_depend_on_the_batch(trained):
+    _, path = trained
+    generator = scene_generator(path, SamplerConfig("ddpm", 3), device="cpu")
+    together = generator.generate([0, 1], seed=5)
+    alone = generator.generate([1], seed=5)
+    assert together.nfe == 3
+    torch.testing.assert_close(together.latents[1:], alone.latents, atol=1e-4, rtol=0)
+    assert not torch.equal(together.latents[0], together.latents[1])
+    padded = scene_generator(path, SamplerConfig("ddpm", 3), device="cpu", batch_size=3)
+    found = padded.generate([1], seed=5).latents
+    torch.testing.assert_close(found, alone.latents, atol=1e-4, rtol=0)
+
+
+def test_sample_and_convert(trained, tmp_path):
+    stage, path = trained
+    exported = tmp_path / "weights.safetensors"
+    main(["convert", str(path), str(exported)])
+    words = ["--num", "2", "--pictures", "0", "--solver", "euler", "--steps", "2"]
+    for source, out in ((path, tmp_path / "a"), (exported, tmp_path / "b")):
+        main(["sample", "--ckpt", str(source), "--out", str(out), *words])
+    first, second = (np.load(tmp_path / name / "range_m.npy") for name in "ab")
+    assert first.shape == (2, 16, 64)
+    np.testing.assert_array_equal(first, second)
+    assert json.loads((tmp_path / "b/metadata.json").read_text())["stage"] == stage
+
+
+def test_the_published_sampler_is_the_default(trained):
+    stage, path = trained
+    generator = scene_generator(path, device="cpu")
+    assert generator.sampler == BASELINES[stage].published
+    with pytest.raises(ValueError, match=r"quality good is not measured for stage"):
+        scene_generator(path, "good")
+
+
+@pytest.mark.usefixtures("coarse_protocols")
+def test_test_scores_scenes(trained, smoke_root, tmp_path):
+    stage, path = trained
+    scorer = ["num_scenes=2", "batch_size=2", "allow_few=true", "spaces=[fgeo]"]
+    scorer += ["sampler={solver: euler, steps: 2}"]
+    words = [f"--scorer.{word}" for word in scorer]
+    main(fit_words("test", stage, smoke_root, tmp_path, "--ckpt_path", str(path), *words))
+    found = json.loads((tmp_path / "evaluation/evaluation.json").read_text())
+    assert found["made_with"]["stage"] == stage
+
+
+def test_known_pixels_of_a_completion_stay(trained):
+    _, path = trained
+    generator = scene_generator(path, SamplerConfig("ddpm", 3), device="cpu")
+    image = generator.generate([0]).latents.clamp(-1, 1)
+    known = torch.zeros(1, 1, *image.shape[2:], dtype=torch.bool)
+    known[..., ::2, :] = True
+    found = generator.complete(image, known, seed=1, resamplings=2)
+    assert found.nfe == 2 * 2 + 1
+    # The last state holds the known part at the least noise of the path, 5.5e-4.
+    difference = (found.latents - image).abs()
+    assert difference[..., ::2, :].max() < 5e-3 < difference[..., 1::2, :].max()
