@@ -63,8 +63,9 @@ def scene_generator(
             f"quality {sampler} is not measured for stage {checkpoint.stage}: give --solver and "
             "--steps, or neither for its published sampler"
         )
-    if options.get("autoguidance") is not None:
-        raise ValueError(f"autoguidance is not for stage {checkpoint.stage}; leave it out")
+    for name in ("autoguidance", "decoder"):
+        if options.get(name) not in (None, "full"):
+            raise ValueError(f"{name} is not for stage {checkpoint.stage}; leave it out")
     if checkpoint.geometry is None:
         raise ValueError(f"{checkpoint.path} does not record which sensor it was trained for")
     baseline = baseline_of(checkpoint, weights).to(usable_device(device))

@@ -21,7 +21,7 @@ OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "
 Solver = Literal[OdeSolverName, "euler_maruyama", "ddpm", "ddim", "average_velocity"]
 Quality = Literal["instant", "draft", "good", "best"]
 _INSTANT = {"solver": "average_velocity", "steps": 2, "shift": 1.0}
-_READS = {
+_READS: dict[str, tuple[str, ...]] = {
     "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
     "ddpm": ("shift", "eta"),
     "average_velocity": (),
