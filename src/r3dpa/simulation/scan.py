@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import lambertw
 
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import ECHO_EFFECTS, EFFECTS, RAY_EFFECTS
@@ -92,9 +93,9 @@ def simulate_scan(
     """
     off = check_switches(switches or {})
     sweep = Sweep(scene, sensor)
-    records = [_run(effect, sweep, key, off) for effect in RAY_EFFECTS]
+    records = [run_effect(effect, sweep, key, off) for effect in RAY_EFFECTS]
     sweep.cast()
-    records += [_run(effect, sweep, key, off) for effect in ECHO_EFFECTS]
+    records += [run_effect(effect, sweep, key, off) for effect in ECHO_EFFECTS]
     return SimulatedScan(*_points(sweep), tuple(records), scene)
 
 
@@ -141,9 +142,10 @@ class Simulator:
         return simulate_scan(scene, self.sensor, key, self.switches)
 
 
-def _run(
+def run_effect(
     effect: Effect, sweep: Sweep, key: tuple[int | str, ...], off: Mapping[str, str]
 ) -> EffectRecord:
+    """Run an effect on a sweep if its scene calls for it, see :func:`simulate_scan`."""
     name = effect_name(effect)
     if name in off:
         return EffectRecord(name, "off", "switched off", 0)
@@ -204,3 +206,20 @@ def calibrated_intensity(
     weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
     return np.round((np.sqrt(power * range_m**2) * ramp.clip(max=1)).clip(0, 0.99), 2)
+
+
+def power_of_intensity(
+    intensity: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
+) -> NDArray[np.float32]:
+    """Received power, m^-2, of intensities above 0: the inverse of :func:`calibrated_intensity`.
+
+    Where the intensity is damped, with Lambert's function W and ``L = ln(b / a)``::
+
+        power = a exp(2 W(c / 2))        c = L intensity / (range sqrt(a))
+    """
+    weakest, ramp = _ZERO_INTENSITY * min_power, np.log(_FULL_INTENSITY / _ZERO_INTENSITY)
+    root = intensity / range_m / np.float32(np.sqrt(weakest))  # of power / a, undamped
+    exponent = 2 * np.log(np.maximum(root, np.finfo(np.float32).tiny))
+    damped = np.flatnonzero(exponent < ramp)
+    exponent[damped] = 2 * lambertw(ramp * root[damped] / 2).real
+    return np.float32(weakest) * np.exp(exponent)

@@ -5,6 +5,7 @@ Letters: R shots of the turn, beam after beam (R = H * W); M chosen rays.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.draws import Draws, RayIndex
-from r3dpa.simulation.raycast import cast, normals
+from r3dpa.simulation.raycast import cast, cast_single, normals
 from r3dpa.simulation.scene import Material, Scene, Semantic
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import (
@@ -86,15 +87,28 @@ class Sweep:
     """
 
     def __init__(self, scene: Scene, sensor: SpinningLidar) -> None:
+        origin, direction = (level(array, scene.pose).reshape(3, -1) for array in sensor.rays)
+        self.shape = (sensor.num_beams, sensor.shots)
+        self._begin(scene, sensor, origin, direction, sensor.time_s.reshape(-1))
+
+    def _begin(
+        self,
+        scene: Scene,
+        sensor: SpinningLidar,
+        start: Floats,
+        direction: Floats,
+        time_s: Floats,
+    ) -> None:
+        """State of a turn with these rays before anything is known of their hits."""
         self.scene = scene
         self.sensor = sensor
-        self.shape = (sensor.num_beams, sensor.shots)
-        self.num_rays = sensor.num_beams * sensor.shots
-        origin, direction = (level(array, scene.pose).reshape(3, -1) for array in sensor.rays)
+        self.num_rays = len(time_s)
         zeros = np.zeros(self.num_rays, dtype=np.float32)
-        self.start: Floats = origin  # (3, R) of the rays in the scene frame, metres
-        self.direction: Floats = direction  # (3, R) unit vectors in the scene frame
-        self.time_s: Floats = sensor.time_s.reshape(-1)  # from the middle of the sweep
+        self.start = start  # (3, R) of the rays in the scene frame, metres
+        self.direction = direction  # (3, R) unit vectors in the scene frame
+        self.time_s = time_s  # from the middle of the sweep
+        # Power (R,) of echoes that are known to have been detected; None before the detection.
+        self.recorded_power: Floats | None = None
         self.actor_time_s: Floats | None = None  # when rays meet moving solids; None: at time 0
         self.optical_depth: Floats | None = None  # depth of rays in foliage; None: it is closed
         self.solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
@@ -202,6 +216,39 @@ class Sweep:
     def on_ground(self) -> NDArray[np.int64]:
         """Rays that hit ground on which water can lie: road, pavement, soil."""
         return np.flatnonzero(IS_GROUND[self.material] & (self.first.surface >= GROUND))
+
+    def on_sheets(self) -> NDArray[np.bool_]:
+        """Which rays ``(R,)`` now have an echo of retro-reflecting sheeting."""
+        is_sheet = [p.material is Material.RETROREFLECTOR for p in self.scene.primitives]
+        return self.of_surface(is_sheet, 0, bool)
+
+    def pairs_around(
+        self, rays: NDArray[np.int64], reach_rad: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pairs of a ray and a neighbour; they contain all neighbours within ``reach_rad``."""
+        num_beams, num_shots = self.shape
+        lasers = np.array(self.sensor.lasers.inclination_rad)
+        steepest = min(np.abs(lasers).max() + reach_rad, math.radians(85))
+        # One more on either side: the azimuths of the beams are shifted within a step.
+        reach = math.ceil(reach_rad / math.cos(steepest) * num_shots / (2 * math.pi)) + 1
+        shots = np.arange(-min(reach, (num_shots - 1) // 2), min(reach, num_shots // 2) + 1)
+        level = -lasers
+        beams_around = np.searchsorted(level, level + reach_rad, "right") - np.arange(num_beams)
+        beams = np.arange(1 - beams_around.max(), beams_around.max())
+        beam, shot = np.divmod(rays, num_shots)
+        beam = beam[:, None, None] + beams[:, None]
+        shot = (shot[:, None, None] + shots) % num_shots
+        beside = beam * num_shots + shot
+        inside = np.broadcast_to((beam >= 0) & (beam < num_beams), beside.shape)
+        return np.broadcast_to(rays[:, None, None], beside.shape)[inside], beside[inside]
+
+    def is_open(self, direction: Floats) -> bool:
+        """Whether nothing stands in a direction ``(3,)`` in the middle of the sweep."""
+        nothing = np.full(1, NO_SURFACE, dtype=np.int32)
+        here, towards = self.start.mean(axis=1, keepdims=True), direction[:, None]
+        now, reach_m = np.zeros(1, dtype=np.float32), np.full(1, 1e3)
+        _, surface = cast_single(self.solids, here, towards, now, reach_m, nothing, nothing)
+        return bool(surface[0] == NO_SURFACE)
 
     def of_material(self, material: Material) -> NDArray[np.int64]:
         """Rays that hit a material of the scene; the recording car counts as diffuse."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from r3dpa.simulation.draws import Draws, RayIndex
 from r3dpa.simulation.effects.surface import sheets
-from r3dpa.simulation.raycast import cast_single
-from r3dpa.simulation.scene import Material, Scene
+from r3dpa.simulation.scene import Scene
 from r3dpa.simulation.sensor import SpinningLidar
 from r3dpa.simulation.solids import NO_SURFACE, Floats
 from r3dpa.simulation.sweep import Echoes, Effect, Origin, Sweep
@@ -45,7 +45,8 @@ class SoftRaydrop(Effect):
 
         p_keep = Phi(ln(power / min_power) / w)        1/2 at min_power
 
-    cut off at four spreads. Source: a matched filter's decision on a noisy amplitude.
+    cut off at four spreads. The threshold of a recorded echo is drawn from those that it exceeded.
+    Source: a matched filter's decision on a noisy amplitude.
     """
 
     def called_by(self, scene: Scene, sensor: SpinningLidar) -> str | None:
@@ -64,7 +65,11 @@ class SoftRaydrop(Effect):
 
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         drawn = draws.normal(rays).clip(-MAX_SPREADS, MAX_SPREADS)
-        sweep.min_power[rays] *= np.exp(np.float32(sweep.sensor.threshold_spread) * drawn)
+        spread = np.float32(sweep.sensor.threshold_spread)
+        if sweep.recorded_power is not None:
+            highest = np.log(sweep.recorded_power[rays] / np.float32(sweep.sensor.min_power))
+            drawn = ndtri(ndtr(drawn) * ndtr(highest / spread)).clip(-MAX_SPREADS, highest / spread)
+        sweep.min_power[rays] *= np.exp(spread * drawn)
 
 
 class DetectionLimit(Effect):
@@ -96,6 +101,9 @@ class RangeNoise(Effect):
 
         sigma = sqrt(sigma_0^2 + sigma_w^2 / (2 SNR)),  at most 0.1 m        SNR = power / min_power
 
+    A recorded range already has the noise of its own power; what is added to it is the rest of the
+    variance.
+
     Source: HDL-64E datasheet (accuracy below 2 cm), its driver (2 mm steps).
     """
 
@@ -111,16 +119,23 @@ class RangeNoise(Effect):
         sensor = sweep.sensor
         for echoes in sweep.echoes():
             drawn = draws.normal(rays)
-            weak = np.float32(sensor.weak_range_sigma_m**2 / 2) * np.float32(sensor.min_power)
-            # Shots without a second echo have the power 0.
-            power = np.maximum(echoes.power[rays], np.finfo(np.float32).tiny)
-            variance = np.float32(sensor.range_sigma_m**2) + weak / power
-            sigma = np.sqrt(variance.clip(max=_MAX_SIGMA_M**2))
+            variance = self._variance(echoes.power[rays], sensor)
+            if sweep.recorded_power is not None:
+                known = self._variance(sweep.recorded_power[rays], sensor)
+                variance -= np.where(echoes.origin[rays] == Origin.SURFACE, known, 0)
+            sigma = np.sqrt(variance.clip(min=0))
             range_m = (echoes.range_m[rays] + sigma * drawn).clip(min=0)
             if sensor.range_step_m:
                 step = np.float32(sensor.range_step_m)
                 range_m = np.round(range_m / step) * step
             echoes.range_m[rays] = range_m
+
+    def _variance(self, power: Floats, sensor: SpinningLidar) -> Floats:
+        weak = np.float32(sensor.weak_range_sigma_m**2 / 2) * np.float32(sensor.min_power)
+        # Shots without a second echo have the power 0.
+        power = np.maximum(power, np.finfo(np.float32).tiny)
+        variance = np.float32(sensor.range_sigma_m**2) + weak / power
+        return variance.clip(max=_MAX_SIGMA_M**2)
 
 
 class LaserCalibration(Effect):
@@ -186,7 +201,7 @@ class SunGlare(Effect):
 
     def rays(self, sweep: Sweep) -> RayIndex:
         """Rays within 10 degrees of a visible sun."""
-        if _is_hidden(sweep):
+        if not sweep.is_open(_sun_direction(sweep.scene)):
             return np.empty(0, dtype=np.int64)
         return np.flatnonzero(
             _sun_direction(sweep.scene) @ sweep.direction > math.cos(math.radians(_SUN_REACH_DEG))
@@ -218,15 +233,6 @@ def _sun_direction(scene: Scene) -> np.ndarray:
     azimuth = math.radians(scene.weather.sun_azimuth_deg) - scene.pose.heading_rad
     level, up = math.cos(elevation), math.sin(elevation)
     return np.array([level * math.cos(azimuth), level * math.sin(azimuth), up], dtype=np.float32)
-
-
-def _is_hidden(sweep: Sweep) -> bool:
-    """Whether a solid stands between the sensor and the sun, in the middle of the sweep."""
-    nothing = np.full(1, NO_SURFACE, dtype=np.int32)
-    here, towards = sweep.start.mean(axis=1, keepdims=True), _sun_direction(sweep.scene)[:, None]
-    now, reach_m = np.zeros(1, dtype=np.float32), np.full(1, 1e3)
-    _, surface = cast_single(sweep.solids, here, towards, now, reach_m, nothing, nothing)
-    return bool(surface[0] != NO_SURFACE)
 
 
 @dataclass(frozen=True)
@@ -272,12 +278,10 @@ class Blooming(Effect):
 
     def _likeliest(self, sweep: Sweep) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
         """Rays beside sheeting, the most probable source ray of each, and the probability."""
-        is_sheet = sweep.of_surface(
-            [p.material is Material.RETROREFLECTOR for p in sweep.scene.primitives], 0, bool
-        )
+        is_sheet = sweep.on_sheets()
         bright = np.flatnonzero(is_sheet & (sweep.first.power > 0))
         halo_rad = math.radians(self.halo_deg)
-        source, beside = _pairs(bright, sweep, 2.5 * halo_rad)
+        source, beside = sweep.pairs_around(bright, 2.5 * halo_rad)
         keep = ~is_sheet[beside]
         source, beside = source[keep], beside[keep]
         # The chord of unit vectors; the cosine of so small an angle is lost in float32.
@@ -291,24 +295,3 @@ class Blooming(Effect):
         order = np.lexsort((-chance, beside))
         likeliest = order[np.diff(beside[order], prepend=-1) > 0]
         return beside[likeliest], source[likeliest], chance[likeliest]
-
-
-def _pairs(
-    rays: NDArray[np.int64], sweep: Sweep, reach_rad: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a ray and a neighbour; they contain all neighbours within ``reach_rad``."""
-    num_beams, num_shots = sweep.shape
-    lasers = np.array(sweep.sensor.lasers.inclination_rad)
-    steepest = min(np.abs(lasers).max() + reach_rad, math.radians(85))
-    # One more on either side: the azimuths of the beams are shifted within a step.
-    reach = math.ceil(reach_rad / math.cos(steepest) * num_shots / (2 * math.pi)) + 1
-    shots = np.arange(-min(reach, (num_shots - 1) // 2), min(reach, num_shots // 2) + 1)
-    level = -lasers
-    beams_around = np.searchsorted(level, level + reach_rad, "right") - np.arange(num_beams)
-    beams = np.arange(1 - beams_around.max(), beams_around.max())
-    beam, shot = np.divmod(rays, num_shots)
-    beam = beam[:, None, None] + beams[:, None]
-    shot = (shot[:, None, None] + shots) % num_shots
-    beside = beam * num_shots + shot
-    inside = np.broadcast_to((beam >= 0) & (beam < num_beams), beside.shape)
-    return np.broadcast_to(rays[:, None, None], beside.shape)[inside], beside[inside]
