@@ -18,8 +18,8 @@ from r3dpa.simulation.sensor import SpinningLidar, load_sensor
 from r3dpa.simulation.street import Street
 from r3dpa.simulation.sweep import Echoes, Effect, Origin, Sweep
 
-# Smallest distance of two echoes of one shot, metres.
-_SECOND_RETURN_M = 1.0
+#: Smallest distance of two echoes of one shot, metres.
+SECOND_RETURN_M = 1.0
 # Powers, in units of the weakest that is detected, below which the intensity is 0 and from which on
 # it is not damped.
 _ZERO_INTENSITY, _FULL_INTENSITY = 6.0, 13.0
@@ -165,7 +165,7 @@ def _points(sweep: Sweep) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDAr
     parts = [_export(sweep, first, seen)]
     beams = [seen // sweep.shape[1]]
     if second is not None and sweep.sensor.return_mode == "dual":
-        apart = np.abs(second.range_m[seen] - first.range_m[seen]) > _SECOND_RETURN_M
+        apart = np.abs(second.range_m[seen] - first.range_m[seen]) > SECOND_RETURN_M
         seen = seen[apart & np.isfinite(second.range_m[seen])]
         points, labels, _ = _export(sweep, second, seen)
         parts.append((points, labels, np.full(len(seen), Origin.SECOND_RETURN, dtype=np.uint8)))
@@ -203,15 +203,22 @@ def calibrated_intensity(
     with the received ``power`` in m^-2. Source: fitted to the intensities of KITTI's scans by
     range and incidence.
     """
+    return np.round(damped_intensity(power, range_m, min_power).clip(0, 0.99), 2)
+
+
+def damped_intensity(
+    power: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
+) -> NDArray[np.float32]:
+    """:func:`calibrated_intensity` before it is limited and rounded."""
     weakest, strong = np.float32(_ZERO_INTENSITY * min_power), _FULL_INTENSITY / _ZERO_INTENSITY
     ramp = np.log(np.maximum(power, weakest) / weakest) / np.float32(np.log(strong))
-    return np.round((np.sqrt(power * range_m**2) * ramp.clip(max=1)).clip(0, 0.99), 2)
+    return np.sqrt(power * range_m**2) * ramp.clip(max=1)
 
 
 def power_of_intensity(
     intensity: NDArray[np.float32], range_m: NDArray[np.float32], min_power: float
 ) -> NDArray[np.float32]:
-    """Received power, m^-2, of intensities above 0: the inverse of :func:`calibrated_intensity`.
+    """Received power, m^-2, of intensities above 0: the inverse of :func:`damped_intensity`.
 
     Where the intensity is damped, with Lambert's function W and ``L = ln(b / a)``::
 

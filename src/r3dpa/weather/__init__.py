@@ -1,5 +1,16 @@
 """Weather and faults on scans from files."""
 
 from r3dpa.weather.recorded import RecordedScan
+from r3dpa.weather.recorded_sweep import Instrument
+from r3dpa.weather.rings import Rings, rings_of
+from r3dpa.weather.weather import ADDED_CLASS, Weather, WeatheredScan
 
-__all__ = ["RecordedScan"]
+__all__ = [
+    "ADDED_CLASS",
+    "Instrument",
+    "RecordedScan",
+    "Rings",
+    "Weather",
+    "WeatheredScan",
+    "rings_of",
+]

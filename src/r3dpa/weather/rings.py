@@ -54,11 +54,11 @@ def rings_of(scan: RecordedScan) -> Rings:
         _, ring = np.unique(scan.ring, return_inverse=True)
         return _rings(ring, inclination, azimuth, "stored", 1.0)
     for turned in (azimuth, -azimuth % (2 * np.pi)):
-        ring = _in_order(inclination, turned)
-        if ring is not None:
-            step = np.diff(turned)[np.diff(ring) == 0]
+        in_order = _in_order(inclination, turned)
+        if in_order is not None:
+            step = np.diff(turned)[np.diff(in_order) == 0]
             sure = float((np.abs(step) < _LARGE_STEP_RAD).mean()) if len(step) else 0.0
-            return _rings(ring, inclination, azimuth, "order", sure)
+            return _rings(in_order, inclination, azimuth, "order", sure)
     ring, sure = _by_inclination(inclination)
     return _rings(ring, inclination, azimuth, "inclination", sure)
 

@@ -1,0 +1,248 @@
+"""A recorded scan as a turn that the effects of the simulator can act on.
+
+One ray per point, from the origin of the frame. Of shots without a return nothing is known, so
+that there are no rays for them: no effect gives them an echo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.scan import damped_intensity, power_of_intensity
+from r3dpa.simulation.scene import Material, Scene
+from r3dpa.simulation.sensor import Lasers, SpinningLidar, load_sensor
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, solids_of
+from r3dpa.simulation.sweep import Echoes, Sweep
+from r3dpa.weather.ground import ground_of
+from r3dpa.weather.recorded import RecordedScan
+from r3dpa.weather.rings import angles
+
+# Intensities from this share of the full one on are taken for retro-reflectors.
+_SATURATED = 0.985
+_UNKNOWN_INTENSITY = 0.2
+# Powers of dark points, see ``RecordedSweep``.
+_NEAR_M, _DARK_M, _DARK_SPREAD, _NEAR_DARK = 20.0, 121.0, 0.43, (1.0, 0.6)
+# A sun with a return within this angle is hidden.
+_SUN_RADIUS_RAD = np.radians(0.5)
+_HIGHEST_RAD = np.radians(80)
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What is assumed of the instrument that recorded a scan.
+
+    Args:
+        sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a
+            calibration file or a :class:`SpinningLidar`; its lasers are not used.
+        returns: Which echoes of a shot it reports.
+        full_intensity: Intensity of a white surface in front of it; None: 1, 255, or the largest
+            in instrument units, by the values of each scan.
+        response: ``root``: intensity is the root of the power, corrected for range and damped for
+            weak echoes as in KITTI's scans; ``linear``: proportional to the power, corrected for
+            range, as in calibrated reflectivities.
+    """
+
+    sensor: str | SpinningLidar = "hdl64e"
+    returns: Literal["strongest", "dual"] = "strongest"
+    full_intensity: float | None = None
+    response: Literal["root", "linear"] = "root"
+
+    def __post_init__(self) -> None:
+        full = self.full_intensity
+        if full is not None and not 0 < full < np.inf:
+            raise ValueError(f"full_intensity must be positive, got {full}")
+        for name, choices in (("returns", ("strongest", "dual")), ("response", _RESPONSES)):
+            if getattr(self, name) not in choices:
+                given = getattr(self, name)
+                raise ValueError(f"{name} must be {' or '.join(choices)}, got {given!r}")
+
+    def sensor_for(self, scan: RecordedScan) -> SpinningLidar:
+        """The sensor within whose limits all points of the scan lie."""
+        sensor = load_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
+        range_m = range_of(scan.points)
+        height_m = float(np.mean(sensor.lasers.height_m))
+        highest = float(np.quantile(angles(scan.points)[0], 0.999).clip(max=_HIGHEST_RAD))
+        return replace(
+            sensor,
+            # Only the sun is compared with the highest laser.
+            lasers=Lasers((highest,), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,)),
+            min_range_m=max(min(sensor.min_range_m, float(range_m.min()) - abs(height_m)), 0.0),
+            max_range_m=max(sensor.max_range_m, float(range_m.max()) + abs(height_m)),
+            range_step_m=0.0,
+            return_mode=self.returns,
+        )
+
+
+_RESPONSES = ("root", "linear")
+
+
+class IntensityScale(NamedTuple):
+    """Units of the intensities of a scan."""
+
+    full: float  # of a white surface
+    step: float  # 0 if they are not on a grid
+    known: bool  # False where they are missing or constant
+    text: str
+
+
+def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityScale:
+    """Scale of intensities ``(P,)``: 1 up to 1, 255 up to 255, else the 99.9 % quantile.
+
+    Raises:
+        ValueError: If some are negative.
+    """
+    assumed = f"a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
+    if intensity is None:
+        return IntensityScale(full or 1.0, 0.0, False, f"no intensity: {assumed}")
+    values = intensity.astype(float)
+    low, high = values.min(), values.max()
+    if low < 0:
+        raise ValueError(f"intensity must be 0 or greater, got {low:g}..{high:g}")
+    if low == high:
+        text = f"intensity is {low:g} throughout: {assumed}"
+        return IntensityScale(full or 1.0, 0.0, False, text)
+    found, unit = next(
+        (pair for pair in ((1.0, "0..1"), (255.0, "0..255")) if high <= pair[0]),
+        (float(np.quantile(values, 0.999)), "instrument units"),
+    )
+    found = full or found
+    step = next((s for s in (found / 100, 1.0) if found > s and _on_grid(values, s)), 0.0)
+    steps = f" in steps of {step:g}" if step else ""
+    text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {found:g}"
+    return IntensityScale(found, step, True, text)
+
+
+def _on_grid(values: NDArray[np.float64], step: float) -> bool:
+    places = values / step
+    return bool(np.abs(places - np.round(places)).max() < 1e-3)
+
+
+def range_of(points: NDArray[np.float32]) -> Floats:
+    """Distance of points ``(P, 3)`` from the origin, ``(P,)``."""
+    return np.sqrt((points.astype(float) ** 2).sum(axis=1)).astype(np.float32)
+
+
+class RecordedSweep(Sweep):
+    """The turn in which a scan was recorded, with one ray for each point.
+
+    Powers are those that give the recorded intensities. An intensity of 0 stands for any power up
+    to six times the detection limit; it is drawn, with n from the normal distribution, as::
+
+        ln(power / min_power) = ln(121 m / range) + 0.43 n      from 20 m on
+        ln(power / min_power) = 1.0 + 0.6 n                     nearer
+
+    limited to that interval; fitted to simulated scans. Saturated ones have the power from which on
+    they saturate. Rays start at the mean height of the instrument's optical centres. The time of a
+    shot is that of its column of the file, or else grows with the azimuth.
+
+    Args:
+        scene: Weather, and boxes of moving vehicles.
+        scan: The scan.
+        instrument: What is assumed of its instrument.
+        sensor: ``instrument.sensor_for(scan)``.
+        draws: Of the unknown powers.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        scan: RecordedScan,
+        instrument: Instrument,
+        sensor: SpinningLidar,
+        draws: Draws,
+    ) -> None:
+        # Points at the origin show nothing.
+        self.rays_of = np.flatnonzero(scan.points.any(axis=1))
+        self.points = scan.points[self.rays_of]
+        start = np.zeros_like(self.points.T)
+        start[2] = sensor.lasers.height_m[0]
+        range_m = range_of(self.points - start.T)
+        direction = ((self.points.T - start) / np.maximum(range_m, 1e-6)).astype(np.float32)
+        if scan.time_s is None:
+            turns = angles(self.points)[1] / (2 * np.pi)
+            time_s = ((turns + 0.5) % 1.0 - 0.5) / sensor.spin_hz
+        else:
+            time_s = scan.time_s[self.rays_of].astype(float)
+            time_s -= (time_s.min() + time_s.max()) / 2
+        self._begin(scene, sensor, start, direction, time_s.astype(np.float32))
+        self.solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
+        self.actor_time_s = self.optical_depth = self.second = None
+        self.cos_incidence = self.reflectivity = np.zeros_like(range_m)
+        self.material = np.full(len(range_m), Material.CONCRETE, dtype=np.uint8)
+
+        self.scale = scale_of(scan.intensity, instrument.full_intensity)
+        self.response = instrument.response
+        share = np.full_like(range_m, _UNKNOWN_INTENSITY)
+        if self.scale.known and scan.intensity is not None:
+            share = (scan.intensity[self.rays_of] / self.scale.full).astype(np.float32)
+        self.share = share.clip(max=1)
+        self.recorded_m = range_m
+        self.recorded_power: Floats = self._power(range_m, draws)
+        surface = np.full(len(range_m), NO_SURFACE, dtype=np.int32)
+        origin = np.zeros(len(range_m), dtype=np.uint8)
+        self.first = Echoes(range_m.copy(), self.recorded_power.copy(), surface, origin)
+
+    def _power(self, range_m: Floats, draws: Draws) -> Floats:
+        least = np.float32(self.sensor.min_power)
+        if self.response == "linear":
+            power: Floats = self.share / np.square(range_m)
+        else:
+            power = power_of_intensity(self.share, range_m, self.sensor.min_power)
+        dark = np.flatnonzero(self.share == 0)
+        if len(dark):
+            far = range_m[dark] > _NEAR_M
+            middle = np.where(far, np.log(_DARK_M / range_m[dark]), _NEAR_DARK[0])
+            spread = np.where(far, _DARK_SPREAD, _NEAR_DARK[1])
+            drawn = (middle + spread * draws.normal(dark)).clip(max=np.log(6))
+            power[dark] = least * np.exp(drawn)
+        # Weaker ones could not have been detected.
+        return np.maximum(power, least * np.exp(np.float32(-3 * self.sensor.threshold_spread)))
+
+    def at(self, rays: NDArray[np.int64], range_m: Floats) -> Floats:
+        """Points ``(M, 3)`` of rays at ranges."""
+        return (self.start[:, rays] + range_m * self.direction[:, rays]).T
+
+    def in_units(self, power: Floats, range_m: Floats) -> Floats:
+        """Intensities of powers in the units and steps of the scan; inverse to the recorded."""
+        if self.response == "linear":
+            share = power * np.square(range_m)
+        else:
+            share = damped_intensity(power, range_m, self.sensor.min_power)
+        values: Floats = share.clip(0, 1) * np.float32(self.scale.full)
+        step = np.float32(self.scale.step)
+        return np.round(values / step) * step if step else values
+
+    def rays_near(self, solids: Solids, actor_time_s: Floats | None) -> list[NDArray[np.int64]]:
+        """All rays for each solid."""
+        return [np.arange(self.num_rays)] * len(solids.shape)
+
+    def on_ground(self) -> NDArray[np.int64]:
+        """Rays that hit the plane of the ground in their sector."""
+        is_ground, normal = ground_of(self.points)
+        rays = np.flatnonzero(is_ground)
+        self.cos_incidence = np.abs(np.einsum("pi,ip->p", normal, self.direction))
+        self.material[rays], self.first.surface[rays] = Material.ASPHALT, GROUND
+        return rays
+
+    def on_sheets(self) -> NDArray[np.bool_]:
+        """Rays of a saturated intensity."""
+        return (self.share >= _SATURATED) & self.scale.known
+
+    def pairs_around(
+        self, rays: NDArray[np.int64], reach_rad: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pairs of a ray and a neighbour within ``reach_rad``."""
+        near = cKDTree(self.direction.T).query_ball_point(self.direction.T[rays], reach_rad)
+        count = np.array([len(rays_near) for rays_near in near], dtype=np.int64)
+        beside = np.array([ray for rays_near in near for ray in rays_near], dtype=np.int64)
+        return np.repeat(rays, count), beside
+
+    def is_open(self, direction: Floats) -> bool:
+        """Whether no point lies within half a degree of a direction ``(3,)``."""
+        return bool((direction @ self.direction).max() < np.cos(_SUN_RADIUS_RAD))

@@ -1,0 +1,272 @@
+"""Weather on recorded scans, by the effects of the simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from r3dpa.simulation import scene
+from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.effects import EFFECTS
+from r3dpa.simulation.scan import (
+    SECOND_RETURN_M,
+    EffectRecord,
+    check_switches,
+    effect_name,
+    run_effect,
+)
+from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic, Shape
+from r3dpa.simulation.sweep import Effect, Origin
+from r3dpa.weather.recorded import RecordedScan
+from r3dpa.weather.recorded_sweep import Instrument, RecordedSweep
+
+#: Added points have this class plus their ``Origin``: no data set uses these numbers.
+ADDED_CLASS = 0xFF00
+_HERE = "the scan shows it already"
+#: Why effects cannot act on a recorded scan.
+REFUSED = {
+    "glass": "what stands behind a pane is not in it",
+    "polished_metal": "what a mirror shows is not in it",
+    "foliage_occlusion": "what stands behind leaves is not in it",
+    "moving_actors": "what vehicles hide is not in it",
+    "rolling_shutter": "what the sensor would see from elsewhere is not in it",
+    "mixed_pixels": _HERE,
+    "ego_occlusion": _HERE,
+    "diffuse_reflection": _HERE,
+    "surface_texture": _HERE,
+    "retro_reflection": _HERE,
+    "laser_calibration": _HERE,
+}
+# Instrument effects that every recorded scan has: they run where they are switched on.
+_ON_REQUEST = ("blooming", "range_noise")
+# Whether an echo is detected is asked again where its power has changed.
+_DETECTION = ("soft_raydrop", "detection_limit")
+# Of labels with an instance: KITTI-360, SemanticKITTI.
+_VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
+_CLOUDBURST_MM_H = 300.0
+# A vehicle of fewer points has no box.
+_LEAST_POINTS = 20
+_INSTRUMENT = Instrument()
+
+
+@dataclass(frozen=True)
+class WeatheredScan:
+    """A scan in weather. Letter Q: points, those that stay in the order of the input.
+
+    Args:
+        points: ``(Q, 3)`` float32, those of the input bit for bit unless ``range_noise`` runs;
+            added points last.
+        intensity: ``(Q,)`` in units and type of the input; None if it has none.
+        labels: ``(Q,)`` uint32, ``ADDED_CLASS`` plus the ``Origin`` of added points; None if the
+            input has none.
+        index: ``(Q,)`` number of each point in the input, -1 for added ones.
+        shot: ``(Q,)`` number of the input's point of the same shot.
+        origins: ``(Q,)`` uint8, the ``Origin`` of each point.
+        effects: Which effects ran, and why.
+        report: What was assumed, and counts of points that were lost, moved and added, by cause.
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray | None
+    labels: NDArray[np.uint32] | None
+    index: NDArray[np.int64]
+    shot: NDArray[np.int64]
+    origins: NDArray[np.uint8]
+    effects: tuple[EffectRecord, ...]
+    report: dict[str, object]
+
+
+@dataclass(frozen=True)
+class Weather(scene.Weather):
+    """State of air, sky and road for recorded scans, see :class:`r3dpa.simulation.Weather`.
+
+    ``sun_azimuth_deg`` is counter-clockwise from the scan's x axis. The scan is taken to be one in
+    clear air over a dry road. Nothing is known of shots without a return: they stay empty, also
+    where fog, rain or snow before the sky would give one.
+
+    Args:
+        traffic_m_s: Speed of vehicles that have an instance in the labels, for their spray; they
+            are taken to drive along their length and ahead rather than back.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(5, 40, (1000, 3)).astype(np.float32)
+        >>> weathered = Weather(visibility_m=60).apply(RecordedScan(points))
+        >>> weathered.report["points"], len(weathered.points) > 0
+        (1000, True)
+    """
+
+    traffic_m_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        scene.check_fields(self, "be 0 or greater", "traffic_m_s")
+        for name in ("rain_mm_h", "snow_mm_h"):
+            if (rate := getattr(self, name)) > _CLOUDBURST_MM_H:
+                raise ValueError(f"{name} must be at most {_CLOUDBURST_MM_H:g}, got {rate:g}")
+
+    def apply(
+        self,
+        scan: RecordedScan,
+        seed: int | tuple[int | str, ...] = 0,
+        instrument: Instrument = _INSTRUMENT,
+        boxes: NDArray[np.floating] | None = None,
+        effects: Mapping[str, str | bool] | None = None,
+    ) -> WeatheredScan:
+        """The scan as it would be in this weather.
+
+        Args:
+            scan: The scan.
+            seed: Of the random draws; of each effect they do not depend on the others.
+            instrument: What is assumed of the instrument.
+            boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
+                metres, heading in radians, speed in m/s.
+            effects: ``off`` omits an effect; ``blooming`` and ``range_noise``, which a recorded
+                scan has already, run where they are ``on``.
+
+        Raises:
+            ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
+                intensities cannot be used.
+        """
+        off, wanted = _switched(effects or {})
+        vehicles = _vehicles(boxes)
+        if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
+            vehicles += _labelled_vehicles(scan, self.traffic_m_s)
+        world = Scene(vehicles, Pose(0, 0, 1e-3), weather=self)
+        sensor = instrument.sensor_for(scan)
+        called = [effect for effect in wanted if effect.called_by(world, sensor)]
+        names = {effect_name(effect) for effect in called} - set(off)
+        key = seed if isinstance(seed, tuple) else (seed,)
+        if not names - {*_DETECTION, "dual_return"}:
+            return _unchanged(scan, wanted, off)
+        sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
+        records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
+        return _result(scan, sweep, records)
+
+
+def _switched(effects: Mapping[str, str | bool]) -> tuple[dict[str, str], list[Effect]]:
+    """Effects that are off, and those that may run."""
+    off = check_switches(effects)
+    on = {name for name, switch in effects.items() if switch in ("on", True)}
+    for name in REFUSED.keys() & on:
+        raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
+    left_out = {*REFUSED, *_ON_REQUEST} - on
+    return off, [effect for effect in EFFECTS if effect_name(effect) not in left_out]
+
+
+def _unchanged(scan: RecordedScan, wanted: list[Effect], off: Mapping[str, str]) -> WeatheredScan:
+    every, origins = np.arange(len(scan)), np.zeros(len(scan), dtype=np.uint8)
+    records = tuple(
+        EffectRecord(name, "off" if name in off else "not_called", "nothing calls for it", 0)
+        for name in map(effect_name, wanted)
+    )
+    report = {"points": len(scan), "lost": {}, "moved": 0, "dimmed": 0, "added": {}}
+    return WeatheredScan(
+        scan.points, scan.intensity, scan.labels, every, every, origins, records, report
+    )
+
+
+def _result(
+    scan: RecordedScan, sweep: RecordedSweep, records: tuple[EffectRecord, ...]
+) -> WeatheredScan:
+    """Points of the echoes that are left: the recorded ones, then those of the air."""
+    echoes = list(sweep.echoes())
+    seen = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
+    if len(echoes) > 1:
+        with np.errstate(invalid="ignore"):
+            seen[1] &= np.abs(echoes[1].range_m - echoes[0].range_m) > SECOND_RETURN_M
+        seen[1] &= seen[0]
+    points, intensity = scan.points.copy(), scan.intensity
+    if intensity is not None:
+        intensity = intensity.copy()
+    stays = np.ones(len(scan), dtype=bool)
+    stays[sweep.rays_of] = False
+    added, moved, dimmed = [], 0, 0
+    for echo, is_seen in zip(echoes, seen, strict=True):
+        rays = np.flatnonzero(is_seen & (echo.origin == Origin.SURFACE))
+        stays[sweep.rays_of[rays]] = True
+        away = rays[echo.range_m[rays] != sweep.recorded_m[rays]]
+        points[sweep.rays_of[away]] = sweep.at(away, echo.range_m[away])
+        weaker = rays[echo.power[rays] != sweep.recorded_power[rays]]
+        moved, dimmed = moved + len(away), dimmed + len(weaker)
+        if intensity is not None and sweep.scale.known:
+            faded = sweep.in_units(echo.power[weaker], echo.range_m[weaker])
+            at = sweep.rays_of[weaker]
+            intensity[at] = np.minimum(intensity[at], faded.astype(intensity.dtype))
+        rays = np.flatnonzero(is_seen & (echo.origin != Origin.SURFACE))
+        shown = sweep.in_units(echo.power[rays], echo.range_m[rays])
+        along = sweep.at(rays, echo.range_m[rays])
+        added.append((along, shown, sweep.rays_of[rays], echo.origin[rays]))
+
+    new, shown, shot, made_by = map(np.concatenate, zip(*added, strict=True))
+    kept = np.flatnonzero(stays)
+    labels = scan.labels
+    if labels is not None:
+        labels = np.concatenate([labels[kept], ADDED_CLASS + made_by.astype(np.uint32)])
+    if intensity is not None:
+        shown = shown if sweep.scale.known else np.full(len(new), intensity[0])
+        intensity = np.concatenate([intensity[kept], shown.astype(intensity.dtype)])
+    outshone = np.where(seen[0], echoes[0].origin, Origin.SURFACE)[~stays[sweep.rays_of]]
+    counts = _by_origin(outshone)
+    lost = {"too weak": counts.pop("surface", 0)} | counts
+    report = {
+        "points": len(scan), "intensity": sweep.scale.text, "lost": lost, "moved": moved,
+        "dimmed": dimmed, "added": _by_origin(made_by),
+    }  # fmt: skip
+    return WeatheredScan(
+        np.concatenate([points[kept], new]),
+        intensity,
+        labels,
+        np.concatenate([kept, np.full(len(new), -1)]),
+        np.concatenate([kept, shot]),
+        np.concatenate([np.zeros(len(kept), dtype=np.uint8), made_by]),
+        records,
+        report,
+    )
+
+
+def _by_origin(origins: NDArray[np.uint8]) -> dict[str, int]:
+    """Number of points of each origin that occurs, by its name."""
+    found, counts = np.unique(origins, return_counts=True)
+    return {Origin(o).name.lower(): int(n) for o, n in zip(found, counts, strict=True)}
+
+
+def _vehicles(boxes: NDArray[np.floating] | None) -> tuple[Primitive, ...]:
+    """Boxes ``(N, 8)`` of :meth:`Weather.apply`."""
+    if boxes is None:
+        return ()
+    boxes = np.asarray(boxes, dtype=float)
+    if boxes.ndim != 2 or boxes.shape[1] != 8 or not np.isfinite(boxes).all():
+        raise ValueError(
+            "boxes must be (N, 8) numbers x, y, z, length, width, height, heading, speed, "
+            f"got the shape {boxes.shape}"
+        )
+    return tuple(
+        Primitive(
+            Shape.BOX, (x, y, z), (length / 2, width / 2, height / 2), Semantic.CAR, 0.5, heading,
+            velocity_m_s=(speed * math.cos(heading), speed * math.sin(heading)),
+        )
+        for x, y, z, length, width, height, heading, speed in boxes.tolist()
+    )  # fmt: skip
+
+
+def _labelled_vehicles(scan: RecordedScan, speed_m_s: float) -> tuple[Primitive, ...]:
+    """Boxes around the points of each vehicle, along the longer axis of these."""
+    assert scan.labels is not None
+    boxes = []
+    is_vehicle = np.isin(scan.labels & 0xFFFF, _VEHICLES) & (scan.labels >> 16 > 0)
+    for code in np.unique(scan.labels[is_vehicle]):
+        points = scan.points[scan.labels == code].astype(float)
+        if len(points) < _LEAST_POINTS:
+            continue
+        _, axes = np.linalg.eigh(np.cov(points[:, :2].T))
+        ahead = axes[:, 1] * (1 if axes[0, 1] >= 0 else -1)
+        turn = np.array([[*ahead, 0], [-ahead[1], ahead[0], 0], [0, 0, 1]])
+        low, high = (points @ turn.T).min(axis=0), (points @ turn.T).max(axis=0)
+        size = (high - low).clip(min=0.1)
+        heading = math.atan2(ahead[1], ahead[0])
+        boxes.append([*(turn.T @ ((low + high) / 2)), *size, heading, speed_m_s])
+    return _vehicles(np.array(boxes)) if boxes else ()
