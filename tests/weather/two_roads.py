@@ -1,5 +1,6 @@
 """Two roads to one scan: weather on a recorded clear scan, and weather simulated in its scene."""
 
+import math
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -71,45 +72,48 @@ def figures(shots, points, intensity, labels, origins, clear_shots):
     }
 
 
-def scene_figures(number, sensor, weather):
-    """Figures of one scene in the clear, on the first road, and twice on the second."""
-    street = Street(1000 + number, number % 11, SimulatedWeather(**asdict(CLEAR) | weather))
+def scene_figures(number, sensor, weathers=WEATHERS):
+    """Figures of one scene by weather: clear, on the first road, and twice on the second."""
+    street = Street(1000 + number, number % 11, CLEAR)
     scene = street.scene(37 * number % 400, sensor.mount_height_m)
-    dry = replace(scene, weather=CLEAR)
-    shots, points, intensity, labels, origins = shown(turn(dry, sensor, (number, "clear")))
+    shots, points, intensity, labels, origins = shown(turn(scene, sensor, (number, "clear")))
     scan = RecordedScan(points, intensity, labels=labels)
-    heading = np.degrees(scene.pose.heading_rad)
-    turned = {"sun_azimuth_deg": scene.weather.sun_azimuth_deg - heading}
-    there = Weather(**asdict(scene.weather) | turned).apply(scan, number)
-    labels_there = np.where(there.index < 0, 0, there.labels)
-    made_by = np.where(there.index < 0, there.origins, origins[there.shot])
-    columns = (shots[there.shot], there.points, there.intensity, labels_there, made_by)
-    roads = [figures(*columns, shots)]
-    roads += [figures(*shown(turn(scene, sensor, (number, seed))), shots) for seed in "ab"]
-    return [figures(shots, points, intensity, labels, origins, shots), *roads]
+    clear = figures(shots, points, intensity, labels, origins, shots)
+    turned_deg = math.degrees(scene.pose.heading_rad)
+    result = {}
+    for name, weather in weathers.items():
+        there = Weather(**asdict(CLEAR) | weather).apply(scan, number)
+        labels_there = np.where(there.index < 0, 0, there.labels)
+        made_by = np.where(there.index < 0, there.origins, origins[there.shot])
+        columns = (shots[there.shot], there.points, there.intensity, labels_there, made_by)
+        roads = [clear, figures(*columns, shots)]
+        azimuth_deg = weather.get("sun_azimuth_deg", 0.0) + turned_deg
+        here = SimulatedWeather(**asdict(CLEAR) | weather | {"sun_azimuth_deg": azimuth_deg})
+        for seed in "ab":
+            seen = shown(turn(replace(scene, weather=here), sensor, (number, seed)))
+            roads.append(figures(*seen, shots))
+        result[name] = roads
+    return result
 
 
-def two_roads(weather, sensor, numbers):
+def compared(every):
     """Means over scenes of both roads, and the spread of the second road's two seeds.
 
-    For each figure: ``clear``, ``recorded`` and ``simulated`` are means per scan; ``spread`` the
-    standard deviation over scenes of the difference of two seeds; ``within`` the share of scenes
-    whose recorded figure differs from a simulated one by no more than 95 % of the scenes' two
-    seeds do; ``offset`` the mean difference of the roads in spreads.
+    ``every``: for each scene the figures of one weather. For each figure: ``clear``, ``recorded``
+    and ``simulated`` are means per scan; ``spread`` the standard deviation over scenes of the
+    difference of two seeds; ``within`` the share of scenes whose recorded figure differs from a
+    simulated one by no more than 95 % of the scenes' two seeds do.
     """
-    every = [scene_figures(number, sensor, weather) for number in numbers]
     result = {}
     for name in every[0][0]:
-        clear, recorded, one, other = (
-            np.array([[r[name] for r in roads] for roads in every]).swapaxes(0, 1).astype(float)
-        )
+        roads = np.array([[road[name] for road in scene] for scene in every], dtype=float)
+        clear, recorded, one, other = roads.swapaxes(0, 1)
         limit = np.quantile(np.abs(one - other), 0.95, axis=0)
-        spread = (one - other).std(axis=0)
-        offset = (recorded - (one + other) / 2).mean(axis=0)
         result[name] = {
-            "clear": clear.mean(axis=0), "recorded": recorded.mean(axis=0),
-            "simulated": ((one + other) / 2).mean(axis=0), "spread": spread, "limit": limit,
+            "clear": clear.mean(axis=0),
+            "recorded": recorded.mean(axis=0),
+            "simulated": ((one + other) / 2).mean(axis=0),
+            "spread": (one - other).std(axis=0),
             "within": (np.abs(recorded - one) <= limit).mean(axis=0),
-            "offset": offset / np.maximum(spread, 1e-9),
-        }  # fmt: skip
+        }
     return result

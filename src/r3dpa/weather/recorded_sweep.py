@@ -190,10 +190,9 @@ class RecordedSweep(Sweep):
 
     def _power(self, range_m: Floats, draws: Draws) -> Floats:
         least = np.float32(self.sensor.min_power)
+        power = power_of_intensity(self.share, range_m, self.sensor.min_power)
         if self.response == "linear":
-            power: Floats = self.share / np.square(range_m)
-        else:
-            power = power_of_intensity(self.share, range_m, self.sensor.min_power)
+            power = (self.share / np.square(range_m)).astype(np.float32)
         dark = np.flatnonzero(self.share == 0)
         if len(dark):
             far = range_m[dark] > _NEAR_M
