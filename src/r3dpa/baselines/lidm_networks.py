@@ -1,0 +1,176 @@
+"""Networks of LiDM: vector-quantised autoencoder, discriminators, U-Net without alignment.
+
+Encoder, decoder and U-Net are those of R3DPA, which took them from LiDM. Letters: B batch, C latent
+channels, H x W image size, h x w latent size.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from r3dpa.nn.discriminator import PatchDiscriminator
+from r3dpa.nn.layers import CircularConv2d, WideCircularConv2d, at_least_float32
+from r3dpa.nn.unet import UNet
+from r3dpa.nn.vae import VAE, Posterior
+from r3dpa.nn.velocity_network import time_frequencies
+
+_COMMITMENT = 0.25
+_LEAST_LOGVAR = -30.0
+
+
+class Quantised(NamedTuple):
+    """Nearest codes ``(B, C, h, w)``, their numbers ``(B, h, w)`` and the codebook loss."""
+
+    latents: Tensor
+    indices: Tensor
+    loss: Tensor
+
+
+class Codebook(nn.Module):
+    """Vectors of which each latent pixel takes the nearest.
+
+    Source: van den Oord et al. 2017, as in VQGAN (Esser et al. 2021).
+
+    Args:
+        num_codes: Vectors.
+        channels: Their width C.
+        legacy: Weigh the codes by 0.25 and the encoder by 1, as in the released training; the
+            papers weigh the encoder by 0.25.
+    """
+
+    def __init__(self, num_codes: int, channels: int, legacy: bool = True) -> None:
+        super().__init__()
+        self.embedding = nn.Embedding(num_codes, channels)
+        nn.init.uniform_(self.embedding.weight, -1 / num_codes, 1 / num_codes)
+        self.legacy = legacy
+
+    def forward(self, latents: Tensor) -> Quantised:
+        """Nearest codes of ``(B, C, h, w)``; gradients pass through as if nothing had changed."""
+        latents = at_least_float32(latents)
+        codes, pixels = self.embedding.weight, latents.movedim(1, -1)
+        products = pixels @ codes.T
+        distance = pixels.square().sum(-1, keepdim=True) + codes.square().sum(1) - 2 * products
+        indices = distance.argmin(dim=-1)
+        nearest = self.embedding(indices).movedim(-1, 1)
+        to_codes = (nearest - latents.detach()).square().mean()
+        to_latents = (nearest.detach() - latents).square().mean()
+        weights = (_COMMITMENT, 1.0) if self.legacy else (1.0, _COMMITMENT)
+        loss = weights[0] * to_codes + weights[1] * to_latents
+        return Quantised(latents + (nearest - latents).detach(), indices, loss)
+
+
+class VQAutoencoder(VAE):
+    """First stage of LiDM, whose latents are quantised when they are decoded.
+
+    The diffusion model works on them before that. With ``mask`` the decoder has a second output,
+    below 0 where a pixel is empty.
+
+    Source: Ran et al. (CVPR 2024). State-dict keys are those of the released checkpoints.
+
+    Args:
+        num_codes: Vectors of the codebook.
+        mask: Predict which pixels are empty.
+        channels: Base width.
+        legacy_upsample: Interpolation of the released weights, see :class:`r3dpa.nn.VAE`.
+        legacy_codebook: See :class:`Codebook`.
+        **sizes: Further arguments of :class:`r3dpa.nn.VAE`.
+    """
+
+    def __init__(
+        self,
+        num_codes: int = 16384,
+        mask: bool = False,
+        channels: int = 64,
+        legacy_upsample: bool = True,
+        legacy_codebook: bool = True,
+        **sizes: Any,
+    ) -> None:
+        super().__init__(channels=channels, legacy_upsample=legacy_upsample, **sizes)
+        width = self.latent_channels
+        self.encoder.conv_out = CircularConv2d(self.encoder.conv_out.in_channels, width, (3, 3))
+        self.quant_conv = nn.Conv2d(width, width, 1)
+        self.quantize = Codebook(num_codes, width, legacy_codebook)
+        if mask:
+            self.decoder.conv_out = WideCircularConv2d(channels, 2, (1, 4))
+
+    def encode(self, image: Tensor) -> Posterior:
+        """Latents ``(B, C, h, w)`` of images ``(B, 1, H, W)`` in [-1, 1], with next to no variance.
+
+        They are not quantised: that is part of :meth:`decode`.
+        """
+        self.latent_size((image.shape[-2], image.shape[-1]))
+        latents = self.quant_conv(self.encoder(image))
+        return Posterior(torch.cat([latents, torch.full_like(latents, _LEAST_LOGVAR)], dim=1))
+
+    def image_of(self, prediction: Tensor) -> Tensor:
+        """Images ``(B, 1, H, W)``, -1 where the second channel, if there is one, is below 0."""
+        image, *masks = prediction.split(1, dim=1)
+        return torch.where(masks[0] < 0, -1.0, image) if masks else image
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Images ``(B, 1, H, W)`` of latents ``(B, C, h, w)``, which are quantised first."""
+        return self.image_of(self.predict(self.quantize(latents).latents))
+
+
+class LiDARDiscriminator(PatchDiscriminator):
+    """Patch discriminators ``v1`` and ``v2`` of LiDM: columns wrap, rows keep their number in v1.
+
+    Args:
+        in_channels: Channels of the image; three with x and y from above.
+        channels: Width of the first layer.
+        num_layers: Strided convolutions after the first ones.
+        wide: Version 2, of a larger receptive field.
+    """
+
+    def __init__(
+        self, in_channels: int = 3, channels: int = 64, num_layers: int = 3, wide: bool = False
+    ) -> None:
+        super().__init__(in_channels, channels, num_layers)
+        layers: list[nn.Module] = []
+        for layer in self.main:
+            if isinstance(layer, nn.Conv2d):
+                first = not layers
+                stride = (1, 2) if first or not wide else (2, 2)
+                stride = stride if layer.stride == (2, 2) else (1, 1)
+                layer = _ring(layer, stride)
+                if first and wide:
+                    layers += [layer, nn.LeakyReLU(0.2)]
+                    layer = _ring(nn.Conv2d(channels, channels, 4), (1, 2))
+            layers.append(layer)
+        self.main = nn.Sequential(*layers)
+
+
+def _ring(layer: nn.Conv2d, stride: tuple[int, int]) -> CircularConv2d:
+    pads = (1, 2, 1, 2)
+    ring = CircularConv2d(layer.in_channels, layer.out_channels, (4, 4), stride, pads)
+    nn.init.normal_(ring.weight, 0.0, 0.02)
+    ring.bias = None if layer.bias is None else nn.Parameter(torch.zeros(layer.out_channels))
+    return ring
+
+
+class LiDMUNet(UNet):
+    """U-Net of LiDM, which predicts noise: :class:`r3dpa.nn.UNet` without classes and alignment.
+
+    Args:
+        position_bias: Learned bias on every latent pixel (APE); the released network has none.
+        **sizes: Arguments of :class:`r3dpa.nn.UNet`.
+    """
+
+    def __init__(self, position_bias: bool = False, **sizes: Any) -> None:
+        super().__init__(feature_dim=1, projector_dim=1, **sizes)
+        del self.projector, self.label_emb
+        if not position_bias:
+            self.ape: nn.Module = nn.Identity()
+
+    def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
+        """Embeddings ``(T, E)`` of steps ``(T,)``, 0 to 999 and unscaled."""
+        return self.time_embed(time_frequencies(at_least_float32(time), self.channels))
+
+    def forward(  # type: ignore[override]
+        self, latents: Tensor, time: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
+        """Noise ``(B, C, h, w)`` in latents of that shape at steps ``(B,)``."""
+        return self.velocity(latents, time)

@@ -1,0 +1,379 @@
+"""LiDM against recorded numbers: first stage, U-Net, diffusion, and the released layout."""
+
+from __future__ import annotations
+
+
+import pytest
+import torch
+from recorded_networks import weights_of
+
+from r3dpa.baselines.lidm import LiDM, StepPath, inpaint, released_times
+from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
+from r3dpa.baselines.lidm_networks import LiDARDiscriminator, LiDMUNet, VQAutoencoder
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.flow.sde import ancestral, ancestral_step
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.nn import PatchDiscriminator
+from r3dpa.nn.velocity_network import time_frequencies
+
+# Factors that cases.json does not list, of the released configuration.
+ADVERSARIAL, START, DEPTH_SCALE = 0.6, 1, 5.84
+
+
+# --- U-Net and diffusion ---
+
+
+@pytest.fixture(scope="module")
+def unet_case(baseline_case):
+    return baseline_case("lidm_unet")
+
+
+@pytest.fixture(scope="module")
+def lidm(unet_case):
+    config = unet_case.config
+    reductions = [2**level for level in range(len(config["channel_mult"]))]
+    unet = LiDMUNet(
+        input_size=tuple(config["image_size"]),
+        in_channels=config["in_channels"],
+        channels=config["model_channels"],
+        channel_multipliers=config["channel_mult"],
+        num_res_blocks=config["num_res_blocks"],
+        head_channels=config["num_head_channels"],
+        attention_resolutions=[r for r in reductions if r in config["attention_resolutions"]],
+    )
+    unet.load_state_dict(unet_case.weights())
+    sizes = {"latent_channels": config["in_channels"], "channels": 32, "num_codes": 4}
+    betas = {"first_beta": config["linear_start"], "last_beta": config["linear_end"]}
+    return LiDM(unet, VQAutoencoder(**sizes), **betas)
+
+
+def of_network(case, lidm) -> dict:
+    unet, seen, hooks = lidm.network, {}, []
+    for key in case.keys("out/act/"):
+        name = key.removeprefix("out/act/")
+        hooks.append(
+            unet.get_submodule(name).register_forward_hook(
+                lambda *given, key=key: seen.__setitem__(key.removeprefix("out/"), given[2])
+            )
+        )
+    x, time = case["in/x"], case["in/t"]
+    with torch.no_grad():
+        y = unet(x, time)
+        for hook in hooks:
+            hook.remove()
+        stride = 2 ** (len(case.config["channel_mult"]) - 1)
+        turned = [
+            (unet(x.roll(by, -1), time).roll(-by, -1) - y).abs().max().item() for by in (1, stride)
+        ]
+    # By the total stride the network commutes to rounding; by 1 it does not, by as much.
+    assert turned[1] < 2e-5
+    return seen | {
+        "y": y,
+        "t_emb": time_frequencies(time.float(), unet.channels),
+        "roll_max_err": torch.tensor([turned[0], case["out/roll_max_err"][1].item()]),
+        "n_parameters": sum(p.numel() for p in unet.parameters()),
+    }
+
+
+def of_losses(case, lidm) -> dict:
+    unet, path = lidm.network, lidm.interpolant
+    data, noise, step = case["in/x_0"], case["in/noise"], case["in/loss_t"]
+    time = (step / path.num_steps).double()
+    results = {"q_sample": path.interpolate(data, noise, time)}
+    for norm in ("l2", "l1"):
+        lidm.norm = norm
+        errors = lidm.errors(unet, data, time, noise)
+        loss = errors.mean()
+        results[f"loss_{norm}"] = results[f"loss_{norm}_simple"] = loss
+        results[f"loss_{norm}_vlb"] = lidm.bound(errors, time).mean()
+        if norm == "l2":
+            unet.zero_grad()
+            loss.backward()
+    lidm.norm = "l2"
+    for key in case.keys("out/grad/"):
+        name = key.removeprefix("out/grad/")
+        results[f"grad/{name}"] = unet.get_parameter(name).grad
+    norms = [p.grad.norm() for p in unet.parameters() if p.grad is not None]
+    return results | {"grad_norm": torch.stack(norms).norm()}
+
+
+def of_schedule(case, lidm) -> dict:
+    """The posterior is what our ancestral step makes of a unit of data, state or noise."""
+    path, index = lidm.interpolant, case["out/schedule_index"]
+    one, none = torch.ones(len(index), 1, dtype=torch.float64), torch.zeros(len(index), 1).double()
+    here, there = index.double() / path.num_steps, (index.double() - 1) / path.num_steps
+    first = (index == 0)[:, None]
+
+    def posterior(data, x, draw):
+        stepped = ancestral_step(data, x, here, there.clamp(min=0), draw, interpolant=path)
+        return torch.where(first, data, stepped)[:, 0]  # before step 0 there is the data alone
+
+    variance = posterior(none, none, one).square()
+    signal = path.signal
+    before = torch.cat([torch.ones(1).double(), signal[:-1]])
+    return {
+        "schedule_index": index,
+        "schedule/betas": path.betas[index],
+        "schedule/alphas_cumprod": signal[index],
+        "schedule/alphas_cumprod_prev": before[index],
+        "schedule/posterior_variance": variance,
+        "schedule/posterior_log_variance_clipped": torch.where(
+            index == 0, variance_of_second(path), variance
+        ).log(),
+        "schedule/posterior_mean_coef1": posterior(one, none, none),
+        "schedule/posterior_mean_coef2": posterior(none, one, none),
+        "schedule/lvlb_weights": path.bound_weights()[index],
+        "schedule/sqrt_recipm1_alphas_cumprod": (1 / signal[index] - 1).sqrt(),
+    }
+
+
+def variance_of_second(path):
+    """What official logarithms have in place of the variance 0 of the first step."""
+    none, one = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
+    here = torch.full((1,), 1 / path.num_steps).double()
+    return ancestral_step(none, none, here, 0 * here, one, interpolant=path).square()[0]
+
+
+def of_samplers(case, lidm) -> dict:
+    path, unet = lidm.interpolant, lidm.network
+
+    def velocity(x, time):
+        with torch.no_grad():
+            return lidm.velocity(unet, x, time)
+
+    x, step = case["in/step_x"], case["in/t"]
+    here = step / path.num_steps
+    data = path.denoise(velocity(x, here), x, here)
+    results = {}
+    for name, clean in (("p_sample", data), ("p_sample_clipped", data.clamp(-1, 1))):
+        there = ((step - 1) / path.num_steps).clamp(min=0)
+        draw = case["in/step_noise"]
+        stepped = ancestral_step(clean, x, here, there, draw, interpolant=path)
+        results[name] = torch.where((step == 0)[:, None, None, None], clean, stepped)
+    for key in case.keys("out/ddim_timesteps_"):
+        name = key.removeprefix("out/ddim_timesteps_")
+        num, eta = int(name[1 : name.index("_")]), float(name[name.index("eta") + 3 :])
+        times = released_times(num)
+        steps = (times * path.num_steps).round().long()
+        a_t, a_s = path.signal[steps[:-1]], path.signal[steps[1:]]
+        sigma = eta * ((1 - a_s) / (1 - a_t) * (1 - a_t / a_s)).sqrt()
+        results[f"ddim_timesteps_{name}"] = steps[:-1].flip(0)
+        results[f"ddim_alphas_{name}"] = a_t.flip(0)
+        results[f"ddim_alphas_prev_{name}"] = a_s.flip(0)
+        results[f"ddim_sigmas_{name}"] = sigma.flip(0)
+        draws = iter(case[f"in/ddim_draws_{name}"]) if eta else ()
+        found = [case["in/ddim_x_T"]]
+        options = {"eta": eta, "interpolant": path}
+        for index in range(num):
+            found.append(ancestral(velocity, found[-1], times[index : index + 2], draws, **options))
+        results[f"ddim_{name}"] = found[-1]
+        if f"out/ddim_states_{name}" in case:
+            results[f"ddim_states_{name}"] = torch.stack(found)
+    results["ddim_masked"] = inpaint(
+        velocity,
+        case["in/ddim_x_T"],
+        case["in/ddim_mask_x0"],
+        case["in/ddim_mask"],
+        released_times(len(case["in/ddim_masked_q_noises"])),
+        iter(case["in/ddim_masked_q_noises"]),
+        path,
+    )
+    return results
+
+
+def of_average(case, lidm) -> dict:
+    average, weight = case["in/ema_before"], case["in/ema_model"]
+    results = {"ema_num_updates": 2}
+    for step in range(2):
+        average = torch.lerp(average, weight, 1 - lidm.ema.decay(step))
+        results[f"ema_after_{step + 1}"] = average
+    return results
+
+
+def test_unet(unet_case, lidm, compare):
+    results = {}
+    for part in (of_network, of_losses, of_schedule, of_samplers, of_average):
+        results |= part(unet_case, lidm)
+    compare(
+        unet_case,
+        {f"out/{key}": value for key, value in results.items()},
+        tolerance=lambda key, expected: {
+            "atol": 2e-5 * max(1.0, expected.abs().max().item()),
+            "rtol": 0,
+        },
+    )
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(4, 4), (16, 17), (64, 67), (128, 143), (250, 250)])
+def test_steps_of_ddim(asked, taken):
+    assert len(released_times(asked)) == taken + 1
+    assert (released_times(asked) * 1000).round()[-2:].tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("asked", [3, 256])
+def test_steps_that_crash_officially_are_refused(asked):
+    with pytest.raises(ValueError, match=f"cannot take {asked} of 1000 steps.*give a divisor"):
+        released_times(asked)
+
+
+# --- first stage ---
+
+
+@pytest.fixture(scope="module")
+def stage_case(baseline_case):
+    return baseline_case("lidm_first_stage")
+
+
+def autoencoder_of(config) -> VQAutoencoder:
+    given = config["ddconfig"]
+    return VQAutoencoder(
+        num_codes=config["n_embed"],
+        mask=config["use_mask"],
+        channels=given["ch"],
+        in_channels=given["in_channels"],
+        latent_channels=given["z_channels"],
+        channel_multipliers=tuple(given["ch_mult"]),
+        strides=tuple(map(tuple, given["strides"])),
+        num_res_blocks=given["num_res_blocks"],
+        attention_levels=tuple(given["attn_levels"]),
+    )
+
+
+def stage_of(case, variant) -> LiDMFirstStage:
+    options = case.config["loss_variants"][variant]
+    weights = case.weights(f"w_{variant}/discriminator.")
+    sizes = {
+        "in_channels": options["disc_in_channels"],
+        "channels": len(weights["main.0.weight"]),
+        "num_layers": options["disc_num_layers"],
+    }
+    if options["disc_version"] == "v0":
+        discriminator = PatchDiscriminator(**sizes)
+    else:
+        discriminator = LiDARDiscriminator(**sizes, wide=options["disc_version"] == "v2")
+    discriminator.load_state_dict(weights)
+    network = autoencoder_of(case.config)
+    network.load_state_dict(case.weights())
+    stage = LiDMFirstStage(
+        network,
+        discriminator,
+        mask_factor=options["mask_factor"],
+        geometry_factor=options["geo_factor"],
+        adversarial=ADVERSARIAL,
+        adversarial_start=START,
+        curve_length=options["curve_length"],
+    )
+    stage.geometry = geometry_of(case.config)
+    return stage
+
+
+def geometry_of(config) -> ScanGeometry:
+    sensor = LidarSensor(*config["size"], *config["fov"])
+    codec = RangeCodec("log2", DEPTH_SCALE, legacy_inverse=True)
+    return ScanGeometry(SphericalProjection(sensor), codec, (2, 4))
+
+
+def of_variant(case, variant) -> dict:
+    image, returns = case["in/x"], case["in/mask"]
+    results = {}
+    for step in range(3):
+        stage = stage_of(case, variant)
+        network = stage.network
+        quantised = network.quantize(network.encode(image).mean)
+        prediction = network.predict(quantised.latents)
+        parts = stage.reconstruction(image, prediction, returns)
+        error = torch.stack(list(parts.values())).sum()
+        weight, loss = stage.adversarial_loss(prediction, error)
+        factor = float(stage.is_adversarial(step))
+        total = error + weight * factor * loss + quantised.loss
+        total.backward()
+        found = {
+            f"gen_{name}_rec_loss": parts.get(ours, torch.zeros(())) * len(parts)
+            for name, ours in (("pix", "reconstruction"), ("geo", "geometry"), ("mask", "mask"))
+        }
+        found |= {
+            "gen_total_loss": total,
+            "gen_quant_loss": quantised.loss,
+            "gen_rec_loss": error,
+            "gen_d_weight": weight,
+            "gen_disc_factor": factor,
+            "gen_g_loss": loss,
+        }
+        for key in case.keys(f"out/{variant}/step{step}/grad/"):
+            name = key.rpartition("/")[2]
+            found[f"grad/{name}"] = network.get_parameter(name).grad
+        assert all(p.grad is None for p in stage.discriminator.parameters())
+        penalty = factor * stage.discriminator_loss(image, prediction, returns)
+        penalty.backward()
+        more = (returns,) if stage.mask_factor else ()
+        found |= {
+            "disc_disc_loss": penalty,
+            "disc_logits_real": stage.logits(image, *more).mean(),
+            "disc_logits_fake": stage.logits(prediction).mean(),
+            "disc_grad_first": stage.discriminator.main[0].weight.grad,
+        }
+        results |= {f"{variant}/step{step}/{name}": value for name, value in found.items()}
+    return results | {
+        f"{variant}/rec_scale": len(parts),
+        f"{variant}/coord_of_input": stage.coordinates(image),
+    }
+
+
+def test_first_stage(stage_case, compare):
+    case = stage_case
+    network = autoencoder_of(case.config)
+    network.load_state_dict(case.weights())
+    latents = network.encode(case["in/x"]).mean
+    quantised = network.quantize(latents)
+    # The recorded margins are of the codes: how far the second-best code is.
+    codes, pixels = network.quantize.embedding.weight.double(), {}
+    for name, values in (("index_margin", latents), ("z_index_margin", case["in/z"])):
+        distance = torch.cdist(values.double().movedim(1, -1).flatten(0, 2), codes).square()
+        best, second = distance.topk(2, largest=False).values.unbind(1)
+        pixels[name] = (second - best).min()
+    results = pixels | {
+        "prequant": latents,
+        "quant": quantised.latents,
+        "quant_loss": quantised.loss,
+        "indices": quantised.indices.flatten(),
+        "rec": network.predict(quantised.latents),
+        "interface_decode": network.decode(case["in/z"]),
+        "interface_decode_no_quantize": network.image_of(network.predict(case["in/z"])),
+        "n_parameters": sum(p.numel() for p in network.parameters()),
+    }
+    for variant in case.config["loss_variants"]:
+        results |= of_variant(case, variant)
+    stage = stage_of(case, "released")
+    for length in (1, 4):
+        stage.curve_length = length
+        results[f"geo_curve{length}"] = stage.coordinates(case["in/x"])
+    results["geo_bev"] = results["geo_curve1"][:, :2]
+
+    def tolerance(key, expected):
+        of_weight = key.endswith(("d_weight", "total_loss")) or "/grad/" in key
+        return {
+            "atol": (1e-4 if of_weight else 1e-5) * max(1.0, expected.abs().max().item()),
+            "rtol": 0,
+        }
+
+    compare(case, {f"out/{key}": value for key, value in results.items()}, tolerance=tolerance)
+
+
+def test_geometry_as_meant_reads_empty_pixels_as_the_least_range(stage_case):
+    stage, empty = stage_of(stage_case, "geometry"), torch.full((1, 1, 16, 64), -1.0)
+    nearest = stage.coordinates(empty).norm(dim=1)
+    assert nearest.mean().item() == pytest.approx(2 ** (DEPTH_SCALE / 2 * 1) - 1, rel=1e-4)
+    stage.released_geometry = False
+    assert stage.coordinates(empty).norm(dim=1).mean().item() == pytest.approx(1.0, rel=1e-4)
+
+
+def test_the_codebook_as_meant_swaps_the_weights(stage_case):
+    network = autoencoder_of(stage_case.config)
+    network.load_state_dict(stage_case.weights())
+    codebook, latents = network.quantize, stage_case["out/prequant"]
+    released = codebook(latents).loss
+    codes = torch.autograd.grad(released, codebook.embedding.weight)[0]
+    codebook.legacy = False
+    meant = codebook(latents).loss
+    torch.testing.assert_close(meant, released)
+    assert torch.allclose(torch.autograd.grad(meant, codebook.embedding.weight)[0], 4 * codes)
