@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
 from recorded_networks import weights_of
 
-from r3dpa.baselines.lidm import LiDM, StepPath, inpaint, released_times
+from r3dpa.baselines import scene_generator
+from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, StepPath, inpaint, released_times
 from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
 from r3dpa.baselines.lidm_networks import LiDARDiscriminator, LiDMUNet, VQAutoencoder
 from r3dpa.checkpoints import read_checkpoint
+from r3dpa.checkpoints.lidm import from_lidm
+from r3dpa.cli import main
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.losses import generator_loss
 from r3dpa.nn import PatchDiscriminator
 from r3dpa.nn.velocity_network import time_frequencies
 
+CALLBACK_MODULE = "pytorch_lightning.callbacks.model_checkpoint"
 # Factors that cases.json does not list, of the released configuration.
 ADVERSARIAL, START, DEPTH_SCALE = 0.6, 1, 5.84
 
@@ -78,8 +85,8 @@ def of_network(case, lidm) -> dict:
 def of_losses(case, lidm) -> dict:
     unet, path = lidm.network, lidm.interpolant
     data, noise, step = case["in/x_0"], case["in/noise"], case["in/loss_t"]
-    time = (step / path.num_steps).double()
-    results = {"q_sample": path.interpolate(data, noise, time)}
+    time = (step + 0.5) / path.num_steps  # a step begins at its time
+    results = {"q_sample": path.interpolate(data, noise, step / path.num_steps)}
     for norm in ("l2", "l1"):
         lidm.norm = norm
         errors = lidm.errors(unet, data, time, noise)
@@ -117,21 +124,12 @@ def of_schedule(case, lidm) -> dict:
         "schedule/alphas_cumprod": signal[index],
         "schedule/alphas_cumprod_prev": before[index],
         "schedule/posterior_variance": variance,
-        "schedule/posterior_log_variance_clipped": torch.where(
-            index == 0, variance_of_second(path), variance
-        ).log(),
+        "schedule/posterior_log_variance_clipped": variance.clamp(min=1e-20).log(),
         "schedule/posterior_mean_coef1": posterior(one, none, none),
         "schedule/posterior_mean_coef2": posterior(none, one, none),
         "schedule/lvlb_weights": path.bound_weights()[index],
         "schedule/sqrt_recipm1_alphas_cumprod": (1 / signal[index] - 1).sqrt(),
     }
-
-
-def variance_of_second(path):
-    """What official logarithms have in place of the variance 0 of the first step."""
-    none, one = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
-    here = torch.full((1,), 1 / path.num_steps).double()
-    return ancestral_step(none, none, here, 0 * here, one, interpolant=path).square()[0]
 
 
 def of_samplers(case, lidm) -> dict:
@@ -305,6 +303,8 @@ def of_variant(case, variant) -> dict:
         assert all(p.grad is None for p in stage.discriminator.parameters())
         penalty = factor * stage.discriminator_loss(image, prediction, returns)
         penalty.backward()
+        if step == 0:  # its recorder did not clear what the generator's backward pass left here
+            (weight * factor * generator_loss(stage.logits(prediction.detach()))).backward()
         more = (returns,) if stage.mask_factor else ()
         found |= {
             "disc_disc_loss": penalty,
@@ -328,7 +328,7 @@ def test_first_stage(stage_case, compare):
     # The recorded margins are of the codes: how far the second-best code is.
     codes, pixels = network.quantize.embedding.weight.double(), {}
     for name, values in (("index_margin", latents), ("z_index_margin", case["in/z"])):
-        distance = torch.cdist(values.double().movedim(1, -1).flatten(0, 2), codes).square()
+        distance = torch.cdist(values.double().movedim(1, -1).flatten(0, 2), codes)
         best, second = distance.topk(2, largest=False).values.unbind(1)
         pixels[name] = (second - best).min()
     results = pixels | {
@@ -377,3 +377,84 @@ def test_the_codebook_as_meant_swaps_the_weights(stage_case):
     meant = codebook(latents).loss
     torch.testing.assert_close(meant, released)
     assert torch.allclose(torch.autograd.grad(meant, codebook.embedding.weight)[0], 4 * codes)
+
+
+# --- released files ---
+
+
+def released(listing) -> dict:
+    """Content of a Lightning 1.4 file with the listed keys, and those of its average."""
+    shapes = dict(listing["state_dict"])
+    parameters = [key for key in shapes if key.startswith("model.diffusion_model.")]
+    for key in parameters:
+        name = key.removeprefix("model.").replace(".", "")
+        shapes[f"model_ema.{name}"] = shapes[key]
+    shapes |= {"model_ema.decay": [], "model_ema.num_updates": []}
+    assert listing["groups"]["model"] == len(parameters)
+    assert listing["groups"]["model_ema"] == sum(key.startswith("model_ema.") for key in shapes)
+    return {"pytorch-lightning_version": "1.4.2", "state_dict": weights_of(shapes)}
+
+
+def test_released_layout_is_read_strictly(baseline_listing, tmp_path):
+    listing = baseline_listing("lidm_uncond_state_dict")
+    content = released(listing)
+    checkpoint = from_lidm(content, tmp_path / "model.ckpt")
+    sizes = {
+        name: sum(v.numel() for v in state.state_dict.values())
+        for name, state in checkpoint.networks.items()
+    }
+    unet, first = listing["param_count_unet"], listing["param_count_first_stage"]
+    assert sizes == {"network": unet, "ema_network": unet, "first_stage": first}
+    arguments = checkpoint.network("network").init_args
+    params = listing["config"]["params"]["unet_config"]["params"]
+    assert arguments["input_size"] == params["image_size"]
+    assert arguments["head_channels"] == params["num_head_channels"]
+    assert arguments["channel_multipliers"] == params["channel_mult"]
+    given = listing["config"]["params"]["first_stage_config"]["params"]
+    assert checkpoint.network("first_stage").init_args["num_codes"] == given["n_embed"]
+    weights = content["state_dict"]
+    key = "input_blocks.4.0.emb_layers.1.weight"
+    flat = f"model_ema.diffusion_model{key.replace('.', '')}"
+    assert checkpoint.network("ema_network").state_dict[key] is weights[flat]
+    for name, message in (
+        ("model.diffusion_model.out.2.bias", "missing in the checkpoint: out.2.bias"),
+        ("first_stage_model.quant_conv.bias", "missing in the checkpoint: quant_conv.bias"),
+    ):
+        fewer = {k: v for k, v in weights.items() if k != name}
+        with pytest.raises(ValueError, match=message):
+            from_lidm({"state_dict": fewer}, tmp_path / "model.ckpt")
+    more = weights | {"cond_stage_model.weight": weights["betas"]}
+    with pytest.raises(ValueError, match=r"cond_stage_model\.weight is no weight of LiDM without"):
+        from_lidm({"state_dict": more}, tmp_path / "model.ckpt")
+
+
+class ModelCheckpoint:
+    """Stands for the class of Lightning 1.4."""
+
+
+def test_a_converted_file_makes_scenes(tmp_path, monkeypatch):
+    torch.manual_seed(0)
+    unet = LiDMUNet(channels=160, channel_multipliers=(1,), num_res_blocks=1)
+    first = VQAutoencoder(num_codes=16, channels=32, num_res_blocks=1, channel_multipliers=(1,) * 4)
+    state = {f"model.diffusion_model.{k}": v for k, v in unet.state_dict().items()}
+    state |= {f"first_stage_model.{k}": v for k, v in first.state_dict().items()}
+    for key, value in unet.state_dict().items():
+        state[f"model_ema.diffusion_model{key.replace('.', '')}"] = value + 0.01
+    state["betas"] = StepPath().betas.float()
+    monkeypatch.setattr(ModelCheckpoint, "__module__", CALLBACK_MODULE)
+    holder = SimpleNamespace(ModelCheckpoint=ModelCheckpoint)
+    monkeypatch.setitem(sys.modules, CALLBACK_MODULE, holder)
+    content = {"pytorch-lightning_version": "1.4.2", "state_dict": state, "global_step": 7}
+    torch.save(
+        content | {"callbacks": {ModelCheckpoint: {"monitor": None}}}, tmp_path / "model.ckpt"
+    )
+    main(["convert", str(tmp_path / "model.ckpt"), str(tmp_path / "ours.safetensors")])
+    checkpoint = read_checkpoint(tmp_path / "ours.safetensors")
+    assert (checkpoint.stage, checkpoint.step) == ("lidm", 7)
+    generator = scene_generator(checkpoint, device="cpu")
+    assert generator.sampler == ReleasedDDIM("ddpm", 250)
+    scenes = generator.with_sampler(ReleasedDDIM("ddim", 2)).generate(1)
+    assert (scenes.range_m.shape, scenes.nfe) == ((1, 64, 1024), 2)
+    mean = checkpoint.network("ema_network").state_dict["out.0.weight"]
+    assert torch.equal(mean, unet.state_dict()["out.0.weight"] + 0.01)
+    assert torch.equal(generator.network.get_parameter("out.0.weight"), mean)

@@ -2,6 +2,8 @@
 
 from r3dpa.baselines.base import AveragedNetwork, Baseline
 from r3dpa.baselines.generator import BaselineGenerator
+from r3dpa.baselines.lidm import LiDM
+from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
 from r3dpa.baselines.r2dm import R2DM
 from r3dpa.baselines.stages import BASELINES, baseline_of, scene_generator
 
@@ -11,6 +13,8 @@ __all__ = [
     "AveragedNetwork",
     "Baseline",
     "BaselineGenerator",
+    "LiDM",
+    "LiDMFirstStage",
     "baseline_of",
     "scene_generator",
 ]

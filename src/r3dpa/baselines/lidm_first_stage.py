@@ -114,7 +114,7 @@ class LiDMFirstStage(Baseline):
         """Weight of the generator's loss by the gradients at the last layer, and that loss."""
         with steps.frozen(self.discriminator):
             loss = losses.generator_loss(self.logits(prediction))
-        last = self.network.decoder.conv_out.weight
+        last = self.network.get_parameter("decoder.conv_out.weight")
         ours, theirs = (
             torch.autograd.grad(value, last, retain_graph=True)[0].norm() for value in (error, loss)
         )

@@ -90,7 +90,8 @@ class VQAutoencoder(VAE):
     ) -> None:
         super().__init__(channels=channels, legacy_upsample=legacy_upsample, **sizes)
         width = self.latent_channels
-        self.encoder.conv_out = CircularConv2d(self.encoder.conv_out.in_channels, width, (3, 3))
+        deepest = self.encoder.get_parameter("conv_out.weight").shape[1]
+        self.encoder.conv_out = CircularConv2d(deepest, width, (3, 3))
         self.quant_conv = nn.Conv2d(width, width, 1)
         self.quantize = Codebook(num_codes, width, legacy_codebook)
         if mask:
@@ -163,7 +164,7 @@ class LiDMUNet(UNet):
         super().__init__(feature_dim=1, projector_dim=1, **sizes)
         del self.projector, self.label_emb
         if not position_bias:
-            self.ape: nn.Module = nn.Identity()
+            self.ape = nn.Identity()
 
     def modulations(self, time: Tensor, labels: Tensor | None = None) -> Tensor:
         """Embeddings ``(T, E)`` of steps ``(T,)``, 0 to 999 and unscaled."""

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.generator import BaselineGenerator
+from r3dpa.baselines.lidm import LiDM
 from r3dpa.baselines.r2dm import R2DM
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.sampler import Quality, SamplerConfig
@@ -14,7 +15,7 @@ from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 
-BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM,)}
+BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM, LiDM)}
 
 
 def scene_generator(

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from r3dpa import __version__
 from r3dpa.checkpoints.baselines import READERS
+from r3dpa.checkpoints.lidm import from_lidm, is_lidm
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
@@ -39,6 +40,8 @@ _LIGHTNING |= {
     "ema_network": ("ema.network.", "network"),
     "first_stage": ("first_stage.", "first_stage"),
 }
+# A class that Lightning 1.4 writes as a key, in the checkpoints of LiDM; read as ``object``.
+_OLD_CALLBACK = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
 _DIFFUSERS_KEY = "encoder.down_blocks.0.resnets.0.norm1.weight"
 # Names of attention layers before diffusers 0.14, as in the files of Stable Diffusion itself.
@@ -76,6 +79,8 @@ def read_checkpoint(
             return _from_ours(path) if described else _from_diffusers(path)
     content = _load_pickle(path)
     with _naming(path):
+        if is_lidm(content):
+            return from_lidm(content, path, encoding)
         if isinstance(content, dict) and "pytorch-lightning_version" in content:
             return _from_lightning(content, path)
         if is_official(content):
@@ -219,7 +224,8 @@ def _naming(path: Path) -> Iterator[None]:
 def _load_pickle(path: Path) -> Any:
     """Content of a file of ``torch.save``: tensors, plain values and ``argparse.Namespace``."""
     mmap = zipfile.is_zipfile(path)
-    with _naming(path), torch.serialization.safe_globals([argparse.Namespace]):
+    known: Any = [argparse.Namespace, (object, _OLD_CALLBACK)]
+    with _naming(path), torch.serialization.safe_globals(known):
         try:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
         except (pickle.UnpicklingError, ValueError) as error:

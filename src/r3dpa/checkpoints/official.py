@@ -39,7 +39,7 @@ _SIT_SIZES = {384: ("S", 12, 6), 768: ("B", 12, 12), 1024: ("L", 24, 16), 1152: 
 _UNET_NAMES = {256: "UNet_lidm", 160: "UNet_small"}  # by channels
 _UNET_HEAD_CHANNELS = 32  # of both
 _UPSAMPLING = {(1, 5): [1, 2], (3, 3): [2, 2]}  # stride of the VAE by kernel of its decoder
-_PROJECTION: dict[str, Any] = {
+PROJECTION: dict[str, Any] = {
     "kind": "spherical",
     "sensor": {
         "beams": 64,
@@ -251,8 +251,8 @@ def _sit_arguments(
     if strides is None:
         rows = columns = patch_size * round(num_tokens**0.5)  # a square image
     else:
-        rows = _PROJECTION["sensor"]["beams"] // strides[0]
-        columns = _PROJECTION["sensor"]["columns"] // strides[1]
+        rows = PROJECTION["sensor"]["beams"] // strides[0]
+        columns = PROJECTION["sensor"]["columns"] // strides[1]
     if rows * columns == num_tokens * patch_size**2:
         inferred["input_size"] = [rows, columns]
     init_args = inferred | dict(given)
@@ -266,7 +266,24 @@ def _sit_arguments(
 
 
 def _unet_arguments(unet: StateDict, given: Options) -> dict[str, Any]:
-    _, channels, *input_size = unet["ape.bias"].shape
+    inferred = unet_sizes(unet) | {
+        "input_size": list(unet["ape.bias"].shape[2:]),
+        "feature_dim": len(unet["projector.4.weight"]),
+        "projector_dim": len(unet["projector.0.weight"]),
+        "num_classes": len(unet["label_emb.weight"]),
+    }
+    init_args = inferred | dict(given)
+    if "head_channels" not in init_args:
+        raise ValueError(
+            f"unknown head_channels of a UNet with {init_args['channels']} channels; give them as "
+            "sit_args"
+        )
+    return init_args
+
+
+def unet_sizes(unet: StateDict) -> dict[str, Any]:
+    """Arguments of the U-Net of R3DPA or LiDM that follow from its weights."""
+    channels, in_channels, *_ = unet["input_blocks.0.0.weight"].shape
     num_levels = 1 + sum(key.endswith(".op.weight") for key in unet)
     num_up = len({key.split(".")[1] for key in unet if key.startswith("output_blocks.")})
     num_res_blocks = num_up // num_levels - 1
@@ -274,26 +291,17 @@ def _unet_arguments(unet: StateDict, given: Options) -> dict[str, Any]:
     last_blocks = [(level + 1) * (num_res_blocks + 1) - 1 for level in range(num_levels)]
     widths = [len(unet[f"input_blocks.{i}.0.out_layers.3.weight"]) for i in last_blocks]
     inferred: dict[str, Any] = {
-        "input_size": list(input_size),
-        "in_channels": unet["input_blocks.0.0.weight"].shape[1],
+        "in_channels": in_channels,
         "channels": channels,
         "channel_multipliers": [width // channels for width in widths],
         "num_res_blocks": num_res_blocks,
-        "feature_dim": len(unet["projector.4.weight"]),
-        "projector_dim": len(unet["projector.0.weight"]),
-        "num_classes": len(unet["label_emb.weight"]),
     }
     attends = [f"input_blocks.{i}.1.qkv.weight" in unet for i in last_blocks]
     if not all(attends):
         inferred["attention_resolutions"] = [2**i for i in range(num_levels) if attends[i]]
     if channels in _UNET_NAMES:
         inferred["head_channels"] = _UNET_HEAD_CHANNELS
-    init_args = inferred | dict(given)
-    if "head_channels" not in init_args:
-        raise ValueError(
-            f"unknown head_channels of a UNet with {channels} channels; give them as sit_args"
-        )
-    return init_args
+    return inferred
 
 
 def _vae_strides(vae: StateDict, args: Options) -> Strides:
@@ -302,7 +310,7 @@ def _vae_strides(vae: StateDict, args: Options) -> Strides:
     ``h2p4d8``: patches of 4 x 4 pixels, twice as long horizontally, 8 channels.
     """
     if _is_vae(vae):
-        return _whole(_vae(vae).init_args["strides"])
+        return whole_stride(_vae(vae).init_args["strides"])
     name = re.fullmatch(r"h(\d+)(?:p(\d+))?d\d+", str(args.get("vae", "")))
     if name is None:
         return None
@@ -310,18 +318,24 @@ def _vae_strides(vae: StateDict, args: Options) -> Strides:
     return patch, patch * int(name[1])
 
 
-def _whole(strides: Sequence[tuple[int, int]]) -> tuple[int, int]:
+def whole_stride(strides: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Rows and columns of the image per latent."""
     return math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)
 
 
 def _vae(weights: StateDict) -> NetworkState:
+    return NetworkState(path_of(VAE), vae_sizes(weights), dict(weights))
+
+
+def vae_sizes(weights: StateDict) -> dict[str, Any]:
+    """Arguments of the VAE of R3DPA or LiDM that follow from its weights."""
     levels = range(len({k.split(".")[2] for k in weights if k.startswith("encoder.down.")}))
     channels = len(weights["encoder.conv_in.weight"])
     widths = [len(weights[f"encoder.down.{i}.block.0.conv1.weight"]) for i in levels]
     ups = [weights[f"decoder.up.{i}.upsample.conv.weight"] for i in levels[1:]]
     blocks = {key.split(".")[4] for key in weights if key.startswith("encoder.down.0.block.")}
     attends = [i for i in levels if f"encoder.down.{i}.attn.0.q.weight" in weights]
-    init_args = {
+    return {
         "in_channels": weights["encoder.conv_in.weight"].shape[1],
         "latent_channels": len(weights["post_quant_conv.weight"]),
         "channels": channels,
@@ -331,7 +345,6 @@ def _vae(weights: StateDict) -> NetworkState:
         "attention_levels": attends,
         "legacy_upsample": True,
     }
-    return NetworkState(path_of(VAE), init_args, dict(weights))
 
 
 def _discriminator(weights: StateDict) -> NetworkState:
@@ -368,7 +381,7 @@ def _geometry(
     else:
         patch_size = sit.init_args["patch_size"]
     return {
-        "projection": _PROJECTION,
+        "projection": PROJECTION,
         "codec": {"encoding": encoding, "scale": None, "legacy_inverse": False},
         "grid_size": [side // patch_size for side in sit.init_args["input_size"]],
     }
@@ -379,7 +392,7 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
     args: dict[str, Any] = {}
     if "vae" in checkpoint.networks:
         vae = checkpoint.network("vae").arguments
-        rows, columns = _whole(vae["strides"])
+        rows, columns = whole_stride(vae["strides"])
         patch = f"p{rows}" if rows > 1 else ""
         args["vae"] = f"h{columns // rows}{patch}d{vae['latent_channels']}"
     state = checkpoint.networks.get("sit") or checkpoint.networks.get("ema")
@@ -399,6 +412,6 @@ def _args_of(checkpoint: Checkpoint) -> dict[str, Any]:
             args["model"] = model
     if checkpoint.geometry is not None:
         projection, codec = checkpoint.geometry["projection"], checkpoint.geometry["codec"]
-        if all(projection[key] == value for key, value in _PROJECTION.items()):
+        if all(projection[key] == value for key, value in PROJECTION.items()):
             args["dataset_config"] = f"configs/{_DATASET_CONFIGS[codec['encoding']]}"
     return args

@@ -120,7 +120,7 @@ class UNet(VelocityNetwork):
                 halved = CircularConv2d(width, width, _KERNEL, (2, 2))
                 self.input_blocks.append(_Layers(named_layers(op=halved)))
                 kept.append(width)
-        self.ape = _PositionBias(channels, self.input_size)
+        self.ape: nn.Module = _PositionBias(channels, self.input_size)
         self.middle_block = _Layers(*blocks(width, width), _TimedResBlock(width, width, embedding))
         self.projector = nn.Sequential(
             nn.Conv2d(width, projector_dim, 1),
