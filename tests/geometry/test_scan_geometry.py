@@ -2,6 +2,7 @@ import json
 import math
 
 import pytest
+import torch
 
 from r3dpa.geometry import (
     LidarSensor,
@@ -80,3 +81,19 @@ def test_a_codec_that_would_show_far_points_as_a_wall_is_refused(sensor, short, 
 def test_a_grid_that_does_not_divide_the_image_is_refused(grid_size):
     with pytest.raises(ValueError, match=r"does not divide the 4 x 32 range image"):
         ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), grid_size)
+
+
+def test_inverse_range_and_reflectance():
+    codec = RangeCodec("inverse", 1.45, reflectance=True)
+    sensor = LidarSensor(beams=1, columns=4, range_min_m=1.45, range_max_m=80.0)
+    range_m = torch.tensor([[2.9, 79.0, -1.0, 1.5]])
+    image = codec.to_image(range_m, torch.tensor([[0.0, 1.0, 0.7, 0.25]]))
+    # 2 * 1.45 / 2.9 - 1 = 0; no return is -1 in both channels.
+    assert image[:, 0, 0].tolist() == [0.0, -1.0]
+    assert image[:, 0, 2].tolist() == [-1.0, -1.0]
+    torch.testing.assert_close(codec.ranges_of(image, sensor), range_m)
+    assert image[1].tolist() == [[-1.0, 1.0, -1.0, -0.5]]
+    with pytest.raises(ValueError, match="needs scans with a reflectance"):
+        codec.to_image(range_m)
+    with pytest.raises(ValueError, match="exclude each other"):
+        RangeCodec(return_channel=True, reflectance=True)

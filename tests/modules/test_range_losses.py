@@ -84,6 +84,8 @@ def test_rate_rises_stays_and_falls_by_step_alone():
     rates = [config.rate(step, 10) for step in range(11)]
     assert rates == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 0.75, 0.5, 0.25, 0.0]
     assert OptimizerConfig(lr=2.0).rate(5, 10) == 2.0
+    cosine = OptimizerConfig(lr=2.0, warmup_steps=2, cosine=True)
+    assert [cosine.rate(step, 10) for step in (2, 6, 10)] == pytest.approx([2.0, 1.0, 0.0])
     module = stage_module("joint", optimizer=config)
     train(module, TinyData([False] * 5))
     assert module.optimizers().param_groups[0]["lr"] == 0.25

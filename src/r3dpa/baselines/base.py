@@ -159,7 +159,7 @@ class Baseline(L.LightningModule):
 
     def log_loss(self, loss: Tensor) -> Tensor:
         """The loss of a training step, logged as ``train/loss``."""
-        self.logged_losses = {"loss": loss.detach()}
+        self.logged_losses = {"loss": loss.detach()}  # for StepGuard
         self.log("train/loss", loss.detach())
         return loss
 

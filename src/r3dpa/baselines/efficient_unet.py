@@ -15,6 +15,7 @@ from einops import rearrange
 from scipy.special import lpmv
 from torch import Tensor, nn
 
+from r3dpa.geometry import LidarSensor, Projection, SphericalProjection
 from r3dpa.nn.layers import CircularConv2d, SelfAttention, Size, zeroed
 
 Encoding = Literal["spherical_harmonics", "polar_coordinates", "fourier_features"]
@@ -74,7 +75,7 @@ class EfficientUNet(nn.Module):
         self.in_channels, self.resolution = in_channels, (resolution[0], resolution[1])
         self.coords_encoding, self.base_channels = coords_encoding, base_channels
         self.register_buffer("coords", hdl64e_angles(self.resolution))
-        with torch.device("cpu"):
+        with torch.device("cpu"):  # also where networks are built without memory
             known = encode_angles(torch.zeros(1, 2, 1, 1), coords_encoding, self.resolution)
         width = temb_channels or 4 * base_channels
         self.time_embedding = nn.Sequential(
@@ -228,28 +229,22 @@ class Resample(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """``(B, C, H, W)`` to ``(B, C, H up / down, W up / down)``."""
-        for axis in (3, 2):
-            image = self._along(image, axis, self.up[axis - 2], self.down[axis - 2])
-        return image
-
-    def _along(self, image: Tensor, axis: int, up: int, down: int) -> Tensor:
-        size, channels, length = len(self.window), image.shape[1], image.shape[axis]
-        shape = (channels, 1, 1, size) if axis == 3 else (channels, 1, size, 1)
-        kernel = image.new_tensor(self.window).view(1, 1, *shape[2:]).expand(shape)
-        steps = (1, down) if axis == 3 else (down, 1)
-        mode = "circular" if self.ring and axis == 3 else "constant"
-        if up == 1:
-            before, after = (size - down + 1) // 2, (size - down) // 2
-            pads = (before, after, 0, 0) if axis == 3 else (0, 0, before, after)
-            return F.conv2d(F.pad(image, pads, mode=mode), kernel, stride=steps, groups=channels)
-        border = -(-size // up)
-        pads = (border, border, 0, 0) if axis == 3 else (0, 0, border, border)
-        steps = (1, up) if axis == 3 else (up, 1)
-        spread = F.conv_transpose2d(
-            F.pad(image, pads, mode=mode), kernel * up, stride=steps, groups=channels
-        )
-        first = border * up + (size - 1) - (size - up + 1) // 2 - up + 1
-        return spread.narrow(axis, first, length * up)
+        size, (rows, columns) = len(self.window), self.up
+        if max(self.up) > 1:
+            batch, channels, height, width = image.shape
+            spread = image.new_zeros(batch, channels, height * rows, width * columns)
+            spread[..., ::rows, ::columns] = image
+            image = spread
+        pads = [
+            pad
+            for up, down in zip(self.up[::-1], self.down[::-1], strict=True)
+            for pad in ((size - up * down + 1) // 2 + up - 1, (size - up * down) // 2)
+        ]
+        image = F.pad(image, (*pads[:2], 0, 0), mode="circular" if self.ring else "constant")
+        window = image.new_tensor(self.window)
+        kernel = rows * columns * torch.outer(window, window).expand(image.shape[1], 1, -1, -1)
+        image = F.pad(image, (0, 0, *pads[2:]))
+        return F.conv2d(image, kernel, stride=self.down, groups=image.shape[1])
 
 
 def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
@@ -264,15 +259,15 @@ def sinusoid(time: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], dim=1)
 
 
-def hdl64e_angles(size: Size) -> Tensor:
-    """Angles ``(1, 2, H, W)`` of the upper left pixel corners, +3 to -25 and 180 to -180 degrees.
+def corner_angles(projection: Projection) -> Tensor:
+    """Inclination and azimuth ``(1, 2, H, W)`` of the upper left pixel corners, radians."""
+    angles = torch.meshgrid(*projection.ray_angles(corner=True), indexing="ij")
+    return torch.stack(angles)[None].float()
 
-    Inclination and azimuth in radians, float32.
-    """
-    rows, columns = size
-    inclination = (3 - 28 * torch.arange(rows) / rows).deg2rad()
-    azimuth = (180 - 360 * torch.arange(columns) / columns).deg2rad()
-    return torch.stack(torch.meshgrid(inclination, azimuth, indexing="ij"))[None]
+
+def hdl64e_angles(size: Size) -> Tensor:
+    """The same of the sensor that R2DM assumes, for images ``(H, W)``."""
+    return corner_angles(SphericalProjection(LidarSensor(*size)))
 
 
 def encode_angles(angles: Tensor, encoding: Encoding | None, size: Size) -> Tensor:

@@ -84,8 +84,7 @@ class BaselineGenerator:
         draws = (filled(noise, size).to(self.device) for noise in noises)
         path = self.baseline.interpolant
         latents = self.sampler.solve(self.velocity, next(draws), draws, path)[: len(indices)]
-        nfe = self.calls
-        return SceneBatch(self.decode(latents), latents, nfe, self.geometry.projection)
+        return SceneBatch(self.decode(latents), latents, self.calls, self.geometry.projection)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -97,31 +96,23 @@ class BaselineGenerator:
 
     @torch.inference_mode()
     def complete(
-        self,
-        image: Tensor,
-        known: Tensor,
-        seed: int = 0,
-        *,
-        resamplings: int = 10,
-        jump: int = 1,
+        self, image: Tensor, known: Tensor, seed: int = 0, *, resamplings: int = 10, jump: int = 1
     ) -> SceneBatch:
-        """Completes scenes by RePaint, see :func:`r3dpa.baselines.diffusion.repaint`.
+        """Completes encoded range images ``(B, C, H, W)`` by RePaint, where samples are images.
 
-        Args:
-            image: ``(B, C, H, W)`` encoded range images of a baseline whose samples are images.
-            known: ``(B, 1, H, W)`` bool, pixels that are kept.
-            seed: Of the random numbers.
-            resamplings: How often each of the sampler's steps is taken.
-            jump: Ancestral steps within each.
+        Pixels that are True in ``known`` ``(B, 1, H, W)`` are kept; other arguments and steps as
+        of :func:`r3dpa.baselines.diffusion.repaint`, with the number of steps of the sampler.
         """
-        self.calls, baseline = 0, self.baseline
-        noises = noise_of(baseline.latent_shape, range(len(image)), seed)
+        self.calls, path = 0, self.baseline.interpolant
+        noises = noise_of(self.baseline.latent_shape, range(len(image)), seed)
         draws = (noise.to(self.device) for noise in noises)
-        image, mask = image.to(self.device), known.to(self.device).float()
-        steps, path = self.sampler.steps, baseline.interpolant
+        image, mask, steps = (
+            image.to(self.device),
+            known.to(self.device).float(),
+            self.sampler.steps,
+        )
         found = repaint(self.velocity, image, mask, draws, path, steps, resamplings, jump)
-        nfe = self.calls
-        return SceneBatch(self.decode(found), found, nfe, self.geometry.projection)
+        return SceneBatch(self.decode(found), found, self.calls, self.geometry.projection)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""

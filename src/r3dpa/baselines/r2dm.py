@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import torch
 from torch import Tensor, nn
 
 from r3dpa.baselines.base import Baseline
@@ -18,7 +17,7 @@ from r3dpa.baselines.diffusion import (
     target_of,
     weighted_mean,
 )
-from r3dpa.baselines.efficient_unet import EfficientUNet
+from r3dpa.baselines.efficient_unet import EfficientUNet, corner_angles
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.times import per_sample
@@ -93,8 +92,7 @@ class R2DM(Baseline):
     def setup(self, stage: str) -> None:
         """Checks the data, and gives the network the ray angles of their projection."""
         super().setup(stage)
-        angles = self.scan_geometry.projection.ray_angles(corner=True)
-        coords = torch.stack(torch.meshgrid(*angles, indexing="ij"))[None]
+        coords = corner_angles(self.scan_geometry.projection)
         for network in (self.network, self.ema.network):
             network.coords.copy_(coords)  # type: ignore[operator]
 

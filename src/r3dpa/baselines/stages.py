@@ -24,9 +24,6 @@ def scene_generator(
     *,
     weights: Literal["ema", "last"] = "ema",
     device: str = "auto",
-    precision: Literal["fp32", "bf16"] = "fp32",
-    batch_size: int | None = None,
-    compile: bool = False,
     **options: Any,
 ) -> SceneGenerator | BaselineGenerator:
     """Generator of a checkpoint, by the stage that it names.
@@ -37,10 +34,8 @@ def scene_generator(
             or the published sampler of a baseline.
         weights: Averaged or last weights.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        precision: As of both generators, like the next two.
-        batch_size: See there.
-        compile: See there.
-        **options: Further ones of :meth:`r3dpa.SceneGenerator.from_checkpoint`.
+        **options: Those of :meth:`r3dpa.SceneGenerator.from_checkpoint`, or of
+            :class:`BaselineGenerator`.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -48,16 +43,9 @@ def scene_generator(
     """
     if not isinstance(checkpoint, Checkpoint):
         checkpoint = read_checkpoint(checkpoint)
-    shared: dict[str, Any] = {
-        "precision": precision,
-        "batch_size": batch_size,
-        "compile": compile,
-    }
     if checkpoint.stage not in BASELINES:
-        chosen = sampler or "good"
-        options |= shared
         return SceneGenerator.from_checkpoint(
-            checkpoint, chosen, weights=weights, device=device, **options
+            checkpoint, sampler or "good", weights=weights, device=device, **options
         )
     if isinstance(sampler, str):
         raise ValueError(
@@ -65,18 +53,14 @@ def scene_generator(
             "--steps, or neither for its published sampler"
         )
     for name in ("autoguidance", "decoder"):
-        if options.get(name) not in (None, "full"):
+        if options.pop(name, None) not in (None, "full"):
             raise ValueError(f"{name} is not for stage {checkpoint.stage}; leave it out")
     if checkpoint.geometry is None:
         raise ValueError(f"{checkpoint.path} does not record which sensor it was trained for")
     baseline = baseline_of(checkpoint, weights).to(usable_device(device))
-    return BaselineGenerator(
-        baseline,
-        baseline.network,
-        ScanGeometry.from_dict(dict(checkpoint.geometry)),
-        sampler or baseline.published,
-        **shared,
-    )
+    geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
+    chosen = sampler or baseline.published
+    return BaselineGenerator(baseline, baseline.network, geometry, chosen, **options)
 
 
 def baseline_of(checkpoint: Checkpoint, weights: Literal["ema", "last"] = "ema") -> Baseline:
