@@ -132,7 +132,7 @@ def test_test_scores_scenes(trained, smoke_root, tmp_path):
     words = [f"--scorer.{word}" for word in scorer]
     main(fit_words("test", stage, smoke_root, tmp_path, "--ckpt_path", str(path), *words))
     found = json.loads((tmp_path / "evaluation/evaluation.json").read_text())
-    assert found["made_with"]["stage"] == stage
+    assert (found["about"]["solver"], found["about"]["extra"]["stage"]) == ("ddpm", stage)
 
 
 def test_known_pixels_of_a_completion_stay(trained):
