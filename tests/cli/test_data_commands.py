@@ -101,6 +101,7 @@ def test_check_names_every_bad_scan(tmp_path, capsys):
     status, lines = check(tmp_path, capsys)
     assert status == 0
     assert "3 scans in 2 drives, all usable" in lines[-1]
+    assert all(" 2 beams by order, " in line for line in lines[:3]), lines
     truncated.write_bytes(truncated.read_bytes()[:-3])
     points = read_scan(infinite)
     points[1, 2] = np.inf
@@ -109,6 +110,20 @@ def test_check_names_every_bad_scan(tmp_path, capsys):
     assert status == 1
     bad = [line.split(": ")[1] for line in lines if line.startswith("bad: ")]
     assert bad == [str(truncated), str(infinite)]
+
+
+def test_check_says_the_columns_and_beams_of_other_formats(tmp_path, capsys):
+    azimuth = np.linspace(0, 6.2, 100)
+    rows = [[5 * np.cos(a), 5 * np.sin(a), z, 0.5, z] for z in (2, 1, 0) for a in azimuth]
+    np.save(tmp_path / "a.npy", np.array(rows, "f4"))
+    status, (line,) = check(tmp_path, capsys)
+    assert status == 0
+    assert "(x, y, z, intensity, ring), 300 points, range 5..5.385, intensity 0.5..0.5" in line
+    assert line.endswith("3 beams by stored, 100% of the points sure")
+    np.save(tmp_path / "b.npy", np.array(rows, "f4") * 100)
+    status, lines = check(tmp_path, capsys)
+    assert status == 1
+    assert lines[1].startswith(f"bad: {tmp_path / 'b.npy'}: ranges have the median")
 
 
 class TestObjects:

@@ -90,13 +90,17 @@ class TestData:
         ]
         assert page["categories"]["origin"] == [[0, "surface", "#56606e"], [6, "rain", "#4e9bff"]]
 
-    def test_the_reference_comes_last_and_its_categories_count(self):
+    def test_scans_beside_come_last_and_their_categories_count(self):
         scans = [PageScan("a", np.ones((2, 3))), PageScan("b", np.ones((2, 3)))]
-        page = page_data(scan_page(scans, "", SEMANTICS, ORIGINS, reference=example("real")))
+        page = page_data(scan_page(scans, "", SEMANTICS, ORIGINS, beside=[example("real")]))
         assert [header["name"] for header in page["scans"]] == ["a", "b", "real"]
-        assert page["reference"] == 2
+        assert (page["shown"], page["beside"]) == (2, [2, 2])
         assert len(page["categories"]["semantic"]) == 3
-        assert page_data(scan_page(scans, "", {}, {}))["reference"] is None
+        page = page_data(scan_page(scans, "", {}, {}, beside=scans))
+        assert (page["shown"], page["beside"]) == (2, [2, 3])
+        assert page_data(scan_page(scans, "", {}, {}))["beside"] == []
+        with pytest.raises(ValueError, match="2 scans need 1 or 2 scans beside them, got 3"):
+            scan_page(scans, "", {}, {}, beside=[*scans, *scans[:1]])
 
 
 class TestSafety:
@@ -110,8 +114,8 @@ class TestSafety:
     def test_names_cannot_end_the_script_or_become_markup(self):
         scan = example(name=EVIL)
         semantics = {7: Category(EVIL), 26: Category("car")}
-        page = scan_page([scan], EVIL, semantics, ORIGINS, reference=example(name=EVIL))
-        harmless = scan_page([scan], "t", SEMANTICS, ORIGINS, reference=example(name="b"))
+        page = scan_page([scan], EVIL, semantics, ORIGINS, beside=[example(name=EVIL)])
+        harmless = scan_page([scan], "t", SEMANTICS, ORIGINS, beside=[example(name="b")])
         for markup in ("<script", "</script", "<!--"):
             assert page.count(markup) == harmless.count(markup)
         assert f"<title>{html.escape(EVIL)}</title>" in page

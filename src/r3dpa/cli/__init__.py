@@ -33,6 +33,8 @@ COMMANDS = {
     "data features": Command("features:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
     "data reference": Command("evaluate:reference", "write statistics of real scans", True),
+    "data weather": Command("weather:weather", "put your scans into fog, rain, snow, sun", True),
+    "data corrupt": Command("weather:corrupt", "give your scans faults of the sensor", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),

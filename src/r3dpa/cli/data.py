@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,36 @@ from r3dpa.pretrained import DEFAULT_WEIGHTS
 def check(path: Path) -> None:
     """List every bad scan and missing folder of a data set; exit with 1 if there is any.
 
-    Args:
-        path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans.
-    """
-    from r3dpa.data.scans import check as check_scans
+    It also says which columns scans hold, which beams they show, and how sure that is.
 
-    text, usable = check_scans(path)
-    sys.stdout.write(f"{text}\n")
+    Args:
+        path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans; or of other scans that
+            ``r3dpa data weather`` reads.
+    """
+    from r3dpa.data.scans import ScanError, evenly, scan_files
+    from r3dpa.data.scans import check as check_scans
+    from r3dpa.weather import rings_of
+    from r3dpa.weather.files import find_files, read_file
+
+    files = [file for file in sorted(scan_files(path)) if file.suffix == ".bin"]
+    text, usable = "", True
+    if not files:
+        with suppress(ScanError):
+            files = find_files(path)[1]
+    if not files or files[0].suffix == ".bin":
+        text, usable = check_scans(path)
+        files = evenly(files, 4)
+    lines = []
+    for file in files:
+        try:
+            scan = read_file(file)
+            rings = rings_of(scan.scan)
+            beams = f"{rings.num_rings} beams by {rings.how}, {rings.sure:.0%} of the points sure"
+            lines.append(f"{file}: {scan.describe()}, {beams}")
+        except ScanError as error:
+            lines += [] if text else [f"bad: {error}"]
+            usable = usable and bool(text)
+    sys.stdout.write("\n".join([*lines, *([text] if text else []), ""]))
     if not usable:
         sys.exit(1)
 

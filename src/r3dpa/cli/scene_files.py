@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from enum import IntEnum
 from functools import partial
@@ -165,9 +165,19 @@ def page_scans(source: Path) -> list[Callable[[], viz.PageScan]]:
     return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 
 
-def write_page(path: Path, scans: Sequence[viz.PageScan], title: str) -> Path:
-    """Writes a page of point clouds, coloured by the classes and origins of the simulator too."""
-    page = viz.scan_page(scans, title, _categories(Semantic), _categories(Origin))
+def write_page(
+    path: Path,
+    scans: Sequence[viz.PageScan],
+    title: str,
+    origins: Mapping[int, viz.Category] | None = None,
+    **options: Any,
+) -> Path:
+    """Writes a page of point clouds, coloured by the classes and origins of the simulator too.
+
+    ``origins`` are further ones; ``options`` those of :func:`r3dpa.viz.scan_page`.
+    """
+    made_by = _categories(Origin) | dict(origins or {})
+    page = viz.scan_page(scans, title, _categories(Semantic), made_by, **options)
     with atomic_path(path) as temporary:
         temporary.write_text(page, "utf-8")
     return path

@@ -18,6 +18,7 @@ Interval = tuple[float, float]
 # Shares of scenes in clear air over a dry and a wet road; and, in the first, of a clear sky.
 _CLEAR_DRY, _CLEAR_WET = 0.85, 0.10
 _CLEAR_SKY = 0.6
+_MOST_MM_H = 500.0
 
 Rule = Literal["be finite", "be positive", "be 0 or greater"]
 
@@ -168,8 +169,8 @@ class Weather:
     Args:
         visibility_m: Meteorological optical range (MOR): where a beam keeps 5 % of its power; at
             least 1 (the densest fogs have some 10 m), infinity without fog.
-        rain_mm_h: Rain rate.
-        snow_mm_h: Snow rate, as millimetres of water.
+        rain_mm_h: Rain rate, at most 500 (a cloudburst has 100).
+        snow_mm_h: Snow rate, as millimetres of water, likewise.
         water_film_mm: Depth of the water on the ground.
         clear_sky: Whether nothing covers the sun.
         sun_elevation_deg: Above the horizon, -90 to 90.
@@ -190,6 +191,12 @@ class Weather:
                 f"visibility_m must be 1 or greater (no fog is denser), got {self.visibility_m}"
             )
         check_fields(self, "be 0 or greater", "rain_mm_h", "snow_mm_h", "water_film_mm")
+        for name in ("rain_mm_h", "snow_mm_h"):
+            if getattr(self, name) > _MOST_MM_H:
+                raise ValueError(
+                    f"{name} must be at most {_MOST_MM_H:g} (a cloudburst has 100), "
+                    f"got {getattr(self, name):g}"
+                )
         check_fields(self, "be finite", "sun_azimuth_deg")
         if not -90 <= self.sun_elevation_deg <= 90:
             raise ValueError(f"sun_elevation_deg must lie in -90..90, got {self.sun_elevation_deg}")

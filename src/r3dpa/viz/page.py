@@ -85,10 +85,11 @@ def scan_page(
     title: str,
     semantics: Mapping[int, Category],
     origins: Mapping[int, Category],
-    reference: PageScan | None = None,
+    beside: Sequence[PageScan] | None = None,
     sensor: LidarSensor | None = None,
     gallery: Mapping[str, Sequence[Tile]] | None = None,
     about: Sequence[str] = (),
+    mode: str = "height",
 ) -> str:
     """HTML page with one scan at a time, turned, moved and coloured by the reader.
 
@@ -99,17 +100,23 @@ def scan_page(
         title: Shown on top.
         semantics: Categories of the labels by number; other numbers are shown as such.
         origins: Categories of the origins by number, likewise.
-        reference: Scan that stays beside the others, seen by the same camera.
+        beside: Scan beside each scan, or one that stays beside all, seen by the same camera.
         sensor: Gives the limits of the range colours; the default sensor if None.
         gallery: Tiles by heading, shown in a column beside the cloud; none if None.
         about: Lines on top of that column.
+        mode: Colours at first: ``height``, ``range``, ``intensity``, ``semantic`` or ``origin``.
 
     Raises:
         ValueError: If there is no scan, or one is empty, of another shape than above or not finite.
     """
     if not scans:
         raise ValueError("scan_page got no scan; give at least one")
-    shown = [*scans, *([] if reference is None else [reference])]
+    others = list(beside or ())
+    if others and len(others) not in (1, len(scans)):
+        raise ValueError(
+            f"{len(scans)} scans need 1 or {len(scans)} scans beside them, got {len(others)}"
+        )
+    shown = [*scans, *others]
     packed = [pack_scan(scan) for scan in shown]
     labels = [scan.labels & 0xFFFF for scan in shown if scan.labels is not None]
     made_by = [scan.origins for scan in shown if scan.origins is not None]
@@ -119,7 +126,7 @@ def scan_page(
         "background": BACKGROUND,
         "ground_m": GROUND_M,
         "ego": [(x, y) for y, x in EGO_OUTLINE_M],
-        "mode": "height",
+        "mode": mode,
         "scales": {
             "height": _scale("height above the sensor (m)", HEIGHT_MAP, 1.0, heights_m),
             "range": _scale("range (m)", PAGE_RANGE_MAP, 0.5, range_ticks(sensor or LidarSensor())),
@@ -130,7 +137,8 @@ def scan_page(
             "origin": _category_rows(origins, made_by),
         },
         "scans": [header for header, _ in packed],
-        "reference": None if reference is None else len(scans),
+        "shown": len(scans),
+        "beside": [len(scans) + n % len(others) for n in range(len(scans))] if others else [],
         "film": None if gallery is None else {"about": list(about), "groups": _groups(gallery)},
     }
     # JSON may hold "<" within strings only, where its escape means the same: no name ends a script.
@@ -181,8 +189,8 @@ def edit_page(
     named = zip(part_names, part_colours(part_names), strict=True)
     categories = {number: Category(*part) for number, part in enumerate(named)}
     first = next((one for one in shown if one.name in before), None)
-    reference = None if first is None else replace(first, name=f"before: {first.name}")
-    return scan_page(shown, title, categories, {}, reference, projection.sensor)
+    beside = None if first is None else [replace(first, name=f"before: {first.name}")]
+    return scan_page(shown, title, categories, {}, beside, projection.sensor)
 
 
 def pack_scan(scan: PageScan) -> tuple[dict[str, Any], str]:

@@ -171,7 +171,7 @@
   }
 
   const panes = [new Pane()];
-  if (page.reference !== null) panes.push(new Pane());
+  if (page.beside.length) panes.push(new Pane());
 
   let scheduled = false;
   function redraw() {
@@ -194,8 +194,9 @@
     const ticket = ++wanted;
     const count = element("scans").options.length;
     const scan = (number + count) % count;
-    const cloud = await cloudOf(scan);
+    const [cloud, other] = await Promise.all([scan, ...page.beside.slice(scan, scan + 1)].map(cloudOf));
     if (ticket !== wanted) return;
+    if (other) panes[1].show(page.scans[page.beside[scan]], other);
     state.scan = scan;
     element("scans").value = String(scan);
     for (const tile of element("film").querySelectorAll("button")) {
@@ -465,10 +466,9 @@
 
   async function begin() {
     if (page.film) showFilm();
-    const scans = page.scans.map((header, number) => [header, number])
-      .filter(([, number]) => number !== page.reference);
+    const scans = page.scans.slice(0, page.shown);
     element("scans").replaceChildren(
-      ...scans.map(([header, number]) => new Option(`${number + 1} · ${header.name}`, number)));
+      ...scans.map((header, number) => new Option(`${number + 1} · ${header.name}`, number)));
     element("steps").hidden = element("leaf").hidden = scans.length < 2;
     element("scans").onchange = (event) => showScan(Number(event.target.value));
     element("previous").onclick = KEYS.ArrowLeft;
@@ -486,9 +486,6 @@
     panes.forEach(listen);
     resize();
     setCamera(state.camera, "orbit");
-    if (page.reference !== null) {
-      panes[1].show(page.scans[page.reference], await cloudOf(page.reference));
-    }
     await showScan(0);
     document.documentElement.dataset.ready = "true";
   }

@@ -15,9 +15,9 @@ import io
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
@@ -33,6 +33,7 @@ from r3dpa.data.scans import (
 )
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 from r3dpa.weather.recorded import RecordedScan
+from r3dpa.weather.weather import WeatheredScan
 
 Table = NDArray[np.void]  # (P,) rows of named columns, in the order of the file
 _Read = tuple[str, Table, Callable[[Table], bytes]]  # format, rows, and file of other rows
@@ -58,6 +59,7 @@ class ScanFile:
         table: Rows ``(P,)`` with all columns of the file.
         columns: Name in the table of x, y, z and, where known, intensity, ring, time_s.
         pack: Bytes of the file for other rows of this table.
+        data: Bytes of the file with these rows, if known.
         labels: ``(P,)`` uint32 from ``label_path``, or None.
         label_path: File of the labels.
     """
@@ -67,6 +69,7 @@ class ScanFile:
     table: Table
     columns: dict[str, str]
     pack: Callable[[Table], bytes]
+    data: bytes | None
     labels: NDArray[np.uint32] | None = None
     label_path: Path | None = None
 
@@ -80,6 +83,20 @@ class ScanFile:
             return RecordedScan(points, **given, labels=self.labels, table=table)
         except ValueError as error:
             raise ScanError(f"{self.path}: {error}") from error
+
+    def changed(self, result: WeatheredScan) -> Self:
+        """The file of a changed scan: rows of kept points, then those of added ones.
+
+        Other columns of an added point, such as the ring, are those of its shot.
+        """
+        scan, rows = self.scan, self.table[result.shot]
+        away = (result.points != scan.points[result.shot]).any(axis=1)
+        for axis, values in zip("xyz", result.points.T, strict=True):
+            rows[self.columns[axis]][away] = values[away]
+        if result.intensity is not None:
+            rows[self.columns["intensity"]] = result.intensity
+        same = rows.tobytes() == self.table.tobytes()
+        return replace(self, table=rows, labels=result.labels, data=self.data if same else None)
 
     def describe(self) -> str:
         """Format, columns, number of points, ranges and intensities in one line."""
@@ -150,7 +167,7 @@ def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -
             f"{path}: ranges have the median {median:.3g} and reach {largest:.4g}, which are no "
             f"metres: {advice}"
         )
-    return ScanFile(path, kind, table, known, pack, labels, label_path)
+    return ScanFile(path, kind, table, known, pack, None if num_bad else data, labels, label_path)
 
 
 def write_file(file: ScanFile, root: Path, out: Path) -> None:
@@ -165,7 +182,7 @@ def write_file(file: ScanFile, root: Path, out: Path) -> None:
         with atomic_path(out / place if inside else path.with_name(place.name)) as temporary:
             temporary.write_bytes(file.labels.astype("<u4").tobytes())
     with atomic_path(path) as temporary:
-        temporary.write_bytes(file.pack(file.table))
+        temporary.write_bytes(file.pack(file.table) if file.data is None else file.data)
 
 
 def _known_columns(path: Path, table: Table) -> dict[str, str]:

@@ -1,0 +1,243 @@
+"""``r3dpa data weather`` and ``data corrupt``: scans of files and folders, changed."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jsonargparse.typing import NonNegativeInt, PositiveInt
+from tqdm import tqdm
+
+from r3dpa.cli.parser import check_folder
+from r3dpa.data.scans import ScanError, evenly
+from r3dpa.io import delete_unfinished, in_processes, only_writer
+from r3dpa.simulation.drive_files import to_json, weather_to_dict, write
+from r3dpa.simulation.drives import differences
+from r3dpa.weather import Instrument, Weather, WeatheredScan
+from r3dpa.weather.faults import Fault, Kind
+from r3dpa.weather.files import ScanFile, find_files, read_file, write_file
+
+_REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
+_LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin
+
+
+def weather(
+    source: Path,
+    *,
+    weather: Weather = Weather(),  # noqa: B008
+    instrument: Instrument = Instrument(),  # noqa: B008
+    effects: Mapping[str, str | bool] | None = None,
+    **options: Any,
+) -> str:
+    """Write scans as they would be in other weather, in their own formats and below their names.
+
+    Points that stay keep their coordinates and order, added ones come last. ``report.jsonl`` has
+    one line per scan, ``scans.html`` shows some beside their results. The same command completes
+    an interrupted run; its files do not depend on the number of workers.
+
+    Args:
+        source: Scan or folder of scans: .bin, .pcd.bin, .pcd, .ply, .npy, .npz, with .label files.
+        weather: Such as ``--weather.visibility_m 60 --weather.rain_mm_h 10``.
+        instrument: What is assumed of the instrument; the intensity scale is found and reported.
+        effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
+        **options: See :class:`FolderOptions`.
+    """
+    change = weather, instrument, effects
+    about = {"weather": weather_to_dict(weather), "instrument": asdict(instrument)}
+    return _run(source, change, about | {"effects": effects}, FolderOptions(**options))
+
+
+def corrupt(
+    source: Path,
+    *,
+    fault: Kind,
+    severity: Literal[0, 1, 2, 3] = 2,
+    strength: float | None = None,
+    **options: Any,
+) -> str:
+    """Write scans with a fault of the sensor, as ``r3dpa data weather`` does.
+
+    Args:
+        source: Scan or folder of scans: .bin, .pcd.bin, .pcd, .ply, .npy, .npz, with .label files.
+        fault: What fails.
+        severity: 0 (nothing) to 3, as in Robo3D.
+        strength: In place of the severity: share of beams or points, metres, degrees.
+        **options: See :class:`FolderOptions`.
+    """
+    change = Fault(fault, severity, strength)
+    return _run(source, change, asdict(change), FolderOptions(**options))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions:
+    """Those of both commands.
+
+    Args:
+        out: Folder of the results.
+        seed: Of the random draws, together with the name of each scan.
+        workers: Processes.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
+        drop_nan: Leave out points with NaN.
+        show: Scans on the page at most.
+    """
+
+    out: Path
+    seed: NonNegativeInt = 0
+    workers: PositiveInt = 1
+    columns: tuple[str, ...] = ()
+    drop_nan: bool = False
+    show: NonNegativeInt = 4
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is done to each scan of a run; a call writes it and returns its line of the report."""
+
+    root: Path
+    change: Fault | tuple[Weather, Instrument, Mapping[str, str | bool] | None]
+    options: FolderOptions
+
+    def name(self, path: Path) -> str:
+        return path.relative_to(self.root).as_posix()
+
+    def read(self, path: Path) -> tuple[ScanFile, WeatheredScan]:
+        file = read_file(path, self.options.columns, self.options.drop_nan)
+        key, scan = (self.options.seed, self.name(path)), file.scan
+        try:
+            if isinstance(self.change, Fault):
+                return file, self.change.apply(scan, key)
+            weather, instrument, effects = self.change
+            return file, weather.apply(scan, key, instrument, effects=effects)
+        except ValueError as error:
+            raise ScanError(f"{path}: {error}") from error
+
+    def __call__(self, path: Path) -> dict[str, Any]:
+        try:
+            file, result = self.read(path)
+        except ScanError as error:
+            return {"scan": self.name(path), "error": str(error)}
+        write_file(file.changed(result), self.root, self.options.out)
+        ran = {effect.name: effect.reason for effect in result.effects if effect.status == "ran"}
+        about = {"scan": self.name(path), "file": file.describe(), "effects": ran}
+        return about | result.report | {"written": len(result.points)}
+
+
+def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
+    root, files = find_files(source)
+    out, job = options.out, _Job(root, change, options)
+    paths = {job.name(path): path for path in files}
+    request |= {"seed": options.seed, "columns": options.columns, "drop_nan": options.drop_nan}
+    _check_out(root, out, len(files), json.loads(json.dumps(request)))
+    with only_writer(out / ".lock", f"writes scans to {out}", wait=True):
+        write(out / _REQUEST, to_json(request))
+        lines = {name: line for name, line in _lines(out) if _is_done(line, paths.get(name), out)}
+        todo = [path for name, path in paths.items() if name not in lines]
+        with (
+            (out / _LINES).open("a") as unfinished,
+            tqdm(total=len(paths), initial=len(lines), unit="scan", disable=None) as bar,
+        ):
+            for line in in_processes(job, todo, options.workers):
+                lines[line["scan"]] = line
+                unfinished.write(json.dumps(line) + "\n")
+                unfinished.flush()
+                bar.update()
+        text = "".join(f"{json.dumps(lines[name])}\n" for name in sorted(lines))
+        write(out / _REPORT, text.encode())
+        (out / _LINES).unlink()
+        delete_unfinished(out)  # at the end: workers of a killed run may outlive it
+        bad = [lines[name]["error"] for name in paths if "error" in lines[name]]
+        if len(bad) == len(paths):
+            (out / _REPORT).unlink()
+            (out / _REQUEST).unlink()
+    if bad:
+        with suppress(OSError):
+            out.rmdir()
+        more = f" ({len(bad)} of {len(paths)} scans cannot be used, see {out / _REPORT})"
+        raise ScanError(bad[0] + (more if len(paths) > 1 else ""))
+    if options.show and (todo or not (out / _PAGE).exists()):
+        _write_page(job, evenly(files, options.show))
+    return _summary([lines[name] for name in paths], len(todo), out)
+
+
+def _check_out(root: Path, out: Path, num: int, request: dict[str, Any]) -> None:
+    """Refuse a folder of other files, before anything is written."""
+    check_folder(out)
+    place, above = out.resolve(), root.resolve()
+    if place == above or (place.is_relative_to(above) and num > 1):
+        raise ValueError(f"--out {out} is the folder of the scans, or in it: give another one")
+    if (out / _REQUEST).is_file():
+        before = json.loads((out / _REQUEST).read_text())
+        if different := "; ".join(differences(before, request)):
+            raise ValueError(
+                f"{out} holds scans of another request ({different}): give another --out, or "
+                "delete it"
+            )
+    elif out.is_dir() and any(out.iterdir()):
+        raise ValueError(f"{out} holds other files: give a new folder as --out")
+
+
+def _lines(out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Lines of earlier runs; the last one of a killed run may be torn."""
+    for path in (out / _REPORT, out / _LINES):
+        for text in path.read_text().splitlines() if path.is_file() else ():
+            with suppress(ValueError):
+                line = json.loads(text)
+                yield line["scan"], line
+
+
+def _is_done(line: dict[str, Any], path: Path | None, out: Path) -> bool:
+    """Whether the result of a scan is there and newer than the scan."""
+    written = out / line["scan"]
+    if path is None or "error" in line or not written.is_file():
+        return False
+    return written.stat().st_mtime_ns >= path.stat().st_mtime_ns
+
+
+def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
+    """Formats, shares of points and effects of all scans."""
+    kinds = {line["file"].partition(")")[0]: line["file"] for line in reversed(lines)}
+    num_points = sum(line["points"] for line in lines)
+    texts = [f"{len(lines)} scans in {out}, {num_now} of them written now", *kinds.values()]
+    for key in ("lost", "moved", "dimmed", "added"):
+        causes = Counter[str]()
+        for line in lines:
+            causes.update(line[key] if isinstance(line[key], dict) else {"": line[key]})
+        shares = [f"{n / num_points:.2%} {cause}".strip() for cause, n in causes.items() if n]
+        texts.append(f"{key}: {', '.join(shares) or 'no point'}")
+    ran = Counter((name, why) for line in lines for name, why in line["effects"].items())
+    texts += [f"{name}: {why}, in {num} scans" for (name, why), num in ran.most_common(12)]
+    return "\n".join([*texts, f"{out / _REPORT} has a line for each; open {out / _PAGE}"])
+
+
+def _write_page(job: _Job, files: list[Path]) -> None:
+    """Page of scans, each beside its result."""
+    from r3dpa import viz
+    from r3dpa.cli.scene_files import write_page
+
+    before, after = [], []
+    for path in files:
+        file, result = job.read(path)
+        scan = file.scan
+        index = result.index[result.index >= 0]
+        fate = np.full(len(scan), _LOST, dtype=np.uint8)
+        fate[index] = 0
+        away = (result.points[: len(index)] != scan.points[index]).any(axis=1)
+        fate[index[away]] = _MOVED
+        made_by = result.origins.copy()
+        made_by[: len(index)][away] = _MOVED
+        sides = ((before, "", scan, fate), (after, ", changed", result, made_by))
+        for scans, note, one, origins in sides:
+            points = one.points
+            if one.intensity is not None:
+                points = np.column_stack([points, one.intensity.astype(np.float32)])
+            scans.append(viz.PageScan(f"{job.name(path)}{note}", points, origins=origins))
+    more = {_LOST: viz.Category("lost", "#ff5c5c"), _MOVED: viz.Category("moved", "#ffb000")}
+    title = f"{job.root.resolve().name} - r3dpa"
+    write_page(job.options.out / _PAGE, before, title, more, beside=after, mode="origin")
