@@ -221,7 +221,8 @@ def _write_page(job: _Job, files: list[Path]) -> None:
     from r3dpa import viz
     from r3dpa.cli.scene_files import write_page
 
-    before, after = [], []
+    before: list[viz.PageScan] = []
+    after: list[viz.PageScan] = []
     for path in files:
         file, result = job.read(path)
         scan = file.scan
