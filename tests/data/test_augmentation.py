@@ -6,11 +6,12 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import default_collate
 
-from r3dpa.data import Augmentation, LidarDataModule, find_scans, read_scan
+from r3dpa.data import Augmentation, LidarDataModule, PointDataModule, find_scans, read_scan
 from r3dpa.data.augmentation import View
 from r3dpa.geometry import LidarSensor, SphericalProjection, pool_cells, range_image
 from r3dpa.nn.backbones import GeometricFeatures
 from r3dpa.simulation import simulate
+from r3dpa.weather import WeatherPrior
 
 GRID = (8, 64)
 PROJECTION = SphericalProjection(LidarSensor())
@@ -203,3 +204,60 @@ def test_grids_that_do_not_follow_are_refused(tmp_path, augmented):
     options = {"sensor": wide, "grid_size": (2, 6), "extractor": geometric}
     with pytest.raises(ValueError, match=r"augmentation\.rotate: .* by a 6th of a turn"):
         LidarDataModule(str(tmp_path), augmentation=Augmentation(rotate=True), **options)
+
+
+STORMY = WeatherPrior(probability=0.8, visibility_m=(20, 100))
+
+
+def test_weather_of_each_scan_and_epoch_and_resumed(tmp_path, data, fit):
+    whole = fit(data(weather=STORMY, seed=5), 9).trained
+    module = data(weather=STORMY, seed=5)
+    saver = ModelCheckpoint(tmp_path / "c", every_n_train_steps=7, filename="{step}")
+    fit(module, 7, saver)
+    resumed = fit(data(weather=STORMY, seed=5), 9, ckpt_path=tmp_path / "c/step=7.ckpt").trained
+    assert_same_images(resumed, whole[7:])
+    clear = 0
+    for number, batch in enumerate(whole):
+        for place, index in enumerate(batch["index"].tolist()):
+            points = read_scan(module.train_set.scans[index].path)
+            there = STORMY.points(points, (5, number // 5, index, 2))
+            clear += there is points
+            image = range_image(torch.from_numpy(there[:, :3]), module.projection)[0]
+            expected = module.codec.to_image(image)
+            assert torch.equal(batch["range_image"][place], expected)
+    assert 0 < clear < 10
+    plain = data().weather_prior
+    assert plain is None
+    for one, other in zip(fit(module, 5).validated, fit(data(), 5).validated, strict=True):
+        assert torch.equal(one["range_image"], other["range_image"])
+
+
+def assert_same_images(actual, expected):
+    assert len(actual) == len(expected) > 0
+    for one, other in zip(actual, expected, strict=True):
+        assert torch.equal(one["range_image"], other["range_image"])
+
+
+def test_weather_of_points_to_prepare(data):
+    source = data(weather=None)
+    module = PointDataModule(source, lambda points, generator: points, weather=STORMY)
+    module.setup("fit")
+    drawn = [module.train_set[epoch, 0] for epoch in range(8)]
+    assert len({len(points) for points in drawn} | {points.sum().item() for points in drawn}) > 4
+    assert torch.equal(drawn[3], module.train_set[3, 0])
+    held_out = PointDataModule(source, lambda points, generator: points)
+    held_out.setup("fit")
+    assert torch.equal(module.val_set[0], held_out.val_set[0])
+
+
+def test_weather_is_refused_where_something_would_not_follow(data, scaled_points):
+    with pytest.raises(ValueError, match="weather: the feature grids are those of the clear"):
+        data(weather=STORMY, extractor=scaled_points())
+    data(weather=STORMY, extractor=scaled_points(), augmentation=BOTH)
+    with pytest.raises(ValueError, match="no order of rings: use projection: spherical"):
+        data(weather=STORMY, projection="rings")
+    with pytest.raises(ValueError, match="weather: cached posteriors are those of the clear"):
+        data(weather=STORMY).use_posteriors(None)
+    for wrong in ({"probability": 2}, {"rain_mm_h": (0, 1)}, {"visibility_m": (0.5, 9)}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            WeatherPrior(**wrong)

@@ -8,6 +8,7 @@ Letters: H beams, W columns, h x w cells, D feature width.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from r3dpa.data.datasets import LidarDataset
+from r3dpa.weather.prior import WeatherPrior
 
-_STREAM = 1  # separates these draws from those of the order, which have the same seed
+# Separate these draws from those of the order, which have the same seed.
+_STREAM, _WEATHER_STREAM = 1, 2
 
 
 @dataclass(frozen=True)
@@ -128,16 +131,20 @@ class Augmentation:
 
 @dataclass(eq=False, repr=False)
 class AugmentedDataset(Dataset[dict[str, Any]]):
-    """Samples ``(epoch, index)`` of a dataset in the view drawn for them."""
+    """Samples ``(epoch, index)`` of a dataset in the weather and the view drawn for them."""
 
     dataset: LidarDataset
     augmentation: Augmentation
     seed: int
     grid_columns: int
+    weather: WeatherPrior | None = None
 
     def __len__(self) -> int:
         return len(self.dataset)
 
     def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
         view = self.augmentation.draw(self.seed, *key, self.grid_columns)
-        return view.sample(self.dataset[key[1]])
+        if self.weather is None:
+            return view.sample(self.dataset[key[1]])
+        change = partial(self.weather.points, seed=(self.seed, *key, _WEATHER_STREAM))
+        return view.sample(self.dataset.sample(key[1], change))

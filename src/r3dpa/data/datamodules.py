@@ -28,6 +28,7 @@ from r3dpa.geometry import (
     SphericalProjection,
 )
 from r3dpa.simulation import Weather, simulate
+from r3dpa.weather.prior import WeatherPrior
 
 _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
@@ -70,13 +71,17 @@ class LidarDataModule(LoaderModule):
         prepare_data_per_node: Whether one process of each node prepares the data, as node-local
             disks need; by default one process of all does, for a disk that the nodes share.
         augmentation: Rotation and mirroring of training scans; none by default.
+        weather: Weather of training scans, drawn anew in each epoch; none by default. Feature grids
+            stay those of the clear scans, which ``augmentation.approximate_grids`` must allow.
 
     Raises:
-        ValueError: If an argument is out of its range, or the features do not follow the
-            augmentation.
+        ValueError: If an argument is out of its range, or features or projection do not follow
+            the augmentation or the weather.
     """
 
-    augmentation = _AUGMENTATION  # also of subclasses that make their batches without __init__
+    # Also of subclasses that make their batches without __init__.
+    augmentation = _AUGMENTATION
+    weather_prior: WeatherPrior | None = None
 
     def __init__(
         self,
@@ -95,6 +100,7 @@ class LidarDataModule(LoaderModule):
         limit: int | None = None,
         prepare_data_per_node: bool = False,
         augmentation: Augmentation = _AUGMENTATION,
+        weather: WeatherPrior | None = None,
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
         self.prepare_data_per_node = prepare_data_per_node
@@ -109,6 +115,18 @@ class LidarDataModule(LoaderModule):
         self.augmentation = augmentation
         if self.features_dir is not None:
             augmentation.check_extractor(extractor, self.grid_size[1])
+        self.weather_prior = weather
+        if weather is not None and projection == "rings":
+            raise ValueError(
+                "weather adds points at the end of a scan, which then has no order of rings: use "
+                "projection: spherical"
+            )
+        with_grids = self.features_dir is not None and not augmentation.approximate_grids
+        if weather is not None and with_grids:
+            raise ValueError(
+                "weather: the feature grids are those of the clear scans. Train without them, or "
+                "on these with augmentation.approximate_grids: true."
+            )
 
     @property
     def feature_dim(self) -> int:
@@ -173,6 +191,11 @@ class LidarDataModule(LoaderModule):
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:
         """Train on cached posteriors ``(2C, h, w)`` of a frozen VAE."""
+        if self.weather_prior is not None:
+            raise ValueError(
+                "weather: cached posteriors are those of the clear scans. Switch it off, or encode "
+                "in each step: model.init_args.cache_latents: false"
+            )
         self.train_set = replace(self.train_set, posteriors=posteriors)
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -182,9 +205,11 @@ class LidarDataModule(LoaderModule):
             raise ValueError(f"No scan to train on in {self.scans}: {_EMPTY_SPLIT}")
         if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self.loader(dataset, train=False)
-        if not self.augmentation.active:
+        if not self.augmentation.active and self.weather_prior is None:
             return self.loader(dataset, train=True)
-        drawn = AugmentedDataset(dataset, self.augmentation, self.seed, self.grid_size[1])
+        drawn = AugmentedDataset(
+            dataset, self.augmentation, self.seed, self.grid_size[1], self.weather_prior
+        )
         return self.loader(drawn, train=True, with_epoch=True)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
@@ -301,6 +326,7 @@ class PointDataModule(LoaderModule):
         batch_size: Scans per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of order and draws.
+        weather: Weather of training scans, drawn anew in each epoch; none by default.
 
     Raises:
         ValueError: If ``source`` has an extractor, or an argument is out of its range.
@@ -313,6 +339,7 @@ class PointDataModule(LoaderModule):
         batch_size: int = 2,
         num_workers: int = 0,
         seed: int = 0,
+        weather: WeatherPrior | None = None,
     ) -> None:
         super().__init__(batch_size, num_workers, seed)
         if source.extractor is not None:
@@ -320,7 +347,7 @@ class PointDataModule(LoaderModule):
                 "data.init_args.source.init_args.extractor must be null: a network on points is "
                 "trained without feature grids."
             )
-        self.source, self.prepare = source, prepare
+        self.source, self.prepare, self.weather_prior = source, prepare, weather
 
     def prepare_data(self) -> None:
         """Simulate the scans, where the source does."""
@@ -329,7 +356,7 @@ class PointDataModule(LoaderModule):
     def setup(self, stage: str) -> None:
         """Index the scans."""
         self.train_set, self.val_set = (
-            DrawnPoints(scans, self.source.sensor, self.prepare, self.seed)
+            DrawnPoints(scans, self.source.sensor, self.prepare, self.seed, self.weather_prior)
             for scans in self.source.limited_split()
         )
 

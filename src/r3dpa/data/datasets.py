@@ -14,6 +14,10 @@ from torch.utils.data import Dataset
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
 from r3dpa.data.store import CachedTensors, ItemKey
 from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
+from r3dpa.weather.prior import WeatherPrior
+
+#: Function of the points ``(P, 4)`` of a scan.
+Change = Callable[[np.ndarray], np.ndarray]
 
 
 class LidarBatch(TypedDict):
@@ -58,22 +62,27 @@ class LidarDataset(Dataset[dict[str, Any]]):
         return len(self.scans)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        return self.sample(index)
+
+    def sample(self, index: int, change: Change | None = None) -> dict[str, Any]:
+        """Sample of a scan whose points ``change`` has changed, unless its image is cached."""
         scan = self.scans[index]
         sample: dict[str, Any]
         if self.posteriors is not None:
             sample = {"posterior_moments": self.posteriors.read(scan)}
         else:
-            image = self._project(scan)
+            image = self._project(scan, change)
             sample = {"range_image": image, "valid_mask": self.codec.returns_of(image)}
         sample |= {"index": index, "name": scan.name}
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
 
-    def _project(self, scan: Scan) -> Tensor:
+    def _project(self, scan: Scan, change: Change | None) -> Tensor:
         if self.images is not None:
             return self.codec.to_image(self.images.read(scan))
-        points = torch.from_numpy(read_scan(scan.path))
+        read = read_scan(scan.path)
+        points = torch.from_numpy(read if change is None else change(read))
         try:
             values = points[:, 3:4] if self.codec.reflectance else None
             range_m, values = range_image(points[:, :3], self.projection, values)
@@ -119,11 +128,16 @@ class DrawnPoints(PointDataset):
     """Random preparation of points, ``prepare(points, generator)``.
 
     An item ``(epoch, index)``, or ``index`` of epoch 0, is a function of these and ``seed`` alone.
+    ``weather`` changes the points of an item of an epoch.
     """
 
     seed: int
+    weather: WeatherPrior | None = None
 
     def __getitem__(self, key: tuple[int, int] | int) -> Any:
         epoch, index = key if isinstance(key, tuple) else (0, key)
-        points = torch.from_numpy(read_scan(self.scans[index].path, self.sensor))
+        read = read_scan(self.scans[index].path, self.sensor)
+        if self.weather is not None and isinstance(key, tuple):
+            read = self.weather.points(read, (self.seed, epoch, index))
+        points = torch.from_numpy(read)
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))

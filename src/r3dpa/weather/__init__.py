@@ -1,5 +1,6 @@
 """Weather and faults on scans from files."""
 
+from r3dpa.weather.prior import WeatherPrior
 from r3dpa.weather.recorded import RecordedScan
 from r3dpa.weather.recorded_sweep import Instrument
 from r3dpa.weather.rings import Rings, rings_of
@@ -11,6 +12,7 @@ __all__ = [
     "RecordedScan",
     "Rings",
     "Weather",
+    "WeatherPrior",
     "WeatheredScan",
     "rings_of",
 ]

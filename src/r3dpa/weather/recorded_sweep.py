@@ -17,7 +17,7 @@ from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.scan import damped_intensity, power_of_intensity
 from r3dpa.simulation.scene import Material, Scene
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, load_sensor
-from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, solids_of
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids
 from r3dpa.simulation.sweep import Echoes, Sweep
 from r3dpa.weather.ground import ground_of
 from r3dpa.weather.recorded import RecordedScan
@@ -30,7 +30,8 @@ _UNKNOWN_INTENSITY = 0.2
 _NEAR_M, _DARK_M, _DARK_SPREAD, _NEAR_DARK = 20.0, 121.0, 0.43, (1.0, 0.6)
 # A sun with a return within this angle is hidden.
 _SUN_RADIUS_RAD = np.radians(0.5)
-_HIGHEST_RAD = np.radians(80)
+# The highest laser: limited as in a sensor's table, by the inclinations of some points.
+_HIGHEST_RAD, _SOME_POINTS = np.radians(80), 4096
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class Instrument:
         sensor = load_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
         range_m = range_of(scan.points)
         height_m = float(np.mean(sensor.lasers.height_m))
-        highest = float(np.quantile(angles(scan.points)[0], 0.999).clip(max=_HIGHEST_RAD))
+        some = scan.points[:: 1 + len(scan) // _SOME_POINTS]
+        highest = float(np.quantile(angles(some)[0], 0.999).clip(max=_HIGHEST_RAD))
         return replace(
             sensor,
             # Only the sun is compared with the highest laser.
@@ -171,9 +173,6 @@ class RecordedSweep(Sweep):
             time_s = scan.time_s[self.rays_of].astype(float)
             time_s -= (time_s.min() + time_s.max()) / 2
         self._begin(scene, sensor, start, direction, time_s.astype(np.float32))
-        self.solids = solids_of(scene.primitives, scene.pose, scene.ground_m)
-        self.actor_time_s = self.optical_depth = self.second = None
-        self.cos_incidence = self.reflectivity = np.zeros_like(range_m)
         self.material = np.full(len(range_m), Material.CONCRETE, dtype=np.uint8)
 
         self.scale = scale_of(scan.intensity, instrument.full_intensity)

@@ -135,7 +135,7 @@ class Weather(scene.Weather):
         vehicles = _vehicles(boxes)
         if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
             vehicles += _labelled_vehicles(scan, self.traffic_m_s)
-        world = Scene(vehicles, Pose(0, 0, 1e-3), weather=self)
+        world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3)
         sensor = instrument.sensor_for(scan)
         called = [effect for effect in wanted if effect.called_by(world, sensor)]
         names = {effect_name(effect) for effect in called} - set(off)
