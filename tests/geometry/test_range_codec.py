@@ -1,8 +1,10 @@
+import json
 import math
 
 import pytest
 import torch
 
+from r3dpa.cli.features import read_data
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, RangeCodec
 
 CODECS = [RangeCodec(), RangeCodec(scale=80.0), RangeCodec("log2"), RangeCodec("log2", scale=6.5)]
@@ -102,3 +104,13 @@ def test_empty_image_decodes_to_no_point(codec):
     naive = codec.to_range(image) > 0
     assert naive.any()
     assert (codec.decode(image, LidarSensor()) == EMPTY_RANGE_M).all()
+
+
+def test_an_encoding_named_alone_in_yaml_has_its_own_scale(tmp_path):
+    path = tmp_path / "data.yaml"
+    settings = {"scans": str(tmp_path), "codec": {"encoding": "log2"}}
+    module = {"class_path": "r3dpa.data.LidarDataModule", "init_args": settings}
+    path.write_text(json.dumps({"data": module}))
+    assert read_data(path).codec == RangeCodec("log2") == RangeCodec("log2", 5.84)
+    assert RangeCodec("log2").encode(torch.tensor(56.0)).item() > 0.99
+    assert RangeCodec("log2", 56.0) != RangeCodec("log2")

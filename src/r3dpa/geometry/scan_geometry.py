@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
@@ -65,14 +65,16 @@ class RangeCodec:
             raise ValueError(f"range encoding must be one of {known}, got {self.encoding!r}")
         if self.return_channel and self.reflectance:
             raise ValueError("codec.return_channel and codec.reflectance exclude each other")
-        if self.scale is None:  # so that a codec equals the same one written out
-            object.__setattr__(self, "scale", _DEFAULT_SCALES[self.encoding])
+        # So that a codec equals the same one written out. Not the number in place of None: the
+        # scale of a default codec would stay when a YAML file names another encoding alone.
+        if self.scale == _DEFAULT_SCALES[self.encoding]:
+            object.__setattr__(self, "scale", None)
         if not 0.0 < self._divisor < math.inf:
             raise ValueError(f"range scale must be positive and finite, got {self.scale}")
 
     @property
     def _divisor(self) -> float:
-        return cast(float, self.scale)
+        return _DEFAULT_SCALES[self.encoding] if self.scale is None else self.scale
 
     @property
     def threshold(self) -> float:
