@@ -12,7 +12,6 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from scipy.special import lpmv
 from torch import Tensor, nn
 
 from r3dpa.geometry import LidarSensor, Projection, SphericalProjection
@@ -296,14 +295,18 @@ def spherical_harmonics(angles: Tensor) -> Tensor:
 
     Orders of a degree run from -l to l. The y axis is that of the official code, to the right.
     """
-    sine, azimuth = angles[:, 0].double().sin().cpu().numpy(), -angles[:, 1].double()
+    sine, azimuth = angles[:, 0].double().sin(), -angles[:, 1].double()
     found = []
     for degree in range(5):
         for order in range(-degree, degree + 1):
             m = abs(order)
-            factor = (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m)
-            factor = math.sqrt(factor / math.factorial(degree + m)) * (-1) ** m
+            below = torch.zeros_like(sine)
+            legendre = math.prod(range(1, 2 * m, 2)) * (1 - sine.square()) ** (m / 2)
+            for n in range(m + 1, degree + 1):
+                above = (2 * n - 1) * sine * legendre - (n + m - 1) * below
+                below, legendre = legendre, above / (n - m)
+            factor = (2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi)
+            factor *= math.factorial(degree - m) / math.factorial(degree + m)
             wave = (m * azimuth).sin() if order < 0 else (m * azimuth).cos()
-            legendre = torch.from_numpy(lpmv(m, degree, sine)).to(azimuth.device)
-            found.append(factor * (math.sqrt(2) if m else 1) * legendre * wave)
+            found.append(math.sqrt(factor) * legendre * wave)
     return torch.stack(found, dim=1).to(angles.dtype)
