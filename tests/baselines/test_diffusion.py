@@ -42,7 +42,7 @@ def test_velocity_is_that_of_the_interpolant(path):
 
 
 @pytest.mark.parametrize(
-    ("solver", "steps"), [("heun", 60), ("ab3", 100), ("euler_maruyama", 400), ("ddpm", 400)]
+    ("solver", "steps"), [("heun", 60), ("ab3", 100), ("euler_maruyama", 150), ("ddpm", 150)]
 )
 def test_solvers_reach_the_spread_of_gaussian_data(solver, steps):
     """Data N(0, 0.25): the expected data is ``alpha / (alpha^2 + 4 sigma^2) x``."""
@@ -53,10 +53,10 @@ def test_solvers_reach_the_spread_of_gaussian_data(solver, steps):
         data = 0.25 * alpha / (0.25 * alpha.square() + sigma.square()) * x
         return path.velocity(data, x, time)
 
-    noise = torch.randn(20_000, 1, generator=generator, dtype=torch.float64)
+    noise = torch.randn(5_000, 1, generator=generator, dtype=torch.float64)
     found = SamplerConfig(solver, steps).solve(velocity, noise, generator, path)
-    # 20,000 draws: the standard error of the deviation is 0.5 %.
-    assert found.std().item() == pytest.approx(0.5, rel=0.03)
+    # 5,000 draws: the standard error of the deviation is 1 %.
+    assert found.std().item() == pytest.approx(0.5, rel=0.05)
 
 
 def test_steps_without_noise_on_the_linear_path_are_euler_steps():
