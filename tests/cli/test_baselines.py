@@ -146,3 +146,9 @@ def test_known_pixels_of_a_completion_stay(trained):
     # The last state holds the known part at the least noise of the path, 5.5e-4.
     difference = (found.latents - image).abs()
     assert difference[..., ::2, :].max() < 5e-3 < difference[..., 1::2, :].max()
+
+
+def test_reflectance_is_for_the_baselines(smoke_args, tmp_path):
+    codec = "--data.init_args.codec={encoding: log2, reflectance: true}"
+    with pytest.raises(ValueError, match=r"stage vae_alignment has no use for the reflectance"):
+        main(smoke_args("vae_alignment", tmp_path, "--trainer.logger=false", codec))

@@ -150,6 +150,11 @@ class GenerativeModule(L.LightningModule):
         self.geometry = geometry
         self.augmentation = getattr(datamodule, "augmentation", None)
         sensor = geometry.projection.sensor
+        if geometry.codec.reflectance:
+            raise ValueError(
+                f"stage {self.stage} has no use for the reflectance of data.codec, which the "
+                "baselines generate: set codec.reflectance to false"
+            )
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
         if stage != "predict":
             self.feature_source = getattr(datamodule, "feature_source", None)
