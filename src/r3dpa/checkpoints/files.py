@@ -175,6 +175,11 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
         if "latent_norm" in checkpoint.networks:
             norm = checkpoint.network("latent_norm").state_dict
             files[_neighbour(out, "latents-stats")] = statistics_of(norm)
+    if not files:
+        raise ValueError(
+            f"{checkpoint.path} is of stage {checkpoint.stage}, which has no official R3DPA layout: "
+            "leave --to out"
+        )
     _refuse_existing(list(files), overwrite)
     for path, weights in files.items():
         with atomic_path(path) as temporary:
