@@ -177,8 +177,8 @@ def _save_official(checkpoint: Checkpoint, out: Path, overwrite: bool) -> list[P
             files[_neighbour(out, "latents-stats")] = statistics_of(norm)
     if not files:
         raise ValueError(
-            f"{checkpoint.path} is of stage {checkpoint.stage}, which has no official R3DPA layout: "
-            "leave --to out"
+            f"{checkpoint.path} is of stage {checkpoint.stage}, which has no official R3DPA "
+            "layout: leave --to out"
         )
     _refuse_existing(list(files), overwrite)
     for path, weights in files.items():
