@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_networks import tiny_checkpoint
 
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
@@ -15,7 +16,14 @@ from r3dpa.cli.sample import sample as sample_command
 from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.generation import SamplerConfig
-from r3dpa.geometry import LidarSensor, SphericalProjection, in_range, points_of
+from r3dpa.geometry import (
+    LidarSensor,
+    RangeCodec,
+    ScanGeometry,
+    SphericalProjection,
+    in_range,
+    points_of,
+)
 from r3dpa.io import source_commit
 
 SENSOR = LidarSensor(beams=16, columns=64)  # of conf/smoke.yaml
@@ -116,6 +124,21 @@ class TestSample:
     def test_every_solver_can_be_chosen(self):
         for solver in (*ODE_SOLVERS, "euler_maruyama"):
             parse(sample_command, ["--ckpt", "a", "--out", "b", "--solver", solver], "sample")
+
+    def test_instant_takes_few_steps_and_the_thin_decoder(self, tiny_file, tmp_path, capsys):
+        geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
+        few = tiny_checkpoint(tmp_path / "few.safetensors", geometry, stage="few_step")
+        words = ["--num", 1, "--quality", "instant"]
+        found = sample(few, tmp_path / "thin", *words, steps=())
+        assert found["sampler"]["solver"] == "average_velocity"
+        assert (found["nfe"], found["decoder"]) == (found["sampler"]["steps"], "thin")
+        assert "quality instant: average_velocity, " in capsys.readouterr().out
+        full = sample(few, tmp_path / "full", *words, "--decoder", "full", steps=())
+        assert full["decoder"] == "full"
+        ranges = [np.load(tmp_path / name / "range_m.npy") for name in ("thin", "full")]
+        assert not np.array_equal(*ranges)
+        with pytest.raises(ValueError, match="is of stage 'joint' and has no thin_decoder"):
+            sample(tiny_file, tmp_path / "joint", *words, steps=())
 
     def test_a_quality_chooses_the_sampler_and_says_so(self, tiny_file, tmp_path, capsys):
         words = ["--num", 1, "--quality", "draft"]
