@@ -154,3 +154,19 @@ def test_reflectance_is_for_the_baselines(smoke_args, tmp_path):
     codec = "--data.init_args.codec={encoding: log2, reflectance: true}"
     with pytest.raises(ValueError, match=r"stage vae_alignment has no use for the reflectance"):
         main(smoke_args("vae_alignment", tmp_path, "--trainer.logger=false", codec))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", TINY)
+@pytest.mark.filterwarnings("ignore:.*fast_dev_run.*")
+def test_a_step_at_full_size(stage, smoke_root, tmp_path, caplog):
+    """One scan of 64 x 1024; R2DM takes 40 s and 3.4 GB on a busy core."""
+    simulate(smoke_root, 12)
+    names = ("num_scans", "batch_size", "num_workers")
+    kept = {key: value for key, value in SETTINGS.items() if key.rpartition(".")[2] in names}
+    kept |= {key: value for key, value in SETTINGS.items() if key.startswith("trainer.")}
+    kept |= {"data.init_args.root": smoke_root, "run_dir": tmp_path}
+    kept |= {"data.init_args.batch_size": 1, "trainer.limit_val_batches": 0}
+    words = [f"--{key}={value}" for key, value in kept.items()]
+    main(["fit", stage, "--preset", "simulated", *words, "--trainer.fast_dev_run=true"])
+    assert "`Trainer.fit` stopped: `max_steps=1` reached" in caplog.text
