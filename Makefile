@@ -7,9 +7,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-# What `make demo` reads: simulated scans, or every .bin below DATA.
+# What `make demo` reads: simulated scans, or every .bin below DATA. SCRATCH=1 trains small networks
+# from nothing instead of starting from the weights of the package.
 DATA ?=
+SCRATCH ?=
 OUT ?= runs/demo
+ifneq ($(SCRATCH),)
 ifeq ($(DATA),)
 SOURCE := --config conf/data/demo.yaml --data.init_args.root $(OUT)/data
 else
@@ -17,10 +20,23 @@ SOURCE := --config conf/data/demo_folder.yaml --data.init_args.scans $(DATA) \
 	--data.init_args.features_dir $(OUT)/feature_grids
 endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
+else
+ifeq ($(DATA),)
+SOURCE := --config conf/box/demo_data.yaml
+REAL := conf/box/demo_data.yaml
+else
+SOURCE := --config conf/box/demo_folder.yaml --data.init_args.scans $(DATA)
+REAL := $(DATA)
+endif
+FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/box/trainer.yaml $(SOURCE)
+endif
+# The long training of r3dpa-s; the same command continues an interrupted run.
+BOX_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/box/trainer.yaml \
+	--config conf/box/data.yaml --ckpt_path last
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo clean bench bench-training \
+	test-faults test-nodes fuzz notebooks demo gallery box clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -67,7 +83,8 @@ fuzz: $(READY) ## 100000 damaged files for all readers: about 6 minutes
 notebooks: $(READY) ## run the notebooks, keeping their outputs
 	$(BIN)/pytest --nbmake --nbmake-timeout=300 --overwrite notebooks
 
-demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin scans]
+ifneq ($(SCRATCH),)
+demo: $(READY) ## the weights of the package, then trained on: make demo [DATA=folder of .bin scans] [SCRATCH=1]
 	rm -rf $(OUT)/vae_alignment $(OUT)/joint
 	$(FIT) --config conf/experiment/vae_alignment.yaml \
 		--config conf/experiment/vae_alignment_demo.yaml --run_dir $(OUT)/vae_alignment
@@ -80,6 +97,33 @@ demo: $(READY) ## the whole method at small size: make demo [DATA=folder of .bin
 	$(BIN)/r3dpa report $(OUT)/joint
 	$(BIN)/r3dpa test --config $(OUT)/joint/config.yaml \
 		--ckpt_path $(OUT)/joint/checkpoints/last.ckpt
+else
+demo: $(READY)
+	rm -rf $(OUT)/vae $(OUT)/flow $(OUT)/reference.safetensors
+	$(BIN)/r3dpa sample --num 16 --out $(OUT)/box --overwrite true
+	$(BIN)/r3dpa edit inpaint --scan $(OUT)/box/bin/000000.bin --box -30 30 -25 3 --num 2 \
+		--steps 16 --out $(OUT)/edit --overwrite true
+	$(BIN)/r3dpa data reference --data $(REAL) --limit 64 --out $(OUT)/reference.safetensors
+	$(BIN)/r3dpa evaluate --samples $(OUT)/box --reference $(OUT)/reference.safetensors \
+		--allow_few --label before --out $(OUT)/before
+	$(FIT) --config conf/box/vae_alignment.yaml --config conf/box/demo_vae.yaml --run_dir $(OUT)/vae
+	$(FIT) --config conf/box/flow_matching.yaml --config conf/box/demo_flow.yaml \
+		--run_dir $(OUT)/flow --model.init_args.init_from $(OUT)/vae/checkpoints/last.ckpt
+	$(BIN)/r3dpa sample --ckpt $(OUT)/flow/checkpoints/last.ckpt --num 16 --out $(OUT)/scenes \
+		--overwrite true
+	$(BIN)/r3dpa evaluate --samples $(OUT)/scenes --reference $(OUT)/reference.safetensors \
+		--allow_few --label after --beside $(OUT)/before/evaluation.json --out $(OUT)/after
+endif
+
+gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
+	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/box/data),--data conf/box/data.yaml)
+
+box: $(READY) ## train the weights of the package: days of two cores; stop and repeat at any time
+	$(BOX_FIT) --config conf/box/vae_alignment.yaml --run_dir runs/box/vae
+	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
+		--model.init_args.init_from runs/box/vae/checkpoints/last.ckpt
+	$(BIN)/r3dpa convert runs/box/flow/checkpoints/last.ckpt runs/box/r3dpa-s.safetensors \
+		--networks vae ema ema_latent_norm --half --overwrite
 
 bench: $(READY) ## micro-benchmarks of simulation, data, features, metrics, VAE, sampling, guidance
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/bench -m bench

@@ -43,6 +43,12 @@ STARTS = {
     "flow_matching_demo": "demo",
     "few_step_demo": "demo",
 }
+BOX = {  # stage, what fine-tunes it, data
+    "box": ("vae_alignment", "data"),
+    "box_flow": ("flow_matching", "data"),
+    "demo": ("vae_alignment", "demo_vae", "demo_data"),
+    "demo_flow": ("flow_matching", "demo_flow", "demo_folder"),
+}
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {
     "trainer.accelerator": "cpu",
@@ -65,6 +71,9 @@ def test_no_file_is_left_out():
     started |= {f"experiment/{name}" for name in STARTS}
     started |= {f"data/{name}" for name in STARTS.values()}
     started |= {f"net/{name}" for name in VELOCITIES}
+    started |= {
+        f"box/{name}" for names in BOX.values() for name in (*names, "vae", "sit", "trainer")
+    }
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     assert files == started | elsewhere
     assert not started & elsewhere
@@ -87,14 +96,14 @@ def start(tmp_path, caplog):
     return start
 
 
-def start_flow(folder, vae, size, sit=None):
+def start_flow(folder, vae, size, sit=None, codec=RangeCodec()):
     """Setting with the checkpoint that a flow or, with a SiT, few steps start from."""
     network, channels = VAE(**vae), vae["latent_channels"]
     norm = LatentNorm(channels)
     norm.num_batches_tracked.fill_(1)
     rows, columns = (side // s for side, s in zip(size, network.stride, strict=True))
     geometry = ScanGeometry(
-        SphericalProjection(LidarSensor(*size)), RangeCodec(), (rows // 2, columns // 2)
+        SphericalProjection(LidarSensor(*size)), codec, (rows // 2, columns // 2)
     )
     networks = {
         "vae": NetworkState.of(network, vae),
@@ -137,6 +146,31 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
             "model.init_args.thin_decoder.init_args": json.dumps(THIN_DECODER),
         }
     start(configs, settings)
+
+
+@pytest.mark.parametrize("name", BOX)
+def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
+    simulate(smoke_root, 12)  # unless they are there
+    stage, *tuned, data = BOX[name]
+    vae, sit = (
+        yaml.safe_load((CONF / f"box/{part}.yaml").read_text())["init_args"]
+        for part in ("vae", "sit")
+    )
+    sit["input_size"] = [2, 4]
+    settings = {
+        "data.init_args.sensor": "{beams: 16, columns: 64}",
+        "data.init_args.grid_size": "[1, 2]",
+        "model.init_args.sit.init_args.input_size": "[2, 4]",
+    }
+    if data == "demo_folder":
+        settings["data.init_args.scans"] = smoke_root
+    else:
+        settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
+    if tuned or stage == "flow_matching":
+        codec = RangeCodec("log2", return_channel=True)
+        settings |= start_flow(tmp_path, vae, (16, 64), sit if tuned else None, codec)
+    configs = ["trainer", "box/trainer", f"box/{data}", f"box/{stage}"]
+    start([*configs, *(f"box/{part}" for part in tuned)], settings)
 
 
 def test_demo_grids_are_the_tokens_and_features_come_from_shipped_weights():

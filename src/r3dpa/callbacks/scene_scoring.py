@@ -7,10 +7,9 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import lightning as L
-import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 from lightning.pytorch.utilities import rank_zero_info
 from safetensors.torch import load_file, save_file
@@ -19,7 +18,6 @@ from tqdm import tqdm
 from r3dpa.baselines import Baseline
 from r3dpa.data import Scan
 from r3dpa.data.datamodules import LidarDataModule
-from r3dpa.data.scans import read_scan
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import points_of
 from r3dpa.io import atomic_path, source_commit
@@ -140,11 +138,11 @@ class SceneScorer(L.Callback):
             return
         if isinstance(statistics, ReferenceStatistics) and not statistics.complete:
             path = folder / "reference.safetensors"
-            sensor = statistics.protocol.sensor
+            datamodule = cast(Any, trainer).datamodule
 
             def scans_from(start: int) -> Iterator[EvaluationScene]:
                 for scan in scans[start:]:
-                    yield EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, sensor)))
+                    yield EvaluationScene(scan.name, datamodule.points(scan))
 
             statistics = compute_reference(statistics, scans_from, spaces, path, renew=True)
         try:

@@ -37,6 +37,7 @@ COMMANDS = {
     "data corrupt": Command("weather:corrupt", "give your scans faults of the sensor", True),
     "data realism": Command("evaluate:realism", "compare simulated scans with real ones"),
     "sample": Command("sample:sample", "generate scenes from a checkpoint", resumable=True),
+    "gallery": Command("gallery:gallery", "write a page of scenes, nearest scans and edits"),
     "edit inpaint": Command("edit:inpaint", "generate a part of a scan anew"),
     "edit mix": Command("edit:mix", "generate scenes that follow one scan on each side"),
     "edit complete": Command("edit:complete", "fill a missing sector or dropped beams"),

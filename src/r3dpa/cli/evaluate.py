@@ -41,10 +41,8 @@ def reference(
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
-    import torch
-
     from r3dpa.cli.features import read_data
-    from r3dpa.data.scans import Scan, evenly, read_scan
+    from r3dpa.data.scans import Scan, evenly
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
     from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
@@ -64,7 +62,7 @@ def reference(
     job = ReferenceStatistics(setting, cards_of(found), [scan.name for scan in scans], about)
 
     def scene(scan: Scan) -> EvaluationScene:
-        return EvaluationScene(scan.name, torch.from_numpy(read_scan(scan.path, module.sensor)))
+        return EvaluationScene(scan.name, module.points(scan))
 
     statistics = compute_reference(job, lambda start: map(scene, scans[start:]), found, out)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
@@ -83,6 +81,7 @@ def evaluate(
     device: str = "auto",
     out: Path | None = None,
     split: Literal["val", "all"] | None = None,
+    beside: tuple[Path, ...] = (),
 ) -> str:
     """Compare the samples of any generator with real scans.
 
@@ -103,16 +102,19 @@ def evaluate(
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
         split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
+        beside: Files ``evaluation.json`` of earlier comparisons, to stand in the table in place of
+            the published numbers.
     """
     from tqdm import tqdm
 
     from r3dpa.data.samples import read_samples
     from r3dpa.metrics import evaluation as metrics
-    from r3dpa.metrics.results import report, save_reports
+    from r3dpa.metrics.results import Evaluation, report, save_reports
     from r3dpa.metrics.scene import EvaluationScene
     from r3dpa.viz.evaluation import save_figures
 
     check_folder(out)
+    earlier = [Evaluation.load(path) for path in beside]
     made_with = _made_with(samples)  # refuses damaged metadata before the work starts
     statistics = metrics.load_reference(reference, split)
     found = metrics.reference_spaces(statistics, spaces, ckpt, device)
@@ -135,10 +137,10 @@ def evaluate(
     if files.bad:  # the reader refused these, so that they never became scenes
         evaluation.about["extra"]["bad_samples"] = [*files.bad, *evaluation.bad_samples]
     if out is not None:
-        save_reports(evaluation, statistics.about.get("split"), out)
+        save_reports(evaluation, statistics.about.get("split"), out, earlier)
         if comparison.figures:
             save_figures(out, **comparison.figures)
-    return report(evaluation, statistics.about.get("split"))
+    return report(evaluation, statistics.about.get("split"), earlier)
 
 
 def _made_with(samples: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
@@ -165,6 +165,10 @@ class LidarDataModule(LoaderModule):
         """The same within ``limit``."""
         train, val = self.split()
         return evenly(train, self.limit), evenly(val, self.limit)
+
+    def points(self, scan: Scan) -> Tensor:
+        """Points ``(P, 3)`` or ``(P, 4)`` of one of the scans, metres and intensity."""
+        return torch.from_numpy(read_scan(scan.path, self.sensor))
 
     def prepare_data(self) -> None:
         """Make the feature grids that are missing, but to predict."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
@@ -71,16 +71,27 @@ class LidarDataset(Dataset[dict[str, Any]]):
         if self.posteriors is not None:
             sample = {"posterior_moments": self.posteriors.read(scan)}
         else:
-            image = self._project(scan, change)
+            image = self.codec.to_image(*self._project(scan, change))
             sample = {"range_image": image, "valid_mask": self.codec.returns_of(image)}
         sample |= {"index": index, "name": scan.name}
         if self.grids is not None:
             sample["feature_grid"] = self.grids.read(scan)
         return sample
 
-    def _project(self, scan: Scan, change: Change | None) -> Tensor:
+    def range_m(self, index: int) -> Tensor:
+        """Range image ``(H, W)`` of a scan in metres, -1 without a return."""
+        return self._project(self.scans[index])[0]
+
+    def ranges_m(self, batch_size: int) -> Iterator[Tensor]:
+        """Range images ``(B, H, W)`` of all scans in order."""
+        for first in range(0, len(self), batch_size):
+            last = min(first + batch_size, len(self))
+            yield torch.stack([self.range_m(index) for index in range(first, last)])
+
+    def _project(self, scan: Scan, change: Change | None = None) -> tuple[Tensor, Tensor | None]:
+        """Ranges and, where the codec takes it, reflectance."""
         if self.images is not None:
-            return self.codec.to_image(self.images.read(scan))
+            return self.images.read(scan), None
         read = read_scan(scan.path)
         points = torch.from_numpy(read if change is None else change(read))
         try:
@@ -90,7 +101,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
             raise ScanError(f"{scan.path}: cannot be projected: {error}") from error
         if not (range_m > 0).any():
             raise out_of_range(scan.path, self.projection.sensor)
-        return self.codec.to_image(range_m, None if values is None else values[0])
+        return range_m, None if values is None else values[0]
 
 
 class PointSample(NamedTuple):

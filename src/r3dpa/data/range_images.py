@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 from zlib import crc32
@@ -20,7 +21,13 @@ from r3dpa.data.datasets import LidarDataset, PointSample
 from r3dpa.data.feature_grids import FeatureGrids, GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
-from r3dpa.geometry import Projection, SphericalProjection, projection_to_dict, range_image
+from r3dpa.geometry import (
+    Projection,
+    SphericalProjection,
+    points_of,
+    projection_to_dict,
+    range_image,
+)
 from r3dpa.io import only_writer
 from r3dpa.simulation import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 
@@ -107,11 +114,21 @@ class SimulatedImageDataModule(SimulatedDataModule):
         if self.features_dir is not None and stage != "predict":
             arguments = self.features_dir, everything, self.projection, self.grid_size
             grids = FeatureGrids(*arguments, cast(Any, self.extractor))
-        images: CachedTensors[Any] = CachedTensors(self._store, everything)
+        images = self.images
         self.train_set, self.val_set, self.all_set = (
             LidarDataset(split, self.projection, self.codec, grids, images=images)
             for split in (train, val, everything)
         )
+
+    @cached_property
+    def images(self) -> CachedTensors[Any]:
+        """Cached range images ``(H, W)`` in metres."""
+        train, val, _ = self._scans_and_projection()
+        return CachedTensors(self._store, sorted(train + val))
+
+    def points(self, scan: Any) -> torch.Tensor:
+        """Points ``(P, 3)`` at the centres of the pixels."""
+        return points_of(self.images.read(scan), SphericalProjection(self.sensor))
 
     @property
     def _store(self) -> Store:

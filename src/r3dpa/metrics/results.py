@@ -320,19 +320,21 @@ class EvaluationTable:
         return lines if any(text != "-" for text in lines[-1][1:]) else lines[:-1]
 
 
-def report(evaluation: Evaluation, split: str | None) -> str:
-    """All numbers of an evaluation, and its distances beside the published ones."""
-    return f"{evaluation}\n\n{_beside_published(evaluation, split)}"
+def report(evaluation: Evaluation, split: str | None, earlier: Sequence[Evaluation] = ()) -> str:
+    """All numbers of an evaluation, and its distances beside earlier or the published ones."""
+    return f"{evaluation}\n\n{_comparison(evaluation, split, earlier)}"
 
 
-def save_reports(evaluation: Evaluation, split: str | None, out: Path) -> None:
+def save_reports(
+    evaluation: Evaluation, split: str | None, out: Path, earlier: Sequence[Evaluation] = ()
+) -> None:
     """Writes ``evaluation.json`` and ``metrics.csv`` (all rows), ``table.md`` and ``table.tex``.
 
-    The latter two have the distances beside the published ones.
+    The latter two have the distances beside earlier or the published ones.
     """
     evaluation.save(out / "evaluation.json")
     save_csv((evaluation,), out / "metrics.csv")
-    table = _beside_published(evaluation, split)
+    table = _comparison(evaluation, split, earlier)
     save_text(out / "table.md", str(table))
     save_text(out / "table.tex", table.latex())
 
@@ -357,7 +359,11 @@ def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
     save_text(path, text.getvalue())
 
 
-def _beside_published(evaluation: Evaluation, split: str | None) -> EvaluationTable:
+def _comparison(
+    evaluation: Evaluation, split: str | None, earlier: Sequence[Evaluation]
+) -> EvaluationTable:
+    if earlier:
+        return EvaluationTable([one.only(_DISTANCES) for one in (*earlier, evaluation)])
     own = evaluation.only(_DISTANCES)
     names = [row.name for row in own.rows]
     published = published_evaluations("val-only" if split == "val" else "train-val")
