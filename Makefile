@@ -36,7 +36,7 @@ BOX_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo gallery box clean bench bench-training \
+	test-faults test-nodes fuzz notebooks demo gallery box box-scores clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
@@ -124,6 +124,10 @@ box: $(READY) ## train the weights of the package: days of two cores; stop and r
 		--model.init_args.init_from runs/box/vae/checkpoints/last.ckpt
 	$(BIN)/r3dpa convert runs/box/flow/checkpoints/last.ckpt runs/box/r3dpa-s.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
+
+box-scores: $(READY) ## measure the weights of the package on 2,000 scenes: hours; notebooks/results/box
+	BOX_SCENES=2000 nice -n 19 $(BIN)/pytest --nbmake --nbmake-timeout=86400 --overwrite \
+		notebooks/07_model_in_the_box.ipynb
 
 bench: $(READY) ## micro-benchmarks of simulation, data, features, metrics, VAE, sampling, guidance
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/bench -m bench

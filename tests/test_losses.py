@@ -5,6 +5,7 @@ import torch
 
 from r3dpa.losses import (
     alignment_loss,
+    balanced_gradient,
     discriminator_loss,
     flow_matching_loss,
     generator_loss,
@@ -23,6 +24,19 @@ def test_reconstruction_loss_is_a_mean_over_all_pixels():
 
 def test_generator_loss_is_minus_the_mean_logit():
     assert generator_loss(torch.tensor([1.0, 3.0])).item() == -2.0
+
+
+def test_a_balanced_gradient_has_a_share_of_the_length_of_that_of_l1():
+    image = torch.randn(3, 1, 4, 8, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    (expected,) = torch.autograd.grad(reconstruction_loss(image, torch.zeros(3, 1, 4, 8)), image)
+    further = balanced_gradient(image, 0.5).square().sum() * 1e-3
+    (found,) = torch.autograd.grad(further, image, retain_graph=True)
+    lengths = [gradient.flatten(1).norm(dim=1) for gradient in (found, expected)]
+    torch.testing.assert_close(lengths[0], 0.5 * lengths[1])
+    directions = torch.nn.functional.cosine_similarity(found.flatten(1), image.flatten(1))
+    torch.testing.assert_close(directions, torch.ones(3))
+    (both,) = torch.autograd.grad(image.sum() + further, image)
+    torch.testing.assert_close(both, 1 + found)  # another loss keeps its gradient
 
 
 def test_discriminator_loss_vanishes_beyond_the_margins():

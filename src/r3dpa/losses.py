@@ -13,6 +13,7 @@ from torch import Tensor
 
 __all__ = [
     "alignment_loss",
+    "balanced_gradient",
     "centred_features",
     "discriminator_loss",
     "flow_matching_loss",
@@ -78,6 +79,32 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
         Scalar, float32.
     """
     return -fake_logits.float().mean()
+
+
+def balanced_gradient(image: Tensor, ratio: float) -> Tensor:
+    """The image, for a further loss whose gradient is ``ratio`` times that of an L1 loss.
+
+    The gradient of each sample that flows back gets this length, whatever its own. Without, the
+    gradient of a fixed adversarial weight is hundredths of that of the reconstruction, or swamps
+    it, depending on the discriminator.
+
+    Source: as the adaptive weight of Esser et al., "Taming transformers" (CVPR 2021), per sample
+    and at the image, so that results do not depend on how a batch is split.
+
+    Args:
+        image: ``(B, C, H, W)`` decoded images.
+        ratio: Length relative to the gradient of the mean absolute error, ``1 / (B sqrt(C H W))``.
+    """
+    length = ratio / (len(image) * image[0].numel() ** 0.5)
+    image = image.view_as(image)  # the gradients of other losses stay as they are
+
+    def scaled(gradient: Tensor) -> Tensor:
+        own = gradient.flatten(1).norm(dim=1).clamp(min=1e-30)
+        return gradient * (length / own)[:, None, None, None]
+
+    if image.requires_grad:
+        image.register_hook(scaled)
+    return image
 
 
 def discriminator_loss(real_logits: Tensor, fake_logits: Tensor) -> Tensor:

@@ -46,6 +46,7 @@ STARTS = {
 BOX = {  # stage, what fine-tunes it, data
     "box": ("vae_alignment", "data"),
     "box_flow": ("flow_matching", "data"),
+    "box_few_step": ("few_step", "data"),
     "demo": ("vae_alignment", "demo_vae", "demo_data"),
     "demo_flow": ("flow_matching", "demo_flow", "demo_folder"),
 }
@@ -166,9 +167,10 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         settings["data.init_args.scans"] = smoke_root
     else:
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
-    if tuned or stage == "flow_matching":
+    if tuned or stage != "vae_alignment":
         codec = RangeCodec("log2", return_channel=True)
-        settings |= start_flow(tmp_path, vae, (16, 64), sit if tuned else None, codec)
+        exported = sit if tuned or stage == "few_step" else None
+        settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
     configs = ["trainer", "box/trainer", f"box/{data}", f"box/{stage}"]
     start([*configs, *(f"box/{part}" for part in tuned)], settings)
 

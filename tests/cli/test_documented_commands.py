@@ -43,7 +43,8 @@ def documented():
         found[path.name] = text
         spans = re.findall(r"`(r3dpa [^`]*--[^`]+)`", text.replace("\n", " "))
         found[path.name] += "\n" + "\n".join(spans)
-    make = re.sub(r"\$\((BOX_)?FIT\)", "r3dpa fit", (TOP / "Makefile").read_text())
+    fit = "r3dpa fit --config conf/data/demo.yaml"
+    make = re.sub(r"\$\((BOX_)?FIT\)", fit, (TOP / "Makefile").read_text())
     make = re.sub(r"\$\(BIN\)/|OMP_NUM_THREADS=1|\$\(if.*", "", make)
     found["Makefile"] = re.sub(r"\$\((\w+)\)", r"\1", make)
     for path in sorted(CONF.rglob("*.yaml")):

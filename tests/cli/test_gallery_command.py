@@ -40,7 +40,7 @@ def test_scenes_have_nearest_scans_and_edits_and_weather_follow(page):
     assert [name for name, _ in groups["Scenes"][0]["pictures"]] == ["scene", "nearest"]
     assert all("nearest training scan at" in tile["note"] for tile in groups["Scenes"])
     assert len(groups["Edits of seed 0"]) == 5
-    assert len(groups["A simulated street"]) == 4
+    assert len(groups["Weather in seed 0"]) == 3
     numbers = [tile["scan"] for tiles in groups.values() for tile in tiles]
     assert numbers == list(range(len(page["scans"])))
     found = r"nearest of \d+ training scans: [\d.]+, of held-out scans [\d.]+"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny_stages import QUIET, SENSOR, STAGES, TinyData, stage_module, tiny_sit, train
@@ -86,6 +88,8 @@ def test_rate_rises_stays_and_falls_by_step_alone():
     assert OptimizerConfig(lr=2.0).rate(5, 10) == 2.0
     cosine = OptimizerConfig(lr=2.0, warmup_steps=2, cosine=True)
     assert [cosine.rate(step, 10) for step in (2, 6, 10)] == pytest.approx([2.0, 1.0, 0.0])
-    module = stage_module("joint", optimizer=config)
+    config = replace(config, discriminator_rate=0.5)
+    module = stage_module("joint", optimizer=config, weights=LossWeights(adversarial_ratio=0.5))
     train(module, TinyData([False] * 5))
-    assert module.optimizers().param_groups[0]["lr"] == 0.25
+    rates = {group["name"]: group["lr"] for group in module.optimizers().param_groups}
+    assert rates == {"vae": 0.25, "discriminator": 0.125, "sit": 0.25}

@@ -25,7 +25,7 @@ def gallery(
     """Write one page of scenes in order, none left out, with clouds to turn.
 
     Beside each scene its nearest training scan shows what is memorised. Edits of the first scene
-    and a simulated street in four weathers follow.
+    and fog, rain and snow in it follow.
 
     Args:
         out: HTML file to write.
@@ -50,7 +50,7 @@ def gallery(
     from r3dpa.geometry import points_of, range_image, regions
     from r3dpa.io import atomic_path, usable_device
     from r3dpa.metrics.nearest import nearest_images
-    from r3dpa.simulation import Simulator, Weather
+    from r3dpa.weather import RecordedScan, Weather
 
     check_file(out)
     generator = SceneGenerator.from_checkpoint(ckpt, quality, device=usable_device(device))
@@ -106,14 +106,14 @@ def gallery(
         for range_m in result.range_m:
             show("Edits of seed 0", name, range_m)
     weathers = {
-        "clear": Weather(),
         "fog, 60 m": Weather(visibility_m=60),
         "rain, 20 mm/h": Weather(rain_mm_h=20, water_film_mm=0.5),
         "snow, 3 mm/h": Weather(snow_mm_h=3),
     }
     for name, weather in weathers.items():
-        points = torch.from_numpy(Simulator(weather=weather).scan(0).points[:, :3])
-        show("A simulated street", name, range_image(points, projection)[0])
+        found = weather.apply(RecordedScan(points_of(scene, projection).numpy()), seed)
+        range_m = range_image(torch.from_numpy(found.points), projection)[0]
+        show("Weather in seed 0", name, range_m)
     page = viz.scan_page(scans, "r3dpa gallery", {}, {}, None, projection.sensor, tiles, about)
     with atomic_path(out) as temporary:
         temporary.write_text(page, "utf-8")

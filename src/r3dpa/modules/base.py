@@ -223,8 +223,11 @@ class GenerativeModule(L.LightningModule):
             parts["kl"] = weights.kl * posterior.kl().mean()
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
+            made = self.vae.image_of(prediction)
+            if weights.adversarial_ratio is not None:
+                made = losses.balanced_gradient(made, weights.adversarial_ratio)
             with frozen(self.discriminator):
-                logits = self.discriminator(self.vae.image_of(prediction))
+                logits = self.discriminator(made)
             parts["adversarial"] = weights.adversarial * losses.generator_loss(logits)
         if not parts.keys() & {"reconstruction", "adversarial"}:
             parts["reconstruction"] = steps.zero_loss(self.vae)

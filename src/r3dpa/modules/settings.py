@@ -23,7 +23,9 @@ class LossWeights:
         returns: Weight of the cross-entropy of the return channel, where images have one.
         kl: Weight of the Kullback-Leibler term, summed per sample.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
-        discriminator: Factor of the discriminator's hinge loss.
+        adversarial_ratio: Length of the adversarial gradient at the image, relative to that of an
+            L1 loss, in place of the weight; None: the weight, with which the discriminator wins.
+        discriminator: Factor of the discriminator's hinge loss, without effect on steps of AdamW.
         adversarial_start: First step at which both adversarial losses count.
         vae_alignment: lambda1, weight of the alignment loss that reaches the VAE.
         denoising: Weight of the velocity error.
@@ -40,6 +42,7 @@ class LossWeights:
     returns: float = 0.2
     kl: float = 1e-6
     adversarial: float = 3e-4
+    adversarial_ratio: float | None = None
     discriminator: float = 1e-3
     adversarial_start: int = 0
     vae_alignment: float = 1.5
@@ -59,6 +62,7 @@ class OptimizerConfig:
         betas: Decay of the first and second moments.
         weight_decay: Applied to every trained parameter, as officially.
         eps: Added to the root of the second moment.
+        discriminator_rate: Rate of the discriminator, relative to ``lr``.
         warmup_steps: First steps, over which the rate rises linearly.
         decay_steps: Last steps before ``trainer.max_steps``, over which the rate falls linearly to
             0. A run that goes on to more steps starts from a checkpoint before the decay.
@@ -70,6 +74,7 @@ class OptimizerConfig:
     betas: tuple[float, float] = (0.9, 0.999)
     weight_decay: float = 0.03
     eps: float = 1e-8
+    discriminator_rate: float = 1.0
     warmup_steps: int = 0
     decay_steps: int = 0
     cosine: bool = False

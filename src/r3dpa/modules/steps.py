@@ -203,9 +203,11 @@ def fit_optimizer(module: L.LightningModule) -> None:
 
 def set_learning_rate(module: Any, optimizer: torch.optim.Optimizer) -> None:
     """Sets the rate of the coming step, a function of its number alone."""
-    rate = module.optimizer_config.rate(module.global_step, module.trainer.max_steps)
+    config = module.optimizer_config
+    rate = config.rate(module.global_step, module.trainer.max_steps)
     for group in optimizer.param_groups:
-        group["lr"] = rate
+        slower = config.discriminator_rate if group.get("name") == "discriminator" else 1.0
+        group["lr"] = slower * rate
 
 
 def gradient_norms(
