@@ -68,8 +68,8 @@ def test_equals_loops_over_the_windows(size, kernel, dilation, wrap):
     ("kernel", "dilation", "wrap", "message"),
     [
         ((3, 4), (1, 1), False, "odd"),
-        ((5, 3), (1, 1), True, "5 rows with dilation 1 need 5 rows"),
-        ((3, 3), (1, 4), False, "need 12 columns"),
+        ((5, 3), (1, 1), True, "need 5 rows and 1 columns, but the image has 4 and 8"),
+        ((3, 3), (1, 4), False, "need 3 rows and 12 columns"),
         ((3, 3), (1, 2), True, "dilation of 1"),
     ],
 )

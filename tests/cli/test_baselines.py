@@ -30,6 +30,19 @@ TINY = {
         "ema_every": 1,
         "optimizer.warmup_steps": 0,
     },
+    "r2flow": {
+        "network.init_args": {
+            "in_channels": 2,
+            "resolution": [16, 64],
+            "base_channels": 8,
+            "time_channels": 8,
+            "depths": [1, 1, 1, 1],
+            "num_heads": [1, 1, 2, 2],
+        },
+        "ema_after": 0,
+        "ema_every": 1,
+        "optimizer.warmup_steps": 0,
+    },
 }
 SETTINGS = {
     "data.init_args.num_scans": 12,

@@ -30,7 +30,7 @@ from r3dpa.baselines.efficient_unet import (
 )
 from r3dpa.baselines.r2dm import R2DM, ema_decay_at
 from r3dpa.checkpoints import read_checkpoint
-from r3dpa.checkpoints.baselines import efficient_unet_weights
+from r3dpa.checkpoints.baselines import unet_weights
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import (
     LidarSensor,
@@ -47,7 +47,7 @@ PREDICTIONS = ("eps", "v", "x_0")
 
 def unet_of(case) -> EfficientUNet:
     network = EfficientUNet(**unet_arguments(case))
-    network.load_state_dict(efficient_unet_weights(case.weights()))
+    network.load_state_dict(unet_weights(case.weights()))
     return network
 
 
@@ -63,7 +63,7 @@ def unet(unet_case):
 
 def gradient(network, official: str) -> torch.Tensor:
     """Gradient of the parameter of an official name."""
-    (ours,) = efficient_unet_weights({official: torch.zeros(())})
+    (ours,) = unet_weights({official: torch.zeros(())})
     return network.get_parameter(ours).grad
 
 

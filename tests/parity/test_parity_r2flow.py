@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
+from dopri5 import dopri5
+from recorded_networks import weights_of
 
+from r3dpa.baselines import ADMUNet, EfficientUNet
 from r3dpa.baselines.hdit import HDiT, _RotaryEmbedding
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
-from r3dpa.baselines.official_r2flow import time_reversed
+from r3dpa.baselines.r2flow import distilled_times, velocity_errors
+from r3dpa.baselines.reflow import as_scanned
+from r3dpa.checkpoints.baselines import from_r2flow, image_geometry, time_reversed, unet_weights
+from r3dpa.flow import Interpolant, sample_time
+from r3dpa.flow.interpolant import _exponential
+from r3dpa.flow.solvers import ab3, euler
+from r3dpa.flow.times import ode_times
+from r3dpa.geometry import ScanGeometry, unproject
+from r3dpa.modules.settings import OptimizerConfig
+
+PATH = Interpolant()
 
 _SCALAR_TIME = 0.82  # 0 is noise
 
@@ -55,6 +70,7 @@ def recorded_outputs(modules, names):
 
 def outputs_of(case, network):
     names = [key.removeprefix("out/act/") for key in case.keys("out/act/")]
+    names.remove("spatial_pe")
     activations, handles = recorded_outputs(dict(network.named_modules()), names)
     image = case["in/x"].requires_grad_()
     velocity = official(network, image, case["in/t"])
@@ -62,13 +78,14 @@ def outputs_of(case, network):
         handle.remove()
     results = {f"out/act/{name}": value for name, value in activations.items()}
     scalar_time = torch.full((len(image),), _SCALAR_TIME)
+    results["out/act/spatial_pe"] = network.spatial_pe["embedding"]
     results |= {"out/y": velocity, "out/y_scalar_time": official(network, image, scalar_time)}
     results["out/n_parameters"] = sum(p.numel() for p in network.parameters())
     return results, image, velocity
 
 
-def gradients_of(network, loss):
-    loss.backward()
+def gradients_of(network, loss, **options):
+    loss.backward(**options)
     own = {name: p.grad for name, p in network.named_parameters()}
     found = time_reversed(own | dict(network.named_buffers()))
     network.zero_grad()
@@ -122,19 +139,171 @@ def test_hdit_constants_are_those_of_the_official_network(hdit):
 def test_hdit_commutes_with_rotations_by_whole_tokens_of_the_last_level(hdit):
     case, network = hdit
     with torch.no_grad():
-        kept = network.spatial_pe.embedding.clone()
-        network.spatial_pe.embedding.zero_()
+        kept = network.spatial_pe["embedding"].clone()
+        network.spatial_pe["embedding"].zero_()
         errors = roll_errors(network, case["in/x"], case["in/t"], (4, 32, 96))
-        network.spatial_pe.embedding.copy_(kept)
+        network.spatial_pe["embedding"].copy_(kept)
     assert errors[0] > 0.1
     assert errors[1:].max() < 5e-5
 
 
-def test_hdit_listing_loads_strictly(baseline_listing):
-    listing = baseline_listing("r2flow_state_dicts")["hdit"]
+@pytest.mark.parametrize("kind", [ADMUNet, EfficientUNet])
+def test_unet(kind, baseline_case, compare):
+    name = {ADMUNet: "r2flow_adm_unet", EfficientUNet: "r2flow_efficient_unet"}[kind]
+    case = baseline_case(name)
+    network = unet_of(kind, case)
+    results = {
+        "out/y": official(network, case["in/x"], case["in/t"]),
+        "out/n_parameters": sum(p.numel() for p in network.parameters()),
+    }
+    if kind is ADMUNet:
+        block = network.get_submodule("down_blocks.1")
+        results["out/block_down_blocks.1"] = block(case["in/block_x"], case["in/block_temb"])
+    compare(case, results, tolerance=relative(2e-5))
+
+
+def unet_of(kind, case):
+    config = {key: value for key, value in case.config.items() if key not in ("seed", "ring")}
+    assert case.config["ring"]
+    network = kind(**config)
+    network.load_state_dict(unet_weights(time_reversed(case.weights())))
+    return network
+
+
+SIZES = {
+    "hdit": ("nat_hdit", 128, (3, 3, 3, 3), (1, 2, 4, 8)),
+    "efficient_unet_base": ("efficient_unet", 64, (3, 3, 3, 3), (1, 2, 4, 8)),
+    "efficient_unet_large": ("efficient_unet", 128, (2, 4, 8, 8), (1, 2, 4, 8)),
+    "adm_unet_base": ("adm_unet", 64, (3, 3, 3, 3), (1, 2, 4, 8)),
+    "adm_unet_large": ("adm_unet", 128, (3, 3, 3, 3), (1, 2, 3, 4)),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_released_layouts_are_read_strictly(name, baseline_listing, tmp_path):
+    listing = baseline_listing("r2flow_state_dicts")
+    architecture, channels, blocks, multiplier = SIZES[name]
+    options = copy.deepcopy(listing["checkpoint"]["cfg_defaults_from_source"])
+    options["model"] |= {
+        "architecture": architecture,
+        "base_channels": channels,
+        "num_residual_blocks": blocks,
+        "channel_multiplier": multiplier,
+    }
+    if name != "hdit":
+        options["model"] |= {"attn_num_heads": 8, "coords_encoding": "fourier_features"}
+    options["finetuning"]["k_distil"] = 4
+    state = weights_of(listing[name]["state_dict"])
+    for key, value in state.items():
+        if key.endswith(".scale") and value.dim() == 0:
+            state[key] = torch.tensor(0.5).sqrt()
+    content = {"cfg": options, "weights": state, "num_images": 2_560_000, "optimizer": {}}
+    checkpoint = from_r2flow(content, tmp_path / "r2flow-kitti360-2rf.pth")
+    assert (checkpoint.stage, checkpoint.step) == ("r2flow", 320_000)
+    assert checkpoint.settings == {"num_steps": 4}
     with torch.device("meta"):
-        network = HDiT()
-    shapes = {key: list(value.shape) for key, value in network.state_dict().items()}
-    assert shapes == listing["state_dict"]
-    assert sum(p.numel() for p in network.parameters()) == listing["param_count"] == 80_908_420
-    assert [name for name, _ in network.named_buffers()] == listing["buffers"]
+        network = checkpoint.network("ema_network").new()
+    assert sum(p.numel() for p in network.parameters()) == listing[name]["param_count"]
+    name = next(iter(content["weights"]))
+    del content["weights"][name]
+    with pytest.raises((ValueError, KeyError), match=name):
+        from_r2flow(content, tmp_path / "broken.pth")
+
+
+def test_flow(hdit, baseline_case, close):
+    case, network = baseline_case("r2flow_flow"), hdit[1]
+    geometry = ScanGeometry.from_dict(image_geometry(network.coords, "log_depth"))
+    results = training_of(case, network)
+    results |= sampling_of(case, network)
+    results |= reflow_of(case, network, geometry)
+    results |= times_of(case)
+    assert set(results) == set(case.keys("out/"))
+    for key, found in results.items():
+        of_solver = "euler" in key or "reflow" in key
+        atol = 1e-3 if "tol1e-5" in key else 1e-4 if of_solver else 1e-5
+        expected = case[key]
+        try:
+            close(found, expected, **relative(atol)(key, expected.double()))
+        except AssertionError as error:
+            raise AssertionError(f"{key}: {error}") from None
+
+
+def training_of(case, network):
+    data, noise, time = case["in/x_1_data"], case["in/x_0_noise"], 1 - case["in/t"]
+    noisy = PATH.interpolate(data, noise, time)
+    velocity, target = network(noisy, time), PATH.target(data, noise, time)
+    results = {"out/x_t": noisy, "out/u_t": -target, "out/v_t": -velocity}
+    results["out/x_t_sigma0.1"] = noisy + 0.1 * case["in/sigma_eps"]  # their other flows
+    for norm in ("l2", "l1", "smooth_l1", "pseudo_huber"):
+        loss = velocity_errors(velocity, target, norm).mean()
+        results[f"out/loss_{norm}"] = loss
+        if f"out/grad_{norm}/norm" in case:
+            gradients = gradients_of(network, loss, retain_graph=True)
+            own = [gradients[name] for name, _ in network.named_parameters()]
+            for key in case.weights(f"out/grad_{norm}/"):
+                value = torch.nn.utils.get_total_norm(own) if key == "norm" else gradients[key]
+                results[f"out/grad_{norm}/{key}"] = value
+    return results
+
+
+@torch.no_grad()
+def sampling_of(case, network):
+    states = [case["in/z_0"]]
+
+    def keep(x, time, index):
+        states.append(x)
+        return x
+
+    results = {
+        f"out/euler_{steps}": euler(network, case["in/z_0"], ode_times(steps)) for steps in (1, 2)
+    }
+    results["out/euler_4"] = euler(network, case["in/z_0"], ode_times(4), after_step=keep)
+    results["out/euler_4_states"] = torch.stack(states)
+    first = case["in/z_0"][:1]
+    time = torch.empty(1)
+    solved, calls = dopri5(lambda x, now: -network(x, time.fill_(1 - now)), first, 1e-5)
+    converged = ab3(network, first, ode_times(100))
+    assert (converged - solved).square().mean().sqrt() < 2e-3
+    results |= {"out/dopri5_tol1e-5": solved, "out/dopri5_nfe": calls}
+    return results
+
+
+@torch.no_grad()
+def reflow_of(case, network, geometry):
+    shape = (network.in_channels, *network.resolution)
+    draws = [torch.Generator().manual_seed(seed) for seed in case["in/reflow_seeds"].tolist()]
+    noise = torch.stack([torch.randn(shape, generator=draw) for draw in draws])
+    data = euler(network, noise, ode_times(4))
+    sensor = geometry.projection.sensor
+    range_m = geometry.codec.ranges_of(data.clamp(-1, 1), sensor).clamp(min=0)
+    pairs = as_scanned(data, geometry)
+    results = {
+        "out/reflow_x_0_cpu": noise,
+        "out/reflow_x_1_raw": data,
+        "out/reflow_saved_depth": range_m[:, None],
+        "out/reflow_saved_xyz": unproject(range_m, geometry.projection, True).movedim(-1, 1),
+        "out/reflow_saved_reflectance": (pairs[:, 1:] + 1) / 2,
+        "out/reflow_x_1_training": pairs,
+    }
+    for steps in (1, 2, 4):
+        time = distilled_times(case["in/distill_u"], steps)
+        noisy, target = PATH.interpolate(pairs, noise, time), PATH.target(pairs, noise, time)
+        loss = velocity_errors(network(noisy, time), target, "pseudo_huber").mean()
+        results |= {f"out/distill_t_{steps}": 1 - time, f"out/distill_x_t_{steps}": noisy}
+        results[f"out/distill_loss_{steps}"] = loss
+    return results
+
+
+def times_of(case):
+    names = {"uniform": "uniform", "u_shaped": "u_shaped", "logit_normal": "lognormal"}
+    results = {}
+    for name, kind in names.items():
+        torch.manual_seed(case.config["timestep_seed"])
+        results[f"out/timesteps_{name}"] = sample_time(8, kind)
+    results["out/u_shaped_before_mirror"] = _exponential(case["in/timesteps_u"])
+    # Their first step has a rate of 0: ours at step n is theirs at n + 1.
+    schedule = OptimizerConfig(lr=1.0, warmup_steps=9, cosine=True)
+    rates = [schedule.rate(step - 1, 99) for step in case["out/lr_factor_steps"].tolist()]
+    results["out/lr_factor"] = torch.tensor(rates, dtype=torch.float64)
+    results["out/lr_factor_steps"] = case["out/lr_factor_steps"]
+    return results

@@ -11,6 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from r3dpa.baselines.efficient_unet import corner_angles
 from r3dpa.baselines.generator import BaselineGenerator
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
@@ -125,7 +126,7 @@ class Baseline(L.LightningModule):
     # Starting and optimisation
 
     def setup(self, stage: str) -> None:
-        """Checks trainer and data against the network."""
+        """Checks the data, and gives a network with ``coords`` the ray angles of their pixels."""
         check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
         geometry = self.geometry = geometry_of(datamodule, self)
@@ -137,6 +138,9 @@ class Baseline(L.LightningModule):
                 f"stage {self.stage} is built for images {self.image_shape()} (channels, rows, "
                 f"columns), but sensor and codec of the data give {wanted}; give both the same"
             )
+        for network in (self.network, self.ema.network):
+            if isinstance(coords := getattr(network, "coords", None), Tensor):
+                coords.copy_(corner_angles(geometry.projection))
 
     def image_shape(self) -> tuple[int, ...]:
         """Channels, rows and columns of the range images that it generates."""
@@ -176,7 +180,8 @@ class Baseline(L.LightningModule):
         """Adds the training loss of the averaged network on held-out scans to the means."""
         draws = steps.draw_held_out(self, batch["index"])
         data = self.encode(batch["range_image"])
-        errors = self.errors(self.ema.network, data, draws.time, draws.noise)
+        noise = batch.get("noise", draws.noise)
+        errors = self.errors(self.ema.network, data, draws.time, noise)
         self.held_out.update(batch["index"], loss=errors)
 
     test_step = validation_step

@@ -16,9 +16,9 @@ from einops import rearrange
 from einops.layers.torch import Rearrange
 from torch import Tensor, nn
 
-from r3dpa.baselines.neighbourhood import Size, neighbourhood_attention
-from r3dpa.geometry import LidarSensor, SphericalProjection
-from r3dpa.nn.layers import at_least_float32, zeroed
+from r3dpa.baselines.efficient_unet import hdl64e_angles
+from r3dpa.baselines.neighbourhood import neighbourhood_attention
+from r3dpa.nn.layers import Size, at_least_float32, zeroed
 
 _MAX_LOG_SCALE = math.log(100)
 _linear = partial(nn.Linear, bias=False)
@@ -28,9 +28,8 @@ class HDiT(nn.Module):
     """Velocity of noisy range images, from an hourglass of attention blocks.
 
     Each level halves rows and columns of the tokens and doubles their width. Attention sees a
-    window of 3 x 9 tokens, whose columns wrap around, and all tokens at the last level. Tokens are
-    rotated by harmonics of their ray angles, so that without ``spatial_pe`` rotating the scene by
-    a whole token of the last level (32 columns) rotates the velocity.
+    window of tokens, whose columns wrap around, and all tokens at the last level. But for
+    ``spatial_pe``, rotating a scene by tokens of the last level (32 columns) rotates the velocity.
 
     Source: Hourglass diffusion transformer (Crowson et al. 2024) as in R2Flow (Nakashima et al.
     2025). The default has 80.9 M parameters.
@@ -68,23 +67,16 @@ class HDiT(nn.Module):
     ) -> None:
         super().__init__()
         levels = len(depths) - 1
-        least = [patch << levels for patch in patch_size]
-        if any(size % cell for size, cell in zip(resolution, least, strict=True)):
-            raise ValueError(
-                f"resolution must be a multiple of {least[0]} x {least[1]} (patch_size at the "
-                f"last of {levels + 1} levels), got {resolution[0]} x {resolution[1]}"
-            )
+        least = patch_size[0] << levels, patch_size[1] << levels
+        if resolution[0] % least[0] or resolution[1] % least[1]:
+            raise ValueError(f"resolution must be a multiple of {least}, got {tuple(resolution)}")
         self.resolution, self.in_channels, self.patch_size = resolution, in_channels, patch_size
-        sensor = LidarSensor(*resolution)
-        angles = SphericalProjection(sensor).ray_angles(corner=True)
-        coords = torch.stack(torch.meshgrid(*angles, indexing="ij"))[None].float()
-        self.register_buffer("coords", coords)  # (1, 2, H, W) radians, of pixel corners
+        self.register_buffer("coords", hdl64e_angles(resolution))
         grid = resolution[0] // patch_size[0], resolution[1] // patch_size[1]
-        self.spatial_pe = _PositionEmbedding(grid, base_channels)
-        mapping = [
-            _FeedForward(time_channels, int(time_channels * mlp_ratio))
-            for _ in range(mapping_depth)
-        ]
+        embedding = nn.init.trunc_normal_(torch.empty(1, *grid, base_channels), std=0.02)
+        self.spatial_pe = nn.ParameterDict({"embedding": embedding})
+        hidden = int(time_channels * mlp_ratio)
+        mapping = [_FeedForward(time_channels, hidden) for _ in range(mapping_depth)]
         self.timestep_pe = nn.Sequential(
             _TimeFeatures(time_channels),
             nn.Sequential(_RmsNorm(time_channels), *mapping, _RmsNorm(time_channels)),
@@ -122,8 +114,7 @@ class HDiT(nn.Module):
         """Velocity ``(B, C, H, W)`` of images ``(B, C, H, W)`` at times ``(B,)`` (0 data)."""
         embedding = self.timestep_pe(time)
         angles = [F.avg_pool2d(self.coords, self.patch_size, self.patch_size)]
-        hidden = self.tokenizer(image)
-        hidden = hidden + self.spatial_pe(angles[0])
+        hidden = self.tokenizer(image) + self.spatial_pe["embedding"]
         skipped = []
         for level in range(len(self.down_levels) // 2):
             hidden = self.down_levels[f"level_{level}"](hidden, angles[-1], embedding)
@@ -157,16 +148,6 @@ class _TimedRmsNorm(nn.Module):
         return _rms_normalised(tokens).to(tokens.dtype) * (1 + self.proj(embedding))
 
 
-class _PositionEmbedding(nn.Module):
-    def __init__(self, grid: Size, width: int) -> None:
-        super().__init__()
-        self.embedding = nn.Parameter(torch.zeros(1, *grid, width))
-        nn.init.trunc_normal_(self.embedding, std=0.02)
-
-    def forward(self, angles: Tensor) -> Tensor:
-        return self.embedding
-
-
 class _TimeFeatures(nn.Module):
     """Linear map of cosines and sines of ``2 pi t f`` at fixed random frequencies."""
 
@@ -194,25 +175,20 @@ class _GatedGelu(nn.Linear):
 
 
 class _FeedForward(nn.Module):
-    def __init__(self, width: int, hidden: int) -> None:
+    """Gated layers of one norm; that of tokens is called ``adarms`` and takes the time."""
+
+    def __init__(self, width: int, hidden: int, embedding: int | None = None) -> None:
         super().__init__()
-        self.norm = _RmsNorm(width)
+        if embedding is None:
+            self.norm = _RmsNorm(width)
+        else:
+            self.adarms = _TimedRmsNorm(width, embedding)
         self.gegelu = _GatedGelu(width, hidden)
         self.linear = zeroed(_linear(hidden, width))
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        return tokens + self.linear(self.gegelu(self.norm(tokens)))
-
-
-class _TimedFeedForward(nn.Module):
-    def __init__(self, width: int, hidden: int, embedding: int) -> None:
-        super().__init__()
-        self.adarms = _TimedRmsNorm(width, embedding)
-        self.gegelu = _GatedGelu(width, hidden)
-        self.linear = zeroed(_linear(hidden, width))
-
-    def forward(self, tokens: Tensor, embedding: Tensor) -> Tensor:
-        return tokens + self.linear(self.gegelu(self.adarms(tokens, embedding)))
+    def forward(self, tokens: Tensor, *time: Tensor) -> Tensor:
+        normalised = self.adarms(tokens, *time) if time else self.norm(tokens)
+        return tokens + self.linear(self.gegelu(normalised))
 
 
 class _RotaryEmbedding(nn.Module):
@@ -294,7 +270,7 @@ class _Block(nn.Module):
     ) -> None:
         super().__init__()
         self.residual_attn = _Attention(width, embedding, num_heads, window, harmonics)
-        self.residual_ffn = _TimedFeedForward(width, hidden, embedding)
+        self.residual_ffn = _FeedForward(width, hidden, embedding)
 
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         return self.residual_ffn(self.residual_attn(tokens, angles, embedding), embedding)

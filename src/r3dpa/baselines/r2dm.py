@@ -17,14 +17,14 @@ from r3dpa.baselines.diffusion import (
     target_of,
     weighted_mean,
 )
-from r3dpa.baselines.efficient_unet import EfficientUNet, corner_angles
+from r3dpa.baselines.efficient_unet import EfficientUNet
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
 
-_OPTIMIZER = OptimizerConfig(betas=(0.9, 0.99), weight_decay=0.0, warmup_steps=10_000, cosine=True)
+RECIPE = OptimizerConfig(betas=(0.9, 0.99), weight_decay=0.0, warmup_steps=10_000, cosine=True)
 
 
 class R2DM(Baseline):
@@ -62,7 +62,7 @@ class R2DM(Baseline):
         norm: Literal["l2", "l1", "huber"] = "l2",
         gamma: float | None = 5.0,
         official_min_snr: bool = False,
-        optimizer: OptimizerConfig = _OPTIMIZER,
+        optimizer: OptimizerConfig = RECIPE,
         ema_decay: float = 0.995,
         ema_every: int = 10,
         ema_after: int = 10_000,
@@ -88,13 +88,6 @@ class R2DM(Baseline):
             "shift": path.shift,
             "clip": self.clip,
         }
-
-    def setup(self, stage: str) -> None:
-        """Checks the data, and gives the network the ray angles of their projection."""
-        super().setup(stage)
-        coords = corner_angles(self.scan_geometry.projection)
-        for network in (self.network, self.ema.network):
-            network.coords.copy_(coords)  # type: ignore[operator]
 
     def denoise(self, network: nn.Module, x: Tensor, time: Tensor) -> Tensor:
         """Clean data ``(B, C, H, W)`` that the network sees in samples at times ``(B,)``."""

@@ -9,13 +9,14 @@ from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.generator import BaselineGenerator
 from r3dpa.baselines.lidm import LiDM
 from r3dpa.baselines.r2dm import R2DM
+from r3dpa.baselines.r2flow import R2Flow
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import usable_device
 
-BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM, LiDM)}
+BASELINES: dict[str, type[Baseline]] = {kind.stage: kind for kind in (R2DM, R2Flow, LiDM)}
 
 
 def scene_generator(

@@ -27,13 +27,15 @@ class LidarBatch(TypedDict):
     True where a pixel has a return; where they are cached, instead ``posterior_moments``
     ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents, see
     :class:`r3dpa.nn.Posterior`. ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
-    where no grids are used; ``index`` ``(B,)`` int64 position in the data set; ``name`` B strings.
+    where no grids are used; ``noise`` ``(B, C, H, W)`` that a generated image was made of, absent
+    for scans; ``index`` ``(B,)`` int64 position in the data set; ``name`` B strings.
     """
 
     range_image: NotRequired[Tensor]
     valid_mask: NotRequired[Tensor]
     posterior_moments: NotRequired[Tensor]
     feature_grid: NotRequired[Tensor]
+    noise: NotRequired[Tensor]
     index: Tensor
     name: list[str]
 

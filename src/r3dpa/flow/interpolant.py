@@ -112,14 +112,15 @@ LINEAR = Interpolant("linear")
 
 def sample_time(
     batch_size: int,
-    kind: Literal["uniform", "lognormal"] = "uniform",
+    kind: Literal["uniform", "lognormal", "u_shaped"] = "uniform",
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Draw one flow time per sample, ``(B,)`` float32 in [0, 1].
 
     ``uniform`` on [0, 1); ``lognormal`` is ``sigmoid(n)`` with n standard Gaussian, denser in the
-    middle (Esser et al. 2024, logit-normal).
+    middle (Esser et al. 2024, logit-normal); ``u_shaped`` has a density like ``exp(4 t)`` plus
+    ``exp(4 (1 - t))``, denser at both ends (Lee et al. 2024, for pairs of a trained flow).
 
     Args:
         batch_size: Number of samples B.
@@ -132,4 +133,13 @@ def sample_time(
         return time.uniform_(generator=generator)
     if kind == "lognormal":
         return time.normal_(generator=generator).sigmoid()
-    raise ValueError(f"times are drawn 'uniform' or 'lognormal', got {kind!r}")
+    if kind == "u_shaped":
+        rising = _exponential(time.uniform_(generator=generator))
+        chosen = torch.randperm(2 * batch_size, generator=generator, device=device)[:batch_size]
+        return torch.cat([rising, 1 - rising])[chosen]
+    raise ValueError(f"times are drawn 'uniform', 'lognormal' or 'u_shaped', got {kind!r}")
+
+
+def _exponential(uniform: Tensor, rate: float = 4.0) -> Tensor:
+    """Times of a density like ``exp(rate t)`` on [0, 1], from uniform ones."""
+    return torch.log1p(uniform * math.expm1(rate)) / rate

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 PathName = Literal["linear", "cosine"]
-TimeSampling = Literal["uniform", "lognormal"]
+TimeSampling = Literal["uniform", "lognormal", "u_shaped"]
 
 
 @dataclass(frozen=True)
