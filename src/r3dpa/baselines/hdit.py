@@ -228,7 +228,7 @@ class _Attention(nn.Module):
         self, width: int, embedding: int, num_heads: int, window: Size | None, harmonics: Size
     ) -> None:
         super().__init__()
-        self.num_heads, self.window = num_heads, window
+        self.heads, self.window = num_heads, window
         self.norm = _TimedRmsNorm(width, embedding)
         self.scale = nn.Parameter(torch.full((num_heads, 1), math.log(10)))
         self.qkv_proj = _linear(width, 3 * width)
@@ -238,7 +238,7 @@ class _Attention(nn.Module):
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         qkv = self.qkv_proj(self.norm(tokens, embedding))
         query, key, value = rearrange(
-            qkv, "B h w (three head d) -> three B h w head d", three=3, head=self.num_heads
+            qkv, "B h w (three head d) -> three B h w head d", three=3, head=self.heads
         )
         scale = self.scale.clamp(max=_MAX_LOG_SCALE).div(2).exp()
         turn = self.rope(angles)

@@ -160,9 +160,10 @@ class PairDataset(Dataset[dict[str, Any]]):
 def as_scanned(samples: Tensor, geometry: ScanGeometry) -> Tensor:
     """Samples ``(B, C, H, W)`` as images of a scan: clamped, empty out of the sensor's range.
 
-    The official pairs pass through files of metric depth, which does the same.
+    The official pairs pass through files of metric depth, which does the same. There a saturated
+    pixel is just below the largest range and counts as a return, so it does here.
     """
-    samples = samples.clamp(-1, 1)
+    samples = samples.clamp(-1, 1 - 1e-6)
     codec, sensor = geometry.codec, geometry.projection.sensor
     ranges = codec.encode(codec.ranges_of(samples, sensor)).unsqueeze(1)
     return torch.cat([ranges, samples[:, 1:]], dim=1)
