@@ -141,6 +141,13 @@ def test_faults_act_on_every_file(folder, tmp_path, capsys):
         assert line["moved"] == round(0.01 * line["points"])
 
 
+def test_a_fault_may_leave_nothing(folder, tmp_path):
+    words = ["--fault", "dropped_sectors", "--strength", "360"]
+    main(["corrupt", str(folder / "b"), "--out", str(tmp_path / "out"), *words])
+    assert sorted(content(tmp_path / "out")) == ["2.bin", "report.jsonl", "request.json"]
+    assert (tmp_path / "out/2.bin").read_bytes() == b""
+
+
 BAD = {
     "visibility": (["--weather.visibility_m", "0"], "visibility_m must be 1 or greater"),
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),

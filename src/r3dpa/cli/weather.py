@@ -225,6 +225,8 @@ def _write_page(job: _Job, files: list[Path]) -> None:
     after: list[viz.PageScan] = []
     for path in files:
         file, result = job.read(path)
+        if not len(result.points):
+            continue
         scan = file.scan
         index = result.index[result.index >= 0]
         fate = np.full(len(scan), _LOST, dtype=np.uint8)
@@ -241,4 +243,5 @@ def _write_page(job: _Job, files: list[Path]) -> None:
             scans.append(viz.PageScan(f"{job.name(path)}{note}", points, origins=origins))
     more = {_LOST: viz.Category("lost", "#ff5c5c"), _MOVED: viz.Category("moved", "#ffb000")}
     title = f"{job.root.resolve().name} - r3dpa"
-    write_page(job.options.out / _PAGE, before, title, more, beside=after, mode="origin")
+    if before:
+        write_page(job.options.out / _PAGE, before, title, more, beside=after, mode="origin")
