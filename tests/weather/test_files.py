@@ -120,7 +120,7 @@ BAD = {
     "empty.bin": (b"", "is empty"),
     "cut.bin": (ROWS.tobytes()[:-3], "797 bytes are no rows of 4 or 5 float32"),
     "negative.bin": (ZERO.astype("f4").tobytes(), "name the columns with --columns"),
-    "one.bin": (ROWS[:1, :4].tobytes(), "holds 1 point, too few for a sweep"),
+    "one.bin": (ROWS[:1, :4].tobytes(), "holds 1 of at least 16 points; remove it"),
     "nan.bin": (NAN.tobytes(), "NaN or infinite values in 1 of 40 points; --drop_nan"),
     "far.bin": ((ROWS[:, :4] * 100).tobytes(), "which are no metres: divide"),
     "near.bin": ((ROWS[:, :4] / 100).tobytes(), "which are no metres: multiply"),

@@ -16,14 +16,9 @@ from r3dpa.weather.rings import angles, rings_of
 from r3dpa.weather.weather import ADDED_CLASS, WeatheredScan
 
 Kind = Literal[
-    "missing_beams",
-    "fewer_beams",
-    "crosstalk",
-    "incomplete_echo",
-    "motion_blur",
-    "shifted_extrinsics",
-    "dropped_sectors",
-]
+    "missing_beams", "fewer_beams", "crosstalk", "incomplete_echo", "motion_blur",
+    "shifted_extrinsics", "dropped_sectors",
+]  # fmt: skip
 #: Strength of severity 1, 2, 3, the greatest one, and its unit.
 STRENGTHS: dict[str, tuple[tuple[float, float, float], float, str]] = {
     "missing_beams": ((0.25, 0.5, 0.75), 1, "of the beams"),  # 16, 32, 48 of 64

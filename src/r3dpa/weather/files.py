@@ -106,9 +106,7 @@ class ScanFile:
         for name, values in (("range", range_m), ("intensity", self.scan.intensity)):
             if values is not None:
                 parts.append(f"{name} {values.min():.3g}..{values.max():.4g}")
-        if self.labels is not None:
-            parts.append(f"labels of {len(np.unique(self.labels & 0xFFFF))} classes")
-        return ", ".join(parts)
+        return ", ".join(parts + ["labels"] * (self.labels is not None))
 
 
 def find_files(source: Path) -> tuple[Path, list[Path]]:
@@ -135,16 +133,19 @@ def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -
         ScanError: If the file is damaged, its columns are ambiguous, or its values are no scan in
             metres.
     """
-    data, read = read_bytes(path), _READERS.get(path.suffix.lower())
-    if read is None or not data:
-        reason = "is of no known format; can be read: " + ", ".join(_READERS)
-        raise ScanError(f"{path}: {'is empty' if not data else reason}")
+    data = read_bytes(path)
+    if not data:
+        raise ScanError(f"{path}: is empty")
     try:
-        kind, table, pack = read(path, data, tuple(columns))
+        kind, table, pack = _READERS[path.suffix.lower()](path, data, tuple(columns))
     except ScanError:
         raise
     except UNPICKLING_ERRORS as error:
-        raise ScanError(f"{path}: is damaged or of another layout ({first_line(error)})") from error
+        if path.suffix.lower() in _READERS:
+            reason = f"is damaged or of another layout ({first_line(error)})"
+        else:
+            reason = f"is of no known format; can be read: {', '.join(_READERS)}"
+        raise ScanError(f"{path}: {reason}") from error
     known = _known_columns(path, table)
     labels, label_path = _labels(path, len(table))
     values = [table[name].astype(np.float64) for name in known.values()]
@@ -157,8 +158,9 @@ def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -
             )
         table, labels = table[finite], None if labels is None else labels[finite]
     if len(table) < _FEWEST_POINTS:
-        number = f"{len(table)} point{'s' * (len(table) != 1)}"
-        raise ScanError(f"{path}: holds {number}, too few for a sweep; take it out of the folder")
+        raise ScanError(
+            f"{path}: holds {len(table)} of at least {_FEWEST_POINTS} points; remove it"
+        )
     range_m = np.sqrt(np.square(values[:3]).sum(axis=0))[finite]
     median, largest = float(np.median(range_m)), float(range_m.max())
     if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
@@ -187,16 +189,14 @@ def write_file(file: ScanFile, root: Path, out: Path) -> None:
 
 def _known_columns(path: Path, table: Table) -> dict[str, str]:
     names = {name.lower(): name for name in table.dtype.names or ()}
-    known = {}
+    known: dict[str, str] = {}
     for key, others in _NAMES.items():
-        name = next((names[other] for other in others.split() if other in names), None)
-        if name is None and key in "xyz":
+        known |= dict([(key, names[other]) for other in others.split() if other in names][:1])
+        kind = table.dtype[known[key]] if key in known else None
+        if kind is None and key in "xyz":
             raise ScanError(f"{path}: has no column {key}, only {', '.join(names.values())}")
-        if name is not None:
-            kind = table.dtype[name]
-            if kind.shape or kind.kind not in ("f" if key in "xyz" else "fiu"):
-                raise ScanError(f"{path}: column {name} is of {kind}; {key} must be one float")
-            known[key] = name
+        if kind and (kind.shape or kind.kind not in ("f" if key in "xyz" else "fiu")):
+            raise ScanError(f"{path}: column {known[key]} is of {kind}; {key} must be one float")
     return known
 
 
@@ -227,17 +227,16 @@ def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
 
 def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     counts = [len(columns)] if columns else [5] if path.stem.endswith(".pcd") else [4, 5]
-    fitting = [count for count in counts if len(data) % (4 * count) == 0]
-    values = np.frombuffer(data, "<f4") if fitting else np.empty(0, "<f4")
-    likely = [c for c in fitting if columns or _plausible(values.reshape(-1, c))]
+    fitting = [np.frombuffer(data, "<f4").reshape(-1, n) for n in counts if not len(data) % (4 * n)]
+    likely = [rows for rows in fitting if columns or _plausible(rows)]
     if len(likely) != 1:
         raise ScanError(
             f"{path}: its {len(data)} bytes are no rows of {' or '.join(map(str, counts))} float32 "
             "numbers that can be x, y, z, intensity, ring: name the columns with --columns, such "
             "as x,y,z,intensity,time"
         )
-    table = _with_names(path, values.reshape(-1, likely[0]), columns)
-    return f"{likely[0]} columns of float32", table, np.ndarray.tobytes
+    table = _with_names(path, likely[0], columns)
+    return f"{likely[0].shape[1]} columns of float32", table, np.ndarray.tobytes
 
 
 def _plausible(rows: NDArray) -> bool:
@@ -249,18 +248,17 @@ def _plausible(rows: NDArray) -> bool:
 def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     arrays = dict(npz_arrays(path)) if data[:2] == b"PK" else {}
     array, *others = arrays.values() or [np.load(io.BytesIO(data), allow_pickle=False)]
-    named = bool(array.dtype.names or others)
-    if {one.shape for one in (array, *others)} != {array.shape[:1] if named else array.shape}:
+    if {one.shape for one in (array, *others)} != {array.shape[:1] if others else array.shape}:
         raise ScanError(f"{path}: must hold one scan: one array of rows, or columns of one length")
-
     if others:
         layout = [(name, one.dtype) for name, one in arrays.items()]
-        table = np.array(list(zip(*arrays.values(), strict=True)), layout)
-    else:
-        table = array if named else _with_names(path, array, columns)
+        array = np.array(list(zip(*arrays.values(), strict=True)), layout)
+    table = array if array.dtype.names else _with_names(path, array, columns)
 
     def pack(table: Table) -> bytes:
-        rows, stream = table if named else structured_to_unstructured(table), io.BytesIO()
+        stream, rows = io.BytesIO(), table
+        if not array.dtype.names:
+            rows = structured_to_unstructured(table)
         packed: dict[str, Any] = {name: table[name] if others else rows for name in arrays}
         np.savez_compressed(stream, **packed) if arrays else np.save(stream, rows)
         return stream.getvalue()
