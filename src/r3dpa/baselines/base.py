@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -11,12 +11,14 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from r3dpa.baselines.diffusion import repaint
 from r3dpa.baselines.efficient_unet import corner_angles
 from r3dpa.baselines.generator import BaselineGenerator
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
 from r3dpa.flow.sampler import SamplerConfig
+from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import ScanGeometry
 from r3dpa.modules import steps
 from r3dpa.modules.checks import check_geometry, check_trainer, geometry_of
@@ -118,6 +120,20 @@ class Baseline(L.LightningModule):
     def errors(self, network: nn.Module, data: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Training loss ``(B,)`` of each sample ``(B, C, h, w)`` at a time ``(B,)``."""
         raise NotImplementedError
+
+    def complete(
+        self,
+        velocity: Velocity,
+        known: Tensor,
+        mask: Tensor,
+        draws: Iterator[Tensor],
+        sampler: SamplerConfig,
+        resamplings: int,
+        jump: int,
+    ) -> Tensor:
+        """Samples ``(B, C, h, w)`` that are ``known`` where the mask ``(B, 1, h, w)`` is 1."""
+        path = self.interpolant
+        return repaint(velocity, known, mask, draws, path, sampler.steps, resamplings, jump)
 
     def settings(self) -> dict[str, Any]:
         """Plain values of the constructor arguments that sampling depends on, but for networks."""

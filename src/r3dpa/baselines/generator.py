@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.baselines.diffusion import repaint
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneBatch, filled, noise_of, scene_indices
 from r3dpa.geometry import ScanGeometry
@@ -98,20 +98,19 @@ class BaselineGenerator:
     def complete(
         self, image: Tensor, known: Tensor, seed: int = 0, *, resamplings: int = 10, jump: int = 1
     ) -> SceneBatch:
-        """Completes encoded range images ``(B, C, H, W)`` by RePaint, where samples are images.
+        """Completes encoded range images ``(B, C, H, W)``.
 
         Pixels that are True in ``known`` ``(B, 1, H, W)`` are kept; other arguments and steps as
         of :func:`r3dpa.baselines.diffusion.repaint`, with the number of steps of the sampler.
+        Latents are completed without resampling, see :func:`r3dpa.baselines.lidm.inpaint`.
         """
-        self.calls, path = 0, self.baseline.interpolant
-        noises = noise_of(self.baseline.latent_shape, range(len(image)), seed)
+        self.calls, baseline = 0, self.baseline
+        noises = noise_of(baseline.latent_shape, range(len(image)), seed)
         draws = (noise.to(self.device) for noise in noises)
-        image, mask, steps = (
-            image.to(self.device),
-            known.to(self.device).float(),
-            self.sampler.steps,
-        )
-        found = repaint(self.velocity, image, mask, draws, path, steps, resamplings, jump)
+        data = baseline.encode(image.to(self.device))
+        # A latent pixel is known where all of its pixels are.
+        mask = -F.adaptive_max_pool2d(-known.to(data), data.shape[-2:])
+        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings, jump)
         return SceneBatch(self.decode(found), found, self.calls, self.geometry.projection)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:

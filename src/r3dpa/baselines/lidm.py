@@ -124,9 +124,8 @@ def inpaint(
     times: Tensor,
     draws: Iterator[Tensor],
     path: Interpolant,
-    eta: float = 0.0,
 ) -> Tensor:
-    """DDIM whose state is overwritten before each step where the mask is 1, as in LiDM.
+    """DDIM without noise, whose state is overwritten before each step where the mask is 1.
 
     Args:
         velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
@@ -134,16 +133,14 @@ def inpaint(
         known: ``(B, ...)`` data.
         mask: Broadcast to ``known``; 1 where it is kept.
         times: ``(T,)`` decreasing times.
-        draws: Gaussian draws ``(B, ...)``: for the known part, then with ``eta`` for the step.
+        draws: T - 1 Gaussian draws ``(B, ...)`` for the known part.
         path: Path of the velocity.
-        eta: Strength of the noise, 0 to 1.
     """
     for now, then in step_pairs(times):
         here, there = batch_time(now, x), batch_time(then, x)
         x = mask * path.interpolate(known, next(draws), here) + (1 - mask) * x
         data = path.denoise(velocity(x, here), x, here)
-        draw = next(draws) if eta else None
-        x = ancestral_step(data, x, here, there, draw, eta=eta, interpolant=path)
+        x = ancestral_step(data, x, here, there, None, interpolant=path)
     return x
 
 
@@ -233,6 +230,20 @@ class LiDM(Baseline):
     def decode(self, latents: Tensor) -> Tensor:
         """Encoded range images ``(B, 1, H, W)`` of latents, which are quantised."""
         return self.first_stage.decode(latents)
+
+    def complete(
+        self,
+        velocity: Velocity,
+        known: Tensor,
+        mask: Tensor,
+        draws: Iterator[Tensor],
+        sampler: SamplerConfig,
+        resamplings: int = 1,
+        jump: int = 1,
+    ) -> Tensor:
+        """Completes latents by :func:`inpaint`, as released: without resampling."""
+        times = released_times(sampler.steps)
+        return inpaint(velocity, next(draws), known, mask, times, draws, self.interpolant)
 
     def velocity(self, network: nn.Module, x: Tensor, time: Tensor) -> Tensor:
         """Velocity on the path, from the noise that the network predicts."""

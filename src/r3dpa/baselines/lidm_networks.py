@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from r3dpa.nn.discriminator import PatchDiscriminator
-from r3dpa.nn.layers import CircularConv2d, WideCircularConv2d, at_least_float32
+from r3dpa.nn.layers import CircularConv2d, WideCircularConv2d, at_least_float32, no_autocast
 from r3dpa.nn.unet import UNet
 from r3dpa.nn.vae import VAE, Posterior
 from r3dpa.nn.velocity_network import time_frequencies
@@ -51,7 +51,8 @@ class Codebook(nn.Module):
         """Nearest codes of ``(B, C, h, w)``; gradients pass through as if nothing had changed."""
         latents = at_least_float32(latents)
         codes, pixels = self.embedding.weight, latents.movedim(1, -1)
-        products = pixels @ codes.T
+        with no_autocast(latents.device):
+            products = pixels @ codes.T
         distance = pixels.square().sum(-1, keepdim=True) + codes.square().sum(1) - 2 * products
         indices = distance.argmin(dim=-1)
         nearest = self.embedding(indices).movedim(-1, 1)
