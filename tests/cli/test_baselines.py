@@ -62,7 +62,13 @@ TINY["lidm"] = {
     "first_stage.init_args": AUTOENCODER,
 }
 FIRST_STAGES = {  # of the baselines that have one
-    "lidm": ("lidm_first_stage", {"network.init_args": AUTOENCODER}),
+    "lidm": (
+        "lidm_first_stage",
+        {
+            "network.init_args": AUTOENCODER,
+            "discriminator.init_args": {"channels": 8, "num_layers": 2},
+        },
+    ),
 }
 SETTINGS = {
     "data.init_args.num_scans": 12,
