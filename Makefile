@@ -103,7 +103,7 @@ demo: $(READY)
 	$(BIN)/r3dpa sample --num 16 --out $(OUT)/box --overwrite true
 	$(BIN)/r3dpa edit inpaint --scan $(OUT)/box/bin/000000.bin --box -30 30 -25 3 --num 2 \
 		--steps 16 --out $(OUT)/edit --overwrite true
-	$(BIN)/r3dpa data reference --data $(REAL) --limit 64 --out $(OUT)/reference.safetensors
+	$(BIN)/r3dpa data reference --data $(REAL) --limit 32 --out $(OUT)/reference.safetensors
 	$(BIN)/r3dpa evaluate --samples $(OUT)/box --reference $(OUT)/reference.safetensors \
 		--allow_few --label before --out $(OUT)/before
 	$(FIT) --config conf/box/vae_alignment.yaml --config conf/box/demo_vae.yaml --run_dir $(OUT)/vae
