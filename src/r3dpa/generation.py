@@ -402,13 +402,17 @@ class _ScheduledNetwork:
         self.table: Tensor | None = None
         self.calls = 0
         self._graphs = graphs
-        networks: list[Callable[[Tensor, Tensor], Tensor]] = [sit.velocity_at]
-        if isinstance(sit, SiT):
-            networks.append(sit.average_velocity_at)
+        self._compiled: list[Callable[[Tensor, Tensor], Tensor]] = []
         if compile:
             mode = "reduce-overhead" if graphs else None
-            networks = [torch.compile(network, dynamic=False, mode=mode) for network in networks]
-        self._networks = networks
+            self._compiled = [
+                torch.compile(network, dynamic=False, mode=mode) for network in self._networks
+            ]
+
+    @property
+    def _networks(self) -> list[Callable[[Tensor, Tensor], Tensor]]:
+        average = [self.sit.average_velocity_at] if isinstance(self.sit, SiT) else []
+        return [self.sit.velocity_at, *average]
 
     def fill_table(self) -> None:
         """Ends the trial run."""
@@ -429,7 +433,7 @@ class _ScheduledNetwork:
             return torch.zeros_like(latents)
         row = self.table[self.calls : self.calls + 1]
         self.calls += 1
-        velocity = self._networks[target is not None](latents, row)
+        velocity = (self._compiled or self._networks)[target is not None](latents, row)
         return velocity.clone() if self._graphs else velocity  # a replay writes to one place
 
 

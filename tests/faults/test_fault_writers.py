@@ -61,7 +61,7 @@ def jobs(scans_folder, tmp_path_factory):
         ),
         "reference": Job(
             ["reference", "--data", folder / "data.yaml", "--spaces", "fgeo", "--device", "cpu"],
-            At("r3dpa.data.scans.read_scan", None, call=4),
+            At("r3dpa.data.datamodules.read_scan", None, call=4),
             is_file=True,
         ),
     }

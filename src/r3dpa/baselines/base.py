@@ -154,7 +154,7 @@ class Baseline(L.LightningModule):
                 f"stage {self.stage} is built for images {self.image_shape()} (channels, rows, "
                 f"columns), but sensor and codec of the data give {wanted}; give both the same"
             )
-        for network in (self.network, self.ema.network):
+        for network in (self.network, getattr(self.ema, "network", None)):
             if isinstance(coords := getattr(network, "coords", None), Tensor):
                 coords.copy_(corner_angles(geometry.projection))
 

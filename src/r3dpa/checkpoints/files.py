@@ -290,7 +290,8 @@ def _from_lightning(content: Mapping[str, Any], path: Path) -> Checkpoint:
     networks: dict[str, NetworkState] = {}
     for name, (prefix, argument) in _LIGHTNING.items():
         own = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
-        if not own:
+        of_baseline = argument in ("network", "first_stage")  # other stages have such parts too
+        if not own or (of_baseline and argument not in arguments):
             continue
         config = arguments.get(argument)
         if config is None and argument == "latent_norm" and "running_mean" in own:
