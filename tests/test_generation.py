@@ -25,7 +25,8 @@ from r3dpa.checkpoints import (
     save_checkpoint,
 )
 from r3dpa.flow import Interpolant, average_times, euler_maruyama, ode_solver, ode_times, sde_times
-from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator, scene_random
+from r3dpa.flow.noise import scene_random
+from r3dpa.generation import Autoguidance, SamplerConfig, SceneGenerator
 from r3dpa.geometry import (
     LidarSensor,
     RangeCodec,

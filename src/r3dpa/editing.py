@@ -18,9 +18,10 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.flow.editing import Trajectory, invert, kept, renoised, spherical_mean
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
+from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.solvers import ODE_SOLVERS, AfterStep, Velocity, evaluations, ode_solver, unchanged
 from r3dpa.flow.times import batch_time, check_interval, ode_times
-from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices, scene_noise
+from r3dpa.generation import SamplerConfig, SceneBatch, SceneGenerator, scene_indices
 from r3dpa.geometry.gaps import filled, range_error_m, refined
 from r3dpa.geometry.regions import check_mask, mask_of_tokens, token_mask
 
@@ -360,7 +361,10 @@ class SceneEditor:
 
     def _draws(self, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
         """Noise after noise ``(B, C, h, w)`` for scenes, drawn on the CPU."""
-        return (x.to(self.generator.device) for x in scene_noise(self._sit, indices, seed))
+        return (
+            x.to(self.generator.device)
+            for x in scene_noise(self.generator.latent_shape, indices, seed)
+        )
 
     def _each(
         self,

@@ -16,6 +16,7 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
+from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
@@ -216,6 +217,11 @@ class SceneGenerator:
         """Device of the networks."""
         return next(self.sit.parameters()).device
 
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Channels, rows and columns of the latents."""
+        return self.sit.in_channels, *self.sit.input_size
+
     def with_sampler(self, sampler: SamplerConfig) -> SceneGenerator:
         """The same networks, compiled where these are, with another solver; both may be used."""
         _check_average(sampler, self.sit, self._autoguidance)
@@ -235,7 +241,7 @@ class SceneGenerator:
             return
         for network in self._networks:
             network.times, network.targets, network.table = [], [], None
-        noise = torch.zeros(1, self.sit.in_channels, *self.sit.input_size, device=self.device)
+        noise = torch.zeros(1, *self.latent_shape, device=self.device)
         self._solve(noise, iter(lambda: noise, None))
         for network in self._networks:
             network.fill_table()
@@ -252,11 +258,13 @@ class SceneGenerator:
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
-            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
+            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are requested")
         self.prepare()
         for network in self._networks:
             network.calls = 0
-        draws = (filled(x, size).to(self.device) for x in scene_noise(self.sit, indices, seed))
+        draws = (
+            filled(x, size).to(self.device) for x in scene_noise(self.latent_shape, indices, seed)
+        )
         latents = self._solve(next(draws), draws)[: len(indices)]
         range_m = self.decode(latents)
         nfe = sum(network.calls for network in self._networks)
@@ -281,7 +289,7 @@ class SceneGenerator:
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the networks."""
-        return next(scene_noise(self.sit, indices, seed)).to(self.device)
+        return next(scene_noise(self.latent_shape, indices, seed)).to(self.device)
 
     @property
     def _networks(self) -> list[_ScheduledNetwork]:
@@ -368,17 +376,12 @@ def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
 def _check_average(
     sampler: SamplerConfig, sit: VelocityNetwork, autoguidance: Autoguidance | None
 ) -> None:
-    if sampler.solver != "average_velocity":
-        return
-    if not isinstance(sit, SiT) or sit.average is None:
+    average = getattr(sit, "average", None)
+    if sampler.solver == "average_velocity" and (average is None or autoguidance is not None):
         raise ValueError(
-            "solver average_velocity needs a network that predicts average velocities: sample from "
-            "a checkpoint of stage few_step, or take another solver or quality"
-        )
-    if autoguidance is not None:
-        raise ValueError(
-            "autoguidance extrapolates velocities at one time, and average_velocity makes whole "
-            "steps: drop autoguidance, or take another solver"
+            "solver average_velocity needs a network that predicts average velocities, from a "
+            "checkpoint of stage few_step, and no autoguidance: drop autoguidance, or take another "
+            "solver or quality"
         )
 
 
@@ -402,12 +405,9 @@ class _ScheduledNetwork:
         self.table: Tensor | None = None
         self.calls = 0
         self._graphs = graphs
-        self._compiled: list[Callable[[Tensor, Tensor], Tensor]] = []
-        if compile:
-            mode = "reduce-overhead" if graphs else None
-            self._compiled = [
-                torch.compile(network, dynamic=False, mode=mode) for network in self._networks
-            ]
+        mode = "reduce-overhead" if graphs else None
+        parts = self._networks if compile else []
+        self._compiled = [torch.compile(part, dynamic=False, mode=mode) for part in parts]
 
     @property
     def _networks(self) -> list[Callable[[Tensor, Tensor], Tensor]]:
@@ -445,21 +445,3 @@ def filled(values: Tensor, size: int) -> Tensor:
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     """Numbers of scenes; a number stands for that many from 0 on."""
     return range(indices) if isinstance(indices, int) else indices
-
-
-def scene_noise(sit: VelocityNetwork, indices: Sequence[int], seed: int) -> Iterator[Tensor]:
-    """Noise after noise ``(B, C, h, w)`` for latents of scenes, each scene's own, on the CPU."""
-    return noise_of((sit.in_channels, *sit.input_size), indices, seed)
-
-
-def noise_of(shape: tuple[int, int, int], indices: Sequence[int], seed: int) -> Iterator[Tensor]:
-    """The same for samples of any shape ``(C, h, w)``."""
-    generators = [scene_random(seed, index) for index in indices]
-    while True:
-        yield torch.stack([torch.randn(shape, generator=g) for g in generators])
-
-
-def scene_random(seed: int, index: int) -> torch.Generator:
-    """Random numbers of a scene, on the CPU; its noise comes first."""
-    key = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
-    return torch.Generator().manual_seed(int(key[0]) >> 1)

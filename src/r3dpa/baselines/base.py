@@ -21,7 +21,7 @@ from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import ScanGeometry
 from r3dpa.modules import steps
-from r3dpa.modules.checks import check_geometry, check_trainer, geometry_of
+from r3dpa.modules.checks import check_trainer, geometry_of
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
 
 
@@ -222,10 +222,4 @@ class Baseline(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images."""
-        self.loaded_step = checkpoint.get("global_step", 0)
-        steps.check_stage(self, checkpoint)
-        there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
-        if self.geometry is None:
-            self.geometry = there
-        else:
-            check_geometry(there, self.geometry, "the checkpoint")
+        steps.check_resumed(self, checkpoint)

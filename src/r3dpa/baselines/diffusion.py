@@ -110,7 +110,7 @@ def data_of(
 def target_of(
     kind: Prediction, data: Tensor, noise: Tensor, alpha: Tensor, sigma: Tensor
 ) -> Tensor:
-    """What the network of :func:`data_of` is trained to predict."""
+    """Training target of a network whose output :func:`data_of` converts to data."""
     return {"eps": noise, "v": alpha * noise - sigma * data, "x_0": data}[kind]
 
 

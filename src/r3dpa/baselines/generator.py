@@ -10,8 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.generation import SceneBatch, filled, noise_of, scene_indices
+from r3dpa.generation import SceneBatch, filled, scene_indices
 from r3dpa.geometry import ScanGeometry
 
 
@@ -78,9 +79,9 @@ class BaselineGenerator:
         indices = scene_indices(indices)
         size = self.batch_size or len(indices)
         if len(indices) > size:
-            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are asked for")
+            raise ValueError(f"batch_size is {size}, but {len(indices)} scenes are requested")
         self.calls = 0
-        noises = noise_of(self.baseline.latent_shape, indices, seed)
+        noises = scene_noise(self.baseline.latent_shape, indices, seed)
         draws = (filled(noise, size).to(self.device) for noise in noises)
         path = self.baseline.interpolant
         latents = self.sampler.solve(self.velocity, next(draws), draws, path)[: len(indices)]
@@ -105,7 +106,7 @@ class BaselineGenerator:
         Latents are completed without resampling, see :func:`r3dpa.baselines.lidm.inpaint`.
         """
         self.calls, baseline = 0, self.baseline
-        noises = noise_of(baseline.latent_shape, range(len(image)), seed)
+        noises = scene_noise(baseline.latent_shape, range(len(image)), seed)
         draws = (noise.to(self.device) for noise in noises)
         data = baseline.encode(image.to(self.device))
         # A latent pixel is known where all of its pixels are.
@@ -115,4 +116,4 @@ class BaselineGenerator:
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""
-        return next(noise_of(self.baseline.latent_shape, indices, seed)).to(self.device)
+        return next(scene_noise(self.baseline.latent_shape, indices, seed)).to(self.device)

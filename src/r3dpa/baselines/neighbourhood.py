@@ -30,7 +30,7 @@ def neighbourhood_attention(
     neighbours across the seam instead; where the kernel is wider than the image, columns come more
     than once. Dilated windows take every ``dilation``-th pixel and shift among these.
 
-    Blocks of queries in one row share their keys, and a mask tells the windows apart.
+    Blocks of queries in one row share their keys, and a mask limits each query to its window.
 
     Source: Neighborhood Attention Transformer (Hassani et al. 2023), windows of natten 0.17.1.
 

@@ -16,8 +16,8 @@ from r3dpa.baselines.stages import scene_generator
 from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.data.loaders import LoaderModule, at_least
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
+from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.generation import noise_of
 from r3dpa.geometry import ScanGeometry
 from r3dpa.io import only_writer
 
@@ -153,7 +153,7 @@ class PairDataset(Dataset[dict[str, Any]]):
         pair = self.pairs[index]
         image = self.images.read(pair)
         channels, rows, columns = image.shape
-        noise = next(noise_of((channels, rows, columns), [pair.number], seed=0))[0]
+        noise = next(scene_noise((channels, rows, columns), [pair.number], seed=0))[0]
         return {"range_image": image, "noise": noise, "index": index, "name": pair.name}
 
 

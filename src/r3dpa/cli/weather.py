@@ -15,13 +15,11 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
 from r3dpa.cli.parser import check_folder
-from r3dpa.data.scans import ScanError, evenly
 from r3dpa.io import delete_unfinished, in_processes, only_writer
 from r3dpa.simulation.drive_files import to_json, weather_to_dict, write
 from r3dpa.simulation.drives import differences
 from r3dpa.weather import Instrument, Weather, WeatheredScan
 from r3dpa.weather.faults import Fault, Kind
-from r3dpa.weather.files import ScanFile, find_files, read_file, write_file
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
 _LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin
@@ -98,7 +96,7 @@ class FolderOptions:
 
 @dataclass(frozen=True)
 class _Job:
-    """What is done to each scan of a run; a call writes it and returns its line of the report."""
+    """Change of a run; a call applies it to a scan, writes the result and returns a report line."""
 
     root: Path
     change: Fault | tuple[Weather, Instrument, Mapping[str, str | bool] | None]
@@ -107,7 +105,10 @@ class _Job:
     def name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def read(self, path: Path) -> tuple[ScanFile, WeatheredScan]:
+    def read(self, path: Path) -> tuple[Any, WeatheredScan]:
+        from r3dpa.data.scans import ScanError
+        from r3dpa.weather.files import read_file
+
         file = read_file(path, self.options.columns, self.options.drop_nan)
         key, scan = (self.options.seed, self.name(path)), file.scan
         try:
@@ -119,6 +120,9 @@ class _Job:
             raise ScanError(f"{path}: {error}") from error
 
     def __call__(self, path: Path) -> dict[str, Any]:
+        from r3dpa.data.scans import ScanError
+        from r3dpa.weather.files import write_file
+
         try:
             file, result = self.read(path)
         except ScanError as error:
@@ -130,6 +134,9 @@ class _Job:
 
 
 def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
+    from r3dpa.data.scans import ScanError, evenly
+    from r3dpa.weather.files import find_files
+
     root, files = find_files(source)
     out, job = options.out, _Job(root, change, options)
     paths = {job.name(path): path for path in files}

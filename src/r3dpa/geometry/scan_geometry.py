@@ -31,7 +31,7 @@ class RangeCodec:
         inverse image = 2 * scale / d - 1
 
     all clipped to [-1, 1]; a pixel without a return is -1 or counts as d = 0. With
-    ``return_channel`` a second channel tells returns (1) from empty pixels (-1), so that a decoder
+    ``return_channel`` a second channel is 1 at returns and -1 at empty pixels, so that a decoder
     does not blur the border between the two into ghost points. With ``reflectance`` the second
     channel is that of the returns instead, from [0, 1] to [-1, 1], and -1 without a return.
 
@@ -48,8 +48,8 @@ class RangeCodec:
         offset_m: Offset of ``log2``, metres.
 
     Raises:
-        ValueError: If the encoding is unknown, the scale is not positive and finite, or two second
-            channels are asked for.
+        ValueError: If the encoding is unknown, the scale is not positive and finite, or both
+            second channels are set.
     """
 
     encoding: Literal["linear", "log2", "inverse"] = "linear"

@@ -1,4 +1,4 @@
-"""Two-sample test by a classifier: how well a small network tells generated scenes from scans."""
+"""Two-sample test by a classifier: accuracy of a small network on scans and generated scenes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CODEC = RangeCodec("log2", return_channel=True)
 
 
 class Accuracy(NamedTuple):
-    """Share of held-out images that are told apart, 0.5 by chance, and its standard error."""
+    """Share of held-out images classified correctly, 0.5 by chance, and its standard error."""
 
     value: float
     standard_error: float
@@ -26,7 +26,7 @@ class Accuracy(NamedTuple):
 def classifier_accuracy(
     real_m: Tensor, generated_m: Tensor, *, epochs: int = 8, batch_size: int = 16, seed: int = 0
 ) -> Accuracy:
-    """Held-out accuracy of a small network trained to tell two sets of range images apart.
+    """Held-out accuracy of a small network trained to separate two sets of range images.
 
     Four strided convolutions whose columns wrap around, a global mean and a linear layer, on log
     range and return mask. 70 % of each set are for training, where scenes are rotated at random.
@@ -79,9 +79,9 @@ def classifier_accuracy(
             for label, images in enumerate(held_out)
             for part in images.split(batch_size)
         ]
-    told = torch.cat(right).double()
-    value = told.mean().item()
-    return Accuracy(value, (value * (1 - value) / len(told)) ** 0.5)
+    correct = torch.cat(right).double()
+    value = correct.mean().item()
+    return Accuracy(value, (value * (1 - value) / len(correct)) ** 0.5)
 
 
 def _network() -> nn.Sequential:

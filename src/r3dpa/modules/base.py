@@ -402,11 +402,5 @@ class GenerativeModule(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images."""
-        self.loaded_step = checkpoint.get("global_step", 0)
+        steps.check_resumed(self, checkpoint)
         self._has_weights = True
-        steps.check_stage(self, checkpoint)
-        there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
-        if self.geometry is None:
-            self.geometry = there
-        else:
-            check_geometry(there, self.geometry, "the checkpoint")

@@ -55,7 +55,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, one parameter group per network; constant rate, then falling to 0 where asked for.
+    """AdamW, one parameter group per network; constant rate with an optional decay to 0.
 
     Args:
         lr: Learning rate.

@@ -16,7 +16,9 @@ from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa import __version__, losses
 from r3dpa.flow import sample_time
+from r3dpa.geometry import ScanGeometry
 from r3dpa.io import source_commit
+from r3dpa.modules.checks import check_geometry
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.nn import VelocityNetwork
 
@@ -255,6 +257,17 @@ def describe_stage(checkpoint: dict[str, Any], stage: str, path: str) -> None:
         "version": __version__,
         "commit": source_commit(),
     }
+
+
+def check_resumed(module: Any, checkpoint: dict[str, Any]) -> None:
+    """Refuses the checkpoint of another stage or of other range images, and keeps its step."""
+    module.loaded_step = checkpoint.get("global_step", 0)
+    check_stage(module, checkpoint)
+    there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
+    if module.geometry is None:
+        module.geometry = there
+    else:
+        check_geometry(there, module.geometry, "the checkpoint")
 
 
 def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:

@@ -6,13 +6,10 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from r3dpa.geometry import LidarSensor
-from r3dpa.geometry.rings import rings_in_order
 from r3dpa.weather.recorded import RecordedScan
 
 _MOST_BEAMS = 256
@@ -75,6 +72,11 @@ def _in_order(
     """Rings of a file that holds ring after ring; None for another order."""
     low, high = np.degrees(np.quantile(inclination, [0.001, 0.999]))
     limits = {"inclination_min_deg": low - 0.5, "inclination_max_deg": high + 0.5}
+    import torch  # not for the options of the commands
+
+    from r3dpa.geometry import LidarSensor
+    from r3dpa.geometry.rings import rings_in_order
+
     sensor = LidarSensor(_MOST_BEAMS // 2, **limits)
     try:
         ring, _ = rings_in_order(torch.from_numpy(inclination), torch.from_numpy(azimuth), sensor)

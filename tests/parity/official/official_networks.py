@@ -13,7 +13,7 @@ from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint, NetworkState, to_official
 from r3dpa.flow import Velocity
-from r3dpa.generation import scene_random
+from r3dpa.flow.noise import scene_random
 from r3dpa.geometry import LidarSensor, RangeCodec
 from r3dpa.nn import VAE, LatentNorm, PatchDiscriminator, SiT
 

@@ -1,0 +1,22 @@
+"""Noise of scenes, a function of the seed and the number of a scene alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def scene_noise(shape: tuple[int, int, int], indices: Sequence[int], seed: int) -> Iterator[Tensor]:
+    """Noise after noise ``(B, C, h, w)`` for samples ``(C, h, w)`` of scenes, on the CPU."""
+    generators = [scene_random(seed, index) for index in indices]
+    while True:
+        yield torch.stack([torch.randn(shape, generator=g) for g in generators])
+
+
+def scene_random(seed: int, index: int) -> torch.Generator:
+    """Random numbers of a scene, on the CPU; its noise comes first."""
+    key = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(key[0]) >> 1)
