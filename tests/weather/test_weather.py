@@ -130,6 +130,14 @@ def test_seeds(scan):
     assert one.index.tobytes() != other.index.tobytes()
 
 
+def test_unknown_powers_are_drawn_by_seed(scan):
+    """Fog has no draws of its own: which hard echoes it loses follows from the powers alone."""
+    off = {"soft_raydrop": "off"}
+    kept = [Weather(visibility_m=60).apply(scan, seed, effects=off).index for seed in (1, 1, 2)]
+    hard = [index[index >= 0].tobytes() for index in kept]
+    assert hard[0] == hard[1] != hard[2]
+
+
 def test_intensities_of_either_scale_give_the_same(scan):
     weather = Weather(visibility_m=80, water_film_mm=0.5)
     one = weather.apply(scan)
