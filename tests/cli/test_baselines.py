@@ -172,6 +172,11 @@ def test_the_published_sampler_is_the_default(trained):
 
 
 @pytest.mark.usefixtures("coarse_protocols")
+@pytest.mark.parametrize(
+    "trained",
+    [s if s == "lidm" else pytest.param(s, marks=pytest.mark.slow) for s in TINY],
+    indirect=True,
+)
 def test_test_scores_scenes(trained, smoke_root, tmp_path):
     stage, path = trained
     scorer = ["num_scenes=2", "batch_size=2", "allow_few=true", "spaces=[fgeo]"]

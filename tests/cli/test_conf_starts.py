@@ -149,7 +149,13 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     start(configs, settings)
 
 
-@pytest.mark.parametrize("name", BOX)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("box", "demo") else pytest.param(name, marks=pytest.mark.slow)
+        for name in BOX
+    ],
+)
 def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
     stage, *tuned, data = BOX[name]
