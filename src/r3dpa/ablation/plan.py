@@ -54,6 +54,12 @@ class Stage(NamedTuple):
         return "grid_size" in self.config["data"]["init_args"]
 
     @property
+    def on_features(self) -> bool:
+        """Whether the scans come with feature grids."""
+        data = self.config["data"]["init_args"]
+        return self.on_scans and bool(data.get("extractor") or data.get("features_dir"))
+
+    @property
     def evaluation(self) -> Path:
         """File with the numbers of its test."""
         return self.folder / "evaluation" / "evaluation.json"

@@ -135,10 +135,11 @@ def _end_with_parent() -> None:
 def _jobs(plan: Plan) -> list[Job]:
     """Scans and their reference, trainings, tests; each after the jobs that it needs."""
     out, data, reference = plan.out, plan.out / "data.yaml", plan.out / "reference.safetensors"
-    on_scans = [stage.config["data"] for stage in plan.stages if stage.on_scans]
-    sizes = sorted({tuple(block["init_args"]["grid_size"]) for block in on_scans})
-    save_text(data, yaml.safe_dump({"data": on_scans[0]}))
-    scans = json.dumps([on_scans[0], sizes], sort_keys=True)
+    # Baselines see the same scans without features, through sensors of their own.
+    featured = [stage.config["data"] for stage in plan.stages if stage.on_features]
+    sizes = sorted({tuple(block["init_args"]["grid_size"]) for block in featured})
+    save_text(data, yaml.safe_dump({"data": featured[0]}))
+    scans = json.dumps([featured[0], sizes], sort_keys=True)
     of_reference = f"{scans} {plan.reference}"
     extract = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]
     refer = ["reference", "--data", str(data), "--out", str(reference), *plan.reference]
