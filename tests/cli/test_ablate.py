@@ -50,16 +50,21 @@ def names_of(stages):
 
 @pytest.mark.parametrize("scale", ["demo", pytest.param("small", marks=pytest.mark.slow), "paper"])
 def test_a_training_of_several_rows_is_run_once(scale):
-    """Two VAEs, four baselines, three joint trainings; table II ends as table III begins."""
+    """Table II ends as table III begins, whose last row is that of table I."""
     plan = plan_of(scale)
-    assert [len(table.rows) for table in plan.tables] == [3, 3, 2]
+    assert [len(table.rows) for table in plan.tables] == [5, 3, 3, 2]
     rows = rows_of(plan)
     assert all(len(row.published) == 6 for row in rows.values())
     assert Counter(stage.words[0] for stage in plan.stages if stage.on_scans) == {
         "vae_alignment": 2,
         "flow_matching": 4,
         "joint": 3,
+        "lidm_first_stage": 1,
+        "lidm": 2,
+        "r2dm": 1,
+        "r2flow": 1,
     }
+    assert rows["table_1", "5_r3dpa"].stages == rows["table_3", "3_joint"].stages
     last = [rows[key].stages[0][-1] for key in (("table_2", "3_aligned"), ("table_3", "1_none"))]
     assert last[0].name == last[1].name
     seen = set()
@@ -81,10 +86,11 @@ def test_a_second_seed_repeats_all_but_the_prior():
 
 def test_paper_scale_has_the_networks_of_the_paper():
     plan = plan_of("paper")
-    models = [stage.config["model"]["init_args"] for stage in plan.stages if stage.on_scans]
+    models = [stage.config["model"]["init_args"] for stage in plan.stages if stage.on_features]
     networks = Counter(model["sit"]["class_path"] for model in models)
     assert networks == {"r3dpa.nn.SiT": 8, "r3dpa.nn.UNet": 1}
-    assert "1 rgb_pretraining of 1000000 steps, 3 joint" in budget_of(plan)
+    for part in ("1 r2dm of 300000 steps", "1 rgb_pretraining of 1000000 steps", "3 joint of"):
+        assert part in budget_of(plan)
 
 
 def test_given_weights_replace_the_pretraining(tmp_path):
