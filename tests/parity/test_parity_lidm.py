@@ -10,12 +10,13 @@ import torch
 from recorded_networks import weights_of
 
 from r3dpa.baselines import scene_generator
-from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, StepPath, inpaint, released_times
+from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
 from r3dpa.baselines.lidm_first_stage import LiDMFirstStage
 from r3dpa.baselines.lidm_networks import LiDARDiscriminator, LiDMUNet, VQAutoencoder
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.checkpoints.lidm import from_lidm
 from r3dpa.cli import main
+from r3dpa.flow.diffusion import StepPath, inpaint
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.losses import generator_loss
@@ -92,7 +93,7 @@ def of_losses(case, lidm) -> dict:
         errors = lidm.errors(unet, data, time, noise)
         loss = errors.mean()
         results[f"loss_{norm}"] = results[f"loss_{norm}_simple"] = loss
-        results[f"loss_{norm}_vlb"] = lidm.bound(errors, time).mean()
+        results[f"loss_{norm}_vlb"] = (bound_weights(path)[step] * errors).mean()
         if norm == "l2":
             unet.zero_grad()
             loss.backward()
@@ -102,6 +103,15 @@ def of_losses(case, lidm) -> dict:
         results[f"grad/{name}"] = unet.get_parameter(name).grad
     norms = [p.grad.norm() for p in unet.parameters() if p.grad is not None]
     return results | {"grad_norm": torch.stack(norms).norm()}
+
+
+def bound_weights(path):
+    """Weights of the squared errors in the bound of the likelihood, logged by the official code."""
+    before = torch.cat([torch.ones(1).double(), path.signal[:-1]])
+    posterior = path.betas * (1 - before) / (1 - path.signal)
+    weights = path.betas.square() / (2 * posterior * (1 - path.betas) * (1 - path.signal))
+    weights[0] = weights[1]
+    return weights
 
 
 def of_schedule(case, lidm) -> dict:
@@ -127,7 +137,7 @@ def of_schedule(case, lidm) -> dict:
         "schedule/posterior_log_variance_clipped": variance.clamp(min=1e-20).log(),
         "schedule/posterior_mean_coef1": posterior(one, none, none),
         "schedule/posterior_mean_coef2": posterior(none, one, none),
-        "schedule/lvlb_weights": path.bound_weights()[index],
+        "schedule/lvlb_weights": bound_weights(path)[index],
         "schedule/sqrt_recipm1_alphas_cumprod": (1 / signal[index] - 1).sqrt(),
     }
 

@@ -11,11 +11,8 @@ import torch.nn.functional as F
 
 from r3dpa.baselines.base import AveragedNetwork
 from r3dpa.baselines.diffusion import (
-    DiffusionPath,
     data_of,
-    forward_step,
     loss_weight,
-    repaint,
     sample_errors,
     target_of,
     weighted_mean,
@@ -31,6 +28,7 @@ from r3dpa.baselines.efficient_unet import (
 from r3dpa.baselines.r2dm import R2DM, ema_decay_at
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.checkpoints.baselines import unet_weights
+from r3dpa.flow.diffusion import DiffusionPath, forward_step, repaint
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import (
     LidarSensor,

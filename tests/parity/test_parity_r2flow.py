@@ -10,9 +10,10 @@ from dopri5 import dopri5
 from recorded_networks import weights_of
 
 from r3dpa.baselines import ADMUNet, EfficientUNet
+from r3dpa.baselines.diffusion import sample_errors
 from r3dpa.baselines.hdit import HDiT, _RotaryEmbedding
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
-from r3dpa.baselines.r2flow import distilled_times, velocity_errors
+from r3dpa.baselines.r2flow import distilled_times
 from r3dpa.baselines.reflow import as_scanned
 from r3dpa.checkpoints.baselines import from_r2flow, image_geometry, time_reversed, unet_weights
 from r3dpa.flow import Interpolant, sample_time
@@ -235,7 +236,8 @@ def training_of(case, network):
     results = {"out/x_t": noisy, "out/u_t": -target, "out/v_t": -velocity}
     results["out/x_t_sigma0.1"] = noisy + 0.1 * case["in/sigma_eps"]  # their other flows
     for norm in ("l2", "l1", "smooth_l1", "pseudo_huber"):
-        loss = velocity_errors(velocity, target, norm).mean()
+        ours = {"smooth_l1": "huber"}.get(norm, norm)
+        loss = sample_errors(velocity, target, ours).mean()
         results[f"out/loss_{norm}"] = loss
         if f"out/grad_{norm}/norm" in case:
             gradients = gradients_of(network, loss, retain_graph=True)
@@ -288,7 +290,7 @@ def reflow_of(case, network, geometry):
     for steps in (1, 2, 4):
         time = distilled_times(case["in/distill_u"], steps)
         noisy, target = PATH.interpolate(pairs, noise, time), PATH.target(pairs, noise, time)
-        loss = velocity_errors(network(noisy, time), target, "pseudo_huber").mean()
+        loss = sample_errors(network(noisy, time), target, "pseudo_huber").mean()
         results |= {f"out/distill_t_{steps}": 1 - time, f"out/distill_x_t_{steps}": noisy}
         results[f"out/distill_loss_{steps}"] = loss
     return results

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from typing import Any, Literal
 
-import lightning as L
 import torch
 from torch import Tensor, nn
 
-from r3dpa.baselines.diffusion import repaint
 from r3dpa.baselines.efficient_unet import corner_angles
 from r3dpa.baselines.generator import BaselineGenerator
-from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow import Interpolant
+from r3dpa.flow.diffusion import repaint
+from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import Velocity
-from r3dpa.geometry import ScanGeometry
 from r3dpa.modules import steps
-from r3dpa.modules.checks import check_trainer, geometry_of
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
+from r3dpa.modules.stage import ScanStage
 
 
 class AveragedNetwork(nn.Module):
@@ -59,51 +55,38 @@ class AveragedNetwork(nn.Module):
         return super().train(False)
 
 
-class Baseline(L.LightningModule):
-    """Base of the baselines, beside :class:`r3dpa.modules.GenerativeModule`.
+class Baseline(ScanStage):
+    """Base of the baselines.
 
     A subclass names its ``stage`` and has its own ``training_step``. To be sampled by every
     command it has an ``interpolant`` between samples (time 0) and noise (time 1), a
     :meth:`velocity` on it, and :meth:`decode` where samples are latents. What it needs beside
     its networks to be rebuilt from a checkpoint is in :meth:`settings`.
 
-    Random numbers of a step are a function of ``(seed, batch, sample)`` alone.
-
     Args:
         network: Network that is trained, from ``latent_shape`` to ``latent_shape``.
         latent_shape: Size ``(C, h, w)`` of a sample; of a range image where :meth:`decode` is none.
         optimizer: Optimiser settings.
-        decay: Decay of the averaged weights by step.
+        decay: Decay of the averaged weights by step; None: no average, and nothing to sample.
         seed: Key of the training draws.
         time_sampling: Density of the training times.
     """
 
-    stage: str
-    interpolant: Interpolant
+    interpolant: Interpolant = LINEAR
     published: SamplerConfig  #: sampler of the paper or of the released script
-    feature_source = None
 
     def __init__(
         self,
         network: nn.Module,
         latent_shape: tuple[int, int, int],
         optimizer: OptimizerConfig,
-        decay: Callable[[int], float],
+        decay: Callable[[int], float] | None,
         seed: int,
         time_sampling: TimeSampling = "uniform",
     ) -> None:
-        super().__init__()
+        super().__init__(optimizer, seed, time_sampling)
         self.network, self.latent_shape = network, latent_shape
-        self.ema = AveragedNetwork(network, decay)
-        self.optimizer_config, self.seed, self.time_sampling = optimizer, seed, time_sampling
-        self.geometry: ScanGeometry | None = None
-        self.augmentation: Augmentation | None = None
-        self.held_out = steps.HeldOutMeans()
-        self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
-        self.step_skipped = False  # set by StepGuard
-        self.loaded_step = 0
-
-    # What a subclass is
+        self.ema: Any = None if decay is None else AveragedNetwork(network, decay)
 
     def velocity(self, network: nn.Module, x: Tensor, time: Tensor) -> Tensor:
         """Velocity on the interpolant of samples ``(B, C, h, w)`` at times ``(B,)``."""
@@ -121,6 +104,10 @@ class Baseline(L.LightningModule):
         """Training loss ``(B,)`` of each sample ``(B, C, h, w)`` at a time ``(B,)``."""
         raise NotImplementedError
 
+    def trainable(self) -> dict[str, nn.Module]:
+        """Networks that it trains, by name."""
+        return {"network": self.network}
+
     def complete(
         self,
         velocity: Velocity,
@@ -128,12 +115,10 @@ class Baseline(L.LightningModule):
         mask: Tensor,
         draws: Iterator[Tensor],
         sampler: SamplerConfig,
-        resamplings: int,
-        jump: int,
+        **resampling: int,
     ) -> Tensor:
         """Samples ``(B, C, h, w)`` that are ``known`` where the mask ``(B, 1, h, w)`` is 1."""
-        path = self.interpolant
-        return repaint(velocity, known, mask, draws, path, sampler.steps, resamplings, jump)
+        return repaint(velocity, known, mask, draws, self.interpolant, sampler.steps, **resampling)
 
     def settings(self) -> dict[str, Any]:
         """Plain values of the constructor arguments that sampling depends on, but for networks."""
@@ -143,10 +128,7 @@ class Baseline(L.LightningModule):
 
     def setup(self, stage: str) -> None:
         """Checks the data, and gives a network with ``coords`` the ray angles of their pixels."""
-        check_trainer(self.trainer)
-        datamodule = getattr(self.trainer, "datamodule", None)
-        geometry = self.geometry = geometry_of(datamodule, self)
-        self.augmentation = getattr(datamodule, "augmentation", None)
+        _, geometry = self.attach()
         sensor = geometry.projection.sensor
         wanted = (geometry.codec.channels, sensor.beams, sensor.columns)
         if self.image_shape() != wanted:
@@ -162,19 +144,11 @@ class Baseline(L.LightningModule):
         """Channels, rows and columns of the range images that it generates."""
         return self.latent_shape
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """AdamW of the network."""
-        return steps.adamw(self, {"network": self.network}, self.optimizer_config)
-
-    configure_gradient_clipping = steps.clip_per_network
-    on_before_optimizer_step = steps.set_learning_rate
-    on_train_start = steps.fit_optimizer
-
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the average, unless the step was skipped."""
         step = self.global_step
         super().optimizer_step(*args, **kwargs)
-        if not self.step_skipped:
+        if self.ema is not None and not self.step_skipped:
             self.ema.update(self.network, step)
 
     def log_loss(self, loss: Tensor) -> Tensor:
@@ -185,13 +159,6 @@ class Baseline(L.LightningModule):
 
     # Evaluation
 
-    @property
-    def scan_geometry(self) -> ScanGeometry:
-        """Geometry of the scans it trains on, known from setup or from a checkpoint."""
-        if self.geometry is None:
-            raise RuntimeError("the module has no scan geometry yet: set it up with a data module")
-        return self.geometry
-
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Adds the training loss of the averaged network on held-out scans to the means."""
         draws = steps.draw_held_out(self, batch["index"])
@@ -201,7 +168,6 @@ class Baseline(L.LightningModule):
         self.held_out.update(batch["index"], loss=errors)
 
     test_step = validation_step
-    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
 
     def scene_generator(
         self, sampler: SamplerConfig, precision: Literal["fp32", "bf16"] = "fp32"
@@ -209,17 +175,7 @@ class Baseline(L.LightningModule):
         """Samples from the averaged weights."""
         return BaselineGenerator(self, self.ema.network, self.scan_geometry, sampler, precision)
 
-    # Checkpoints
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage, settings and scan geometry, enough to sample from."""
-        steps.describe_stage(checkpoint, self.stage, self.interpolant.path)
-        checkpoint["r3dpa"] |= {
-            "geometry": self.scan_geometry.to_dict(),
-            "augmentation": None if self.augmentation is None else asdict(self.augmentation),
-            "settings": self.settings(),
-        }
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images."""
-        steps.check_resumed(self, checkpoint)
+        """Adds the settings that sampling needs."""
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["r3dpa"]["settings"] = self.settings()

@@ -6,8 +6,9 @@ Letters: B batch, C channels, H x W image size, D width of the time embedding.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -20,6 +21,16 @@ from r3dpa.nn.layers import CircularConv2d, SelfAttention, Size, zeroed
 Encoding = Literal["spherical_harmonics", "polar_coordinates", "fourier_features"]
 _HALF = 1 / math.sqrt(2)  # keeps the variance of a sum of two branches
 _LEVELS = 4
+
+
+class Shared(NamedTuple):
+    """What the blocks of a network share: width D, norms and convolutions, heads, ring."""
+
+    width: int
+    norm: Callable[..., nn.GroupNorm]
+    conv: Callable[[int, int], nn.Conv2d]
+    heads: int
+    ring: bool
 
 
 class EfficientUNet(nn.Module):
@@ -80,36 +91,36 @@ class EfficientUNet(nn.Module):
         self.time_embedding = nn.Sequential(
             nn.Linear(base_channels, width), nn.SiLU(), nn.Linear(width, width)
         )
-        c = [base_channels, *(base_channels * factor for factor in channel_multiplier)]
-        n = num_residual_blocks
-        norm = gn_num_groups, gn_eps
+        norm, conv = partial(nn.GroupNorm, gn_num_groups, eps=gn_eps), partial(conv3x3, ring=ring)
+        shared = Shared(width, norm, conv, attn_num_heads, ring)
+        widths = [base_channels * factor for factor in channel_multiplier]
+        self._build(in_channels + known.shape[1], widths, num_residual_blocks, shared)
 
-        def block(level: int, ins: int, outs: int, **options: int) -> Block:
-            heads = attn_num_heads if level == _LEVELS - 1 else 0
-            return Block(ins, outs, n[level], width, norm, heads, ring, **options)
-
-        self.in_conv = conv3x3(in_channels + known.shape[1], c[0], ring)
+    def _build(
+        self, channels: int, widths: Sequence[int], counts: Sequence[int], shared: Shared
+    ) -> None:
+        """First and last convolution, and the levels between, on an image of some channels."""
+        base, last = self.base_channels, _LEVELS - 1
+        c = [base, *widths]
+        self.in_conv: nn.Module = shared.conv(channels, base)
         self.down = nn.ModuleList(
-            block(level, c[level], c[level + 1], down=2 if level else 1) for level in range(_LEVELS)
+            Block(c[i], c[i + 1], counts[i], shared, i == last, down=i > 0) for i in range(_LEVELS)
         )
         # Deepest first; the skip of its own level joins every block but that.
         self.up = nn.ModuleList(
-            block(
-                level,
-                c[level + 1] * (1 if level == _LEVELS - 1 else 2),
-                c[level],
-                up=2 if level else 1,
-            )
-            for level in reversed(range(_LEVELS))
+            Block(c[i + 1] * (1 + (i < last)), c[i], counts[i], shared, i == last, up=i > 0)
+            for i in reversed(range(_LEVELS))
         )
-        self.out_conv = zeroed(conv3x3(c[0], in_channels, ring))
+        self.out_conv: nn.Module = zeroed(shared.conv(base, self.in_channels))
 
     def forward(self, image: Tensor, time: Tensor) -> Tensor:
         """Prediction ``(B, C, H, W)`` for images at times ``(B,)`` or ``()``, unscaled."""
         embedding = self.time_embedding(sinusoid(time.expand(len(image)), self.base_channels))
         angles = encode_angles(self.coords, self.coords_encoding, self.resolution)
-        hidden = torch.cat([image, angles.to(image).expand(len(image), -1, -1, -1)], dim=1)
-        hidden = self.in_conv(hidden)
+        image = torch.cat([image, angles.to(image).expand(len(image), -1, -1, -1)], dim=1)
+        return self.out_conv(self._levels(self.in_conv(image), embedding))
+
+    def _levels(self, hidden: Tensor, embedding: Tensor) -> Tensor:
         skips: list[Tensor] = []
         for block in self.down:
             hidden = block(hidden, embedding)
@@ -118,7 +129,17 @@ class EfficientUNet(nn.Module):
         hidden = self.up[0](hidden, embedding)
         for block in self.up[1:]:
             hidden = block(torch.cat([hidden, skips.pop()], dim=1), embedding)
-        return self.out_conv(hidden)
+        return hidden
+
+
+class Blocks(nn.ModuleList):
+    """Blocks in a row, with further inputs that all of them take."""
+
+    def forward(self, hidden: Tensor, *more: Tensor) -> Tensor:
+        """Output of the last one, of the shape that it gives."""
+        for block in self:
+            hidden = block(hidden, *more)
+        return hidden
 
 
 class Block(nn.Module):
@@ -129,71 +150,70 @@ class Block(nn.Module):
         in_channels: int,
         out_channels: int,
         num_blocks: int,
-        width: int,
-        norm: tuple[int, float],
-        heads: int,
-        ring: bool,
-        down: int = 1,
-        up: int = 1,
+        shared: Shared,
+        attends: bool,
+        down: bool = False,
+        up: bool = False,
     ) -> None:
         super().__init__()
-        first = in_channels
-        self.downsample = self.upsample = None
-        if down > 1:
-            conv = conv3x3(in_channels, out_channels, ring)
-            self.downsample = nn.Sequential(conv, Resample(down=(down, down), ring=ring))
-            first = out_channels
-        self.blocks = nn.ModuleList(
-            ResidualBlock(first if i == 0 else out_channels, out_channels, width, norm, ring)
-            for i in range(num_blocks)
-        )
-        self.attention = ImageAttention(out_channels, heads, norm) if heads else None
-        if up > 1:
-            conv = conv3x3(out_channels, out_channels, ring)
-            self.upsample = nn.Sequential(Resample(up=(up, up), ring=ring), conv)
+        self.downsample: nn.Module = nn.Identity()
+        self.upsample: nn.Module = nn.Identity()
+        if down:
+            half = Resample(down=(2, 2), ring=shared.ring)
+            self.downsample = nn.Sequential(shared.conv(in_channels, out_channels), half)
+            in_channels = out_channels
+        inputs = [in_channels, *[out_channels] * (num_blocks - 1)]
+        self.blocks = Blocks(ResidualBlock(width, out_channels, shared) for width in inputs)
+        self.attention = ImageAttention(out_channels, shared) if attends else nn.Identity()
+        if up:
+            twice = Resample(up=(2, 2), ring=shared.ring)
+            self.upsample = nn.Sequential(twice, shared.conv(out_channels, out_channels))
 
     def forward(self, image: Tensor, embedding: Tensor) -> Tensor:
         """``(B, C, H, W)`` and ``(B, D)`` to the size after the step."""
-        if self.downsample is not None:
-            image = self.downsample(image)
-        for block in self.blocks:
-            image = block(image, embedding)
-        if self.attention is not None:
-            image = self.attention(image)
-        return image if self.upsample is None else self.upsample(image)
+        return self.upsample(self.attention(self.blocks(self.downsample(image), embedding)))
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions after group norm and SiLU, the second norm modulated by the time."""
+    """Two convolutions after group norm and SiLU, the second norm modulated by the time.
+
+    ``resample`` changes the size in both branches, ``attends`` adds attention behind.
+    """
 
     def __init__(
-        self, in_channels: int, out_channels: int, width: int, norm: tuple[int, float], ring: bool
+        self,
+        in_channels: int,
+        out_channels: int,
+        shared: Shared,
+        attends: bool = False,
+        resample: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        groups, eps = norm
-        self.norm1 = nn.GroupNorm(groups, in_channels, eps)
-        self.conv1 = conv3x3(in_channels, out_channels, ring)
-        self.norm2 = nn.GroupNorm(groups, out_channels, eps, affine=False)
-        self.modulation = nn.Linear(width, 2 * out_channels)
-        self.conv2 = zeroed(conv3x3(out_channels, out_channels, ring))
+        self.norm1 = shared.norm(in_channels)
+        self.conv1 = shared.conv(in_channels, out_channels)
+        self.norm2 = shared.norm(out_channels, affine=False)
+        self.modulation = nn.Linear(shared.width, 2 * out_channels)
+        self.conv2 = zeroed(shared.conv(out_channels, out_channels))
         same = in_channels == out_channels
         self.skip = nn.Identity() if same else nn.Conv2d(in_channels, out_channels, 1)
+        self.resample = resample or nn.Identity()
+        self.attention = ImageAttention(out_channels, shared) if attends else nn.Identity()
 
     def forward(self, image: Tensor, embedding: Tensor) -> Tensor:
         """``(B, in_channels, H, W)`` and ``(B, D)`` to ``(B, out_channels, H, W)``."""
-        hidden = self.norm2(self.conv1(F.silu(self.norm1(image))))
+        hidden = self.norm2(self.conv1(F.silu(self.resample(self.norm1(image)))))
         scale, shift = self.modulation(F.silu(embedding))[..., None, None].chunk(2, dim=1)
         hidden = self.conv2(F.silu(hidden * (1 + scale) + shift))
-        return (self.skip(image) + hidden) * _HALF
+        return self.attention((self.resample(self.skip(image)) + hidden) * _HALF)
 
 
 class ImageAttention(nn.Module):
     """Multi-head attention between all pixels, added to the image."""
 
-    def __init__(self, channels: int, heads: int, norm: tuple[int, float]) -> None:
+    def __init__(self, channels: int, shared: Shared) -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(norm[0], channels, norm[1])
-        self.mix = SelfAttention(channels, heads)
+        self.norm = shared.norm(channels)
+        self.mix = SelfAttention(channels, shared.heads)
         zeroed(self.mix.proj)
 
     def forward(self, image: Tensor) -> Tensor:

@@ -15,6 +15,8 @@ from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.generation import SceneBatch, filled, scene_indices
 from r3dpa.geometry import ScanGeometry
 
+FULL_SCALE = 1 - 1e-6  # of images: a saturated pixel is a return just below the largest range
+
 
 class BaselineGenerator:
     """Draws scenes from a baseline.
@@ -90,7 +92,7 @@ class BaselineGenerator:
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Range images ``(B, H, W)``, metres, as in :class:`r3dpa.SceneBatch`, of samples."""
-        image = self.baseline.decode(latents).float().clamp(-1, 1)
+        image = self.baseline.decode(latents).float().clamp(-1, FULL_SCALE)
         range_m = self.geometry.codec.ranges_of(image, self.geometry.projection.sensor)
         finite = image.flatten(1).isfinite().all(dim=1)
         return torch.where(finite[:, None, None], range_m, torch.nan)
@@ -102,8 +104,8 @@ class BaselineGenerator:
         """Completes encoded range images ``(B, C, H, W)``.
 
         Pixels that are True in ``known`` ``(B, 1, H, W)`` are kept; other arguments and steps as
-        of :func:`r3dpa.baselines.diffusion.repaint`, with the number of steps of the sampler.
-        Latents are completed without resampling, see :func:`r3dpa.baselines.lidm.inpaint`.
+        of :func:`r3dpa.flow.diffusion.repaint`, with the number of steps of the sampler.
+        Latents are completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
         """
         self.calls, baseline = 0, self.baseline
         noises = scene_noise(baseline.latent_shape, range(len(image)), seed)
@@ -111,7 +113,8 @@ class BaselineGenerator:
         data = baseline.encode(image.to(self.device))
         # A latent pixel is known where all of its pixels are.
         mask = -F.adaptive_max_pool2d(-known.to(data), data.shape[-2:])
-        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings, jump)
+        options = {"resamplings": resamplings, "jump": jump}
+        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, **options)
         return SceneBatch(self.decode(found), found, self.calls, self.geometry.projection)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:

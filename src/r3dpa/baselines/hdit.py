@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +17,7 @@ from einops import rearrange
 from einops.layers.torch import Rearrange
 from torch import Tensor, nn
 
-from r3dpa.baselines.efficient_unet import hdl64e_angles
+from r3dpa.baselines.efficient_unet import Blocks, hdl64e_angles
 from r3dpa.baselines.neighbourhood import neighbourhood_attention
 from r3dpa.nn.layers import Size, at_least_float32, zeroed
 
@@ -90,14 +91,13 @@ class HDiT(nn.Module):
             width = base_channels << level
             harmonics = max(1, grid[0] // 2 >> level), max(1, grid[1] // 2 >> level)
             window = window_size if level < levels else None
-            block = partial(
-                _Block, width, time_channels, heads, window, harmonics, int(width * mlp_ratio)
-            )
+            attention = width, time_channels, heads, window, harmonics
+            feed_forward = width, int(width * mlp_ratio), time_channels
             if level == levels:
-                self.mid_levels = _Blocks(block() for _ in range(depth))
+                self.mid_levels = _blocks(depth, attention, feed_forward)
                 break
             for part in (self.down_levels, self.up_levels):
-                part[f"level_{level}"] = _Blocks(block() for _ in range(depth))
+                part[f"level_{level}"] = _blocks(depth, attention, feed_forward)
             self.down_levels[f"merge_{level}"] = nn.Sequential(
                 Rearrange("B (h p) (w q) D -> B h w (p q D)", p=2, q=2),
                 _linear(4 * width, 2 * width),
@@ -163,19 +163,8 @@ class _TimeFeatures(nn.Module):
         return self.linear(torch.cat([angles.cos(), angles.sin()], dim=1))
 
 
-class _GatedGelu(nn.Linear):
-    """Linear layer to twice the width, one half times the GELU of the other."""
-
-    def __init__(self, in_features: int, out_features: int) -> None:
-        super().__init__(in_features, 2 * out_features, bias=False)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        values, gate = super().forward(inputs).chunk(2, dim=-1)
-        return values * F.gelu(gate)
-
-
 class _FeedForward(nn.Module):
-    """Gated layers of one norm; that of tokens is called ``adarms`` and takes the time."""
+    """Linear layers around a gated GELU; the norm of tokens is ``adarms`` and takes the time."""
 
     def __init__(self, width: int, hidden: int, embedding: int | None = None) -> None:
         super().__init__()
@@ -183,12 +172,13 @@ class _FeedForward(nn.Module):
             self.norm = _RmsNorm(width)
         else:
             self.adarms = _TimedRmsNorm(width, embedding)
-        self.gegelu = _GatedGelu(width, hidden)
+        self.gegelu = _linear(width, 2 * hidden)
         self.linear = zeroed(_linear(hidden, width))
 
     def forward(self, tokens: Tensor, *time: Tensor) -> Tensor:
         normalised = self.adarms(tokens, *time) if time else self.norm(tokens)
-        return tokens + self.linear(self.gegelu(normalised))
+        values, gate = self.gegelu(normalised).chunk(2, dim=-1)
+        return tokens + self.linear(values * F.gelu(gate))
 
 
 class _RotaryEmbedding(nn.Module):
@@ -258,29 +248,17 @@ class _Attention(nn.Module):
         return tokens + self.out_proj(mixed)
 
 
+def _blocks(depth: int, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> Blocks:
+    return Blocks(_Block(attention, feed_forward) for _ in range(depth))
+
+
 class _Block(nn.Module):
-    def __init__(
-        self,
-        width: int,
-        embedding: int,
-        num_heads: int,
-        window: Size | None,
-        harmonics: Size,
-        hidden: int,
-    ) -> None:
+    def __init__(self, attention: tuple[Any, ...], feed_forward: tuple[Any, ...]) -> None:
         super().__init__()
-        self.residual_attn = _Attention(width, embedding, num_heads, window, harmonics)
-        self.residual_ffn = _FeedForward(width, hidden, embedding)
+        self.residual_attn, self.residual_ffn = _Attention(*attention), _FeedForward(*feed_forward)
 
     def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
         return self.residual_ffn(self.residual_attn(tokens, angles, embedding), embedding)
-
-
-class _Blocks(nn.ModuleList):
-    def forward(self, tokens: Tensor, angles: Tensor, embedding: Tensor) -> Tensor:
-        for block in self:
-            tokens = block(tokens, angles, embedding)
-        return tokens
 
 
 class _Expand(nn.Module):
@@ -298,4 +276,4 @@ class _Expand(nn.Module):
 
 def _rms_normalised(tokens: Tensor) -> Tensor:
     values = at_least_float32(tokens)
-    return values * torch.rsqrt(values.square().mean(dim=-1, keepdim=True) + 1e-6)
+    return F.rms_norm(values, values.shape[-1:], eps=1e-6)

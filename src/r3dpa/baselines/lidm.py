@@ -8,76 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r3dpa.baselines.base import Baseline
-from r3dpa.baselines.diffusion import DiffusionPath, sample_errors
+from r3dpa.baselines.diffusion import Norm, sample_errors
 from r3dpa.baselines.lidm_networks import LiDMUNet, VQAutoencoder
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
+from r3dpa.flow.diffusion import StepPath, inpaint
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.flow.sde import ancestral, ancestral_step
+from r3dpa.flow.sde import ancestral
 from r3dpa.flow.solvers import Velocity
-from r3dpa.flow.times import batch_time, per_sample, step_pairs
+from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
-
-_STEPS = 1000
-_FIRST_BETA, _LAST_BETA = 0.0015, 0.0195
-
-
-@dataclass(frozen=True)
-class StepPath(DiffusionPath):
-    """Path of a diffusion in discrete steps; between two steps the log-SNR is interpolated.
-
-    The roots of the variances of the steps rise linearly, ``linear`` in LDM and LiDM. The first
-    step is at time 0 and not free of noise.
-    """
-
-    first_beta: float = _FIRST_BETA
-    last_beta: float = _LAST_BETA
-    num_steps: int = _STEPS
-
-    @cached_property
-    def betas(self) -> Tensor:
-        """Variances ``(num_steps,)`` of the steps, float64."""
-        ends = self.first_beta**0.5, self.last_beta**0.5
-        return torch.linspace(*ends, self.num_steps, dtype=torch.float64).square()
-
-    @cached_property
-    def signal(self) -> Tensor:
-        """``alpha^2`` of each step ``(num_steps,)``, float64."""
-        return (1 - self.betas).cumprod(0)
-
-    def step_of(self, time: Tensor) -> Tensor:
-        """Step of a time, with a fraction; times of whole steps have none."""
-        step = (time * self.num_steps).clamp(0, self.num_steps - 1)
-        return torch.where((step - step.round()).abs() < 1e-3, step.round(), step)
-
-    def log_snr(self, time: Tensor) -> Tensor:
-        """Log signal-to-noise ratio at times in [0, 1] of any shape."""
-        step, table = self.step_of(time), self.signal.logit().to(time.device)
-        low = step.floor().long().clamp(max=self.num_steps - 2)
-        return torch.lerp(table[low], table[low + 1], (step - low).double()).to(time.dtype)
-
-    def _rate(self, time: Tensor) -> Tensor:
-        table = self.signal.logit().to(time.device).diff() * self.num_steps
-        low = self.step_of(time).floor().long().clamp(max=self.num_steps - 2)
-        return table[low].to(time.dtype)
-
-    def bound_weights(self) -> Tensor:
-        """Weights ``(num_steps,)`` of the squared errors in the bound of the likelihood."""
-        before = F.pad(self.signal[:-1], (1, 0), value=1.0)
-        posterior = self.betas * (1 - before) / (1 - self.signal)
-        weights = self.betas.square() / (2 * posterior * (1 - self.betas) * (1 - self.signal))
-        weights[0] = weights[1]
-        return weights
 
 
 @dataclass(frozen=True)
@@ -97,7 +45,7 @@ class ReleasedDDIM(SamplerConfig):
         return ancestral(velocity, noise, times, draws, eta=eta, interpolant=interpolant)
 
 
-def released_times(num: int, num_steps: int = _STEPS) -> Tensor:
+def released_times(num: int, num_steps: int = 1000) -> Tensor:
     """Times of DDIM in the released code, float64, largest first and 0 last.
 
     They are every ``floor(1000 / num)``-th step plus 1: more than ``num`` where it does not divide
@@ -115,35 +63,6 @@ def released_times(num: int, num_steps: int = _STEPS) -> Tensor:
     return torch.cat([chosen.flip(0), torch.zeros(1)]).double() / num_steps
 
 
-@torch.no_grad()
-def inpaint(
-    velocity: Velocity,
-    x: Tensor,
-    known: Tensor,
-    mask: Tensor,
-    times: Tensor,
-    draws: Iterator[Tensor],
-    path: Interpolant,
-) -> Tensor:
-    """DDIM without noise, whose state is overwritten before each step where the mask is 1.
-
-    Args:
-        velocity: ``(x (B, ...), time (B,)) -> (B, ...)``.
-        x: ``(B, ...)`` Gaussian noise, the state at the first time.
-        known: ``(B, ...)`` data.
-        mask: Broadcast to ``known``; 1 where it is kept.
-        times: ``(T,)`` decreasing times.
-        draws: T - 1 Gaussian draws ``(B, ...)`` for the known part.
-        path: Path of the velocity.
-    """
-    for now, then in step_pairs(times):
-        here, there = batch_time(now, x), batch_time(then, x)
-        x = mask * path.interpolate(known, next(draws), here) + (1 - mask) * x
-        data = path.denoise(velocity(x, here), x, here)
-        x = ancestral_step(data, x, here, there, None, interpolant=path)
-    return x
-
-
 class LiDM(Baseline):
     """LiDM: diffusion on the latents of a frozen first stage, before their quantisation.
 
@@ -154,7 +73,7 @@ class LiDM(Baseline):
         network: U-Net of the latents; with a position bias it is the table's "LiDM + APE".
         first_stage: Autoencoder; its weights come from ``init_from`` and stay fixed.
         init_from: Checkpoint of stage ``lidm_first_stage``, or a converted one of LiDM.
-        norm: ``l2`` or ``l1`` error of the noise.
+        norm: Error of the noise, see :func:`sample_errors`.
         first_beta: Variance of the first step.
         last_beta: Variance of the last step.
         optimizer: Optimiser settings; the released rate is 1e-6 times the batch size.
@@ -170,18 +89,17 @@ class LiDM(Baseline):
         network: LiDMUNet,
         first_stage: VQAutoencoder,
         init_from: str | None = None,
-        norm: Literal["l2", "l1"] = "l2",
-        first_beta: float = _FIRST_BETA,
-        last_beta: float = _LAST_BETA,
+        norm: Norm = "l2",
+        first_beta: float = 0.0015,
+        last_beta: float = 0.0195,
         optimizer: OptimizerConfig = OptimizerConfig(lr=1.6e-5, weight_decay=0.01),
         ema_decay: float = 0.9999,
         seed: int = 0,
     ) -> None:
-        def decay(step: int) -> float:
-            return min(ema_decay, (2 + step) / (11 + step))
-
         shape = (network.in_channels, *network.input_size)
-        super().__init__(network, shape, optimizer, decay, seed)
+        super().__init__(
+            network, shape, optimizer, lambda step: min(ema_decay, (2 + step) / (11 + step)), seed
+        )
         with steps.networks_as_settings():
             self.save_hyperparameters()
         if first_stage.latent_channels != network.in_channels:
@@ -191,12 +109,11 @@ class LiDM(Baseline):
             )
         self.first_stage = first_stage.eval().requires_grad_(False)
         self.interpolant: StepPath = StepPath(first_beta=first_beta, last_beta=last_beta)
-        self.norm, self.init_from, self._has_weights = norm, init_from, False
+        self.norm, self.init_from = norm, init_from
 
     def settings(self) -> dict[str, Any]:
         """Schedule of the steps."""
-        path = self.interpolant
-        return {"first_beta": path.first_beta, "last_beta": path.last_beta}
+        return {name: getattr(self.interpolant, name) for name in ("first_beta", "last_beta")}
 
     def image_shape(self) -> tuple[int, ...]:
         """Channels, rows and columns of the images of the first stage."""
@@ -205,7 +122,7 @@ class LiDM(Baseline):
 
     def on_fit_start(self) -> None:
         """Loads the first stage, unless this run goes on from a checkpoint of its own."""
-        if self._has_weights:
+        if self.loaded_step:
             return
         if self.init_from is None:
             raise ValueError(
@@ -238,8 +155,7 @@ class LiDM(Baseline):
         mask: Tensor,
         draws: Iterator[Tensor],
         sampler: SamplerConfig,
-        resamplings: int = 1,
-        jump: int = 1,
+        **resampling: int,
     ) -> Tensor:
         """Completes latents by :func:`inpaint`, as released: without resampling."""
         times = released_times(sampler.steps)
@@ -255,31 +171,10 @@ class LiDM(Baseline):
         """Error ``(B,)`` of the noise at the steps that times in [0, 1) belong to."""
         step = (time * self.interpolant.num_steps).floor()
         noisy = self.interpolant.interpolate(data, noise, step / self.interpolant.num_steps)
-        return sample_errors(network(noisy, step).float(), noise, self.norm)
+        return sample_errors(network(noisy, step), noise, self.norm)
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on encoded range images ``(B, 1, H, W)``."""
         latents = self.encode(batch["range_image"])
         draws = steps.draw_path(self, len(latents))
         return self.log_loss(self.errors(self.network, latents, draws.time, draws.noise).mean())
-
-    def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
-        """Adds held-out scans to the means: the loss, and its part of the likelihood bound."""
-        draws, latents = (
-            steps.draw_held_out(self, batch["index"]),
-            self.encode(batch["range_image"]),
-        )
-        errors = self.errors(self.ema.network, latents, draws.time, draws.noise)
-        self.held_out.update(batch["index"], loss=errors, bound=self.bound(errors, draws.time))
-
-    test_step = validation_step
-
-    def bound(self, errors: Tensor, time: Tensor) -> Tensor:
-        """Weighted errors ``(B,)`` at times ``(B,)``, LiDM's ``loss_vlb``."""
-        step = (time * self.interpolant.num_steps).long()
-        return self.interpolant.bound_weights().to(errors)[step] * errors
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses the checkpoint of another stage or of other range images."""
-        super().on_load_checkpoint(checkpoint)
-        self._has_weights = True

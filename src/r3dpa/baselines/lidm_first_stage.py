@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from r3dpa import losses
 from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow import Interpolant
 from r3dpa.geometry import unproject
 from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
@@ -46,9 +43,6 @@ class LiDMFirstStage(Baseline):
     """
 
     stage = "lidm_first_stage"
-    trains_velocity = False
-    interpolant = Interpolant()
-    ema = None  # type: ignore[assignment] # trained without an average, and nothing to sample
     network: VQAutoencoder
 
     def __init__(
@@ -66,10 +60,9 @@ class LiDMFirstStage(Baseline):
         seed: int = 0,
     ) -> None:
         shape = (network.latent_channels, 1, 1)
-        super().__init__(network, shape, optimizer, lambda step: 0.0, seed)
+        super().__init__(network, shape, optimizer, None, seed)
         with steps.networks_as_settings():
             self.save_hyperparameters()
-        del self.ema
         self.discriminator = discriminator
         self.mask_factor, self.geometry_factor = mask_factor, geometry_factor
         self.adversarial, self.adversarial_start = adversarial, adversarial_start
@@ -166,11 +159,6 @@ class LiDMFirstStage(Baseline):
 
     test_step = validation_step
 
-    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """Steps the optimiser."""
-        super(Baseline, self).optimizer_step(*args, **kwargs)
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """AdamW with a group for the autoencoder and one for the discriminator."""
-        networks = {"network": self.network, "discriminator": self.discriminator}
-        return steps.adamw(self, networks, self.optimizer_config)
+    def trainable(self) -> dict[str, nn.Module]:
+        """Autoencoder and discriminator."""
+        return {"network": self.network, "discriminator": self.discriminator}

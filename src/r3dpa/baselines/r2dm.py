@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 from torch import Tensor, nn
 
 from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.diffusion import (
-    DiffusionPath,
+    Norm,
     Prediction,
-    Schedule,
     data_of,
     loss_weight,
     sample_errors,
@@ -19,6 +19,7 @@ from r3dpa.baselines.diffusion import (
 )
 from r3dpa.baselines.efficient_unet import EfficientUNet
 from r3dpa.data.datasets import LidarBatch
+from r3dpa.flow.diffusion import DiffusionPath, Schedule
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
@@ -39,7 +40,7 @@ class R2DM(Baseline):
         schedule: Log-SNR by time, see :class:`DiffusionPath`.
         shift: Added to the log-SNR.
         clip: Clip the data that the network predicts to [-1, 1] when sampling.
-        norm: ``l2``, ``l1`` or ``huber`` error of the prediction.
+        norm: Error of the prediction, see :func:`sample_errors`.
         gamma: Bound of the min-SNR weights; None for the plain SNR.
         official_min_snr: Weight as the released code does, see :func:`weighted_mean`.
         optimizer: Optimiser settings.
@@ -59,7 +60,7 @@ class R2DM(Baseline):
         schedule: Schedule = "cosine",
         shift: float = 0.0,
         clip: bool = True,
-        norm: Literal["l2", "l1", "huber"] = "l2",
+        norm: Norm = "l2",
         gamma: float | None = 5.0,
         official_min_snr: bool = False,
         optimizer: OptimizerConfig = RECIPE,
@@ -68,9 +69,7 @@ class R2DM(Baseline):
         ema_after: int = 10_000,
         seed: int = 0,
     ) -> None:
-        def decay(step: int) -> float:
-            return ema_decay_at(step, ema_decay, ema_every, ema_after)
-
+        decay = partial(ema_decay_at, decay=ema_decay, every=ema_every, after=ema_after)
         shape = (network.in_channels, *network.resolution)
         super().__init__(network, shape, optimizer, decay, seed)
         with steps.networks_as_settings():
@@ -81,11 +80,10 @@ class R2DM(Baseline):
 
     def settings(self) -> dict[str, Any]:
         """Prediction, schedule and clipping."""
-        path = self.interpolant
         return {
             "prediction": self.prediction,
-            "schedule": path.schedule,
-            "shift": path.shift,
+            "schedule": self.interpolant.schedule,
+            "shift": self.interpolant.shift,
             "clip": self.clip,
         }
 
@@ -105,7 +103,7 @@ class R2DM(Baseline):
         alpha, sigma, *_ = self.interpolant.coefficients(per_sample(time, data))
         prediction = network(alpha * data + sigma * noise, self.interpolant.log_snr(time))
         target = target_of(self.prediction, data, noise, alpha, sigma)
-        return sample_errors(prediction.float(), target, self.norm)
+        return sample_errors(prediction, target, self.norm)
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, C, H, W)`` of range and reflectance."""

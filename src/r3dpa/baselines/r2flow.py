@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r3dpa.baselines.base import Baseline
+from r3dpa.baselines.diffusion import Norm, sample_errors
 from r3dpa.baselines.r2dm import RECIPE, ema_decay_at
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow import Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
-
-Norm = Literal["l2", "l1", "smooth_l1", "pseudo_huber"]
 
 
 class R2Flow(Baseline):
@@ -34,7 +31,7 @@ class R2Flow(Baseline):
     Args:
         network: :class:`~r3dpa.baselines.HDiT`, :class:`~r3dpa.baselines.ADMUNet` or
             :class:`~r3dpa.baselines.EfficientUNet`.
-        norm: Error of the velocity, see :func:`velocity_errors`.
+        norm: Error of the velocity, see :func:`sample_errors`.
         num_steps: Euler steps to distil to; None: all times.
         init_from: Checkpoint of the flow before, whose averaged weights training starts from.
         optimizer: Optimiser settings.
@@ -66,16 +63,12 @@ class R2Flow(Baseline):
     ) -> None:
         if num_steps is not None and num_steps < 1:
             raise ValueError(f"num_steps must be at least 1, got {num_steps}")
-
-        def decay(step: int) -> float:
-            return ema_decay_at(step, ema_decay, ema_every, ema_after)
-
+        decay = partial(ema_decay_at, decay=ema_decay, every=ema_every, after=ema_after)
         sized: Any = network
         shape = (sized.in_channels, *sized.resolution)
         super().__init__(network, shape, optimizer, decay, seed, time_sampling)
         with steps.networks_as_settings():
             self.save_hyperparameters()
-        self.interpolant = Interpolant("linear")
         self.norm, self.num_steps, self.init_from = norm, num_steps, init_from
         if num_steps is not None:
             self.published = SamplerConfig("euler", num_steps)
@@ -98,7 +91,7 @@ class R2Flow(Baseline):
         """Error ``(B,)`` of the velocity at the times, or at those that they are rounded to."""
         time = distilled_times(time, self.num_steps)
         predicted = network(self.interpolant.interpolate(data, noise, time), time)
-        return velocity_errors(predicted, self.interpolant.target(data, noise, time), self.norm)
+        return sample_errors(predicted, self.interpolant.target(data, noise, time), self.norm)
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """One step on images ``(B, C, H, W)``, with the noise of the batch if it is of pairs."""
@@ -114,19 +107,3 @@ def distilled_times(time: Tensor, num_steps: int | None) -> Tensor:
     ``1 - floor(u k) / k`` for uniform draws u in [0, 1): with one step always 1, pure noise.
     """
     return time if num_steps is None else 1 - torch.floor(time * num_steps) / num_steps
-
-
-def velocity_errors(velocity: Tensor, target: Tensor, norm: Norm) -> Tensor:
-    """Mean error ``(B,)`` of velocities ``(B, C, H, W)``, float32.
-
-    ``pseudo_huber`` is ``sqrt(d^2 + c^2) - c`` with ``c = 0.00054 sqrt(C H W)``: quadratic in
-    errors far below c, linear above (Lee et al. 2024). ``smooth_l1`` changes at 1.
-    """
-    velocity, target = velocity.float(), target.float()
-    if norm == "pseudo_huber":
-        c = 0.00054 * math.sqrt(target[0].numel())
-        each = torch.sqrt((velocity - target).square() + c**2) - c
-    else:
-        losses = {"l2": F.mse_loss, "l1": F.l1_loss, "smooth_l1": F.smooth_l1_loss}
-        each = losses[norm](velocity, target, reduction="none")
-    return each.flatten(1).mean(dim=1)

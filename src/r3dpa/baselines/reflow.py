@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
+from r3dpa.baselines.generator import FULL_SCALE
 from r3dpa.baselines.stages import scene_generator
 from r3dpa.checkpoints import read_checkpoint, weights_sha256
 from r3dpa.data.loaders import LoaderModule, at_least
@@ -106,10 +107,8 @@ class ReflowPairs(LoaderModule):
         store, pairs = self._store()
         images = CachedTensors(store, pairs)
         split = len(pairs) - self.num_held_out
-        self.train_set, self.val_set = (
-            PairDataset(pairs[:split], images),
-            PairDataset(pairs[split:], images),
-        )
+        self.train_set = PairDataset(pairs[:split], images)
+        self.val_set = PairDataset(pairs[split:], images)
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled pairs."""
@@ -126,9 +125,8 @@ class ReflowPairs(LoaderModule):
         if checkpoint.geometry is None:
             raise ValueError(f"{self.checkpoint} does not record which sensor it was trained for")
         self.geometry = ScanGeometry.from_dict(dict(checkpoint.geometry))
-        network = checkpoint.network("ema_network")
         settings = {
-            "weights": weights_sha256(network.state_dict),
+            "weights": weights_sha256(checkpoint.network("ema_network").state_dict),
             "settings": dict(checkpoint.settings),
             "sampler": asdict(self.sampler),
             "geometry": self.geometry.to_dict(),
@@ -160,10 +158,9 @@ class PairDataset(Dataset[dict[str, Any]]):
 def as_scanned(samples: Tensor, geometry: ScanGeometry) -> Tensor:
     """Samples ``(B, C, H, W)`` as images of a scan: clamped, empty out of the sensor's range.
 
-    The official pairs pass through files of metric depth, which does the same. There a saturated
-    pixel is just below the largest range and counts as a return, so it does here.
+    The official pairs pass through files of metric depth, which does the same.
     """
-    samples = samples.clamp(-1, 1 - 1e-6)
+    samples = samples.clamp(-1, FULL_SCALE)
     codec, sensor = geometry.codec, geometry.projection.sensor
     ranges = codec.encode(codec.ranges_of(samples, sensor)).unsqueeze(1)
     return torch.cat([ranges, samples[:, 1:]], dim=1)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any, Literal, cast
 
-import lightning as L
 import torch
 from lightning.pytorch.utilities import rank_zero_info
-from torch import Tensor, nn
+from torch import Tensor
 
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, load_into, read_checkpoint, transfer_rgb
-from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
 from r3dpa.flow.sampler import SamplerConfig
@@ -25,16 +22,15 @@ from r3dpa.modules.checks import (
     check_features,
     check_geometry,
     check_latents,
-    check_trainer,
-    geometry_of,
 )
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
+from r3dpa.modules.stage import ScanStage
 from r3dpa.modules.steps import PathDraws, frozen
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
 from r3dpa.nn.vae import RangeMixture
 
 
-class GenerativeModule(L.LightningModule):
+class GenerativeModule(ScanStage):
     """Base of the training modules.
 
     A subclass names its stage, lists its networks in :meth:`trainable` and has its own
@@ -95,17 +91,16 @@ class GenerativeModule(L.LightningModule):
         channels_last: bool = False,
         compile: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(optimizer, seed, time_sampling)
         with steps.networks_as_settings():
             self.save_hyperparameters()
         self.vae = vae
         self.sit = sit
         self.discriminator = discriminator
         self.latent_norm = latent_norm or LatentNorm(vae.latent_channels)
-        self.weights, self.optimizer_config = weights, optimizer
+        self.weights = weights
         self.interpolant = Interpolant(path)
         self.latent_shape = (vae.latent_channels, *sit.input_size)
-        self.time_sampling, self.seed = time_sampling, seed
         self.init_from = init_from
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
         self.rgb_weights, self.keep_projector = rgb_weights, keep_projector
@@ -113,13 +108,6 @@ class GenerativeModule(L.LightningModule):
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
-        self.geometry: ScanGeometry | None = None
-        self.augmentation: Augmentation | None = None
-        self.held_out = steps.HeldOutMeans()
-        self.loaded_step = 0
-        self.feature_source: str | None = None
-        self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
-        self.step_skipped = False  # set by StepGuard
         self._has_weights = False
         self._previous_geometry: Mapping[str, Any] | None = None
 
@@ -144,11 +132,7 @@ class GenerativeModule(L.LightningModule):
         The data module may be any that gives :class:`r3dpa.data.LidarBatch` batches and has a
         ``geometry`` after its own setup.
         """
-        check_trainer(self.trainer)
-        datamodule = getattr(self.trainer, "datamodule", None)
-        geometry = geometry_of(datamodule, self)
-        self.geometry = geometry
-        self.augmentation = getattr(datamodule, "augmentation", None)
+        datamodule, geometry = self.attach()
         sensor = geometry.projection.sensor
         if geometry.codec.reflectance:
             raise ValueError(
@@ -202,10 +186,6 @@ class GenerativeModule(L.LightningModule):
         return before
 
     # Training
-
-    def trainable(self) -> dict[str, nn.Module]:
-        """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
-        raise NotImplementedError
 
     def needs_features(self) -> bool:
         """Whether a training batch must hold feature grids."""
@@ -302,14 +282,6 @@ class GenerativeModule(L.LightningModule):
 
     # Optimisation
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One AdamW with a parameter group per trained network."""
-        return steps.adamw(self, self.trainable(), self.optimizer_config)
-
-    configure_gradient_clipping = steps.clip_per_network
-    on_before_optimizer_step = steps.set_learning_rate
-    on_train_start = steps.fit_optimizer
-
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the averages, unless the step was skipped."""
         super().optimizer_step(*args, **kwargs)
@@ -317,13 +289,6 @@ class GenerativeModule(L.LightningModule):
             self.ema.update(self.sit, self.latent_norm)
 
     # Evaluation
-
-    @property
-    def scan_geometry(self) -> ScanGeometry:
-        """Geometry of the scans it trains on, known from setup or from a checkpoint."""
-        if self.geometry is None:
-            raise RuntimeError("the module has no scan geometry yet: set it up with a data module")
-        return self.geometry
 
     def reconstruct(self, image: Tensor) -> Tensor:
         """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
@@ -367,7 +332,6 @@ class GenerativeModule(L.LightningModule):
         return {}
 
     test_step = validation_step
-    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
 
     def predict_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
         """Reconstructed ranges ``(B, H, W)`` in metres, -1 where the image has no return."""
@@ -387,20 +351,12 @@ class GenerativeModule(L.LightningModule):
     # Checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds stage and scan geometry, enough to sample from, and what it was trained with.
-
-        Weights are written in the usual order in memory, whatever this run works with.
-        """
+        """Writes weights in the usual order in memory, whatever this run works with."""
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {name: value.contiguous() for name, value in state.items()}
-        steps.describe_stage(checkpoint, self.stage, self.interpolant.path)
-        checkpoint["r3dpa"] |= {
-            "geometry": self.scan_geometry.to_dict(),
-            "augmentation": None if self.augmentation is None else asdict(self.augmentation),
-            "feature_source": self.feature_source,
-        }
+        super().on_save_checkpoint(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage or of other range images."""
-        steps.check_resumed(self, checkpoint)
+        super().on_load_checkpoint(checkpoint)
         self._has_weights = True

@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from r3dpa.baselines.diffusion import DiffusionPath, loss_weight, repaint, weighted_mean
+from r3dpa.baselines.diffusion import loss_weight, weighted_mean
+from r3dpa.flow.diffusion import DiffusionPath, repaint
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.sde import ancestral, ancestral_step
