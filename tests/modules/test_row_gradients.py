@@ -47,11 +47,12 @@ STARTS = {  # networks that the last stage takes from the stage before; from the
 
 @pytest.fixture(scope="module")
 def rows():
-    """Stages on scans of each row."""
+    """Stages on scans of each row but those of table I, which are other generators."""
     plan = make_plan(TABLES, TABLES / "scale" / "paper.yaml", (0,), Path(), resolved)
     return {
         (table.name, row.key): [stage for stage in row.stages[0] if stage.on_scans]
         for table in plan.tables
+        if table.name != "table_1"
         for row in table.rows
     }
 
