@@ -10,7 +10,6 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 from tiny_stages import (
     QUIET,
-    STAGES,
     NamedData,
     constant_loss,
     guarded,
@@ -31,9 +30,9 @@ pytestmark = [
 
 TWO_PROCESSES = {"devices": 2, "strategy": "ddp_fork", "use_distributed_sampler": False}
 FAULTS = [
-    *((stage, fault) for stage in STAGES for fault in (infinite_image, constant_loss)),
-    # Stage flow_matching normalises them before it computes anything.
-    *((stage, huge_latents) for stage in ("vae_alignment", "joint")),
+    *((stage, infinite_image) for stage in ("joint", "flow_matching", "few_step")),
+    *((stage, constant_loss) for stage in ("vae_alignment", "joint")),
+    ("joint", huge_latents),
 ]
 
 
@@ -227,13 +226,12 @@ def test_a_step_passes_on_who_asks_to_stop():
 
 
 @pytest.mark.ddp
-@pytest.mark.parametrize("fault", [infinite_image, constant_loss])
-def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_thread):
-    """With ``constant_loss`` no gradient of any process tells: only the check itself can agree."""
+def test_a_bad_batch_of_one_process_skips_the_step_of_all(tmp_path, one_thread):
+    """No gradient of any process tells: only the check itself can agree."""
 
     def only_of_the_second(module, batch):
         if module.global_rank == 1:
-            fault(module, batch)
+            constant_loss(module, batch)
 
     module = guarded("joint", [1], only_of_the_second)
 
@@ -249,8 +247,7 @@ def test_a_bad_batch_of_one_process_skips_the_step_of_all(fault, tmp_path, one_t
         assert value.isfinite().all(), key
         assert torch.equal(value, second["weights"][key]), key
     ranks = {path.stem[-1] for path in (tmp_path / "bad_batches").iterdir()}
-    # An infinite image reaches both through the shared latent statistics.
-    assert ranks == ({"1"} if fault is constant_loss else {"0", "1"})
+    assert ranks == {"1"}
 
 
 @pytest.mark.ddp

@@ -98,7 +98,7 @@ def test_given_weights_replace_the_pretraining(tmp_path):
     for content in (b"one", b"other"):
         weights = tmp_path / f"{content.decode()}.pt"
         weights.write_bytes(content)
-        plan = plan_of("demo", rgb_weights=weights)
+        plan = plan_of("demo", tables=TABLES / "table_2", rgb_weights=weights)
         assert all(stage.on_scans for stage in plan.stages)
         rows = rows_of(plan)
         stage = rows["table_2", "2_rgb"].stages[0][-1]
@@ -463,9 +463,9 @@ def test_wandb_gets_the_newest_numbers_of_each_row(command, tmp_path, processes,
 
 def test_processes_are_real(tmp_path):
     """What is started is this package; a failure shows the end of what it wrote."""
-    job = runner.Job("check", ["check", str(tmp_path / "none")], tmp_path / "check", "")
-    assert "ended with status 1" in (failure := asyncio.run(runner._run(job, 1)))
-    assert "none" in failure.splitlines()[-1]
+    job = runner.Job("check", ["check", "--colour"], tmp_path / "check", "")
+    assert "ended with status 2" in (failure := asyncio.run(runner._run(job, 1)))
+    assert "colour" in failure
     assert not job.done
 
 

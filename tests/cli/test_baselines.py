@@ -177,7 +177,8 @@ def test_the_published_sampler_is_the_default(trained):
     [s if s == "lidm" else pytest.param(s, marks=pytest.mark.slow) for s in TINY],
     indirect=True,
 )
-def test_test_scores_scenes(trained, smoke_root, tmp_path):
+def test_test_scores_scenes(trained, smoke_root, tmp_path, monkeypatch):
+    monkeypatch.setattr("r3dpa.callbacks.scene_scoring.save_figures", lambda *_, **__: None)
     stage, path = trained
     scorer = ["num_scenes=2", "batch_size=2", "allow_few=true", "spaces=[fgeo]"]
     scorer += ["sampler={solver: ddpm, steps: 2}"]  # its last noise keeps ranges off the limits

@@ -33,21 +33,18 @@ ELSEWHERE = {  # by the test that starts them
     ),
 }
 EXPERIMENTS = ("vae_alignment", "joint", "flow_matching", "few_step")
-STARTS = {
-    "vae_alignment": "kitti360",
-    "joint": "folder",
-    "flow_matching": "simulated",
-    "few_step": "simulated",
-    "vae_alignment_demo": "demo",
+STARTS = {  # each after the YAML of its stage, which test_stages starts alone
+    "vae_alignment_demo": "kitti360",
     "joint_demo": "demo_folder",
     "flow_matching_demo": "demo",
-    "few_step_demo": "demo",
+    "few_step_demo": "simulated",
+    "joint": "folder",
 }
-BOX = {  # stage, what fine-tunes it, data
+BOX = {  # stage, and what is given after it
     "box": ("vae_alignment", "data"),
     "box_flow": ("flow_matching", "data"),
     "box_few_step": ("few_step", "data"),
-    "demo": ("vae_alignment", "demo_vae", "demo_data"),
+    "demo": ("vae_alignment", "demo_vae", "data", "demo_data"),
     "demo_flow": ("flow_matching", "demo_flow", "demo_folder"),
 }
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
@@ -69,7 +66,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fast_dev_run.*")
 def test_no_file_is_left_out():
     files = {path.relative_to(CONF).with_suffix("").as_posix() for path in CONF.rglob("*.yaml")}
     started = {"smoke", "trainer", "trainer_demo"}
-    started |= {f"experiment/{name}" for name in STARTS}
+    started |= {f"experiment/{name}" for name in (*STARTS, *EXPERIMENTS)}
     started |= {f"data/{name}" for name in STARTS.values()}
     started |= {f"net/{name}" for name in VELOCITIES}
     started |= {
@@ -151,14 +148,12 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
 
 @pytest.mark.parametrize(
     "name",
-    [
-        name if name in ("box", "demo") else pytest.param(name, marks=pytest.mark.slow)
-        for name in BOX
-    ],
+    [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in BOX],
 )
 def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
-    stage, *tuned, data = BOX[name]
+    stage, *given = BOX[name]
+    tuned = "demo_vae" in given or "demo_flow" in given
     vae, sit = (
         yaml.safe_load((CONF / f"box/{part}.yaml").read_text())["init_args"]
         for part in ("vae", "sit")
@@ -169,7 +164,7 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         "data.init_args.grid_size": "[1, 2]",
         "model.init_args.sit.init_args.input_size": "[2, 4]",
     }
-    if data == "demo_folder":
+    if "demo_folder" in given:
         settings["data.init_args.scans"] = smoke_root
     else:
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
@@ -177,8 +172,8 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         codec = RangeCodec("log2", return_channel=True)
         exported = sit if tuned or stage == "few_step" else None
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
-    configs = ["trainer", "box/trainer", f"box/{data}", f"box/{stage}"]
-    start([*configs, *(f"box/{part}" for part in tuned)], settings)
+    configs = ["trainer", "box/trainer", f"box/{stage}", *(f"box/{part}" for part in given)]
+    start(configs, settings)
 
 
 def test_demo_grids_are_the_tokens_and_features_come_from_shipped_weights():

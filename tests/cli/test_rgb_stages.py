@@ -95,14 +95,19 @@ def test_the_vae_is_frozen_and_the_sit_trained_and_resumed_exactly(image_vae, rg
 
 
 def test_vae_alignment_starts_from_it(rgb, smoke_args, tmp_path, caplog):
-    still = ["--model.init_args.optimizer.lr=0", "--trainer.logger=false"]
-    main(smoke_args("vae_alignment", tmp_path, f"--model.init_args.rgb_weights={rgb}", *still))
+    """With the blocks, on another grid; the projector is fresh."""
+    more = ["--model.init_args.optimizer.lr=0", "--model.init_args.keep_projector=false"]
+    more += [f"--model.init_args.rgb_weights={rgb}", "--trainer.logger=false"]
+    main(smoke_args("vae_alignment", tmp_path, *more))
     state = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     source = read_checkpoint(rgb).network("sit").state_dict
+    kept = ("blocks.", "t_embedder.", "y_embedder.")
+    fresh = [key for key in source if re.match(r"projector.*\.weight", key)]
+    assert fresh
     for key, value in source.items():
-        if key.startswith(("blocks.", "t_embedder.", "y_embedder.")):
-            assert torch.equal(state[f"sit.{key}"], value), key
-    assert "resized" in caplog.text
+        if key.startswith(kept) or key in fresh:
+            assert torch.equal(state[f"sit.{key}"], value) != (key in fresh), key
+    assert all(word in caplog.text for word in ("resized", "fresh", "kept"))
 
 
 def test_images_of_a_folder_are_aligned_with_a_teacher(image_vae, tmp_path):

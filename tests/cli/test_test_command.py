@@ -12,7 +12,9 @@ import pytest
 
 from r3dpa.callbacks import SceneScorer, scene_scoring
 from r3dpa.cli import main
+from r3dpa.data import SimulatedDataModule
 from r3dpa.generation import SceneGenerator
+from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
 
@@ -22,9 +24,6 @@ FILES = {"evaluation.json", "metrics.csv", "table.md", "table.tex"}
 PICTURES = {"birds_eye.png", "matches.png", "ranges.png"}
 QUIET = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
 GEOMETRIC = ["--scorer.spaces=[fgeo]"]
-WEIGHTS = ("vae_alignment", "sit_alignment")
-NO_FEATURES = [f"--model.init_args.weights.{name}=0" for name in WEIGHTS]
-NO_FEATURES += ["--data.init_args.extractor=null"]
 
 
 @pytest.fixture(autouse=True)
@@ -88,7 +87,10 @@ def test_the_table_is_printed_written_and_logged(scored):
         assert float(logged[key]) == pytest.approx(stored.row(metric).value)
 
 
-def test_scenes_are_those_of_sample_and_evaluate(scored, reference, joint_checkpoint, tmp_path):
+def test_scenes_are_those_of_sample_and_evaluate(
+    scored, reference, joint_checkpoint, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("r3dpa.viz.evaluation.save_figures", lambda *_, **__: None)
     out = ["--out", str(tmp_path / "scenes"), "--device", "cpu"]
     how = ["--num", "4", "--solver", "euler", "--steps", "2", "--pictures", "0"]
     main(["sample", "--ckpt", str(joint_checkpoint), *out, *how])
@@ -101,28 +103,26 @@ def test_scenes_are_those_of_sample_and_evaluate(scored, reference, joint_checkp
         assert theirs[name][0] == pytest.approx(mine[name][0], rel=0.02), name
 
 
-def test_the_reference_is_kept_while_it_fits(words, smoke_root, tmp_path, monkeypatch):
-    """And computed again under another protocol, or where a scan has changed."""
-    done = []
-    compute = ReferenceStatistics.update
-    monkeypatch.setattr(
-        ReferenceStatistics, "update", lambda *args: (done.append(1), compute(*args))
-    )
-    data, run_dir = tmp_path / "data", tmp_path / "run"
-    shutil.copytree(smoke_root, data)
-    fixed = [*QUIET, *GEOMETRIC, *NO_FEATURES, "--data.init_args.root", str(data)]
-    main(words(run_dir, *fixed))
-    first = values(run_dir)
-    main(words(run_dir, *fixed))
-    assert len(done) == 1
-    assert values(run_dir) == first
-    main(words(run_dir, *fixed, "--scorer.protocol=published"))
-    assert len(done) == 2
-    assert values(run_dir) != first
-    scan = next(data.rglob("velodyne_points/data/*.bin"))
+def test_the_reference_is_kept_while_it_fits(words, scored, tmp_path, monkeypatch):
+    """What does not fit is renewed: metrics/test_reference.py."""
+    monkeypatch.setattr(ReferenceStatistics, "update", lambda *_: pytest.fail("computed again"))
+    shutil.copytree(scored, tmp_path / "run")
+    main(words(tmp_path / "run", *QUIET, *GEOMETRIC))
+    assert values(tmp_path / "run") == values(scored)
+
+
+def test_a_reference_knows_its_scans_from_others_of_their_names(reference, smoke_root, tmp_path):
+    def stamp(root):
+        data = SimulatedDataModule(str(root), num_scans=12, sensor=LidarSensor(16, 64))
+        data.setup("predict")
+        return scene_scoring._stamp(data.all_set.scans)
+
+    shutil.copytree(smoke_root, tmp_path / "data")
+    stored = ReferenceStatistics.load(reference).about["scans_sha256"]
+    assert stored == stamp(smoke_root) == stamp(tmp_path / "data")
+    scan = next((tmp_path / "data").rglob("velodyne_points/data/*.bin"))
     scan.write_bytes(scan.read_bytes()[:-160])
-    main(words(run_dir, *fixed, "--scorer.protocol=published"))
-    assert len(done) == 3
+    assert stored != stamp(tmp_path / "data")
 
 
 @pytest.mark.parametrize(

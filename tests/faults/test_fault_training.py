@@ -67,22 +67,23 @@ def goes_on(ended, scans_folder, undisturbed):
 
 
 class TestStopped:
-    @pytest.mark.parametrize(
-        ("target", "fault", "call", "step"),
-        [
-            (STEP, TERMINATE, 5, 3),  # in the first of the two batches of step 3
-            (STEP, INTERRUPT, 3, 2),
-            pytest.param("torch.save", TERMINATE, 1, 2, marks=pytest.mark.slow),
-        ],
-    )
-    def test_at_the_end_of_a_step(self, target, fault, call, step, faulty, goes_on):
-        run_dir, status, seen = faulty(At(target, fault, call))
-        number, name = (143, "SIGTERM") if fault is TERMINATE else (130, "SIGINT")
-        assert status == number, seen
-        says = f"stopped by {name} after step {step}: the same command goes on with --ckpt_path "
-        assert f"{says}{last(run_dir)}\n" in seen
-        assert "Traceback" not in seen
-        assert step_of(last(run_dir)) == step
+    def test_at_the_end_of_a_step(self, faulty, goes_on):
+        """Once in the second step, and resumed in the first of the two batches of the third."""
+        stops = ((INTERRUPT, 3, 130, "SIGINT", 2), (TERMINATE, 1, 143, "SIGTERM", 3))
+        for fault, call, number, name, step in stops:
+            more = ["--ckpt_path", "last"] if step == 3 else []
+            run_dir, status, seen = faulty(At(STEP, fault, call), more=more)
+            assert status == number, seen
+            says = f"stopped by {name} after step {step}: the same command goes on with --ckpt_path"
+            assert f"{says} {last(run_dir)}\n" in seen
+            assert "Traceback" not in seen
+            assert step_of(last(run_dir)) == step
+        goes_on(run_dir)
+
+    @pytest.mark.slow
+    def test_while_a_checkpoint_is_written(self, faulty, goes_on):
+        run_dir, status, _ = faulty(At("torch.save", TERMINATE, 1))
+        assert (status, step_of(last(run_dir))) == (143, 2)
         goes_on(run_dir)
 
     @pytest.mark.slow

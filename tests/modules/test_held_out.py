@@ -119,12 +119,16 @@ def evaluate(rank, num_processes, port, counts, folder):
         pytest.param(3, range(1, 8), marks=pytest.mark.slow),
     ],
 )
-def test_losses_do_not_depend_on_the_number_of_processes(num_processes, counts, tmp_path):
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
+def test_losses_do_not_depend_on_the_number_of_processes(
+    num_processes, counts, tmp_path, one_thread
+):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     evaluate(0, 1, 0, counts, tmp_path)
-    mp.spawn(evaluate, (num_processes, port, counts, tmp_path), nprocs=num_processes)
+    arguments = (num_processes, port, counts, tmp_path)
+    mp.start_processes(evaluate, arguments, nprocs=num_processes, start_method="fork")
     alone = json.loads((tmp_path / "1_0.json").read_text())
     for rank in range(num_processes):
         shared = json.loads((tmp_path / f"{num_processes}_{rank}.json").read_text())

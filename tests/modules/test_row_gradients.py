@@ -48,11 +48,12 @@ STARTS = {  # networks that the last stage takes from the stage before; from the
 @pytest.fixture(scope="module")
 def rows():
     """Stages on scans of each row but those of table I, which are other generators."""
-    plan = make_plan(TABLES, TABLES / "scale" / "paper.yaml", (0,), Path(), resolved)
+    scale, names = TABLES / "scale" / "paper.yaml", ("table_2", "table_3", "table_4")
+    plans = [make_plan(TABLES / name, scale, (0,), Path(), resolved) for name in names]
     return {
         (table.name, row.key): [stage for stage in row.stages[0] if stage.on_scans]
+        for plan in plans
         for table in plan.tables
-        if table.name != "table_1"
         for row in table.rows
     }
 

@@ -12,14 +12,12 @@ import torch
 import wandb
 import yaml
 
-from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.data import read_scan
-from r3dpa.nn import LatentNorm, SiT
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 STAGES = ("vae_alignment", "joint", "flow_matching", "few_step")
-QUICK = ["--trainer.logger=false", "--trainer.limit_val_batches=0"]
+QUICK = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
 
 
 @pytest.fixture
@@ -53,7 +51,9 @@ def test_stage_trains_logs_and_draws(
     stage, smoke_args, vae_checkpoint, from_previous, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("WANDB_MODE", "offline")
-    main(smoke_args(stage, tmp_path, *from_previous(stage)))
+    csv = "--trainer.logger={class_path: CSVLogger, init_args: {save_dir: x, name: ''}}"
+    more = [] if stage == "joint" else [csv]  # wandb takes a second
+    main(smoke_args(stage, tmp_path, *from_previous(stage), *more))
     wandb.finish()  # or the next logger of this process would join the run
     content = load(tmp_path)
     assert content["global_step"] == 3
@@ -73,7 +73,7 @@ def test_stage_trains_logs_and_draws(
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert "val_reconstruction_0000003.png" in pictures
     assert ("val_samples_0000003.png" in pictures) == (stage != "vae_alignment")
-    assert list(tmp_path.glob("wandb/offline-run-*"))
+    assert any(tmp_path.glob("wandb/offline-run-*")) == (stage == "joint")
     if stage == "few_step":
         assert {"val/endpoint_1", "val/endpoint_4", "val/thin_return_iou"} <= columns
     elif stage == "flow_matching":  # VAE and latent statistics stay
@@ -87,14 +87,14 @@ def test_stage_trains_logs_and_draws(
 
 
 def test_flow_matching_without_latent_statistics_is_refused(smoke_args, from_previous, tmp_path):
-    more = ["--trainer.logger=false", *from_previous("flow_matching")]
+    more = [*QUICK, *from_previous("flow_matching")]
     with pytest.raises(ValueError, match="init_networks name latent_norm"):
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.init_networks=[vae]"))
 
 
 def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_previous, tmp_path):
-    """At learning rate 0 the loaded weights are still there after three steps."""
-    still = ["--model.init_args.optimizer.lr", "0", "--trainer.logger=false"]
+    """At learning rate 0 the loaded weights are still there after a step."""
+    still = ["--model.init_args.optimizer.lr", "0", *QUICK, "--trainer.max_steps=1"]
     main(smoke_args("joint", tmp_path, *from_previous("joint"), *still))
     before = torch.load(vae_checkpoint, weights_only=True)["state_dict"]
     after = load(tmp_path)["state_dict"]
@@ -104,31 +104,6 @@ def test_joint_starts_from_the_stage_before(smoke_args, vae_checkpoint, from_pre
         for key in keys:
             torch.testing.assert_close(after[key], before[key])
     torch.testing.assert_close(after["ema.sit.pos_embed"], before["sit.pos_embed"])
-
-
-def test_rgb_weights_keep_the_blocks_and_leave_the_patch_embedding_fresh(
-    smoke_args, tmp_path, caplog
-):
-    """An RGB model with other latents, otherwise the SiT of conf/smoke.yaml."""
-    sit_args = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]
-    rgb_args = sit_args["init_args"] | {"input_size": [8, 8], "in_channels": 3}
-    rgb = SiT(**rgb_args)
-    for parameter in rgb.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    networks = {
-        "sit": NetworkState.of(rgb, rgb_args),
-        "latent_norm": NetworkState.of(LatentNorm(3), {"channels": 3}),
-    }
-    path = tmp_path / "rgb.safetensors"
-    save_checkpoint(Checkpoint(path, "rgb", networks), path)
-    more = ["--model.init_args.rgb_weights", str(path), "--trainer.logger=false"]
-    more += ["--model.init_args.optimizer.lr", "0", "--model.init_args.keep_projector", "false"]
-    main(smoke_args("vae_alignment", tmp_path / "run", *more))
-    trained = load(tmp_path / "run")["state_dict"]
-    fresh = ("x_embedder", "final_layer.linear", "pos_embed", "projector")
-    for key, value in rgb.state_dict().items():
-        assert torch.equal(trained[f"sit.{key}"], value) != key.startswith(fresh), key
-    assert all(word in caplog.text for word in ("x_embedder", "fresh", "kept", "latent channels"))
 
 
 @pytest.mark.slow
@@ -204,9 +179,12 @@ def test_a_second_fit_does_not_mix_with_the_first(joint_run, smoke_args):
     assert (joint_run / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
-def test_resume_takes_the_learning_rate_of_the_run(joint_run, smoke_args, tmp_path):
+def test_resuming_keeps_the_given_settings(joint_run, smoke_args, tmp_path):
+    """The command line decides, not the checkpoint, and config.yaml says what ran."""
     last = str(joint_run / "checkpoints" / "last.ckpt")
     resume = ["--trainer.max_steps", "4", "--model.init_args.optimizer.lr", "0.5"]
+    resume += ["--model.init_args.ema_decay=0.7"]
     main(smoke_args("joint", tmp_path, *QUICK, *resume, "--ckpt_path", last))
     groups = load(tmp_path)["optimizer_states"][0]["param_groups"]
     assert [group["lr"] for group in groups] == [0.5, 0.5, 0.5]
+    assert "ema_decay: 0.7" in (tmp_path / "config.yaml").read_text()

@@ -64,7 +64,8 @@ class TestCachedLatents:
         assert max((before[key] - plain[key]).abs().max() for key in blocks) > 1e-3
 
     def test_a_fast_dev_run_does_without(self, smoke_args, vae_checkpoint, tmp_path):
-        more = ["--trainer.fast_dev_run=1", "--model.init_args.init_from", str(vae_checkpoint)]
+        more = [*QUICK, "--trainer.fast_dev_run=1"]
+        more += ["--model.init_args.init_from", str(vae_checkpoint)]
         main(smoke_args("flow_matching", tmp_path, *more, "--model.init_args.cache_latents=true"))
         assert not (tmp_path / "latents").exists()
 
@@ -81,7 +82,7 @@ class TestCachedLatents:
         assert rows[0] == rows[1]
 
     def test_mirrored_scans_are_refused_at_once(self, smoke_args, vae_checkpoint, tmp_path):
-        more = ["--trainer.logger=false", "--model.init_args.init_from", str(vae_checkpoint)]
+        more = [*QUICK, "--model.init_args.init_from", str(vae_checkpoint)]
         more += ["--data.init_args.augmentation.flip=true"]
         with pytest.raises(ValueError, match=r"mirroring.*cache_latents: false"):
             main(smoke_args("flow_matching", tmp_path, *more))
