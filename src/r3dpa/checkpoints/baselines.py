@@ -40,11 +40,7 @@ _CONSTANTS = re.compile(r"(^_dummy|\.scale|\.kernel|^coords_encoding\.(freqs|pha
 
 
 def unet_weights(official: StateDict) -> dict[str, Tensor]:
-    """Weights of an official ``EfficientUNet`` or ``ADMUNet`` by our names, without its constants.
-
-    Raises:
-        ValueError: If a scale of the residual branches is not 1 / sqrt(2).
-    """
+    """Weights of an official ``EfficientUNet`` or ``ADMUNet`` by our names, without constants."""
     weights = {}
     for key, value in official.items():
         if key.endswith(".scale") and (value - math.sqrt(0.5)).abs().max() > 1e-6:

@@ -45,9 +45,6 @@ def from_lidm(
         content: Of the file.
         path: Of the file.
         encoding: ``linear`` for the networks ``*_wo_logscale``; ``log2`` where None.
-
-    Raises:
-        ValueError: If a key is unknown or missing, or a shape does not fit.
     """
     found: dict[str, dict[str, Tensor]] = {}
     for key, value in content["state_dict"].items():

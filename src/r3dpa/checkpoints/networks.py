@@ -120,11 +120,7 @@ class NetworkState:
             ) from error
 
     def build(self) -> nn.Module:
-        """The network with these weights, on the CPU, in training mode as constructed.
-
-        Raises:
-            ValueError: As :meth:`new`, or if any key or shape does not fit, listing all of them.
-        """
+        """The network with these weights, on the CPU, in training mode as constructed."""
         network = self.new()
         self._refuse_problems(network)
         network.load_state_dict(self.state_dict, strict=True)

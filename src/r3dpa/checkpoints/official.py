@@ -72,10 +72,6 @@ def from_official(
 
     ``args`` are the options of the official training script, where ``content`` has none; without
     an encoding, there or given, the geometry is unknown.
-
-    Raises:
-        ValueError: If a key is unknown or missing, a shape is inconsistent, or an argument of SiT
-            or UNet can neither be read nor inferred.
     """
     given = sit_args or {}
     if isinstance(content.get(OURS), Mapping):

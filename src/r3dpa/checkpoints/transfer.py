@@ -172,9 +172,6 @@ def read_snapshot(
         strong: Checkpoint of the model to be guided.
         weights: Whose latent statistics it uses, those of the average or of the last step.
         allow: Warn of latents that differ instead of refusing them.
-
-    Raises:
-        ValueError: If the file has no average or fitted statistics, or does not fit ``strong``.
     """
     weak = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(weak.networks):

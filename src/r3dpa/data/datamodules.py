@@ -73,10 +73,6 @@ class LidarDataModule(LoaderModule):
         augmentation: Rotation and mirroring of training scans; none by default.
         weather: Weather of training scans, drawn anew in each epoch; none by default. Feature grids
             stay those of the clear scans, which ``augmentation.approximate_grids`` must allow.
-
-    Raises:
-        ValueError: If an argument is out of its range, or features or projection do not follow
-            the augmentation or the weather.
     """
 
     # Also of subclasses that make their batches without __init__.
@@ -283,9 +279,6 @@ class SimulatedDataModule(KITTI360DataModule):
         effects: ``auto``, ``on`` or ``off`` by effect; those not named are ``auto``.
         weather: Weather of all scans; drawn where None.
         kwargs: Arguments of :class:`LidarDataModule`.
-
-    Raises:
-        ValueError: If an argument is out of its range.
     """
 
     def __init__(
@@ -331,9 +324,6 @@ class PointDataModule(LoaderModule):
         num_workers: Loader processes per training process.
         seed: Seed of order and draws.
         weather: Weather of training scans, drawn anew in each epoch; none by default.
-
-    Raises:
-        ValueError: If ``source`` has an extractor, or an argument is out of its range.
     """
 
     def __init__(

@@ -89,9 +89,6 @@ class ImageDataModule(LoaderModule):
             latents of centre crops as they are.
         prepare_data_per_node: Whether the processes of each node encode the images for themselves,
             as node-local disks need; by default all share the work, on a disk that the nodes share.
-
-    Raises:
-        ValueError: If an argument is out of its range.
     """
 
     def __init__(

@@ -63,9 +63,6 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     Returns:
         ``(P,)`` KITTI-360 class in the lower 16 bits, see :data:`CLASS_NAMES`, 0 without a label;
         number of the object in the upper, 0 for none.
-
-    Raises:
-        ScanError: If there are no labels, or a file is damaged or of another scan.
     """
     scan = Path(scan)
     simulated = read_beside(scan, "labels")

@@ -66,9 +66,6 @@ class SimulatedImageDataModule(SimulatedDataModule):
         root: Folder of the caches.
         every: Take every this many scans of a drive; neighbours are 0.1 s apart.
         kwargs: Arguments of :class:`SimulatedDataModule`; only ``projection: spherical``.
-
-    Raises:
-        ValueError: If an argument is out of its range.
     """
 
     def __init__(self, root: str, every: int = 1, **kwargs: Any) -> None:

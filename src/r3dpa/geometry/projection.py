@@ -132,9 +132,6 @@ def range_image(
         ``range_m`` ``(H, W)`` or ``(B, H, W)`` float32, ``EMPTY_RANGE_M`` without a return, and
         the values of the nearest returns ``(F, H, W)`` or ``(B, F, H, W)``, 0 without a return,
         or None.
-
-    Raises:
-        ValueError: If the points have another shape.
     """
     check_points(points)
     if points.ndim not in (2, 3):
@@ -188,9 +185,6 @@ def points_of(range_m: Tensor, projection: Projection, corner: bool = False) -> 
     Within a row the order is that of the image, or for rings that of a scan, whose azimuth grows
     from 0, so that a written file can be read with the same projection. Otherwise as
     :func:`unproject`.
-
-    Raises:
-        ValueError: If the image is batched.
     """
     if range_m.ndim != 2:
         raise ValueError(f"images must be (H, W), one by one, got {tuple(range_m.shape)}")

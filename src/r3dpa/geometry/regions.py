@@ -36,10 +36,6 @@ def angle_box(
     Azimuths run leftwards from the first to the second: ``170, -170`` are the 20 degrees across
     the seam behind the sensor, ``-10, 10`` the 20 degrees ahead. The first border of each pair
     belongs to the box, the second does not.
-
-    Raises:
-        ValueError: If a pair of borders is empty, the box lies outside the field of view or
-            between two rays, or all pixels are selected.
     """
     what = (
         f"box of azimuth {azimuth_from_deg:g}..{azimuth_to_deg:g} and inclination "
@@ -79,10 +75,6 @@ def box3d(
 
     Returns:
         ``(H, W)`` bool.
-
-    Raises:
-        ValueError: If a value is not finite or a size not positive, the box contains the sensor,
-            or no ray meets it (out of range, outside the field of view, or between rays).
     """
     sensor = projection.sensor
     what = (
@@ -115,11 +107,7 @@ def box3d(
 
 
 def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
-    """Pixels ``(H, W)`` bool of the beams that a scan with only the rows ``kept`` lacks.
-
-    Raises:
-        ValueError: If none or all remain.
-    """
+    """Pixels ``(H, W)`` bool of the beams that a scan with only the rows ``kept`` lacks."""
     beams = projection.sensor.beams
     missing = torch.ones(beams, projection.sensor.columns, dtype=torch.bool)
     missing[list(kept)] = False
@@ -131,9 +119,6 @@ def sensor_pair(projection: Projection, other: Projection) -> Tensor:
 
     Each ray of the other sensor in the field of view of ``projection`` fills the pixel whose ray
     is nearest, the upper and left one at a tie.
-
-    Raises:
-        ValueError: If it fills no pixel, or all.
     """
     sensor = projection.sensor
     inclination, azimuth = _rays_deg(projection)
@@ -174,9 +159,6 @@ def token_mask(pixel_mask: Tensor, grid_size: tuple[int, int], dilation: int = 0
 
     Returns:
         ``(N,)`` bool, row after row, as feature grids are.
-
-    Raises:
-        ValueError: If no or every token is selected.
     """
     cells = rearrange(pixel_mask, "(h p) (w q) -> h w (p q)", h=grid_size[0], w=grid_size[1])
     what = f"tokens with any of their {cells.shape[-1]} pixels selected"
@@ -226,10 +208,6 @@ def sector_weights(
 
     Returns:
         ``(S, N)`` float32, row after row; the sum over S is 1.
-
-    Raises:
-        ValueError: If two sectors start at one azimuth, the sources are not numbered from 0 without
-            gaps or are fewer than two, or a number is out of its range.
     """
     if not 0 <= blend_deg <= _TURN_DEG:
         raise ValueError(f"blend must be 0 to 360 degrees, got {blend_deg:g}")

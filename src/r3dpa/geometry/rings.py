@@ -47,9 +47,6 @@ class RingProjection:
         legacy_rows: Count rings from the bottom row, each from where the quadrant falls from the
             last to the first, as R2DM and R2Flow do; see :func:`unfolded_rows`.
         legacy_hiding: See :class:`r3dpa.geometry.SphericalProjection`.
-
-    Raises:
-        ValueError: If there are not H inclinations, or one is outside [-90, 90].
     """
 
     sensor: LidarSensor
@@ -77,9 +74,6 @@ class RingProjection:
         Args:
             scans: Each ``(P, 3)`` metres, points in the order of the file.
             sensor: Image size, range limits and field of view.
-
-        Raises:
-            ValueError: If a scan is not stored as above, or none shows H rings.
         """
         measured: list[list[Tensor]] = [[] for _ in range(sensor.beams)]
         counts_seen = []
@@ -112,9 +106,6 @@ class RingProjection:
 
         Returns:
             ``(row, column)``, each ``(P,)`` or ``(B, P)`` int64, in ``[0, H)`` and ``[0, W)``.
-
-        Raises:
-            ValueError: If a scan is not stored as above, or shows more than H rings.
         """
         if points.ndim == 3:
             rows, columns = zip(*map(self.pixel_of, points), strict=True)
@@ -164,9 +155,6 @@ def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) ->
     """Ring ``(P,)`` of each return from the wraps of the azimuth, and the number of rings.
 
     ``inclination`` and ``azimuth`` are ``(P,)`` radians in the order of the file.
-
-    Raises:
-        ValueError: If the returns are not stored ring after ring.
     """
     if len(azimuth) == 0:
         return torch.zeros_like(azimuth, dtype=torch.int64), 0

@@ -46,10 +46,6 @@ class RangeCodec:
         return_channel: Images have a second channel, whose sign says where returns are.
         reflectance: Images have a second channel of reflectance.
         offset_m: Offset of ``log2``, metres.
-
-    Raises:
-        ValueError: If the encoding is unknown, the scale is not positive and finite, or both
-            second channels are set.
     """
 
     encoding: Literal["linear", "log2", "inverse"] = "linear"
@@ -178,10 +174,6 @@ class ScanGeometry:
         projection: Points to pixels and back, with its sensor.
         codec: Metres to [-1, 1] and back.
         grid_size: Rows and columns of the feature grid.
-
-    Raises:
-        ValueError: If the codec ends before the farthest range of the sensor, or the grid does
-            not divide the range image.
     """
 
     projection: Projection

@@ -24,9 +24,6 @@ class LidarSensor:
         inclination_min_deg: Lower border of the last row, degrees above the horizon.
         range_min_m: Points at this distance or nearer are dropped, metres.
         range_max_m: Points at this distance or farther are dropped, metres.
-
-    Raises:
-        ValueError: If a count is below one or an interval is empty or out of bounds.
     """
 
     beams: int = 64
@@ -55,11 +52,7 @@ class LidarSensor:
             )
 
     def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns of pixels in one cell of a grid ``(rows, columns)``.
-
-        Raises:
-            ValueError: If the grid does not divide the range image.
-        """
+        """Rows and columns of pixels in one cell of a grid ``(rows, columns)``."""
         rows, columns = grid_size
         if rows < 1 or columns < 1 or self.beams % rows or self.columns % columns:
             raise ValueError(

@@ -40,9 +40,6 @@ def classifier_accuracy(
         epochs: Passes over the training images.
         batch_size: Images per step, half of each set.
         seed: Of split, weights and order.
-
-    Raises:
-        ValueError: If the images differ in size, or a set has fewer than four.
     """
     if real_m.shape[1:] != generated_m.shape[1:]:
         sizes = f"{tuple(real_m.shape[1:])} and {tuple(generated_m.shape[1:])}"

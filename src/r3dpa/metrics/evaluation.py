@@ -170,9 +170,6 @@ def scene_distance(
         ckpt: Official weights of the feature space.
         device: Of its network.
 
-    Raises:
-        ValueError: If there is no such metric, there are too few scenes, or one cannot be used.
-
     Example:
         >>> cloud = torch.tensor([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
         >>> scene_distance("JSD", [("real", cloud)], [("made", cloud), ("again", cloud)])

@@ -41,11 +41,7 @@ class BEVGrid:
         return math.ceil(2 * self.half_m / self.cell_m)
 
     def kept(self, points: Tensor, name: str = "cloud") -> Tensor:
-        """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one.
-
-        Raises:
-            ValueError: If a coordinate is NaN or infinite, or no point is inside the limits.
-        """
+        """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one."""
         found = _checked_points(points, name)
         found = found[(found[:, :2].abs() < self.half_m).all(dim=1)]
         if len(found) == 0:

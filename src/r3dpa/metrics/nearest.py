@@ -28,9 +28,6 @@ def nearest_images(range_m: Tensor, references: Iterable[Tensor]) -> Nearest:
     Args:
         range_m: ``(N, H, W)`` metres, not above 0 without a return, which counts as range 0.
         references: Batches ``(B, H, W)`` of the images to search.
-
-    Raises:
-        ValueError: If there is no reference.
     """
     cells = _cells(range_m)
     best = Nearest(torch.full((len(cells),), torch.inf), torch.zeros(len(cells), dtype=torch.long))

@@ -103,11 +103,7 @@ class OfficialStatistics:
 
     @classmethod
     def load(cls, path: str | Path, split: OfficialSplit | None = None) -> OfficialStatistics:
-        """Reads the file without executing anything in it; ``val`` comes first without a split.
-
-        Raises:
-            ValueError: If the file is missing, damaged or of something else, or lacks the split.
-        """
+        """Reads the file without executing anything in it; ``val`` comes first without a split."""
         path = Path(path)
         try:
             stream = io.BytesIO(path.read_bytes())

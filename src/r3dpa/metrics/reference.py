@@ -42,9 +42,6 @@ class ReferenceStatistics:
             keep features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
         spaces: Cards of the feature spaces, see :func:`cards_of`.
         num_done: Scans added so far.
-
-    Raises:
-        ValueError: If there are fewer than two scans, or a name occurs twice.
     """
 
     def __init__(

@@ -130,9 +130,6 @@ def scan_statistics(points: NDArray[np.float32]) -> ScanStatistics:
     Args:
         points: ``(P, 4)`` x, y, z in metres, x forward, z up, and intensity in [0, 1], in storage
             order.
-
-    Raises:
-        ValueError: If the shape is another or an intensity is outside [0, 1].
     """
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must be (P, 4) x, y, z, intensity, got shape {points.shape}")

@@ -157,9 +157,6 @@ class GenerativeModule(ScanStage):
         """Loads ``rgb_weights`` and ``init_from`` and restarts the EMA from the loaded weights.
 
         A fit does it by itself; called earlier, it says early what does not fit.
-
-        Raises:
-            ValueError: Listing everything in the file that does not fit this stage.
         """
         if self.rgb_weights is not None:
             if not isinstance(self.sit, SiT):

@@ -48,9 +48,6 @@ class RGBPretraining(L.LightningModule):
         latents_dir: Folder of the encoded images, which runs may share: 33 kB each at 4 x 32 x 32;
             ``<run_dir>/latents`` where None.
         seed: Key of the training draws.
-
-    Raises:
-        ValueError: If SiT, teacher and weights do not belong together.
     """
 
     stage = "rgb_pretraining"

@@ -76,9 +76,6 @@ class LatentNorm(nn.Module):
         must then call it, as gradients flow through the shared statistics. The biased variance
         normalises, the unbiased one enters the running statistics. A batch with a non-finite
         latent, or whose variance overflows, leaves mean, variance and count unchanged.
-
-        Raises:
-            ValueError: If there is a single value per channel, which has no variance.
         """
         latents = at_least_float32(latents)
         positions = latents.numel() // self.channels

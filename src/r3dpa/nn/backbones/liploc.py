@@ -73,9 +73,6 @@ class LIPLoc(nn.Module):
         Args:
             path: ``model.ckpt`` of the release.
             num_heads: Attention heads. Default: those of the released ViT of this width.
-
-        Raises:
-            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         try:
             weights = {

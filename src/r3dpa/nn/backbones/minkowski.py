@@ -130,9 +130,6 @@ class MinkowskiNet(nn.Module):
             path: ``model.ckpt`` of the release, a state dict below ``state_dict`` or a bare one.
                 If the network is one module of several, its prefix is removed and the other
                 weights are ignored.
-
-        Raises:
-            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         path = Path(path)
         try:

@@ -17,12 +17,7 @@ _MODEL = "the model.ckpt of the released weights"
 
 
 def read_released(path: Path, released: str = _MODEL) -> Any:
-    """Content of a file of ``torch.save``, tensors on the CPU.
-
-    Raises:
-        ValueError: If the file is missing, damaged, or holds more than tensors and plain values;
-            the message recommends ``released``.
-    """
+    """Content of a file of ``torch.save``, tensors on the CPU."""
     if not path.is_file():
         raise ValueError(f"no such file; give {released}.")
     try:
@@ -55,9 +50,6 @@ def load_strictly(
     """Loads every key of an official state dict.
 
     Official weights may have additional last axes of size 1: some linear layers are convolutions.
-
-    Raises:
-        ValueError: If a weight is missing, left over or of another shape, by official name.
     """
     own = network.state_dict()
     keys = {official_name(key): key for key in own}

@@ -143,9 +143,6 @@ class ScaLR(TokenFeatures):
         Args:
             path: ``ckpt_last.pth`` of the release.
             grid: Preparation of scans, as in its training. Default: that of the release.
-
-        Raises:
-            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         path, grid = Path(path), grid or ScanGrid()
         try:

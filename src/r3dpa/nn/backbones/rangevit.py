@@ -129,9 +129,6 @@ class RangeViT(nn.Module):
             sensor: Image size, field of view and range limits. Default: those of R3DPA.
             num_heads: Attention heads. Default: those of the released ViT of this width.
             **sizes: ``trained_size`` and ``patch_size``, if not those of the release.
-
-        Raises:
-            ValueError: If the file cannot be read or does not hold this network, naming the file.
         """
         try:
             weights = read_state_dict(Path(path))

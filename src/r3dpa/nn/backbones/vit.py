@@ -137,9 +137,6 @@ class DINOv2(nn.Module):
 
     Attributes:
         trained: Whether the weights are those of a file.
-
-    Raises:
-        ValueError: If the file is missing, damaged, would run code, or does not fit.
     """
 
     mean: Tensor
