@@ -17,8 +17,7 @@ from typing import NamedTuple
 import yaml
 
 from r3dpa.ablation.plan import Plan
-from r3dpa.io import no_follow, only_writer
-from r3dpa.metrics.results import save_text
+from r3dpa.io import no_follow, only_writer, write_text
 
 _CSV_LOGGER = {
     "class_path": "lightning.pytorch.loggers.CSVLogger",
@@ -123,7 +122,7 @@ async def _run(job: Job, cores: int) -> str | None:
         why = f"ended with status {status}" if status else f"left no {job.makes and job.makes.name}"
         lines = log_path.read_text(encoding="utf-8", errors="replace").splitlines()[-_TAIL:]
         return "\n      ".join([f"{why}; {log_path} ends with", *lines])
-    save_text(job.place.with_suffix(".done"), job.content)
+    write_text(job.place.with_suffix(".done"), job.content)
     return None
 
 
@@ -138,7 +137,7 @@ def _jobs(plan: Plan) -> list[Job]:
     # Baselines see the same scans without features, through sensors of their own.
     featured = [stage.config["data"] for stage in plan.stages if stage.on_features]
     sizes = sorted({tuple(block["init_args"]["grid_size"]) for block in featured})
-    save_text(data, yaml.safe_dump({"data": featured[0]}))
+    write_text(data, yaml.safe_dump({"data": featured[0]}))
     scans = json.dumps([featured[0], sizes], sort_keys=True)
     of_reference = f"{scans} {plan.reference}"
     extract = ["features", "--data", str(data), "--grid_sizes", json.dumps(sizes)]

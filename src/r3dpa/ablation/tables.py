@@ -13,13 +13,12 @@ import torch
 
 from r3dpa import viz
 from r3dpa.ablation.plan import Plan, Table
-from r3dpa.io import command, machine, versions
+from r3dpa.io import command, machine, versions, write_text
 from r3dpa.metrics.results import (
     Evaluation,
     EvaluationTable,
     published_evaluation,
     save_csv,
-    save_text,
 )
 from r3dpa.metrics.scene_features import SPACES
 from r3dpa.metrics.seeds import mean_of_seeds, relative_change
@@ -119,8 +118,8 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
     )
     notes = [*_described(table, orders), *lost]
     listed = "\n".join(f"- {line}" for line in notes)
-    save_text(file.with_suffix(".md"), f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
-    save_text(file.with_suffix(".tex"), f"% {' '.join(head.split())}\n{shown.latex()}")
+    write_text(file.with_suffix(".md"), f"# {table.name}\n\n{head}\n\n{shown}\n{listed}\n")
+    write_text(file.with_suffix(".tex"), f"% {' '.join(head.split())}\n{shown.latex()}")
     save_csv(means, file.with_suffix(".csv"))
     stored = {
         "table": table.name,
@@ -142,7 +141,7 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
         "orders": [order._asdict() for order in orders],
         "failed": dict(failed),
     }
-    save_text(file.with_suffix(".json"), json.dumps(stored, indent=1) + "\n")
+    write_text(file.with_suffix(".json"), json.dumps(stored, indent=1) + "\n")
     return "\n".join([f"{table.name}: {head}", "", str(shown), *notes]), results
 
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from r3dpa import viz
 from r3dpa.bench.measure import Comparison
 from r3dpa.bench.problems import Setting
-from r3dpa.io import one_line, text_table
-from r3dpa.metrics.results import save_text
+from r3dpa.io import one_line, text_table, write_text
 
 Floats = NDArray[np.float64]
 
@@ -234,7 +233,7 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
     """Writes all files; returns the text of the summary."""
     records = {name: _record(part) for name, part in found.items()}
     content = facts | {"problems": records}
-    save_text(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_text(out / "sampling.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     name = "model" if "model" in found else "mixture"
     viz.save(_picture(name, found[name]), out / "pareto.png")
     tail = ["no checkpoint was given: all figures are of the mixture, none of a model"]
@@ -242,7 +241,7 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
         levels = quality_levels(found[name].rows)
         where = f"{facts['machine']['gpu'] or facts['machine']['cpu']}, {one_line(facts['model'])}"
         table = {"levels": levels, "measured_on": where}
-        save_text(out / "quality.json", json.dumps(table, indent=2, allow_nan=False) + "\n")
+        write_text(out / "quality.json", json.dumps(table, indent=2, allow_nan=False) + "\n")
         tail = [
             f"quality {level}: {choice['solver']}, {choice['steps']} steps, shift "
             f"{choice['shift']:g} (error {choice['error']:.3g}, {choice['seconds_share']:.0%} of "
@@ -255,7 +254,7 @@ def write_report(out: Path, found: Mapping[str, Finding], facts: dict[str, Any])
         lines += [f"## {_TITLES[key]}", "", "What each further second buys:", ""]
         lines += [f"- {sentence}" for sentence in records[key]["sentences"]]
         lines += ["", "```", _table(records[key]["rows"]), *_notes(part), "```", ""]
-    save_text(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
+    write_text(out / "summary.md", "\n".join([*lines, *(f"- {line}" for line in tail), ""]))
     files = sorted(path.name for path in out.iterdir() if path.is_file())
     return "\n".join([*lines[4:], *tail, f"files: {', '.join(files)}"])
 

@@ -27,8 +27,15 @@ from r3dpa.bench.measure import peak_bytes, synchronise
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import command, machine, one_line, text_table, usable_device, versions
-from r3dpa.metrics.results import save_text
+from r3dpa.io import (
+    command,
+    machine,
+    one_line,
+    text_table,
+    usable_device,
+    versions,
+    write_text,
+)
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
 from r3dpa.nn.backbones import GeometricFeatures
@@ -113,7 +120,7 @@ def training(
     }
     if out is not None:
         content = about | {"stages": [asdict(cost) for cost in costs]}
-        save_text(out, json.dumps(content, indent=2) + "\n")
+        write_text(out, json.dumps(content, indent=2) + "\n")
     rows = [cost.row() for cost in costs]
     table = text_table(([*row.values()] for row in rows), list(rows[0]))
     return "\n".join([table, *(f"{name}: {one_line(values)}" for name, values in about.items())])

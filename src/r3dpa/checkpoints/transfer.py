@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -159,19 +158,16 @@ def read_snapshot(
     path: str | Path,
     strong: Checkpoint,
     weights: Literal["ema", "last"] = "ema",
-    allow: bool = False,
 ) -> WeakModel:
     """Reads a weak model that may guide a given one.
 
-    If both models have one VAE, which stage ``flow_matching`` freezes, normalisations that drifted
-    apart are converted, up to ``NORM_TOLERANCE``. With another VAE, as after a snapshot of stage
-    ``joint``, the normalised latents of both are equated, which is refused unless allowed.
+    Both models have one VAE, which stage ``flow_matching`` freezes; normalisations that drifted
+    apart are converted, up to ``NORM_TOLERANCE``.
 
     Args:
         path: File of :class:`r3dpa.callbacks.EMASnapshots`, or any checkpoint with an average.
         strong: Checkpoint of the model to be guided.
         weights: Whose latent statistics it uses, those of the average or of the last step.
-        allow: Warn of latents that differ instead of refusing them.
     """
     weak = read_checkpoint(path)
     if not {"ema", "ema_latent_norm"} <= set(weak.networks):
@@ -198,16 +194,14 @@ def read_snapshot(
     reason, vae = "", _vae_note(weak)
     if vae is None or vae != _vae_note(strong):
         reason = "its latents are those of another VAE, as within stage joint"
-        scale, shift = torch.ones(()), torch.zeros_like(shift)
     elif spread > NORM_TOLERANCE:
         limit = f"{NORM_TOLERANCE:.0%}"
         reason = f"the scales of its latents differ by {spread:.1%} between channels, over {limit}"
     if reason:
-        problem = f"{path} cannot guide {strong.path} exactly: {reason}"
-        if not allow:
-            remedy = "Give a snapshot of stage flow_matching on this VAE, or allow other latents"
-            raise ValueError(f"{problem}. {remedy}")
-        warnings.warn(f"{problem}; allowed: an approximation", stacklevel=2)
+        raise ValueError(
+            f"{path} cannot guide {strong.path}: {reason}. Give a snapshot of stage flow_matching "
+            "on this VAE"
+        )
     sit = weak.network("ema").build()
     assert isinstance(sit, VelocityNetwork)  # _latent_size
     sit.eval().requires_grad_(False)

@@ -29,7 +29,7 @@ from r3dpa.flow.solvers import evaluations
 from r3dpa.geometry import in_range, range_image
 from r3dpa.geometry.gaps import check_view, filled, range_error_m
 from r3dpa.geometry.regions import check_mask
-from r3dpa.io import atomic_path, usable_device
+from r3dpa.io import atomic_path, usable_device, write_text
 from r3dpa.nn.backbones import feature_source
 
 _SHOWN = 8  # results on the sheet and the page
@@ -201,8 +201,7 @@ class EditSession:
         viz.save(viz.edit_sheet(rows, part_names, self.projection), out / "edit.png")
         title = f"r3dpa {command}"
         page = viz.edit_page(before, after, numbers, part_names, self.projection, title)
-        with atomic_path(out / "edit.html") as temporary:
-            temporary.write_text(page, "utf-8")
+        write_text(out / "edit.html", page)
 
 
 def held_out_errors(made: Tensor, range_m: Tensor, missing: Tensor) -> dict[str, Any]:

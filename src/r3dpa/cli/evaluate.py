@@ -172,7 +172,7 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from tqdm import tqdm
 
     from r3dpa.data.scans import ScanError, find_scans, read_scan
-    from r3dpa.io import atomic_path
+    from r3dpa.io import write_text
     from r3dpa.metrics import ScanStatistics, realism_table, scan_statistics
 
     check_file(out)
@@ -191,6 +191,5 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
         notes.append("B is a single drive: there is no floor; give a reference of two drives")
     table = realism_table(statistics[0], statistics[1], notes)
     if out is not None:
-        with atomic_path(out) as temporary:
-            temporary.write_text(json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
+        write_text(out, json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table

@@ -48,7 +48,7 @@ def gallery(
     from r3dpa.editing import SceneEditor
     from r3dpa.generation import SceneGenerator
     from r3dpa.geometry import points_of, range_image, regions
-    from r3dpa.io import atomic_path, usable_device
+    from r3dpa.io import usable_device, write_text
     from r3dpa.metrics.nearest import nearest_images
     from r3dpa.weather import RecordedScan, Weather
 
@@ -115,6 +115,5 @@ def gallery(
         range_m = range_image(torch.from_numpy(found.points), projection)[0]
         show("Weather in seed 0", name, range_m)
     page = viz.scan_page(scans, "r3dpa gallery", {}, {}, None, projection.sensor, tiles, about)
-    with atomic_path(out) as temporary:
-        temporary.write_text(page, "utf-8")
+    write_text(out, page)
     return f"open {out}: {len(scans)} scenes, {len(page) / 1e6:.0f} MB"

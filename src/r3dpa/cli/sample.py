@@ -19,11 +19,9 @@ def sample(
     shift: float | None = None,
     eta: float | None = None,
     sde_last: Literal["denoise", "mean"] | None = None,
-    sde_last_time: float | None = None,
     autoguidance: Path | None = None,
     guidance_scale: float | None = None,
     guidance_interval: tuple[float, float] | None = None,
-    allow_other_latents: bool = False,
     decoder: Literal["full", "thin"] | None = None,
     precision: Literal["fp32", "bf16"] = "fp32",
     compile: bool = False,
@@ -45,11 +43,9 @@ def sample(
         shift: Finer steps near noise (above 1) or data (below 1) of the ODE; default: 1.
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
-        sde_last_time: Time at which the last SDE step starts; default: 0.04.
         autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
         guidance_scale: Strength of autoguidance, 1 for none; default: 2.
         guidance_interval: Guided times, such as ``0.2 0.8``; 0 is data, 1 noise; default: all.
-        allow_other_latents: Accept a snapshot whose latents are only about the same.
         decoder: Decoder of the VAE or the thin one of stage few_step; default: thin for
             ``--quality instant``, else full.
         precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
@@ -66,22 +62,20 @@ def sample(
     from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
 
-    of_solver = ("solver", "steps", "shift", "eta", "sde_last", "sde_last_time")
+    of_solver = ("solver", "steps", "shift", "eta", "sde_last")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
     sampler = SamplerConfig(**given) if given else quality
     decoder = decoder or ("thin" if quality == "instant" else "full")
-    if autoguidance is None and (guidance_scale or guidance_interval or allow_other_latents):
-        raise ValueError(
-            "--guidance_scale, --guidance_interval and --allow_other_latents need --autoguidance"
-        )
+    if autoguidance is None and (guidance_scale or guidance_interval):
+        raise ValueError("--guidance_scale and --guidance_interval need --autoguidance")
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
     guidance, about_guide = None, None
     if autoguidance is not None:
-        weak = read_snapshot(autoguidance, checkpoint, files.weights, allow_other_latents)
+        weak = read_snapshot(autoguidance, checkpoint, files.weights)
         scale = 2.0 if guidance_scale is None else guidance_scale
         interval = guidance_interval or (0.0, 1.0)
         sit, latent_shift = weak.sit.to(device), weak.shift.to(device)

@@ -26,7 +26,7 @@ from r3dpa.data.scans import ScanError, find_scans, read_beside, read_npz, read_
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
-from r3dpa.io import atomic_path, source_commit
+from r3dpa.io import source_commit, write_text
 from r3dpa.simulation import Origin, Semantic
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
@@ -178,8 +178,7 @@ def write_page(
     """
     made_by = _categories(Origin) | dict(origins or {})
     page = viz.scan_page(scans, title, _categories(Semantic), made_by, **options)
-    with atomic_path(path) as temporary:
-        temporary.write_text(page, "utf-8")
+    write_text(path, page)
     return path
 
 

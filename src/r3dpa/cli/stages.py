@@ -19,7 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from r3dpa.callbacks import RunCheckpoint, SceneScorer
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import Parser
-from r3dpa.io import atomic_path, delete_unfinished, only_writer, source_commit
+from r3dpa.io import delete_unfinished, only_writer, source_commit, write_text
 from r3dpa.modules import GenerativeModule
 
 _STAGES = ("experiment", "baseline")  # folders of their configurations
@@ -64,8 +64,7 @@ class _RecordConfig(SaveConfigCallback):
         """Not to ``trainer.log_dir``, which would need all processes."""
         text = self.parser.dump(self.config, skip_unset=False, skip_validation=True)
         path = Path(trainer.default_root_dir) / self.config_filename
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text)
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger):
                 logger.log_hyperparams(yaml.safe_load(text) | {"commit": source_commit()})
@@ -191,8 +190,7 @@ class StageCLI(LightningCLI):
         """Fills what the configuration leaves open; `test` and a resumed `fit` join the run."""
         model, note = self.config[self.subcommand].get("model"), run_dir / "wandb_id.txt"
         if self.subcommand == "fit" and not note.exists():
-            with atomic_path(note) as temporary:
-                temporary.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
+            write_text(note, uuid.uuid4().hex[:8])
         names = {
             "name": "/".join(run_dir.parts[-2:]),
             "group": run_dir.resolve().parent.name,

@@ -9,7 +9,7 @@ from typing import Any
 from r3dpa.data.augmentation import Augmentation
 from r3dpa.data.datasets import LidarBatch, LidarDataset, PointSample
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, pooled_grids, write_feature_grids
-from r3dpa.data.images import DeadLeaves, ImageFolder, TarImages
+from r3dpa.data.images import DeadLeaves, ImageFolder
 from r3dpa.data.samples import read_samples
 from r3dpa.data.scans import (
     Scan,
@@ -54,7 +54,6 @@ __all__ = [
     "SimulatedDataModule",
     "SimulatedImageDataModule",
     "StoreError",
-    "TarImages",
     "check",
     "find_scans",
     "kitti360_scans",

@@ -78,6 +78,7 @@ class LidarDataModule(LoaderModule):
     # Also of subclasses that make their batches without __init__.
     augmentation = _AUGMENTATION
     weather_prior: WeatherPrior | None = None
+    images: CachedTensors[Any] | None = None  # range images that the scans are read from
 
     def __init__(
         self,
@@ -186,7 +187,8 @@ class LidarDataModule(LoaderModule):
             arguments = self.features_dir, scans, self.projection, self.grid_size, extractor
             grids = FeatureGrids(*arguments)
         self.train_set, self.val_set, self.all_set = (
-            LidarDataset(split, self.projection, self.codec, grids) for split in (train, val, scans)
+            LidarDataset(split, self.projection, self.codec, grids, images=self.images)
+            for split in (train, val, scans)
         )
 
     def use_posteriors(self, posteriors: CachedTensors) -> None:

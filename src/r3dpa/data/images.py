@@ -124,9 +124,6 @@ class ImageFolder(ImageSource):
         return found
 
 
-TarImages = ImageFolder  # name in older configurations
-
-
 def _entry(path: Path, name: str) -> ImageEntry:
     try:
         about = path.stat()
@@ -226,17 +223,6 @@ class DeadLeaves(ImageSource):
     seed: int = 0
     smallest: float = 0.06
     largest: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.num_images < 1 or self.seed < 0:
-            raise ValueError(
-                f"num_images >= 1 and seed >= 0 are needed, got {self.num_images} and {self.seed}"
-            )
-        if not 0 < self.smallest < self.largest:
-            raise ValueError(
-                "0 < smallest < largest is needed (radii in sides of the image), got "
-                f"{self.smallest} and {self.largest}"
-            )
 
     def entries(self) -> list[ImageEntry]:
         """Entries named by their number."""

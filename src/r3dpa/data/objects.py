@@ -6,7 +6,7 @@ Letters: P points, K values before the linear step, N = h * w cells, D feature w
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from operator import add
 from pathlib import Path
@@ -194,9 +194,8 @@ def object_library(
     extractor: Extractor,
     projection: Projection,
     grid_size: tuple[int, int] = (8, 64),
-    classes: Sequence[str] | None = None,
 ) -> ObjectLibrary:
-    """Mean feature of each class over the cells of labelled scans.
+    """Mean feature of each class, by id, over the cells of labelled scans.
 
     In a cell, the features of the class's own points are averaged; the means are weighted with the
     share of the cell's points that are of the class::
@@ -208,18 +207,13 @@ def object_library(
 
     Source: R3DPA (ICRA 2026) averages the points of the class in a single scan.
 
-    ``grid_size`` are the rows and columns (h, w) of the cells. The result has the ``classes`` in
-    this order, or by id all that the labelled scans show.
-
-    ``ScanError`` if a scan or its labels cannot be used; ``ValueError`` if a class is unknown,
-    named twice or not shown, the grid does not divide the image, or a feature is not finite.
+    ``grid_size`` are the rows and columns (h, w) of the cells. ``ScanError`` if a scan or its
+    labels cannot be used; ``ValueError`` if no class is shown, or a feature is not finite.
     """
     cell_rows, cell_columns = projection.sensor.cell_size(grid_size)
-    wanted = _wanted(classes)
     lift = getattr(extractor, "lift", torch.nn.Identity())
     # By class: features and directions, weighted; weight; numbers of scans, cells and points.
     found: dict[str, tuple[Any, ...]] = {}
-    shown: set[int] = set()
     for scan in scans:
         whole = torch.from_numpy(read_scan(scan.path, projection.sensor))
         labels = torch.from_numpy(read_labels(scan.path, len(whole))) & 0xFFFF
@@ -228,9 +222,8 @@ def object_library(
         row, column = projection.pixel_of(points)
         cell = row // cell_rows * grid_size[1] + column // cell_columns
         kept = in_range(points, projection.sensor)
-        shown.update(labels[kept].unique().tolist())
         totals = torch.bincount(cell[kept], minlength=grid_size[0] * grid_size[1])
-        for name, number in wanted.items():
+        for name, number in _ID.items():
             own = (kept & (labels == number)).nonzero()[:, 0]
             if len(own) == 0:
                 continue
@@ -247,15 +240,10 @@ def object_library(
             directions = shares @ F.normalize(lifted, dim=1)
             part = shares @ lifted, directions, shares.sum().item(), 1, len(cells), len(own)
             found[name] = tuple(map(add, found[name], part)) if name in found else part
-    missing = [name for name in wanted if name not in found]
-    if not found or (classes is not None and missing):
-        seen = ", ".join(name for number, name in CLASS_NAMES.items() if number in shown)
-        raise ValueError(
-            f"the scans have no labelled point of {', '.join(missing)} within range; they show "
-            f"{seen or 'no class at all'}. Give more scans or other classes"
-        )
+    if not found:
+        raise ValueError("the scans have no labelled point within range: give more scans")
     features, results = [], []
-    for name in (name for name in wanted if name in found):
+    for name in (name for name in _ID if name in found):
         total, directions, weight, num_scans, num_cells, num_points = found[name]
         mean = total / weight
         cosine = (F.normalize(mean, dim=0) @ directions / weight).item()
@@ -268,13 +256,3 @@ def object_library(
         projection_to_dict(projection),
         (grid_size[0], grid_size[1]),
     )
-
-
-def _wanted(classes: Sequence[str] | None) -> dict[str, int]:
-    if classes is None:
-        return _ID
-    if not classes or len(set(classes)) < len(classes):
-        raise ValueError(f"classes must be different names, at least one, got {list(classes)}")
-    if unknown := [name for name in classes if name not in _ID]:
-        raise ValueError(f"there is no class {', '.join(unknown)}; there are {', '.join(_ID)}")
-    return {name: _ID[name] for name in classes}

@@ -17,8 +17,8 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import SimulatedDataModule
-from r3dpa.data.datasets import LidarDataset, PointSample
-from r3dpa.data.feature_grids import FeatureGrids, GridSettings, pooled_grids
+from r3dpa.data.datasets import PointSample
+from r3dpa.data.feature_grids import GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
@@ -104,21 +104,8 @@ class SimulatedImageDataModule(SimulatedDataModule):
             if lacking:
                 self._simulate(sorted(lacking), projection, stores)
 
-    def setup(self, stage: str) -> None:
-        """Open the caches."""
-        train, val, self.projection = self._scans_and_projection()
-        grids, everything = None, sorted(train + val)
-        if self.features_dir is not None and stage != "predict":
-            arguments = self.features_dir, everything, self.projection, self.grid_size
-            grids = FeatureGrids(*arguments, cast(Any, self.extractor))
-        images = self.images
-        self.train_set, self.val_set, self.all_set = (
-            LidarDataset(split, self.projection, self.codec, grids, images=images)
-            for split in (train, val, everything)
-        )
-
     @cached_property
-    def images(self) -> CachedTensors[Any]:
+    def images(self) -> CachedTensors[Any]:  # type: ignore[override] # an attribute there
         """Cached range images ``(H, W)`` in metres."""
         train, val, _ = self._scans_and_projection()
         return CachedTensors(self._store, sorted(train + val))

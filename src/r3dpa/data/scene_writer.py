@@ -20,7 +20,7 @@ from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.data.store import append
 from r3dpa.geometry import points_of
 from r3dpa.geometry.projection import Projection
-from r3dpa.io import atomic_path, delete_unfinished, no_follow, only_writer
+from r3dpa.io import delete_unfinished, no_follow, only_writer, write_text
 
 _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "ply": write_ply}
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
@@ -134,8 +134,7 @@ class SceneWriter:
 
     def finish(self, metadata: dict[str, Any]) -> None:
         """Write ``metadata.json``, which marks the folder as complete."""
-        with atomic_path(self.out / "metadata.json") as temporary:
-            temporary.write_text(json.dumps(metadata, indent=2) + "\n")
+        write_text(self.out / "metadata.json", json.dumps(metadata, indent=2) + "\n")
         self._state.unlink()
 
     def _written_before(self) -> tuple[int, int]:
@@ -226,5 +225,4 @@ class SceneWriter:
 
     def _save_state(self, num_done: int, evaluations: int) -> None:
         state = {"request": self._request, "num_done": num_done, "evaluations": evaluations}
-        with atomic_path(self._state) as temporary:
-            temporary.write_text(json.dumps(state))
+        write_text(self._state, json.dumps(state))

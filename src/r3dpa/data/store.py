@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.io import atomic_path, no_follow, refuse_name
+from r3dpa.io import no_follow, refuse_name, write_text
 
 ItemKey = tuple[str, int, int]
 """Name, size in bytes and time of change (ns) of the file that a row is made from."""
@@ -189,8 +189,8 @@ class StoreWriter:
         self._known = set(store.places())
         settings = store.folder / "settings.json"
         if not settings.exists():
-            with writing(store.what, store.folder), atomic_path(settings) as temporary:
-                temporary.write_text(store.settings)
+            with writing(store.what, store.folder):
+                write_text(settings, store.settings)
 
     def add(self, keys: Sequence[ItemKey], tensors: Tensor) -> None:
         """Append rows ``(B, *shape)`` of those keys that the store lacks, and flush them to disk.

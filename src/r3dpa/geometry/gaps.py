@@ -29,11 +29,7 @@ def check_view(
 ) -> None:
     """Refuse a scan that does not fill the field of view that a model was trained on.
 
-    Args:
-        points: ``(P, 3)`` metres.
-        range_m: ``(H, W)``, range image of the points.
-        projection: Projection of the model.
-        missing: ``(H, W)`` bool, pixels that need not be filled.
+    ``range_m`` ``(H, W)`` is the image of the points; pixels ``missing`` need not be filled.
 
     Raises:
         ValueError: If fewer than half of the rows or three quarters of the columns hold a return,

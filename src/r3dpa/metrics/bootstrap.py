@@ -30,17 +30,13 @@ class Resampling:
         return torch.Generator().manual_seed(self.seed)
 
     def interval(self, statistic: Callable[[Tensor], float], size: int) -> Ends | None:
-        """Interval of a number of ``size`` samples; None without resamples or two samples.
+        """Interval of a function of ``(size,)`` indices; None without resamples or two samples.
 
         The ends are the value minus the quantiles of (resampled - mean of all resampled). The mean
         removes the growth of distances when samples repeat: the interval shows the spread at this
         number of samples, not the bias of few samples. An end may lie below zero.
 
         Source: basic bootstrap (Davison and Hinkley 1997, eq. 5.6) about the mean of the resamples.
-
-        Args:
-            statistic: Of a vector of indices ``(size,)`` int64.
-            size: Number of samples.
         """
         if size < 2 or not self.num_resamples:
             return None

@@ -58,19 +58,6 @@ class SceneMetric(Metric):
         self._empty: dict[str, Tensor] = {}  # rows of the states that are lists of tensors
         self._add_states("count", torch.zeros((), dtype=torch.int64))
 
-    def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """As torchmetrics does it, but an update that fails leaves the state as it was."""
-        states = {name: getattr(self, name) for name in self._defaults}
-        states = {name: v[:] if isinstance(v, list) else v for name, v in states.items()}
-        count = self._update_count
-        try:
-            return super().forward(*args, **kwargs)
-        except Exception:
-            for name, value in states.items():
-                setattr(self, name, value)
-            self._update_count = count
-            raise
-
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distances as rows of a table, with intervals; of this process alone."""
         raise NotImplementedError

@@ -79,11 +79,6 @@ def evaluate(
         skip_bad: Leave out scenes that are empty, hold NaN or have another size, and list them.
         baseline_metrics: Also JSD and MMD as R2DM, R2Flow and LiDM define them.
         resampling: Seed, and cost of the intervals.
-
-    Raises:
-        TooFewScenesError: If there are fewer than two scenes.
-        ValueError: If the reference is not complete or lacks a space, or there are, without
-            ``allow_few``, not more scenes than features; without ``skip_bad``, for a bad scene.
     """
     resampling = resampling or Resampling()
     reference.check(spaces)

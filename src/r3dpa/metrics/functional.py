@@ -267,16 +267,11 @@ def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dic
 
     Source: Kynkäänniemi et al., NeurIPS 2019; Naeem et al., ICML 2020 (strict inequality).
 
-    Args:
-        real: ``(N, F)``.
-        generated: ``(M, F)``.
-        num_neighbors: k, below N and M.
-
     Returns:
-        float64, in this order: ``precision`` ``(M,)``, 1 for a generated sample in a real ball;
-        ``recall`` ``(N,)``, 1 for a real sample in a generated ball; ``density`` ``(M,)``, real
-        balls around a generated sample divided by k; ``coverage`` ``(N,)``, 1 for a real sample
-        whose ball holds a generated one.
+        float64, of N real and M generated samples, in this order: ``precision`` ``(M,)``, 1 for a
+        generated sample in a real ball; ``recall`` ``(N,)``, 1 for a real sample in a generated
+        ball; ``density`` ``(M,)``, real balls around a generated sample divided by k; ``coverage``
+        ``(N,)``, 1 for a real sample whose ball holds a generated one.
     """
     real, generated = checked_pair(real, generated, num_neighbors + 1)
     centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances

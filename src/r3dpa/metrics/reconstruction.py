@@ -12,34 +12,25 @@ _BIN_M = 1e-3  # of the histogram that the median is taken from
 _NUM_BINS = 60_000
 
 
-def flying_pixels(range_m: Tensor, edge_m: float = EDGE_M) -> Tensor:
+def flying_pixels(range_m: Tensor) -> Tensor:
     """Pixels, bool, that lie between their left and right neighbours, far from both.
 
     In a cloud they are rays of points between a near and a far surface, which decoders draw where
-    a scan has an edge.
-
-    Args:
-        range_m: ``(..., H, W)`` metres, -1 without a return; columns wrap around.
-        edge_m: Least distance from either neighbour.
+    a scan has an edge. Images are ``(..., H, W)`` metres, -1 without a return; columns wrap around.
     """
     left, right = range_m.roll(1, -1), range_m.roll(-1, -1)
     near, far = torch.minimum(left, right), torch.maximum(left, right)
-    between = (range_m > near + edge_m) & (range_m < far - edge_m)
+    between = (range_m > near + EDGE_M) & (range_m < far - EDGE_M)
     return between & (near > 0)
 
 
-def edge_pixels(range_m: Tensor, edge_m: float = EDGE_M) -> Tensor:
-    """Pixels with a return, bool, at least one neighbour of which is on another surface.
-
-    Args:
-        range_m: ``(..., H, W)`` metres, -1 without a return; columns wrap around.
-        edge_m: Least difference from the neighbour.
-    """
+def edge_pixels(range_m: Tensor) -> Tensor:
+    """Pixels with a return, bool, at least one neighbour of which is on another surface."""
     seen = range_m > 0
     edges = torch.zeros_like(seen)
     for shift, axis in ((1, -1), (-1, -1), (1, -2), (-1, -2)):
         beside = range_m.roll(shift, axis)
-        apart = seen & (beside > 0) & ((range_m - beside).abs() > edge_m)
+        apart = seen & (beside > 0) & ((range_m - beside).abs() > EDGE_M)
         if axis == -2:  # rows do not wrap around
             apart[..., 0 if shift == 1 else -1, :] = False
         edges |= apart

@@ -19,7 +19,7 @@ from typing import Any, Literal, Self
 
 from tabulate import LATEX_ESCAPE_RULES
 
-from r3dpa.io import atomic_path, text_table
+from r3dpa.io import text_table, write_text
 from r3dpa.metrics.bootstrap import Ends
 
 Direction = Literal["lower", "higher"]
@@ -189,7 +189,7 @@ class Evaluation:
 
     def save(self, path: str | Path) -> None:
         """Writes the evaluation as JSON."""
-        save_text(path, json.dumps(asdict(self), indent=2, ensure_ascii=False) + "\n")
+        write_text(path, json.dumps(asdict(self), indent=2, ensure_ascii=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -335,14 +335,8 @@ def save_reports(
     evaluation.save(out / "evaluation.json")
     save_csv((evaluation,), out / "metrics.csv")
     table = _comparison(evaluation, split, earlier)
-    save_text(out / "table.md", str(table))
-    save_text(out / "table.tex", table.latex())
-
-
-def save_text(path: str | Path, text: str) -> None:
-    """Writes a text file at once."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(out / "table.md", str(table))
+    write_text(out / "table.tex", table.latex())
 
 
 def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
@@ -356,7 +350,7 @@ def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
             ends = row.interval or (None, None)
             values = [getattr(row, key) for key in keys]
             writer.writerow([e.label, e.published, row.name, *ends, *values])
-    save_text(path, text.getvalue())
+    write_text(path, text.getvalue())
 
 
 def _comparison(

@@ -125,12 +125,7 @@ BINS: dict[str, Bins] = {
 
 
 def scan_statistics(points: NDArray[np.float32]) -> ScanStatistics:
-    """Counts of one scan.
-
-    Args:
-        points: ``(P, 4)`` x, y, z in metres, x forward, z up, and intensity in [0, 1], in storage
-            order.
-    """
+    """Counts of one scan ``(P, 4)`` x, y, z (metres), intensity in [0, 1], in storage order."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must be (P, 4) x, y, z, intensity, got shape {points.shape}")
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)

@@ -104,11 +104,8 @@ class VelocityNetwork(nn.Module, ABC):
         """Velocity ``(B, C, h, w)`` from precomputed modulations.
 
         All samples of a schedule share their times, and much of a network's weights may only turn
-        times into modulations, so the rows of a whole schedule are computed once.
-
-        Args:
-            latents: ``(B, C, h, w)`` noisy normalised latents.
-            modulations: ``(B, M)`` rows of :meth:`modulations`, or ``(1, M)`` for all samples.
+        times into modulations, so the rows ``(B, M)`` or ``(1, M)`` of :meth:`modulations` of a
+        whole schedule are computed once.
         """
         return self._finish(self._begin(latents, modulations), modulations)
 

@@ -102,11 +102,8 @@ class GeometricFeatures(nn.Module):
 
         Values 3 and 4 turn with the ray: rotating the scan about z rotates the features with it.
 
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity.
-
-        Returns:
-            ``(P, 9)`` float32. A point with fewer than two neighbours has shape and normal 0.
+        Returns ``(P, 9)`` float32 of points ``(P, 4)`` x, y, z in metres, intensity. A point with
+        fewer than two neighbours has shape and normal 0.
         """
         xyz = points[:, :3].float()
         radius = torch.linalg.vector_norm(xyz, dim=1)
@@ -125,19 +122,11 @@ class GeometricFeatures(nn.Module):
     prepare = descriptors
 
     def forward(self, points: Tensor) -> Tensor:
-        """Features ``(P, dim)`` float32 of unit norm.
-
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity 0..1.
-        """
+        """Features ``(P, dim)`` float32 of unit norm of points ``(P, 4)``."""
         return self.lift(self.point_features([self.prepare(points)])[0])
 
     def point_features(self, prepared: Sequence[Tensor]) -> list[Tensor]:
-        """Kernel features ``phi`` ``(P_i, K)`` float32 of each scan, before the linear lift.
-
-        Args:
-            prepared: ``(P_i, 9)`` of each scan, as ``prepare`` returns them.
-        """
+        """Kernel features ``phi`` ``(P_i, K)`` float32 of prepared scans, before the lift."""
         values = ((own.to(self.basis.device) - self.centres) / self.spreads for own in prepared)
         phases = (own @ self.frequencies for own in values)
         root = math.sqrt(self.frequencies.shape[1])

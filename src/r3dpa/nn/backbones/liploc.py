@@ -14,7 +14,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.nn.backbones.official import load_strictly, read_state_dict, renamed
+from r3dpa.nn.backbones.official import (
+    FrozenNetwork,
+    load_strictly,
+    naming,
+    read_state_dict,
+    renamed,
+)
 from r3dpa.nn.backbones.vit import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -30,7 +36,7 @@ _ENCODER = "encoder_lidar.model."
 _NAMES = {"embedding.": "patch_embed.proj.", "encoder.": "", "norm.": "fc_norm."}
 
 
-class LIPLoc(nn.Module):
+class LIPLoc(FrozenNetwork):
     """Features of range images for FLD: mean of the patch tokens of a ViT, normalised.
 
     Range images become grey pictures as in the published numbers, see :func:`wrapped_picture`.
@@ -68,13 +74,8 @@ class LIPLoc(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path, *, num_heads: int | None = None) -> Self:
-        """Network with the weights and sizes of ``encoder_lidar`` in an official checkpoint.
-
-        Args:
-            path: ``model.ckpt`` of the release.
-            num_heads: Attention heads. Default: those of the released ViT of this width.
-        """
-        try:
+        """Network with the weights and sizes of ``encoder_lidar`` in an official ``model.ckpt``."""
+        with naming(path):
             weights = {
                 name.removeprefix(_ENCODER): value
                 for name, value in read_state_dict(Path(path)).items()
@@ -84,13 +85,7 @@ class LIPLoc(nn.Module):
             heads = usual_heads(sizes["width"]) if num_heads is None else num_heads
             network = cls(**sizes, num_heads=heads)
             load_strictly(network, weights, renamed(_NAMES))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return network
-
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode."""
-        return super().train(False)
 
     def forward(self, range_m: Tensor) -> Tensor:
         """Features ``(B, dim)`` of range images ``(B, H, W)`` in metres, -1 without a return."""
@@ -105,10 +100,6 @@ def wrapped_picture(range_m: Tensor, size: tuple[int, int] = (224, 224)) -> Tens
     three colours, and normalised with the constants of ImageNet.
 
     Source: ``createRangeImage`` and ``Model.preprocess`` of valeoai/R3DPA.
-
-    Args:
-        range_m: ``(B, H, W)`` metres, -1 without a return, all finite.
-        size: Rows and columns of the pictures.
     """
     grey = wrapped_grey_levels(range_m).float()[:, None] / 255
     grey = F.interpolate(grey, size, mode="bilinear", align_corners=False, antialias=True)

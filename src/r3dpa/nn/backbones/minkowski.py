@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.official import load_strictly, naming, read_released
 from r3dpa.nn.backbones.sparse import KernelMap, SparseConv, Voxels, kernel_offsets, voxel_keys
 from r3dpa.nn.layers import at_least_float32, named_layers
 
@@ -124,28 +124,20 @@ class MinkowskiNet(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> Self:
-        """Network with the weights of an official checkpoint, which determine its widths.
+        """Network with the weights of an official ``model.ckpt``, which determine its widths.
 
-        Args:
-            path: ``model.ckpt`` of the release, a state dict below ``state_dict`` or a bare one.
-                If the network is one module of several, its prefix is removed and the other
-                weights are ignored.
+        If the network is one module of several, the weights of the others are ignored.
         """
-        path = Path(path)
-        try:
-            weights = _network_weights(read_released(path, _RELEASED))
+        with naming(path):
+            weights = _network_weights(read_released(Path(path), _RELEASED))
             network = cls(*_sizes(weights))
             load_strictly(network, weights, official_name)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return network
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
         """Features ``(P, F)`` before the head, in the order of the input.
 
-        Args:
-            coordinates: ``(P, 4)`` integers x, y, z, batch, each voxel once.
-            features: ``(P, C)``.
+        Coordinates are ``(P, 4)`` integers x, y, z, batch, each voxel once; features ``(P, C)``.
         """
         voxels, rows = Voxels.from_coordinates(coordinates)
         if len(voxels) != len(coordinates):
@@ -178,15 +170,10 @@ class MinkowskiNet(nn.Module):
 
 
 class Points(NamedTuple):
-    """Points between the voxels of B clouds.
+    """Points between the voxels of B clouds."""
 
-    Attributes:
-        xyz: ``(P, 3)`` float32 in units of the finest voxels.
-        batch: ``(P,)`` int64 cloud of each point.
-    """
-
-    xyz: Tensor
-    batch: Tensor
+    xyz: Tensor  #: ``(P, 3)`` float32 in units of the finest voxels
+    batch: Tensor  #: ``(P,)`` int64 cloud of each point
 
     def voxel_of(self, stride: int) -> Tensor:
         """``(P, 4)`` int64 lowest corner of the voxel of this stride around each point."""
@@ -264,12 +251,7 @@ class SPVCNN(MinkowskiNet):
         )
 
     def forward(self, coordinates: Tensor, features: Tensor) -> Tensor:
-        """Features ``(P, F)`` before the head, in the order of the input.
-
-        Args:
-            coordinates: ``(P, 4)`` integers x, y, z, batch; rows of one voxel are averaged.
-            features: ``(P, C)``.
-        """
+        """As of :class:`MinkowskiNet`, but rows of one voxel are averaged."""
         points = self._points(coordinates)
         voxels, _ = Voxels.from_coordinates(points.voxel_of(1))
         stem = self._stem(to_voxels(features, points, voxels), voxels)

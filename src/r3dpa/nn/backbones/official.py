@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,23 @@ from torch import Tensor, nn
 from r3dpa.io import UNPICKLING_ERRORS
 
 _MODEL = "the model.ckpt of the released weights"
+
+
+class FrozenNetwork(nn.Module):
+    """Network that stays in evaluation mode: batch statistics would change its features."""
+
+    def train(self, mode: bool = True) -> Self:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Adds the file to a ``ValueError`` of the block."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def read_released(path: Path, released: str = _MODEL) -> Any:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +20,13 @@ from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 from r3dpa.nn.backbones.geometric import GeometricFeatures, random_basis
-from r3dpa.nn.backbones.official import load_strictly, read_released, renamed
+from r3dpa.nn.backbones.official import (
+    FrozenNetwork,
+    load_strictly,
+    naming,
+    read_released,
+    renamed,
+)
 from r3dpa.nn.backbones.voxels import (
     PointCloudBatch,
     PreparedScan,
@@ -55,7 +61,7 @@ _SHIPPED = Path(str(files("r3dpa.nn.backbones"))) / "waffleiron_s.safetensors"
 _ABOUT = "waffleiron"  # metadata key of that file: sizes of the network, grid
 
 
-class TokenFeatures(nn.Module):
+class TokenFeatures(FrozenNetwork):
     """Frozen feature extractor: tokens of a WaffleIron on the points of a scan, of unit norm.
 
     A point has the token of the nearest point that the network saw, so points beyond the field of
@@ -88,27 +94,14 @@ class TokenFeatures(nn.Module):
         self.settings: dict[str, Any] = {"weights": sha256(network), "version": 1}
         self.eval()
 
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: batch statistics would change the features."""
-        return super().train(False)
-
     def forward(self, points: Tensor) -> Tensor:
-        """Features ``(P, dim)`` of unit norm.
-
-        Args:
-            points: ``(P, 4)`` x, y, z in metres, intensity 0..1, all finite.
-        """
+        """Features ``(P, dim)`` of unit norm of points ``(P, 4)``, finite."""
         return self.point_features([self.prepare(points)])[0]
 
     def point_features(self, prepared: Sequence[PreparedScan]) -> list[Tensor]:
-        """Features of unit norm, of all scans in one pass of the network.
+        """Features ``(P_i, F)`` of unit norm of prepared scans, in one pass of the network.
 
-        Args:
-            prepared: Results of ``prepare``, at least one.
-
-        Returns:
-            ``(P_i, F)`` float32 of each scan on the device of the network; zeros where no point
-            of the scan lies in the field of view.
+        They are on its device; zeros where no point of a scan lies in the field of view.
         """
         device = self.network.embedding.merge.weight.device
         counts = [len(scan.features) for scan in prepared]
@@ -138,19 +131,12 @@ class ScaLR(TokenFeatures):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path, grid: ScanGrid | None = None) -> ScaLR:
-        """Extractor with the weights of a ScaLR checkpoint, which determines width and depth.
-
-        Args:
-            path: ``ckpt_last.pth`` of the release.
-            grid: Preparation of scans, as in its training. Default: that of the release.
-        """
-        path, grid = Path(path), grid or ScanGrid()
-        try:
-            weights = _scalr_weights(read_released(path, _RELEASED))
+        """Extractor with the weights of ``ckpt_last.pth``, which determine width and depth."""
+        grid = grid or ScanGrid()
+        with naming(path):
+            weights = _scalr_weights(read_released(Path(path), _RELEASED))
             network = _network_like(weights, grid)
             load_strictly(network, weights, official_name)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return cls(network, grid)
 
 

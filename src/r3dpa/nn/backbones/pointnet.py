@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.official import FrozenNetwork, load_strictly, naming, read_released
 
 #: Metres that the network reads as 1.
 POINTS_SCALE_M = 80.0
@@ -58,7 +58,7 @@ class _Features(_PointLayers):
         return self.pooled(self.stn(points).transpose(1, 2) @ points)
 
 
-class PointNet(nn.Module):
+class PointNet(FrozenNetwork):
     """PointNet for ShapeNet; always in evaluation mode.
 
     Source: Qi et al. (CVPR 2017), with the weights of SpareNet that LiDARGen and R2DM use.
@@ -80,15 +80,9 @@ class PointNet(nn.Module):
     def from_checkpoint(cls, path: str | Path) -> Self:
         """Network of SpareNet's ``cls_model_39.pth``; a ``ValueError`` names the file."""
         network = cls()
-        try:
+        with naming(path):
             load_strictly(network, read_released(Path(path), "cls_model_39.pth"), lambda key: key)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return network
-
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: batch statistics would change the features."""
-        return super().train(False)
 
     def forward(self, points: Tensor) -> Tensor:
         """All four last layers ``(B, dim)`` of points ``(B, 3, P)`` in units of 80 m.

@@ -19,7 +19,7 @@ from einops import reduce
 from torch import Tensor, nn
 
 from r3dpa.io import UNPICKLING_ERRORS, first_line
-from r3dpa.nn.backbones.official import load_strictly, read_released
+from r3dpa.nn.backbones.official import FrozenNetwork, load_strictly, read_released
 
 _BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}
 _WIDTH = 32
@@ -32,7 +32,7 @@ _PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "arch_cfg.yam
 _RELEASED = "the .tar.gz of the release, or the folder of its files"
 
 
-class RangeNet(nn.Module):
+class RangeNet(FrozenNetwork):
     """RangeNet++ with zero padding on all sides; always in evaluation mode.
 
     Columns are halved five times, rows never. Weights have the names that R2Flow gives them.
@@ -114,10 +114,6 @@ class RangeNet(nn.Module):
         }
         weights = {key: value for part in parts.values() for key, value in part.items()}
         return cls.from_weights(weights, **constants)
-
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: batch statistics would change the features."""
-        return super().train(False)
 
     def normalise(self, image: Tensor) -> Tensor:
         """Image ``(B, C, H, W)`` as R2Flow feeds it: standardised, 0 where the range is not > 0."""

@@ -15,7 +15,13 @@ from einops import rearrange, reduce
 from torch import Tensor, nn
 
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, unproject
-from r3dpa.nn.backbones.official import load_strictly, read_state_dict, renamed
+from r3dpa.nn.backbones.official import (
+    FrozenNetwork,
+    load_strictly,
+    naming,
+    read_state_dict,
+    renamed,
+)
 from r3dpa.nn.backbones.vit import TransformerTrunk, trunk_depth, usual_heads
 
 _NORM_EPS = 1e-5
@@ -40,7 +46,7 @@ _CLASSIFIER = "rangevit.kpclassifier."  # works on points, behind the features
 Size = tuple[int, int]
 
 
-class RangeViT(nn.Module):
+class RangeViT(FrozenNetwork):
     """Features of range images for FRID: decoder channels averaged over bands of rows.
 
     Always in evaluation mode. The defaults are the sizes of the released networks: ``in_channels``
@@ -122,15 +128,11 @@ class RangeViT(nn.Module):
         num_heads: int | None = None,
         **sizes: Any,
     ) -> Self:
-        """Network with the weights of an official checkpoint, which determine most sizes.
+        """Network with the weights of an official ``model.ckpt``, which determine most sizes.
 
-        Args:
-            path: ``model.ckpt`` of the release.
-            sensor: Image size, field of view and range limits. Default: those of R3DPA.
-            num_heads: Attention heads. Default: those of the released ViT of this width.
-            **sizes: ``trained_size`` and ``patch_size``, if not those of the release.
+        Others are those of the release, unless ``num_heads`` or ``sizes`` give them.
         """
-        try:
+        with naming(path):
             weights = read_state_dict(Path(path))
             stem_channels, in_channels = _shape(weights, f"{_STEM}conv_block.0.conv1.weight")[:2]
             width, skip_channels = _shape(weights, f"{_STEM}proj_block.1.weight")[:2]
@@ -146,20 +148,13 @@ class RangeViT(nn.Module):
                 **sizes,
             )
             load_official(network, weights)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return network
-
-    def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: batch statistics would change the features."""
-        return super().train(False)
 
     def forward(self, range_m: Tensor, intensity: Tensor | None = None) -> Tensor:
         """Features ``(B, dim)``: for each channel the means of bands of rows, from the top.
 
-        Args:
-            range_m: ``(B, H, W)`` metres, ``EMPTY_RANGE_M`` without a return.
-            intensity: ``(B, H, W)`` in [0, 1]; read with ``in_channels`` 5 only.
+        Ranges ``(B, H, W)`` are metres, ``EMPTY_RANGE_M`` without a return; the intensity, in
+        [0, 1], is read with ``in_channels`` 5 only.
         """
         features = self.feature_map(range_m, intensity)
         return reduce(features, "B C (band row) W -> B (C band)", "mean", row=self.band_rows)
@@ -192,20 +187,12 @@ class RangeViT(nn.Module):
 
 
 def range_channels(range_m: Tensor, sensor: LidarSensor, intensity: Tensor | None = None) -> Tensor:
-    """Input of RangeViT before normalisation: range, x, y, z in metres (and intensity).
+    """Input of RangeViT ``(B, 4 or 5, H, W)``: range, x, y, z in metres (and intensity).
 
     The point of a pixel lies on the ray through its upper left corner, as in the official training.
     Pixels not strictly inside the range limits have x = y = z = -1; their range is unchanged.
 
     Source: ``preprocess_range`` and ``range2xyz`` of valeoai/R3DPA.
-
-    Args:
-        range_m: ``(B, H, W)`` metres, ``EMPTY_RANGE_M`` without a return.
-        sensor: Image size, field of view and range limits.
-        intensity: ``(B, H, W)`` in [0, 1].
-
-    Returns:
-        ``(B, 4, H, W)`` float32, with intensity ``(B, 5, H, W)``.
     """
     range_m = range_m.float()
     points = unproject(range_m, SphericalProjection(sensor), corner=True)

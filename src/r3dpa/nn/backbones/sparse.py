@@ -89,11 +89,7 @@ class Voxels:
 
     @classmethod
     def from_coordinates(cls, coordinates: Tensor) -> tuple[Voxels, Tensor]:
-        """Voxels of stride 1, and the voxel ``(P,)`` int64 of each row of coordinates.
-
-        Args:
-            coordinates: ``(P, 4)`` integers x, y, z, batch, in any order; rows may repeat.
-        """
+        """Voxels of stride 1 of rows ``(P, 4)`` x, y, z, batch, and the voxel ``(P,)`` of each."""
         keys, rows = torch.unique(voxel_keys(coordinates), return_inverse=True)
         return cls(keys), rows
 
@@ -172,12 +168,7 @@ class Voxels:
 
 
 def voxel_keys(coordinates: Tensor) -> Tensor:
-    """Keys ``(P,)`` int64 of voxels, in the order of (batch, x, y, z).
-
-    Args:
-        coordinates: ``(P, 4)`` integers x, y, z in ``[-MAX_COORDINATE, MAX_COORDINATE)`` and batch
-            in ``[0, MAX_CLOUDS)``; other keys would collide.
-    """
+    """Keys ``(P,)`` int64 of voxels ``(P, 4)`` x, y, z, batch, in the order of batch, x, y, z."""
     coordinates = coordinates.long()
     xyz, batch = coordinates[:, :3], coordinates[:, 3]
     outside = (xyz < -MAX_COORDINATE) | (xyz >= MAX_COORDINATE)
@@ -239,11 +230,7 @@ def voxelize(
 
         voxel = round(point / voxel_m), minus its minimum over the points
 
-    Args:
-        points: ``(P, 3)`` x, y, z in metres, finite; further columns are ignored.
-        voxel_m: Edge of a voxel in metres.
-        range_min_m: Points nearer than this are dropped.
-        range_max_m: Points farther than this are dropped.
+    Points ``(P, 3 or more)`` in metres beyond the range limits are dropped.
 
     Returns:
         Voxels ``(N, 3)`` int64 from 0, and inputs ``(N, 4)`` float32: x, y, z of the point of
@@ -274,14 +261,8 @@ def pool_voxels(
     Rings are distances in space with borders at 0, 7.25, 10.5, ..., 56 m; voxels beyond are left
     out.
 
-    Args:
-        features: ``(N, F)``.
-        coordinates: ``(N, 4)`` x, y, z in voxels, batch.
-        num_clouds: B; a cloud without voxels gives zeros.
-        voxel_m: Edge of a voxel in metres.
-
-    Returns:
-        ``(B, 16 * F)`` at least float32, ring after ring; zeros where a ring is empty.
+    Features are ``(N, F)`` and coordinates ``(N, 4)`` x, y, z in voxels, batch. Returns
+    ``(B, 16 * F)`` at least float32, ring after ring; zeros where a ring is empty.
     """
     features = at_least_float32(features)
     # In float64 the mean of whole numbers is exact: it does not depend on the order of the voxels.

@@ -165,11 +165,9 @@ class DINOv2(nn.Module):
             self._load(Path(weights))
 
     def forward(self, image: Tensor, grid_size: tuple[int, int]) -> Tensor:
-        """Features ``(B, N, D)`` of the cells of a grid, row-major.
+        """Features ``(B, N, D)`` of the cells of a grid ``(h, w)``, row-major.
 
-        Args:
-            image: ``(B, 3, S, S)`` red, green, blue in [-1, 1]; resized to 14 pixels a cell.
-            grid_size: Rows and columns ``(h, w)`` of the cells.
+        Images are ``(B, 3, S, S)`` red, green, blue in [-1, 1], resized to 14 pixels a cell.
         """
         sides = [_PATCH * cells for cells in grid_size]
         image = ((image + 1) / 2 - self.mean) / self.std

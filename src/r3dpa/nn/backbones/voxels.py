@@ -128,9 +128,7 @@ def prepare_scan(points: np.ndarray | Tensor, grid: ScanGrid | None = None) -> P
     Source: Puy et al., "Using a Waffle Iron for Automotive Point Cloud Semantic Segmentation"
     (ICCV 2023); settings of ScaLR (Puy et al., CVPR 2024).
 
-    Args:
-        points: ``(P, 4)`` x, y, z in metres, intensity 0..1, finite.
-        grid: Settings. Default: those of ScaLR.
+    Points are ``(P, 4)`` x, y, z in metres, intensity 0..1, finite.
     """
     grid = grid or ScanGrid()
     if isinstance(points, Tensor):

@@ -59,13 +59,10 @@ class WaffleIron(nn.Module):
         return self.mix(self.embedding(batch.features, batch.neighbors), batch)
 
     def mix(self, tokens: Tensor, batch: PointCloudBatch, visible: Tensor | None = None) -> Tensor:
-        """Tokens ``(N, F)`` of the last layer.
+        """Tokens ``(N, F)`` of the last layer, from those of the first.
 
-        Args:
-            tokens: ``(N, F)`` input of the first layer.
-            batch: Their cells.
-            visible: ``(N,)`` bool: the other points read the planes but write nothing there, so
-                that no point depends on them. Default: all.
+        Points that are not ``visible`` ``(N,)`` read the planes but write nothing there, so that no
+        point depends on them.
         """
         planes = self._planes(batch, visible)
         for layer, (spatial, channel) in enumerate(zip(self.spatial, self.channel, strict=True)):
