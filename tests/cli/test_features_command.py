@@ -140,7 +140,10 @@ class TestForms:
         (["--data", "no/folder"], "--data no/folder: is no folder of scans and no data YAML"),
         (["--data", "{scans}"], "there is no extractor: give --extractor, one of scalr, "),
         (["--data", "{scans}", "--ckpt", "no.pth"], "no.pth: no such file; give ckpt_last.pth"),
-        (["--data", "{yaml}", "--trainer.precision", "16-true"], "trainer.precision must be one"),
+        (
+            ["--data", "{yaml}", "--trainer.precision", "16-true"],
+            "precision 16-true is not",
+        ),
     ],
 )
 def test_errors_name_what_is_wrong(words, message, data, tmp_path, monkeypatch):

@@ -27,10 +27,12 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from r3dpa.io import sha256_of
 from r3dpa.metrics.results import PUBLISHED_SCALES
 
 _NAME = re.compile(r"{(\w+)}")
 _WEIGHTS = re.compile(r'"([^"{]+\.(?:pt|pth|ckpt|safetensors))"')
+_digest = cache(sha256_of)  # tables share weights
 _NOT_TRAINED = ("scorer", "run_dir", "ckpt_path")  # keys that do not change a training
 
 
@@ -198,12 +200,6 @@ def _table(folder: Path, scale: _Scale, seeds: Sequence[int]) -> Table:
         if len(pair) != 2 or not rows.keys() >= set(pair):
             raise ValueError(f"{path}: {name}: {pair} is no pair of {sorted(rows)}")
     return Table(folder.name, about["caption"], list(rows.values()), orders)
-
-
-@cache
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(path: Path, needed: Sequence[str], more: Sequence[str]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import pickle
 import re
@@ -26,20 +25,23 @@ from r3dpa.checkpoints.baselines import READERS
 from r3dpa.checkpoints.lidm import from_lidm, is_lidm
 from r3dpa.checkpoints.networks import FACTS, Checkpoint, NetworkState, path_of
 from r3dpa.checkpoints.official import OURS, from_official, is_official, statistics_of, to_official
-from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, source_commit, text_table
+from r3dpa.io import (
+    UNPICKLING_ERRORS,
+    atomic_path,
+    first_line,
+    sha256_of,
+    source_commit,
+    text_table,
+)
 from r3dpa.nn.image_vae import ImageVAE
 from r3dpa.pretrained import weights_file
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
-_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder")
+_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder", "network", "first_stage")
 _LIGHTNING = {name: (f"{name}.", name) for name in _PLAIN}
 _LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
-_LIGHTNING |= {
-    "network": ("network.", "network"),
-    "ema_network": ("ema.network.", "network"),
-    "first_stage": ("first_stage.", "first_stage"),
-}
+_LIGHTNING |= {"ema_network": ("ema.network.", "network")}
 # A class that Lightning 1.4 writes as a key, in the checkpoints of LiDM; read as ``object``.
 _OLD_CALLBACK = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")
@@ -117,7 +119,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, *, overwrite: bool
     about["left_out"] = dict(checkpoint.left_out)
     with atomic_path(path) as weights_file, atomic_path(description) as description_file:
         save_file(weights, weights_file)
-        about["sha256"] = _sha256(weights_file)
+        about["sha256"] = sha256_of(weights_file)
         description_file.write_text(yaml.safe_dump(about, sort_keys=False))
     return path
 
@@ -271,7 +273,7 @@ def _from_ours(path: Path) -> Checkpoint:
         kept = {key: about[key] for key in ("step", "official_args", "left_out")}
         facts = {key: about[key] for key in FACTS if key in about}  # older files have fewer
         configs, sha256 = dict(about["networks"]), about["sha256"]
-    if sha256 != _sha256(path):
+    if sha256 != sha256_of(path):
         raise ValueError(
             f"the file is not the one that {description.name} was written for (SHA-256 differs): "
             "it is incomplete, was changed, or belongs to another checkpoint"
@@ -351,8 +353,3 @@ def _from_diffusers(path: Path) -> Checkpoint:
 
 def _count(keys: Iterable[str], pattern: str) -> int:
     return len({found[1] for key in keys if (found := re.match(pattern, key))})
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -16,10 +16,9 @@ from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
 from r3dpa.geometry import Projection
+from r3dpa.modules.checks import check_trainer
 from r3dpa.modules.feature_extraction import FeatureExtraction
 from r3dpa.nn.backbones.point_features import SOURCES, feature_source
-
-_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")  # others would convert the prepared scans too
 
 
 def features(args: list[str]) -> None:
@@ -33,10 +32,7 @@ def features(args: list[str]) -> None:
         config.data.init_args.features_dir = str(config.out)
     objects = parser.instantiate(config)
     trainer = Trainer(**objects.trainer, logger=False, enable_checkpointing=False)
-    if trainer.precision not in _PRECISIONS:
-        raise ValueError(
-            f"trainer.precision must be one of {', '.join(_PRECISIONS)}, got {trainer.precision}"
-        )
+    check_trainer(trainer)
     data: LidarDataModule = objects.data
     if data.extractor is None or data.features_dir is None:
         raise ValueError(

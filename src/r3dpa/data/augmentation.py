@@ -25,13 +25,9 @@ _STREAM, _WEATHER_STREAM = 1, 2
 
 @dataclass(frozen=True)
 class View:
-    """A scan mirrored or not, then rotated by whole grid columns.
+    """A scan mirrored or not, then rotated by ``columns`` of the ``grid_columns`` w of its grid.
 
-    Args:
-        columns: Grid columns, each ``2 * pi / grid_columns``, by which everything moves to the
-            right, that is clockwise seen from above.
-        mirrored: Swap left and right, before the rotation.
-        grid_columns: Columns w of the feature grid.
+    Everything moves to the right, that is clockwise seen from above.
     """
 
     columns: int

@@ -42,23 +42,14 @@ class LidarBatch(TypedDict):
 
 @dataclass(eq=False, repr=False)
 class LidarDataset(Dataset[dict[str, Any]]):
-    """Range image and mask, or cached posterior, and feature grid of each scan; nothing random.
-
-    Args:
-        scans: The scans, in the order of the indices.
-        projection: Points to pixels; its sensor sets the image size and range limits.
-        codec: Metres to [-1, 1].
-        grids: Feature grids, if any.
-        posteriors: Moments ``(2C, h, w)`` of a frozen VAE, which replace image and mask.
-        images: Cached range images ``(H, W)`` in metres, which the scans are read from.
-    """
+    """Range image and mask, or cached posterior, and feature grid of each scan; nothing random."""
 
     scans: list[Scan]
     projection: Projection
     codec: RangeCodec
     grids: CachedTensors[Scan] | None = None
-    posteriors: CachedTensors[Scan] | None = None
-    images: CachedTensors[Any] | None = None
+    posteriors: CachedTensors[Scan] | None = None  #: ``(2C, h, w)``, in place of image and mask
+    images: CachedTensors[Any] | None = None  #: ``(H, W)`` metres, which the scans are read from
 
     def __len__(self) -> int:
         return len(self.scans)

@@ -72,22 +72,13 @@ Item = TypeVar("Item", bound=Cacheable)
 
 @dataclass(frozen=True)
 class Store:
-    """Store of one tensor of ``shape`` per item.
-
-    Args:
-        folder: Its folder.
-        settings: All that the tensors depend on beside the item, as JSON text.
-        shape: Shape of each tensor.
-        dtype: ``"float16"`` clamps larger values.
-        what: Name of the rows, for messages.
-        remedy: How rows are made again, for messages.
-    """
+    """Store of one tensor of ``shape`` per item."""
 
     folder: Path
-    settings: str
+    settings: str  #: all that the tensors depend on beside the item, as JSON text
     shape: tuple[int, ...]
-    dtype: Literal["float32", "float16"] = "float32"
-    what: str = "cached tensors"
+    dtype: Literal["float32", "float16"] = "float32"  #: float16 clamps larger values
+    what: str = "cached tensors"  #: name of the rows, and how they are made again, for messages
     remedy: str = "by starting the run again"
 
     @property

@@ -61,29 +61,19 @@ _LATEX: dict[Mark, str] = {
 class MetricResult:
     """One number of an evaluation.
 
-    Args:
-        name: Of the metric, as in the head of a column.
-        value: In ``unit``; None if unknown, with the reason in ``note``.
-        interval: Ends of the 95 % interval: the spread of the value over sets of this many scenes.
-            Not corrected for the bias of few scenes, except for extrapolated values.
-        floor: Value of real scans against real scans.
-        direction: Which values are better.
-        unit: Of value, interval and floor; empty for a plain number.
-        scale: Power of ten of the printed column.
-        num_samples: Generated scans that were used, None if unknown.
-        num_references: Real scans that were used, None if unknown.
-        note: Remark for the reader; may be empty.
+    The 95 % interval is the spread of the value over sets of this many scenes, not corrected for
+    the bias of few scenes, except for extrapolated values.
     """
 
-    name: str
-    value: float | None
+    name: str  #: of the metric, as in the head of a column
+    value: float | None  #: in ``unit``; None if unknown, with the reason in ``note``
     interval: Ends | None = None
-    floor: float | None = None
-    direction: Direction = "lower"
+    floor: float | None = None  #: value of real scans against real scans
+    direction: Direction = "lower"  #: which values are better
     unit: str = ""
-    scale: int = 0
-    num_samples: int | None = None
-    num_references: int | None = None
+    scale: int = 0  #: power of ten of the printed column
+    num_samples: int | None = None  #: generated scans that were used
+    num_references: int | None = None  #: real scans that were used
     note: str = ""
 
     def __post_init__(self) -> None:

@@ -69,17 +69,11 @@ PROTOCOLS = {protocol.name: protocol for protocol in (DEFAULT, PUBLISHED)}
 class EvaluationScene(NamedTuple):
     """A scene as a file or a generator gives it, or as :func:`through_sensor` makes it.
 
-    Letters: P points, H x W range image.
-
-    Args:
-        name: Unique within its set; ``drive/frame`` for a scan of a recording.
-        points: ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and, if known, intensity; None beside a
-            range image.
-        range_m: ``(H, W)`` metres, not above 0 without a return; None beside points.
-        intensity: ``(H, W)`` beside ``range_m``, None if unknown.
+    Either points ``(P, 3)`` or ``(P, 4)`` x, y, z in metres and, if known, intensity, or a range
+    image ``(H, W)`` in metres, not above 0 without a return, and its intensity, if known.
     """
 
-    name: str
+    name: str  #: unique within its set; ``drive/frame`` for a scan of a recording
     points: Tensor | None
     range_m: Tensor | None = None
     intensity: Tensor | None = None

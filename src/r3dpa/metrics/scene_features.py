@@ -55,19 +55,12 @@ _INTENSITY = CENTRES[-1]
 
 @dataclass(frozen=True)
 class SceneFeatures:
-    """A frozen network as a map from scenes to vectors.
+    """A frozen network as a map from scenes to vectors."""
 
-    Args:
-        name: One of :data:`SPACES`.
-        dim: Width F of the features.
-        card: ``backbone``, ``layer``, ``weights`` (SHA-256 or None) and ``preprocessing``.
-        extract: Features ``(B, F)`` of scenes that :func:`through_sensor` made.
-    """
-
-    name: str
-    dim: int
-    card: dict[str, Any]
-    extract: Callable[[Sequence[EvaluationScene]], Tensor]
+    name: str  #: one of :data:`SPACES`
+    dim: int  #: width F of the features
+    card: dict[str, Any]  #: ``backbone``, ``layer``, ``weights`` (SHA-256), ``preprocessing``
+    extract: Callable[[Sequence[EvaluationScene]], Tensor]  #: ``(B, F)``, of :func:`through_sensor`
 
     @property
     def label(self) -> str:

@@ -17,8 +17,8 @@ def check_trainer(trainer: Any) -> None:
     """Refuses precisions that the stages cannot train with."""
     if trainer.precision not in _PRECISIONS:
         raise ValueError(
-            f"trainer.precision {trainer.precision} is not supported, as weights, averages and "
-            f"latent statistics are float32: give one of {', '.join(_PRECISIONS)}"
+            f"trainer.precision {trainer.precision} is not supported, as weights, statistics and "
+            f"prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
         )
 
 

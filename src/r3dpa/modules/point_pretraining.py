@@ -19,13 +19,14 @@ from r3dpa.nn.backbones.point_features import save_weights
 from r3dpa.nn.backbones.voxels import NUM_TARGETS, MaskedScan, Masking
 
 _SCANS_TO_QUANTISE = 16
+_NUM_BINS = 8  # quantiles of each descriptor
 
 
 class PointPretraining(LightningModule):
     """WaffleIron trained to predict the geometry of whole scans from parts of them.
 
     Blocks of rays are hidden; the hidden points are known by their cells alone. From the token of
-    every point, hidden or not, a linear layer predicts in which of ``num_bins`` quantiles each
+    every point, hidden or not, a linear layer predicts in which of 8 quantiles each
     descriptor of the point lies, see :meth:`r3dpa.nn.backbones.Masking.describe`; the loss is the
     mean cross-entropy.
 
@@ -38,7 +39,6 @@ class PointPretraining(LightningModule):
             ``max_steps`` of the trainer.
         weight_decay: Of AdamW, on matrices only.
         warmup: Steps.
-        num_bins: Quantiles of each descriptor.
     """
 
     edges: Tensor
@@ -49,15 +49,14 @@ class PointPretraining(LightningModule):
         lr: float = 2e-3,
         weight_decay: float = 0.03,
         warmup: int = 100,
-        num_bins: int = 8,
     ) -> None:
         super().__init__()
         self.network = network
         self.lr, self.weight_decay, self.warmup = lr, weight_decay, warmup
         self.hidden_token = nn.Parameter(torch.zeros(network.width))
         self.norm = nn.BatchNorm1d(network.width, affine=False)
-        self.head = nn.Linear(network.width, NUM_TARGETS * num_bins)
-        self.register_buffer("edges", torch.full((NUM_TARGETS, num_bins - 1), torch.nan))
+        self.head = nn.Linear(network.width, NUM_TARGETS * _NUM_BINS)
+        self.register_buffer("edges", torch.full((NUM_TARGETS, _NUM_BINS - 1), torch.nan))
         self.grid: ScanGrid | None = None
 
     def setup(self, stage: str) -> None:

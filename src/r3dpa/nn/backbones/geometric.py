@@ -54,12 +54,6 @@ class GeometricFeatures(nn.Module):
 
     Args:
         dim: Width D of the features, even.
-
-    Attributes:
-        name: ``"geometric"``.
-        num_headings: Rotations by multiples of this part of a turn leave the features unchanged.
-        mirror_invariant: So does swapping left and right.
-        settings: Everything that determines the features, see :class:`r3dpa.data.Extractor`.
     """
 
     name = "geometric"

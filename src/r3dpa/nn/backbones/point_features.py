@@ -71,12 +71,6 @@ class TokenFeatures(FrozenNetwork):
     Args:
         network: Trained network; its head is removed.
         grid: Preparation of scans, as in its training. Default: that of the release of ScaLR.
-
-    Attributes:
-        name: Short name of the source.
-        dim: Width of the features.
-        settings: Everything that determines the features, see :class:`r3dpa.data.Extractor`.
-        prepare: :class:`PreparedScan` of the points ``(P, 4)`` of one scan; holds no weights.
     """
 
     name: str

@@ -55,13 +55,9 @@ def kernel_offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class KernelMap(NamedTuple):
-    """Pairs of input rows and result rows for each offset of a kernel.
+    """Pairs ``(inputs, outputs)`` of rows, int64 of equal length, for each of the K offsets.
 
-    Attributes:
-        pairs: For each of the K offsets ``(inputs, outputs)``, int64 of equal length; no row of
-            the result appears twice at an offset. None if all rows pair with themselves.
-        num_inputs: Rows of the input.
-        num_outputs: Rows of the result.
+    No row of the result appears twice at an offset; None if all rows pair with themselves.
     """
 
     pairs: list[tuple[Tensor, Tensor] | None]

@@ -79,38 +79,26 @@ class ScanGrid:
 class PreparedScan(NamedTuple):
     """Input of WaffleIron for one scan, computed from its points alone.
 
-    Attributes:
-        features: ``(M, 5)`` float32: intensity (standardised), x, y, z, distance to the sensor
-            (metres) of the kept points.
-        neighbors: ``(M, K)`` int64 nearest kept points, nearest first, without the point itself.
-            With fewer than K others the farthest is repeated; a single point is its own neighbour.
-        cells: ``(3, M)`` int64 cell of each point on the planes xy, xz, yz, row-major.
-        kept: ``(M,)`` int64 row of each kept point in the original scan.
-        upsample: ``(P,)`` int64 nearest kept point of each original point; M, which is no valid
-            index, where no point was kept.
+    Neighbours are the nearest first, without the point itself; with fewer than K others the
+    farthest is repeated, and a single point is its own neighbour.
     """
 
-    features: Tensor
-    neighbors: Tensor
-    cells: Tensor
-    kept: Tensor
-    upsample: Tensor
+    features: Tensor  #: ``(M, 5)`` float32: intensity (standardised), x, y, z, range of kept points
+    neighbors: Tensor  #: ``(M, K)`` int64 kept points
+    cells: Tensor  #: ``(3, M)`` int64 cell of each point on the planes xy, xz, yz, row-major
+    kept: Tensor  #: ``(M,)`` int64 row of each kept point in the original scan
+    upsample: (
+        Tensor  #: ``(P,)`` int64 nearest kept point of each original one; M where none is kept
+    )
 
 
 class PointCloudBatch(NamedTuple):
-    """Concatenated kept points of B scans of any length, without padding.
+    """Concatenated kept points of B scans of any length, without padding."""
 
-    Attributes:
-        features: ``(N, 5)`` as in :class:`PreparedScan`.
-        neighbors: ``(N, K)`` int64, rows of this batch.
-        cells: ``(3, N)`` int64, counted anew in each scan.
-        num_points: ``(B,)`` int64 points of each scan; their sum is N.
-    """
-
-    features: Tensor
-    neighbors: Tensor
-    cells: Tensor
-    num_points: Tensor
+    features: Tensor  #: ``(N, 5)`` as in :class:`PreparedScan`
+    neighbors: Tensor  #: ``(N, K)`` int64, rows of this batch
+    cells: Tensor  #: ``(3, N)`` int64, counted anew in each scan
+    num_points: Tensor  #: ``(B,)`` int64 points of each scan; their sum is N
 
     def to(self, device: torch.device | str) -> Self:
         """The same batch on another device."""
@@ -192,17 +180,11 @@ def _one_per_voxel(xyz: np.ndarray, voxel_m: float) -> np.ndarray:
 
 
 class MaskedScan(NamedTuple):
-    """A scan for masked prediction.
-
-    Attributes:
-        scan: The whole scan, prepared.
-        hidden: ``(M,)`` bool: kept points that the network must not see.
-        targets: ``(M, T)`` float32 descriptors of the kept points within the whole scan.
-    """
+    """A whole scan, prepared for masked prediction."""
 
     scan: PreparedScan
-    hidden: Tensor
-    targets: Tensor
+    hidden: Tensor  #: ``(M,)`` bool: kept points that the network must not see
+    targets: Tensor  #: ``(M, T)`` float32 descriptors of the kept points within the whole scan
 
 
 @dataclass(frozen=True)

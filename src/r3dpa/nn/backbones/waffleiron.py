@@ -84,19 +84,12 @@ class WaffleIron(nn.Module):
 
 
 class Plane(NamedTuple):
-    """Cells of the points of a batch on one plane.
+    """Cells of the points of a batch on one plane."""
 
-    Attributes:
-        cells: ``(N,)`` int64 cell of each point, ``(scan * rows + row) * columns + column``.
-        share: ``(B * rows * columns, 1)`` float32 one over the number of visible points.
-        size: B, rows, columns.
-        weight: ``(N, 1)`` float32, 1 for visible points, 0 for others; None if all are visible.
-    """
-
-    cells: Tensor
-    share: Tensor
-    size: tuple[int, int, int]
-    weight: Tensor | None
+    cells: Tensor  #: ``(N,)`` int64, ``(scan * rows + row) * columns + column``
+    share: Tensor  #: ``(B * rows * columns, 1)`` float32 one over the number of visible points
+    size: tuple[int, int, int]  #: B, rows, columns
+    weight: Tensor | None  #: ``(N, 1)`` float32, 1 for visible points, else 0; None: all visible
 
 
 class Embedding(nn.Module):
