@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import torch
 from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
@@ -16,7 +15,7 @@ from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of, weights
 from r3dpa.nn import LatentNorm, SiT, VelocityNetwork
 
 Weights = Mapping[str, Tensor]
-Result = Literal["kept", "fresh", "resized", "truncated", "extended"]
+Result = Literal["kept", "fresh", "resized", "truncated"]
 # Largest difference between channels in how the latent scales of two models differ: on a frozen
 # VAE, running statistics 100 to 900 steps apart differ by up to 0.031 (batch 4) or 0.014 (32).
 NORM_TOLERANCE = 0.05
@@ -40,12 +39,11 @@ def transfer_rgb(
     ``sit`` and ``latent_norm`` are changed in place. Fresh, that is unchanged, stay: patch
     embedding, output layer and latent statistics if the number of latent channels differs, the
     former two also if the patch size does; the position table if the token grid differs; the
-    projector without ``keep_projector``, or if it does not fit; rows of the label table that the
-    file lacks. A longer label table is cut to its first rows, and its last one if this run has a
-    row for "no class". All other weights must fit. Returns a row for each group of weights.
+    projector without ``keep_projector``, or if it does not fit. A label table is cut to its first
+    row if this run has one. All other weights must fit. Returns a row for each group of weights.
 
-    Source: tuning stages of valeoai/R3DPA, which always cut the label table to one row and keep the
-    position table of another latent size if it has as many tokens.
+    Source: tuning stages of valeoai/R3DPA, which keep the position table of another latent size if
+    it has as many tokens.
 
     Raises:
         ValueError: If the checkpoint holds no SiT, or anything beside those groups does not fit;
@@ -74,7 +72,7 @@ def transfer_rgb(
         elif result == "kept":
             merged |= rgb_part
         else:
-            merged |= {key: _label_rows(rgb_part[key], value) for key, value in own_part.items()}
+            merged |= {key: value[:1] for key, value in rgb_part.items()}
         rows.append(TransferRow(group, len(own_part), result, reason))
     norm = {k.removeprefix(_NORM): v for k, v in merged.items() if k.startswith(_NORM)}
     weights = {k: v for k, v in merged.items() if not k.startswith(_NORM)}
@@ -109,21 +107,9 @@ def _transfer_result(
         return "fresh", "not requested"
     if group == "projector" and shapes_of(theirs.get(group, {})) != shapes_of(ours[group]):
         return "fresh", "requested, but its shapes differ"
-    # Label tables of another width stay as they are: all shapes that differ are listed together.
-    if group != "y_embedder" or rgb[:1] == own[:1] or rgb[1:] != own[1:]:
-        return "kept", "fits"
-    if rgb[0] < own[0]:
-        return "extended", f"{own[0]} rows here: the last {own[0] - rgb[0]} stay fresh"
-    if own[0] == 1:
+    if group == "y_embedder" and own[0] == 1 < rgb[0]:
         return "truncated", "one row here: the first is taken"
-    return "truncated", f"{own[0]} rows here: the first {own[0] - 1} and the last, of no class"
-
-
-def _label_rows(theirs: Tensor, ours: Tensor) -> Tensor:
-    """Label table as long as ours; our last row, if not the only one, is that of no class."""
-    if len(theirs) < len(ours):
-        return torch.cat([theirs, ours[len(theirs) :].to(theirs)])
-    return theirs[:1] if len(ours) == 1 else torch.cat([theirs[: len(ours) - 1], theirs[-1:]])
+    return "kept", "fits"
 
 
 def _grouped(sit: Weights, norm: Weights) -> dict[str, dict[str, Tensor]]:

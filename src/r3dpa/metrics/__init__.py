@@ -1,6 +1,5 @@
 """How realistic scans are, and how near generated scenes are to real ones."""
 
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     BEVHistogramDistance,
     MinimumMatchingDistance,
@@ -13,21 +12,17 @@ from r3dpa.metrics.feature_distances import (
     PolynomialMMD,
     PrecisionRecall,
 )
-from r3dpa.metrics.functional_bev import BEVGrid
 from r3dpa.metrics.realism import measures, realism_table
-from r3dpa.metrics.reference import ReferenceStatistics
-from r3dpa.metrics.results import Evaluation, EvaluationTable
+from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scan_statistics import ScanStatistics, scan_statistics
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, Protocol
 
 __all__ = [
     "DEFAULT",
     "PUBLISHED",
-    "BEVGrid",
     "BEVHistogramDistance",
     "Evaluation",
     "EvaluationScene",
-    "EvaluationTable",
     "FrechetDistance",
     "FrechetInfinity",
     "MinimumMatchingDistance",
@@ -35,8 +30,6 @@ __all__ = [
     "PrecisionRecall",
     "Protocol",
     "RangeHistogramDistance",
-    "ReferenceStatistics",
-    "Resampling",
     "ScanStatistics",
     "evaluate",
     "measures",

@@ -5,13 +5,10 @@ from r3dpa.nn.backbones.liploc import LIPLoc
 from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
 from r3dpa.nn.backbones.point_features import SOURCES, ScaLR, WaffleIronS, feature_source
 from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
 from r3dpa.nn.backbones.vit import DINOv2
 from r3dpa.nn.backbones.voxels import (
-    MaskedScan,
     Masking,
     PointCloudBatch,
-    PreparedScan,
     ScanGrid,
     collate_scans,
     prepare_scan,
@@ -24,11 +21,9 @@ __all__ = [
     "DINOv2",
     "GeometricFeatures",
     "LIPLoc",
-    "MaskedScan",
     "Masking",
     "MinkowskiNet",
     "PointCloudBatch",
-    "PreparedScan",
     "RangeViT",
     "ScaLR",
     "ScanGrid",
@@ -36,7 +31,5 @@ __all__ = [
     "WaffleIronS",
     "collate_scans",
     "feature_source",
-    "pool_voxels",
     "prepare_scan",
-    "voxelize",
 ]
