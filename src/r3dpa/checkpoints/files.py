@@ -38,10 +38,14 @@ from r3dpa.pretrained import weights_file
 
 _FORMAT = "r3dpa-checkpoint-1"
 # Where a LightningModule keeps each network: beginning of its keys, name of its argument.
-_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder", "network", "first_stage")
+_PLAIN = ("vae", "discriminator", "sit", "latent_norm", "thin_decoder")
 _LIGHTNING = {name: (f"{name}.", name) for name in _PLAIN}
 _LIGHTNING |= {"ema": ("ema.sit.", "sit"), "ema_latent_norm": ("ema.latent_norm.", "latent_norm")}
-_LIGHTNING |= {"ema_network": ("ema.network.", "network")}
+_LIGHTNING |= {
+    "network": ("network.", "network"),
+    "ema_network": ("ema.network.", "network"),
+    "first_stage": ("first_stage.", "first_stage"),
+}
 # A class that Lightning 1.4 writes as a key, in the checkpoints of LiDM; read as ``object``.
 _OLD_CALLBACK = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
 _LOST = ("sensor and encoding", "step", "arguments of the latent statistics")

@@ -104,17 +104,24 @@ def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
     return HistogramDistance(math.sqrt(divergence), divergence, l1, l1 / 2)
 
 
-def point_histogram(points: Tensor, half_m: float = 80.0) -> Tensor:
-    """Number of points ``(P, 3 or more)`` in each cell seen from above, ``(100, 100)`` float32.
+def point_histogram(
+    points: Tensor,
+    half_m: float = 80.0,
+    num_bins: int = 100,
+    nearest_m: float = 3.0,
+    farthest_m: float = 70.0,
+) -> Tensor:
+    """Points ``(P, 3 or more)`` in each cell seen from above, ``(num_bins, num_bins)`` float32.
 
-    Only points strictly between 3 and 70 m count, and the upper border of the grid belongs to it.
+    Only points strictly between the two distances from the sensor count, and the upper border of
+    the grid, ``half_m`` to both sides, belongs to it.
     Of LiDARGen (Zyrianov et al. 2022), as R2DM and R2Flow use it: :class:`BEVGrid` counts
     clouds, not points.
     """
     xyz = _checked_points(points, "cloud")[:, :3].float().cpu()
     distance = xyz.norm(dim=1)
-    counted = xyz[(distance > 3.0) & (distance < 70.0), :2]
-    return torch.histogramdd(counted, 100, range=[-half_m, half_m] * 2).hist
+    counted = xyz[(distance > nearest_m) & (distance < farthest_m), :2]
+    return torch.histogramdd(counted, num_bins, range=[-half_m, half_m] * 2).hist
 
 
 def gaussian_kernel(a: Tensor, b: Tensor, sigma: float = 0.5) -> Tensor:
