@@ -158,6 +158,13 @@ class LoaderModule(LightningDataModule):
         at_least(0, num_workers=num_workers, seed=seed)
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
 
+    def __getattr__(self, name: str) -> Any:
+        """AttributeError with the remedy: data sets and geometry are known after ``setup``."""
+        raise AttributeError(
+            f"{type(self).__name__} has no {name}; if it depends on the data, call prepare_data() "
+            "and setup('fit') first"
+        )
+
     def loader(
         self, dataset: Dataset[Any], *, train: bool, kind: str = "scans", **options: Any
     ) -> DataLoader[Any]:
