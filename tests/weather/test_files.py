@@ -1,13 +1,17 @@
 """Formats of scans: columns, round trips, and what is wrong with a file."""
 
+import math
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from r3dpa.data.scans import ScanError
-from r3dpa.weather.files import _decompress, find_files, read_file, write_file
+from r3dpa.weather import Weather
+from r3dpa.weather.faults import STRENGTHS, Fault
+from r3dpa.weather.files import find_files, read_file, write_file
 
 random = np.random.default_rng(0)
 NUM = 40
@@ -26,7 +30,8 @@ def text(table):
 def pcd(mode, body, table=TABLE):
     names, kinds, sizes = zip(*((n, k[0].upper(), k[1]) for n, k in FIELDS), strict=True)
     head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(sizes)}\n"
-    head += f"TYPE {' '.join(kinds)}\nWIDTH 2\nHEIGHT {len(table) // 2}\nPOINTS {len(table)}\n"
+    head += f"TYPE {' '.join(kinds)}\nCOUNT {' '.join('1' * len(FIELDS))}\nWIDTH 2\n"
+    head += f"HEIGHT {len(table) // 2}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(table)}\n"
     return f"{head}DATA {mode}\n".encode() + body
 
 
@@ -50,6 +55,14 @@ def ply(kind, order=""):
 
 def npy(path):
     np.save(path, ROWS.astype("f8"))
+
+
+def write(path, content):
+    """A file of bytes, or of a function that writes it."""
+    if path.suffix == ".pcd":
+        pytest.importorskip("pypcd4")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content(path) if callable(content) else path.write_bytes(content)
 
 
 FILES = {
@@ -76,11 +89,10 @@ FILES = {
 def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     num_columns, content = FILES[name]
     path, out = tmp_path / "in" / "a" / name, tmp_path / "out"
-    path.parent.mkdir(parents=True)
-    content(path) if callable(content) else path.write_bytes(content)
+    write(path, content)
     file = read_file(path)
     scan = file.scan
-    assert len(scan.table) == num_columns
+    assert len(file.table.dtype.names) == num_columns
     np.testing.assert_array_equal(scan.points, POINTS)
     np.testing.assert_array_equal(scan.intensity, INTENSITY)
     if num_columns > 4:
@@ -101,12 +113,35 @@ def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     np.testing.assert_array_equal(read_file(out / "a" / name).table, file.table[::2])
 
 
-def test_lzf_copies_overlapping_parts():
-    # Two literals, then seven bytes from two places back; four from one place back.
-    assert _decompress(bytes([1, 5, 6, 5 << 5, 1]), 9) == bytes([5, 6] * 4 + [5])
-    assert _decompress(bytes([0, 9, 7 << 5, 1, 0]), 11) == bytes([9] * 11)
-    with pytest.raises(ValueError, match="not 12"):
-        _decompress(bytes([0, 9, 7 << 5, 1, 0]), 12)
+NOTHING = [
+    *({}, {"visibility_m": math.inf}, {"rain_mm_h": 0.0}, {"snow_mm_h": 0.0}),
+    *({"water_film_mm": 0.0, "traffic_m_s": 25.0}, {"sun_elevation_deg": 80.0}),
+]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_no_strength_of_any_effect_or_fault_gives_the_same_file(tmp_path, name):
+    path, out = tmp_path / "in" / name, tmp_path / "out"
+    write(path, FILES[name][1])
+    file = read_file(path)
+    changes = [Weather(**weather) for weather in NOTHING]
+    changes += [Fault(kind, severity=0) for kind in STRENGTHS]
+    for change in changes:
+        write_file(file.changed(change.apply(file.scan)), tmp_path / "in", out)
+        assert (out / name).read_bytes() == path.read_bytes(), change
+
+
+def test_added_points_have_the_other_columns_of_their_shot(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, TABLE)
+    file = read_file(path)
+    result = Weather(visibility_m=20).apply(file.scan)
+    changed = file.changed(result)
+    new = result.index < 0
+    assert new.any()
+    for name in ("ring", "t"):
+        np.testing.assert_array_equal(changed.table[name], TABLE[name][result.shot])
+    np.testing.assert_array_equal(changed.scan.points[new], result.points[new])
 
 
 def bad_npz(path):
@@ -126,7 +161,8 @@ BAD = {
     "near.bin": ((ROWS[:, :4] / 100).tobytes(), "which are no metres: multiply"),
     "scan.las": (b"LASF", "is of no known format; can be read: .bin"),
     "short.pcd": (pcd("binary", TABLE.tobytes()[:-1]), "is damaged or of another layout"),
-    "head.pcd": (b"VERSION 0.7\n", "header ends with no DATA"),
+    "rows.pcd": (pcd("binary", TABLE[:-1].tobytes()), "is damaged: holds 39 of 40 points"),
+    "head.pcd": (b"VERSION 0.7\n", "is damaged or of another layout"),
     "bomb.pcd": (pcd("binary_compressed", stored(bytes(99))), "is damaged"),
     "faces.ply": (ply("ascii").replace(b"face 0", b"face 2"), "must hold points alone"),
     "noz.ply": (ply("ascii").replace(b"float z", b"float w"), "has no column z, only x, y, w"),
@@ -140,7 +176,7 @@ BAD = {
 def test_bad_files_are_named_in_one_line(tmp_path, name):
     content, message = BAD[name]
     path = tmp_path / name
-    content(path) if callable(content) else path.write_bytes(content)
+    write(path, content)
     with pytest.raises(ScanError) as raised:
         read_file(path)
     assert str(raised.value).startswith(f"{path}: ")
@@ -179,6 +215,14 @@ def test_labels_go_with_their_scan(tmp_path, scan, labels, written):
     assert (out / written).read_bytes() == values.tobytes()
     (root / labels).resolve().write_bytes(values[:-1].tobytes())
     with pytest.raises(ScanError, match=r"holds 39 labels but .* 40 points: delete the one"):
+        read_file(path)
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pypcd4", None)
+    path = tmp_path / "a.pcd"
+    path.write_bytes(pcd("binary", TABLE.tobytes()))
+    with pytest.raises(ScanError, match=r"a\.pcd: \.pcd needs pypcd4: pip install 'r3dpa\[pcd\]'"):
         read_file(path)
 
 

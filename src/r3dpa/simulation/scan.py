@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -57,6 +58,7 @@ class SimulatedScan:
     scene: Scene
 
 
+@cache
 def effect_name(effect: Effect) -> str:
     """Name of an effect for switches and reports: its class in snake case."""
     return re.sub(r"(?<!^)(?=[A-Z])", "_", type(effect).__name__).lower()

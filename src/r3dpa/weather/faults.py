@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from r3dpa.simulation.draws import generator_for
 from r3dpa.simulation.scan import EffectRecord
-from r3dpa.weather.recorded import RecordedScan
-from r3dpa.weather.rings import angles, rings_of
-from r3dpa.weather.weather import ADDED_CLASS, WeatheredScan
+from r3dpa.weather.recorded import RecordedScan, angles
+from r3dpa.weather.rings import rings_of
+from r3dpa.weather.weather import ADDED_CLASS, WeatheredScan, kept_part
 
 Kind = Literal[
     "missing_beams", "fewer_beams", "crosstalk", "incomplete_echo", "motion_blur",
@@ -126,19 +126,10 @@ class Fault:
             points = (turned + _METRES_PER_DEGREE * self.amount * way).astype(np.float32)
         kept = np.flatnonzero(stays)
         lost, moved = len(scan) - len(kept), int((points != scan.points).any(axis=1).sum())
-        status: Literal["ran", "not_called"] = "ran" if self.amount else "not_called"
         how = f"{self.amount:g} {STRENGTHS[self.kind][2]}"
-        return WeatheredScan(
-            points[kept],
-            None if scan.intensity is None else scan.intensity[kept],
-            None if labels is None else labels[kept],
-            index=kept,
-            shot=kept,
-            origins=np.zeros(len(kept), dtype=np.uint8),
-            effects=(EffectRecord(self.kind, status, how, lost + moved),),
-            report={"points": len(scan), "lost": {self.kind: lost}, "moved": moved}
-            | {"dimmed": 0, "added": {}},
-        )
+        record = EffectRecord(self.kind, "ran" if self.amount else "not_called", how, lost + moved)
+        changed = replace(scan, points=points, labels=labels)
+        return kept_part(changed, kept, (record,), {self.kind: lost}, moved)
 
     def _beams(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         rings = rings_of(scan)

@@ -1,12 +1,9 @@
 """Scans of any lidar from files, and back, with every column as it was.
 
 ``.bin`` holds float32 rows x, y, z, intensity (KITTI), the ring as fifth (nuScenes, ``.pcd.bin``),
-or other columns that are named; ``.pcd`` is ASCII, binary or compressed, and written uncompressed
-if so; ``.ply`` is ASCII or binary, of vertices alone; ``.npy`` and ``.npz`` hold such rows, or
-columns with names. Labels lie in a ``.label`` of SemanticKITTI, beside the scan or in ``labels``
-beside its folder.
-
-Sources: PCL's description of PCD 0.7; Turk, "The PLY Polygon File Format" (1994); liblzf 3.6.
+or other columns that are named; ``.pcd`` needs the package pypcd4; ``.ply`` is ASCII or binary, of
+vertices alone; ``.npy`` and ``.npz`` hold such rows, or columns with names. Labels lie in a
+``.label`` of SemanticKITTI, beside the scan or in ``labels`` beside its folder.
 """
 
 from __future__ import annotations
@@ -23,14 +20,7 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
-from r3dpa.data.scans import (
-    ScanError,
-    files_below,
-    npz_arrays,
-    parse_table,
-    ply_table,
-    read_bytes,
-)
+from r3dpa.data.scans import ScanError, files_below, npz_arrays, ply_table, read_bytes
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
 from r3dpa.weather.recorded import RecordedScan
 from r3dpa.weather.weather import WeatheredScan
@@ -78,9 +68,8 @@ class ScanFile:
         """The points as float32, and the columns that are understood."""
         given = {key: self.table[name] for key, name in self.columns.items()}
         points = np.stack([given.pop(axis).astype(np.float32) for axis in "xyz"], axis=1)
-        table = {name: self.table[name] for name in self.table.dtype.names or ()}
         try:
-            return RecordedScan(points, **given, labels=self.labels, table=table)
+            return RecordedScan(points, **given, labels=self.labels)
         except ValueError as error:
             raise ScanError(f"{self.path}: {error}") from error
 
@@ -133,18 +122,16 @@ def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -
         ScanError: If the file is damaged, its columns are ambiguous, or its values are no scan in
             metres.
     """
-    data = read_bytes(path)
-    if not data:
-        raise ScanError(f"{path}: is empty")
+    data, suffix = read_bytes(path), path.suffix.lower()
+    if not data or suffix not in _READERS:
+        reason = f"of no known format; can be read: {', '.join(_READERS)}" if data else "empty"
+        raise ScanError(f"{path}: is {reason}")
     try:
-        kind, table, pack = _READERS[path.suffix.lower()](path, data, tuple(columns))
+        kind, table, pack = _READERS[suffix](path, data, tuple(columns))
     except ScanError:
         raise
     except UNPICKLING_ERRORS as error:
-        if path.suffix.lower() in _READERS:
-            reason = f"is damaged or of another layout ({first_line(error)})"
-        else:
-            reason = f"is of no known format; can be read: {', '.join(_READERS)}"
+        reason = f"is damaged or of another layout ({first_line(error)})"
         raise ScanError(f"{path}: {reason}") from error
     known = _known_columns(path, table)
     labels, label_path = _labels(path, len(table))
@@ -180,8 +167,8 @@ def write_file(file: ScanFile, root: Path, out: Path) -> None:
     path = out / file.path.relative_to(root)
     if file.labels is not None and file.label_path is not None:
         place = Path(os.path.relpath(file.label_path.absolute(), root.absolute()))
-        inside = place.parts[0] != ".."
-        with atomic_path(out / place if inside else path.with_name(place.name)) as temporary:
+        beside = place.parts[0] == ".."
+        with atomic_path(path.with_name(place.name) if beside else out / place) as temporary:
             temporary.write_bytes(file.labels.astype("<u4").tobytes())
     with atomic_path(path) as temporary:
         temporary.write_bytes(file.pack(file.table) if file.data is None else file.data)
@@ -191,12 +178,13 @@ def _known_columns(path: Path, table: Table) -> dict[str, str]:
     names = {name.lower(): name for name in table.dtype.names or ()}
     known: dict[str, str] = {}
     for key, others in _NAMES.items():
-        known |= dict([(key, names[other]) for other in others.split() if other in names][:1])
-        kind = table.dtype[known[key]] if key in known else None
-        if kind is None and key in "xyz":
+        name = next((names[other] for other in others.split() if other in names), None)
+        if name is None and key in "xyz":
             raise ScanError(f"{path}: has no column {key}, only {', '.join(names.values())}")
-        if kind and (kind.shape or kind.kind not in ("f" if key in "xyz" else "fiu")):
-            raise ScanError(f"{path}: column {known[key]} is of {kind}; {key} must be one float")
+        if name is not None:
+            known[key], kind = name, table.dtype[name]
+            if kind.kind not in ("f" if key in "xyz" else "fiu"):
+                raise ScanError(f"{path}: column {name} is of {kind}; {key} must be one float")
     return known
 
 
@@ -278,63 +266,35 @@ def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
 
 
 def _read_pcd(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
-    found = re.match(rb"((?:[^\n]*\n)*?DATA +(ascii|binary|binary_compressed)\s*?\n)", data)
-    if found is None:
-        raise ScanError(f"{path}: is no .pcd file: its header ends with no DATA")
-    head, mode, body = found[1].decode(), found[2].decode(), data[found.end() :]
-    header = {line.split()[0]: line.split()[1:] for line in head.splitlines() if line.strip()}
-    names = [f"_{n}" if name == "_" else name for n, name in enumerate(header["FIELDS"])]
-    kinds, sizes, repeats = (header.get(key, ["1"] * len(names)) for key in _PCD_FIELDS)
-    fields = zip(names, kinds, sizes, map(int, repeats), strict=True)
-    layout = np.dtype([(n, f"<{k.lower()}{s}", (r,) if r > 1 else ()) for n, k, s, r in fields])
-    count = int(header["POINTS"][0])
-    size = count * layout.itemsize
-    if mode == "binary_compressed":  # column after column
-        lengths = np.frombuffer(body[:8], "<u4")
-        whole = io.BytesIO(_decompress(body[8 : 8 + lengths[0]], size))
-        table = np.empty(count, layout)
-        for name in names:
-            part = table[name]
-            part[...] = np.frombuffer(whole.read(part.nbytes), part.dtype).reshape(part.shape)
-    else:
-        rows = body if mode == "ascii" else body[:size]
-        table = parse_table(rows, layout, count, mode == "ascii")
+    try:
+        from pypcd4 import Encoding, PointCloud
+    except ImportError as error:
+        raise ScanError(f"{path}: .pcd needs pypcd4: pip install 'r3dpa[pcd]'") from error
+    cloud = PointCloud.from_fileobj(io.BytesIO(data))
+    about, rows = cloud.metadata, cloud.pc_data
+    if len(rows) != about.points:
+        raise ScanError(f"{path}: is damaged: holds {len(rows)} of {about.points} points")
+    # Padding has random names.
+    names = [f"_{n}" if "#" in name else name for n, name in enumerate(rows.dtype.names)]
+    table = rows.view([(name, rows.dtype[n]) for n, name in enumerate(names)])
 
     def pack(table: Table) -> bytes:
-        text = re.sub(r"(?m)^(WIDTH|POINTS) .*", rf"\g<1> {len(table)}", head)
-        text = re.sub(r"(?m)^HEIGHT .*", "HEIGHT 1", text).replace("binary_compressed", "binary")
-        return text.encode() + (_text(table) if mode == "ascii" else table.tobytes())
+        cloud = PointCloud(about.derive(points=len(table), width=len(table), height=1), table)
+        if about.data is Encoding.ASCII:  # the package keeps ten decimals
+            return cloud.metadata.compose_header().encode() + _text(table)
+        stream = io.BytesIO()
+        cloud.save(stream, about.data)
+        return stream.getvalue()
 
-    return f".pcd, {mode}", table, pack
+    return f".pcd, {about.data.value}", table, pack
 
 
 def _text(table: Table) -> bytes:
     """Rows of numbers, each with the fewest digits that give it again."""
-    parts = [table[name].reshape(len(table), -1).astype(str) for name in table.dtype.names or ()]
-    return "".join(f"{' '.join(row)}\n" for row in np.concatenate(parts, axis=1)).encode()
+    parts = [table[name].astype(str) for name in table.dtype.names or ()]
+    return "".join(f"{' '.join(row)}\n" for row in zip(*parts, strict=True)).encode()
 
 
-def _decompress(data: bytes, size: int) -> bytes:
-    """Data of liblzf: runs of literals, and copies of earlier parts."""
-    out, place = bytearray(), 0
-    while place < len(data) and len(out) <= size:
-        control, place = data[place], place + 1
-        if control < 32:
-            out += data[place : place + control + 1]
-            place += control + 1
-            continue
-        length = control >> 5
-        if length == 7:
-            length, place = length + data[place], place + 1
-        start, place = len(out) - ((control & 31) << 8) - data[place] - 1, place + 1
-        part = out[max(start, 0) :][: length + 2]  # shorter than the copy where they overlap
-        out += (part * (length + 2))[: length + 2]
-    if len(out) != size:
-        raise ValueError(f"{len(out)} bytes, not {size}, after decompression")
-    return bytes(out)
-
-
-_PCD_FIELDS = ("TYPE", "SIZE", "COUNT")
 _READERS: dict[str, Callable[[Path, bytes, tuple[str, ...]], _Read]] = {
     ".bin": _read_bin,
     ".npy": _read_numpy,

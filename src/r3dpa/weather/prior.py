@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from r3dpa.simulation.scene import Interval
 from r3dpa.weather.recorded import RecordedScan
 from r3dpa.weather.recorded_sweep import Instrument
 from r3dpa.weather.weather import Weather
 
+_FIELDS = ("visibility_m", "rain_mm_h", "snow_mm_h")
 _FULL_FILM_MM = 1.5
 _INSTRUMENT = Instrument()
 
@@ -32,28 +34,27 @@ class WeatherPrior:
     """
 
     probability: float = 0.5
-    visibility_m: tuple[float, float] = (30.0, 1000.0)
-    rain_mm_h: tuple[float, float] = (1.0, 30.0)
-    snow_mm_h: tuple[float, float] = (0.5, 3.0)
+    visibility_m: Interval = (30.0, 1000.0)
+    rain_mm_h: Interval = (1.0, 30.0)
+    snow_mm_h: Interval = (0.5, 3.0)
     instrument: Instrument = _INSTRUMENT
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1:
             raise ValueError(f"probability must lie in [0, 1], got {self.probability}")
-        for name in ("visibility_m", "rain_mm_h", "snow_mm_h"):
+        for name in _FIELDS:
             low, high = getattr(self, name)
             if not 0 < low <= high < math.inf:
                 raise ValueError(f"{name} must be a positive interval, got {low}..{high}")
-            limits: list[dict[str, Any]] = [{name: low}, {name: high}]
-            for values in limits:
-                Weather(**values)
+            for limit in (low, high):
+                Weather(**{name: limit})
 
     def draw(self, generator: np.random.Generator) -> Weather | None:
         """Weather of one scan; None where it stays as it is."""
         chance, kind, share, film = generator.random(4)
         if chance >= self.probability:
             return None
-        name = ("visibility_m", "rain_mm_h", "snow_mm_h")[int(3 * kind)]
+        name = _FIELDS[int(3 * kind)]
         low, high = np.log(getattr(self, name))
         values: dict[str, Any] = {name: math.exp(low + share * (high - low))}
         if name == "rain_mm_h":

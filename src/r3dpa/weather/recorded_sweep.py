@@ -7,6 +7,7 @@ that there are no rays for them: no effect gives them an echo.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,23 +16,35 @@ from scipy.spatial import cKDTree
 
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.scan import damped_intensity, power_of_intensity
-from r3dpa.simulation.scene import Material, Scene
+from r3dpa.simulation.scene import Material, Primitive, Scene
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, load_sensor
 from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids
 from r3dpa.simulation.sweep import Echoes, Sweep
 from r3dpa.weather.ground import ground_of
-from r3dpa.weather.recorded import RecordedScan
-from r3dpa.weather.rings import angles
+from r3dpa.weather.recorded import RecordedScan, angles
 
+Returns = Literal["strongest", "dual"]
 # Intensities from this share of the full one on are taken for retro-reflectors.
 _SATURATED = 0.985
 _UNKNOWN_INTENSITY = 0.2
-# Powers of dark points, see ``RecordedSweep``.
-_NEAR_M, _DARK_M, _DARK_SPREAD, _NEAR_DARK = 20.0, 121.0, 0.43, (1.0, 0.6)
+# ln(power / min_power) of points without intensity by the least range of their row in metres: these
+# shares of them are below.
+_SHARES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+_DARK = {
+    0.0: (-0.75, -0.05, 0.35, 1.05, 1.55, 1.95, 2.45, 3.2),
+    5.0: (-0.8, -0.1, 0.15, 0.65, 1.0, 1.35, 2.1, 3.1),
+    8.0: (-1.05, -0.3, -0.05, 0.35, 0.75, 1.2, 2.05, 3.1),
+    11.0: (-0.95, -0.3, 0.0, 0.65, 1.5, 2.3, 2.95, 3.1),
+    20.0: (-0.95, 0.05, 0.6, 1.35, 1.65, 1.9, 2.2, 2.3),
+    30.0: (-0.8, 0.1, 0.5, 1.0, 1.3, 1.55, 1.95, 2.3),
+    40.0: (-0.75, -0.05, 0.25, 0.7, 1.0, 1.3, 1.7, 2.3),
+    50.0: (-0.8, -0.2, 0.05, 0.45, 0.75, 1.1, 1.5, 2.3),
+    65.0: (-0.85, -0.35, -0.15, 0.2, 0.5, 0.85, 1.35, 2.2),
+}
 # A sun with a return within this angle is hidden.
 _SUN_RADIUS_RAD = np.radians(0.5)
-# The highest laser: limited as in a sensor's table, by the inclinations of some points.
-_HIGHEST_RAD, _SOME_POINTS = np.radians(80), 4096
+# Points whose inclinations show the highest laser, which at most is so high.
+_SOME_POINTS, _HIGHEST_DEG = 256, 80
 
 
 @dataclass(frozen=True)
@@ -50,7 +63,7 @@ class Instrument:
     """
 
     sensor: str | SpinningLidar = "hdl64e"
-    returns: Literal["strongest", "dual"] = "strongest"
+    returns: Returns = "strongest"
     full_intensity: float | None = None
     response: Literal["root", "linear"] = "root"
 
@@ -58,30 +71,25 @@ class Instrument:
         full = self.full_intensity
         if full is not None and not 0 < full < np.inf:
             raise ValueError(f"full_intensity must be positive, got {full}")
-        for name, choices in (("returns", ("strongest", "dual")), ("response", _RESPONSES)):
+        for name, choices in (("returns", ("strongest", "dual")), ("response", ("root", "linear"))):
             if getattr(self, name) not in choices:
                 given = getattr(self, name)
                 raise ValueError(f"{name} must be {' or '.join(choices)}, got {given!r}")
 
     def sensor_for(self, scan: RecordedScan) -> SpinningLidar:
-        """The sensor within whose limits all points of the scan lie."""
-        sensor = load_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
-        range_m = range_of(scan.points)
-        height_m = float(np.mean(sensor.lasers.height_m))
-        some = scan.points[:: 1 + len(scan) // _SOME_POINTS]
-        highest = float(np.quantile(angles(some)[0], 0.999).clip(max=_HIGHEST_RAD))
-        return replace(
-            sensor,
-            # Only the sun is compared with the highest laser.
-            lasers=Lasers((highest,), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,)),
-            min_range_m=max(min(sensor.min_range_m, float(range_m.min()) - abs(height_m)), 0.0),
-            max_range_m=max(sensor.max_range_m, float(range_m.max()) + abs(height_m)),
-            range_step_m=0.0,
-            return_mode=self.returns,
-        )
+        """The sensor with one laser, as high as some points of the scan, which the sun needs."""
+        some = angles(scan.points[:: 1 + len(scan) // _SOME_POINTS])[0]
+        return _with_laser(self.sensor, self.returns, int(np.ceil(np.degrees(some.max()))))
 
 
-_RESPONSES = ("root", "linear")
+@lru_cache
+def _with_laser(
+    sensor: str | SpinningLidar, returns: Returns, inclination_deg: int
+) -> SpinningLidar:
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    highest, height_m = min(inclination_deg, _HIGHEST_DEG), float(np.mean(sensor.lasers.height_m))
+    laser = Lasers((np.radians(highest),), (0.0,), (height_m,), (0.0,), (0.0,), (1.0,))
+    return replace(sensor, lasers=laser, range_step_m=0.0, return_mode=returns)
 
 
 class IntensityScale(NamedTuple):
@@ -99,55 +107,40 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     Raises:
         ValueError: If some are negative.
     """
-    assumed = f"a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
-    if intensity is None:
-        return IntensityScale(full or 1.0, 0.0, False, f"no intensity: {assumed}")
-    values = intensity.astype(float)
+    values = np.zeros(1) if intensity is None else intensity.astype(float)
     low, high = values.min(), values.max()
     if low < 0:
         raise ValueError(f"intensity must be 0 or greater, got {low:g}..{high:g}")
     if low == high:
-        text = f"intensity is {low:g} throughout: {assumed}"
+        missing = "no intensity" if intensity is None else f"intensity is {low:g} throughout"
+        text = f"{missing}: a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
         return IntensityScale(full or 1.0, 0.0, False, text)
     found, unit = next(
         (pair for pair in ((1.0, "0..1"), (255.0, "0..255")) if high <= pair[0]),
         (float(np.quantile(values, 0.999)), "instrument units"),
     )
     found = full or found
-    step = next((s for s in (found / 100, 1.0) if found > s and _on_grid(values, s)), 0.0)
+    off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (found / 100, 1.0)}
+    step = next((s for s, most in off_grid.items() if found > s and most < 1e-3), 0.0)
     steps = f" in steps of {step:g}" if step else ""
     text = f"intensity {low:g}..{high:g}{steps}: {unit}, full scale {found:g}"
     return IntensityScale(found, step, True, text)
 
 
-def _on_grid(values: NDArray[np.float64], step: float) -> bool:
-    places = values / step
-    return bool(np.abs(places - np.round(places)).max() < 1e-3)
-
-
-def range_of(points: NDArray[np.float32]) -> Floats:
-    """Distance of points ``(P, 3)`` from the origin, ``(P,)``."""
-    return np.sqrt((points.astype(float) ** 2).sum(axis=1)).astype(np.float32)
-
-
 class RecordedSweep(Sweep):
     """The turn in which a scan was recorded, with one ray for each point.
 
-    Powers are those that give the recorded intensities. An intensity of 0 stands for any power up
-    to six times the detection limit; it is drawn, with n from the normal distribution, as::
-
-        ln(power / min_power) = ln(121 m / range) + 0.43 n      from 20 m on
-        ln(power / min_power) = 1.0 + 0.6 n                     nearer
-
-    limited to that interval; fitted to simulated scans. Saturated ones have the power from which on
-    they saturate. Rays start at the mean height of the instrument's optical centres. The time of a
-    shot is that of its column of the file, or else grows with the azimuth.
+    Powers are those that give the recorded intensities. An intensity of 0 stands for any power
+    below about six times the detection limit; it is drawn from the distribution that such points
+    of simulated scans have at their range. Saturated ones have the power from which on they
+    saturate. Rays start at the mean height of the instrument's optical centres. The time of a shot
+    is that of its column of the file, or else grows with the azimuth.
 
     Args:
-        scene: Weather, and boxes of moving vehicles.
+        scene: Weather, and boxes of moving vehicles as the scan shows them.
         scan: The scan.
         instrument: What is assumed of its instrument.
-        sensor: ``instrument.sensor_for(scan)``.
+        sensor: ``instrument.sensor_for(scan)``; its limits are widened to hold all points.
         draws: Of the unknown powers.
     """
 
@@ -164,14 +157,23 @@ class RecordedSweep(Sweep):
         self.points = scan.points[self.rays_of]
         start = np.zeros_like(self.points.T)
         start[2] = sensor.lasers.height_m[0]
-        range_m = range_of(self.points - start.T)
-        direction = ((self.points.T - start) / np.maximum(range_m, 1e-6)).astype(np.float32)
+        along = self.points.T - start
+        range_m = np.sqrt((along.astype(float) ** 2).sum(axis=0)).astype(np.float32)
+        direction = (along / np.maximum(range_m, 1e-6)).astype(np.float32)
+        nearest, farthest = range_m.min(initial=np.inf), range_m.max(initial=0)
+        sensor = replace(
+            sensor,
+            min_range_m=min(sensor.min_range_m, float(nearest)),
+            max_range_m=max(sensor.max_range_m, float(farthest)),
+        )
         if scan.time_s is None:
             turns = angles(self.points)[1] / (2 * np.pi)
             time_s = ((turns + 0.5) % 1.0 - 0.5) / sensor.spin_hz
         else:
             time_s = scan.time_s[self.rays_of].astype(float)
             time_s -= (time_s.min() + time_s.max()) / 2
+        moved = tuple(_in_the_middle(box, direction, time_s) for box in scene.primitives)
+        scene = replace(scene, primitives=moved)
         self._begin(scene, sensor, start, direction, time_s.astype(np.float32))
         self.material = np.full(len(range_m), Material.CONCRETE, dtype=np.uint8)
 
@@ -189,16 +191,15 @@ class RecordedSweep(Sweep):
 
     def _power(self, range_m: Floats, draws: Draws) -> Floats:
         least = np.float32(self.sensor.min_power)
-        power = power_of_intensity(self.share, range_m, self.sensor.min_power)
         if self.response == "linear":
             power = (self.share / np.square(range_m)).astype(np.float32)
+        else:
+            power = power_of_intensity(self.share, range_m, self.sensor.min_power)
         dark = np.flatnonzero(self.share == 0)
-        if len(dark):
-            far = range_m[dark] > _NEAR_M
-            middle = np.where(far, np.log(_DARK_M / range_m[dark]), _NEAR_DARK[0])
-            spread = np.where(far, _DARK_SPREAD, _NEAR_DARK[1])
-            drawn = (middle + spread * draws.normal(dark)).clip(max=np.log(6))
-            power[dark] = least * np.exp(drawn)
+        row = np.searchsorted(list(_DARK), range_m[dark], "right") - 1
+        for number, logarithms in enumerate(_DARK.values()):
+            rays = dark[row == number]
+            power[rays] = least * np.exp(np.interp(draws.uniform(rays), _SHARES, logarithms))
         # Weaker ones could not have been detected.
         return np.maximum(power, least * np.exp(np.float32(-3 * self.sensor.threshold_spread)))
 
@@ -244,3 +245,10 @@ class RecordedSweep(Sweep):
     def is_open(self, direction: Floats) -> bool:
         """Whether no point lies within half a degree of a direction ``(3,)``."""
         return bool((direction @ self.direction).max() < np.cos(_SUN_RADIUS_RAD))
+
+
+def _in_the_middle(box: Primitive, direction: Floats, time_s: NDArray) -> Primitive:
+    """A vehicle that is where rays show it, moved to its place in the middle of the turn."""
+    time = float(time_s[(np.array(box.centre) @ direction).argmax()])
+    x, y = (c - v * time for c, v in zip(box.centre, box.velocity_m_s, strict=False))
+    return replace(box, centre=(x, y, box.centre[2]))

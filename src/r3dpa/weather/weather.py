@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +46,7 @@ REFUSED = {
 # Instrument effects that every recorded scan has: they run where they are switched on.
 _ON_REQUEST = ("blooming", "range_noise")
 # Whether an echo is detected is asked again where its power has changed.
-_DETECTION = ("soft_raydrop", "detection_limit")
+_DETECTION = {"soft_raydrop", "detection_limit", "dual_return"}
 # Of labels with an instance: KITTI-360, SemanticKITTI.
 _VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
 _CLOUDBURST_MM_H = 300.0
@@ -137,11 +139,10 @@ class Weather(scene.Weather):
             vehicles += _labelled_vehicles(scan, self.traffic_m_s)
         world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3)
         sensor = instrument.sensor_for(scan)
-        called = [effect for effect in wanted if effect.called_by(world, sensor)]
-        names = {effect_name(effect) for effect in called} - set(off)
-        key = seed if isinstance(seed, tuple) else (seed,)
-        if not names - {*_DETECTION, "dual_return"}:
+        called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
+        if not called - off.keys() - _DETECTION:
             return _unchanged(scan, wanted, off)
+        key = seed if isinstance(seed, tuple) else (seed,)
         sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
         records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
         return _result(scan, sweep, records)
@@ -158,15 +159,36 @@ def _switched(effects: Mapping[str, str | bool]) -> tuple[dict[str, str], list[E
 
 
 def _unchanged(scan: RecordedScan, wanted: list[Effect], off: Mapping[str, str]) -> WeatheredScan:
-    every, origins = np.arange(len(scan)), np.zeros(len(scan), dtype=np.uint8)
-    records = tuple(
-        EffectRecord(name, "off" if name in off else "not_called", "nothing calls for it", 0)
-        for name in map(effect_name, wanted)
-    )
-    report = {"points": len(scan), "lost": {}, "moved": 0, "dimmed": 0, "added": {}}
+    names = map(effect_name, wanted)
+    records = (EffectRecord(n, "off" if n in off else "not_called", "", 0) for n in names)
+    every = _numbers(1 << len(scan).bit_length())[: len(scan)]
+    return kept_part(scan, every, tuple(records))
+
+
+def kept_part(
+    scan: RecordedScan,
+    kept: NDArray[np.int64],
+    records: tuple[EffectRecord, ...],
+    lost: dict[str, int] | None = None,
+    moved: int = 0,
+) -> WeatheredScan:
+    """Result that consists of some points ``(Q,)`` of a scan."""
+    report = {"points": len(scan), "lost": lost or {}, "moved": moved, "dimmed": 0, "added": {}}
+    columns: dict[str, Any] = {n: getattr(scan, n) for n in ("points", "intensity", "labels")}
+    if len(kept) < len(scan):
+        columns = {n: None if column is None else column[kept] for n, column in columns.items()}
+    nothing = np.zeros(len(kept), dtype=np.uint8)
     return WeatheredScan(
-        scan.points, scan.intensity, scan.labels, every, every, origins, records, report
+        index=kept, shot=kept, origins=nothing, effects=records, report=report, **columns
     )
+
+
+@cache
+def _numbers(num: int) -> NDArray[np.int64]:
+    """0, 1, 2, ...: kept, since it would be most of the cost of clear weather."""
+    numbers = np.arange(num)
+    numbers.flags.writeable = False
+    return numbers
 
 
 def _result(
@@ -179,9 +201,8 @@ def _result(
         with np.errstate(invalid="ignore"):
             seen[1] &= np.abs(echoes[1].range_m - echoes[0].range_m) > SECOND_RETURN_M
         seen[1] &= seen[0]
-    points, intensity = scan.points.copy(), scan.intensity
-    if intensity is not None:
-        intensity = intensity.copy()
+    points = scan.points.copy()
+    intensity = None if scan.intensity is None else scan.intensity.copy()
     stays = np.ones(len(scan), dtype=bool)
     stays[sweep.rays_of] = False
     added, moved, dimmed = [], 0, 0
@@ -197,9 +218,9 @@ def _result(
             at = sweep.rays_of[weaker]
             intensity[at] = np.minimum(intensity[at], faded.astype(intensity.dtype))
         rays = np.flatnonzero(is_seen & (echo.origin != Origin.SURFACE))
-        shown = sweep.in_units(echo.power[rays], echo.range_m[rays])
-        along = sweep.at(rays, echo.range_m[rays])
-        added.append((along, shown, sweep.rays_of[rays], echo.origin[rays]))
+        range_m, origin = echo.range_m[rays], echo.origin[rays]
+        shown = sweep.in_units(echo.power[rays], range_m)
+        added.append((sweep.at(rays, range_m), shown, sweep.rays_of[rays], origin))
 
     new, shown, shot, made_by = map(np.concatenate, zip(*added, strict=True))
     kept = np.flatnonzero(stays)
