@@ -46,20 +46,14 @@ _SEMANTIC_KITTI, _ITS_VEHICLES = 45, (10, 11, 13, 15, 16, 18, 20, 252, *range(25
 class Fault:
     """A fault of a severity, or of any strength.
 
-    ``missing_beams``
-        A share of the beams, by chance, has no return.
-    ``fewer_beams``
-        Another sensor: evenly spread beams stay, and of these every second shot.
-    ``crosstalk``
-        A share of the points is elsewhere: normal with 3 m, of ``CROSSTALK_CLASS``.
-    ``incomplete_echo``
-        A share of the points of each labelled class of vehicles is lost.
-    ``motion_blur``
-        The scan moves along each axis, normal, and its points by a tenth of that (z: a twentieth).
-    ``shifted_extrinsics``
-        A turn about a random axis, and 0.1 m per degree in a random direction.
-    ``dropped_sectors``
-        Three sectors, which take so much of the turn together, are dark.
+    - ``missing_beams``: a share of the beams, by chance, has no return.
+    - ``fewer_beams``: another sensor; evenly spread beams stay, and of these every second shot.
+    - ``crosstalk``: a share of the points is elsewhere, normal with 3 m, of ``CROSSTALK_CLASS``.
+    - ``incomplete_echo``: a share of the points of each labelled class of vehicles is lost.
+    - ``motion_blur``: the scan moves along each axis, normal, and its points by a tenth of that (z:
+      a twentieth).
+    - ``shifted_extrinsics``: a turn about a random axis, and 0.1 m per degree in some direction.
+    - ``dropped_sectors``: three sectors, which take so much of the turn together, are dark.
 
     Robo3D draws missing beams with replacement, so that fewer are missing than it says, and adds
     crosstalk to intensities too. Source: Kong et al., "Robo3D" (ICCV 2023) and its code for the

@@ -216,7 +216,11 @@ def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
 def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     counts = [len(columns)] if columns else [5] if path.stem.endswith(".pcd") else [4, 5]
     fitting = [np.frombuffer(data, "<f4").reshape(-1, n) for n in counts if not len(data) % (4 * n)]
-    likely = [rows for rows in fitting if columns or _plausible(rows)]
+    likely = []
+    for rows in fitting:
+        shares, ring = rows[:, 3:], rows[:, 4:]  # NaN is for a later message
+        if columns or not ((shares < 0).any() or (ring > 255).any() or (ring % 1 > 0).any()):
+            likely.append(rows)
     if len(likely) != 1:
         raise ScanError(
             f"{path}: its {len(data)} bytes are no rows of {' or '.join(map(str, counts))} float32 "
@@ -225,12 +229,6 @@ def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
         )
     table = _with_names(path, likely[0], columns)
     return f"{likely[0].shape[1]} columns of float32", table, np.ndarray.tobytes
-
-
-def _plausible(rows: NDArray) -> bool:
-    """Whether intensities and rings can be such; NaN is for a later message."""
-    ring = rows[:, 4:5]
-    return not ((rows[:, 3:] < 0).any() or (ring > 255).any() or (ring % 1 > 0).any())
 
 
 def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:

@@ -6,6 +6,7 @@ that there are no rays for them: no effect gives them an echo.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -78,8 +79,9 @@ class Instrument:
 
     def sensor_for(self, scan: RecordedScan) -> SpinningLidar:
         """The sensor with one laser, as high as some points of the scan, which the sun needs."""
-        some = angles(scan.points[:: 1 + len(scan) // _SOME_POINTS])[0]
-        return _with_laser(self.sensor, self.returns, int(np.ceil(np.degrees(some.max()))))
+        x, y, z = scan.points[:: 1 + len(scan) // _SOME_POINTS].T
+        highest_deg = math.degrees(np.arctan2(z, np.hypot(x, y)).max())
+        return _with_laser(self.sensor, self.returns, math.ceil(highest_deg))
 
 
 @lru_cache
