@@ -177,7 +177,7 @@ def protocols(
     from r3dpa.metrics.evaluation import feature_spaces
     from r3dpa.metrics.protocol_shifts import protocol_shifts
     from r3dpa.metrics.results import save_text
-    from r3dpa.metrics.scene import EvaluationScene
+    from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
     module = read_data(data)
@@ -191,7 +191,7 @@ def protocols(
         {"all": [*scans], "train": [s.name for s in train], "val": [s.name for s in val]},
         lambda name: module.points(scans[name]),
         lambda protocol: feature_spaces(spaces, ckpt, protocol, device),
-        module.sensor,
+        replace(PROTOCOLS["published"], sensor=module.sensor),
         {"data": str(data), "commit": source_commit()},
     )
     if out is not None:

@@ -9,12 +9,12 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from r3dpa.geometry import LidarSensor, Projection, RingProjection, SphericalProjection, range_image
+from r3dpa.geometry import Projection, RingProjection, SphericalProjection, range_image
 from r3dpa.io import text_table
 from r3dpa.metrics.evaluation import evaluate
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of
 from r3dpa.metrics.results import Evaluation
-from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, Protocol
+from r3dpa.metrics.scene import EvaluationScene, Protocol
 from r3dpa.metrics.scene_features import SceneFeatures
 
 Split = Literal["all", "train", "val"]
@@ -36,18 +36,18 @@ class Choice(NamedTuple):
     share: float = 1.0
 
 
-def choices(sensor: LidarSensor) -> list[Choice]:
-    """Choices that papers state or their code shows, for a sensor's field of view; R3DPA's first.
+def choices(base: Protocol) -> list[Choice]:
+    """Choices that papers state or their code shows, one at a time changed from R3DPA's, ``base``.
 
     Source: ``evaluate.py`` and paper of R3DPA; data and metrics of R2DM and R2Flow; LiDM.
     """
-    base = replace(PUBLISHED, sensor=replace(sensor, range_min_m=1.0, range_max_m=56.0))
 
     def within(least: float, most: float) -> Protocol:
-        return replace(base, sensor=replace(sensor, range_min_m=least, range_max_m=most))
+        return replace(base, sensor=replace(base.sensor, range_min_m=least, range_max_m=most))
 
+    base = within(1.0, 56.0)
     hiding = SphericalProjection(base.sensor, legacy_hiding=True)
-    rings = RingProjection(base.sensor, (0.0,) * sensor.beams, legacy_rows=True)
+    rings = RingProjection(base.sensor, (0.0,) * base.sensor.beams, legacy_rows=True)
     theirs = "R2DM, R2Flow"
     return [
         Choice("", "corners, 1-56 m, train and val", "R3DPA", base),
@@ -70,45 +70,48 @@ class ProtocolShifts(NamedTuple):
     evaluations: list[Evaluation]
 
     def entries(self) -> list[dict[str, Any]]:
-        """Value, shift from the first choice, and 95 % interval of each metric by choice."""
-        base = {row.name: row for row in self.evaluations[0].rows}
-        found = []
+        """Value, 95 % interval and shift from the first choice of each metric, by choice."""
+        rows = [row for row in self.evaluations[0].rows if row.direction == "lower"]
+        base, found = {row.name: (row.value, row.interval) for row in rows}, []
         for choice, evaluation in zip(self.choices, self.evaluations, strict=True):
             metrics = {}
             for row in evaluation.rows:
-                own, first = row.value, base[row.name]
-                if row.direction == "lower" and own is not None and first.value is not None:
-                    low, high = first.interval or (first.value, first.value)
+                value, (unshifted, interval) = row.value, base.get(row.name, (None, None))
+                if value is not None and unshifted is not None and interval:
                     metrics[row.name] = {
-                        "value": own,
+                        "value": value,
                         "interval": row.interval,
-                        "shift": own - first.value,
-                        "beyond_interval": not low <= own <= high,
+                        "shift": value - unshifted,
+                        "beyond_interval": not interval[0] <= value <= interval[1],
                     }
-            entry = {"factor": choice.factor, "choice": choice.choice, "source": choice.source}
-            counts = [(row.num_samples, row.num_references) for row in evaluation.rows[:1]]
-            found.append(entry | {"counts": counts[0], "metrics": metrics})
+            count = evaluation.rows[0]
+            entry = {
+                "factor": choice.factor,
+                "choice": choice.choice,
+                "source": choice.source,
+                "samples": count.num_samples,
+                "scans": count.num_references,
+                "metrics": metrics,
+            }
+            found.append(entry)
         return found
 
     def __str__(self) -> str:
-        first, *others = self.entries()
-        names = list(first["metrics"])
-        lines = []
-        for name in names:
-            own = first["metrics"][name]
-            low, high = own["interval"] or (own["value"], own["value"])
-            cells = [name, f"{own['value']:.3g} [{low:.3g}, {high:.3g}]"]
-            for entry in others:
-                shifted = entry["metrics"].get(name)
-                mark = "*" if shifted and shifted["beyond_interval"] else ""
-                cells.append(f"{shifted['shift']:+.2g}{mark}" if shifted else "-")
-            lines.append(cells)
-        rows = [list(row) for row in zip(*lines, strict=True)]
-        heads = [f"{e['factor']}: {e['choice']} ({e['source']})".lstrip(": ") for e in others]
-        labels = ["", f"{first['choice']} ({first['source']})", *heads]
-        table = [[label, *row] for label, row in zip(labels[1:], rows[1:], strict=True)]
-        note = "shift of the value; * outside the 95 % interval of the first row"
-        return f"{text_table(table, ['', *names])}\n{note}"
+        rows = []
+        names = list(self.entries()[0]["metrics"])
+        for entry in self.entries():
+            cells = ["{factor}: {choice} ({source})".format(**entry).removeprefix(": ")]
+            for name in names:
+                cell = entry["metrics"].get(name)
+                if cell is None:
+                    cells.append("-")
+                elif not entry["factor"]:
+                    cells.append("{:.3g} [{:.3g}, {:.3g}]".format(cell["value"], *cell["interval"]))
+                else:
+                    cells.append(f"{cell['shift']:+.2g}{'*' * cell['beyond_interval']}")
+            rows.append(cells)
+        note = "below the first row: shift of the value; * outside the first row's 95 % interval"
+        return f"{text_table(rows, ['', *names])}\n{note}"
 
 
 def protocol_shifts(
@@ -116,7 +119,7 @@ def protocol_shifts(
     scans: Mapping[Split, Sequence[str]],
     points: Callable[[str], Tensor],
     spaces: Callable[[Protocol], Sequence[SceneFeatures]],
-    sensor: LidarSensor,
+    base: Protocol,
     about: dict[str, Any],
 ) -> ProtocolShifts:
     """Evaluates samples under each of :func:`choices`; a split of fewer than 2 scans is left out.
@@ -126,10 +129,10 @@ def protocol_shifts(
         scans: Names of the real scans by split.
         points: Points ``(P, 3)`` or ``(P, 4)`` of a scan.
         spaces: Feature spaces for a protocol.
-        sensor: Image size and field of view.
+        base: Protocol of R3DPA, with image size and field of view of the sensor.
         about: Card of the references.
     """
-    kept = [choice for choice in choices(sensor) if len(scans[choice.split]) > 1]
+    kept = [choice for choice in choices(base) if len(scans[choice.split]) > 1]
     references: dict[Any, ReferenceStatistics] = {}
     evaluations: list[Evaluation] = []
     for choice in kept:
