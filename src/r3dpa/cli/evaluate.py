@@ -173,10 +173,9 @@ def protocols(
     from r3dpa.cli.features import read_data
     from r3dpa.data.samples import read_samples
     from r3dpa.data.scans import evenly
-    from r3dpa.io import command, machine, source_commit, versions
+    from r3dpa.io import command, machine, source_commit, versions, write_text
     from r3dpa.metrics.evaluation import feature_spaces
     from r3dpa.metrics.protocol_shifts import protocol_shifts
-    from r3dpa.metrics.results import save_text
     from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
 
     check_file(out)
@@ -198,7 +197,7 @@ def protocols(
         card = {"command": command(), "machine": machine(), "commit": source_commit()}
         card |= {"samples": str(samples), "data": str(data), "versions": versions(torch)}
         content = card | {"choices": shifts.entries()}
-        save_text(out, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        write_text(out, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return shifts
 
 
