@@ -156,6 +156,14 @@ class TestOurFiles:
         with pytest.raises(ValueError, match=class_path):
             read_checkpoint(path)
 
+    def test_a_damaged_number_of_layers_is_refused_before_all_are_built(self, checkpoint, tmp_path):
+        path = save_checkpoint(checkpoint, tmp_path / "a.safetensors")
+        change_description(
+            path, lambda about: about["networks"]["sit"]["init_args"].update(depth=3000)
+        )
+        with pytest.raises(ValueError, match="parameters, far more than its weights"):
+            read_checkpoint(path)
+
     def test_a_class_imported_into_our_package_is_not_ours(self, monkeypatch):
         monkeypatch.setattr("r3dpa.nn.Linear", nn.Linear, raising=False)
         state = NetworkState("r3dpa.nn.Linear", {"in_features": 1, "out_features": 1}, {})

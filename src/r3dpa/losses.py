@@ -14,6 +14,7 @@ from torch import Tensor
 __all__ = [
     "alignment_loss",
     "balanced_gradient",
+    "centred_features",
     "discriminator_loss",
     "flow_matching_loss",
     "generator_loss",
@@ -160,6 +161,14 @@ def alignment_loss(
         return -cosine.mean(dim=1)
     occupied = feature_grid.abs().amax(dim=-1) > 0
     return -(cosine * occupied).sum(dim=1) / occupied.sum(dim=1).clamp(min=1)
+
+
+def centred_features(feature_grid: Tensor) -> Tensor:
+    """Feature grids ``(B, N, D)`` minus their mean over the occupied cells; empty cells stay 0."""
+    feature_grid = feature_grid.float()
+    occupied = (feature_grid.abs().amax(dim=-1, keepdim=True) > 0).float()
+    mean = feature_grid.sum(dim=1, keepdim=True) / occupied.sum(dim=1, keepdim=True).clamp(min=1)
+    return (feature_grid - mean) * occupied
 
 
 def _unit(vectors: Tensor, eps: float = 1e-6) -> Tensor:

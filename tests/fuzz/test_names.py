@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import zipfile
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from r3dpa.data import read_samples
 from r3dpa.data.scans import read_npz
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
+from r3dpa.metrics.official_statistics import OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import PROTOCOLS
 from r3dpa.simulation import expected_scans
@@ -74,3 +76,33 @@ def test_few_bytes_that_ask_for_much_memory(tmp_path, count):
         archive.writestr("a.npy", data)
     with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': is damaged"):
         read_npz(tmp_path / "a.npz")
+
+
+def test_a_directory_that_claims_more_than_the_archive_holds(tmp_path):
+    np.savez(tmp_path / "a.npz", a=POINTS)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    size = data.index(b"PK\x01\x02") + 24  # of the unpacked size
+    data[size : size + 4] = (2**31).to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.npz, member 'a\.npy': .*larger than the file"):
+        read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("pickled", "reason"),
+    [
+        (b"\x80\x04}r\xff\xff\xff\x7f.", "no attribute 'item'"),
+        (b"\x80\x05\x8e" + (2**40).to_bytes(8, "little") + b"abc.", "EOFError"),
+        (b"cnumpy\nndarray\n(I1099511627776\ntR.", "not callable"),
+        (
+            pickle.dumps(np.array([None] * 77), 3).replace(b"KM\x85", b"J\xff\xff\xff\x7f\x85"),
+            r"array of shape \(2147483647,\) is cut short",
+        ),
+    ],
+)
+def test_pickles_that_ask_for_much_memory(pickled, reason, tmp_path):
+    path = tmp_path / "statistics.npy"
+    np.save(path, np.array(None), allow_pickle=True)
+    path.write_bytes(path.read_bytes()[:128] + pickled)
+    with pytest.raises(ValueError, match=rf"statistics\.npy: is no official .*{reason}"):
+        OfficialStatistics.load(path)

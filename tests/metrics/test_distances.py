@@ -201,6 +201,20 @@ def test_a_refused_cloud_leaves_the_state(cloud, message):
     assert updated(metric, "bev").compute() == pytest.approx(expected("bev"))
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_failed_forward_leaves_the_state(name):
+    """torchmetrics empties the states before it updates them with the batch."""
+    metric = updated(metric_of(name), name)
+    broken = data(name, True)
+    broken = [torch.zeros(0, 3)] if isinstance(broken, list) else broken * torch.nan
+    updates = metric.update_count
+    with pytest.raises(ValueError, match="real"):
+        metric(broken, real=True)
+    assert metric.update_count == updates
+    assert metric.compute() == pytest.approx(expected(name), rel=1e-6)
+    assert updated(metric, name).count("real") == 2 * len(data(name, True))
+
+
 def test_refused_features_leave_the_state():
     metric, broken = FrechetDistance(3), draw(5, 3)
     broken[4, 1] = torch.nan

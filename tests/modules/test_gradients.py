@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import StochasticWeightAveraging
 from tiny_stages import QUIET, TinyData, group_of, stage_module, train
 from torch import nn
 
@@ -162,6 +163,8 @@ class TestNonFiniteGradients:
         ({"precision": "bf16-true"}, "precision bf16-true is not supported.*bf16-mixed"),
         ({"precision": "16-true"}, "precision 16-true is not supported"),
         ({"precision": "64-true"}, "precision 64-true is not supported"),
+        ({"reload_dataloaders_every_n_epochs": 1}, "would break the order of a resumed run"),
+        ({"callbacks": [StochasticWeightAveraging(0.1)]}, "is not supported.*model.ema_decay"),
         (CLIP_BY_VALUE, "by norm per network; .*got 'value'"),
     ],
 )

@@ -9,7 +9,7 @@ import torch
 from tiny_stages import QUIET, SENSOR, STAGES, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.geometry import RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.losses import masked_mean, return_loss
+from r3dpa.losses import centred_features, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig
 from r3dpa.nn import VAE
 
@@ -64,6 +64,11 @@ def test_means_and_cross_entropy_by_hand():
     certain = torch.tensor([[50.0, -50.0]])
     assert return_loss(certain, torch.tensor([[True, False]])).item() == pytest.approx(0.0)
     assert return_loss(certain, torch.tensor([[False, False]])).item() == pytest.approx(25.0)
+
+
+def test_centred_features_have_no_mean_and_keep_empty_cells():
+    grid = torch.tensor([[[1.0, 2.0], [3.0, 6.0], [0.0, 0.0]]])
+    assert centred_features(grid).tolist() == [[[-1.0, -2.0], [1.0, 2.0], [0.0, 0.0]]]
 
 
 def test_alignment_of_the_sit_stops():

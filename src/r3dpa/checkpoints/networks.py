@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import itertools
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.utils.hooks import RemovableHandle
 
 from r3dpa.io import UNPICKLING_ERRORS
 
@@ -44,6 +47,17 @@ def shapes_of(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 def _tuples(value: Any) -> Any:
     """YAML and JSON know lists only; the networks' sequence arguments are tuples."""
     return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
+
+
+def _at_most(count: int) -> RemovableHandle:
+    """Limits the number of parameters: a damaged file may ask for a billion layers."""
+    left = itertools.count(count, -1)
+
+    def counted(*_: Any) -> None:
+        if next(left) <= 0:
+            raise ValueError(f"more than {count} parameters, far more than its weights are")
+
+    return register_module_parameter_registration_hook(counted)
 
 
 @dataclass(frozen=True)
@@ -110,7 +124,7 @@ class NetworkState:
     def checked(self, name: str = "") -> NetworkState:
         """This state; a ``ValueError`` as of :meth:`build`, but without memory for weights."""
         try:
-            with torch.device("meta"):
+            with torch.device("meta"), _at_most(4 * len(self.state_dict) + 4):
                 network = self.new()
             self._refuse_problems(network)
         except ValueError as error:

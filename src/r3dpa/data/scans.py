@@ -284,12 +284,15 @@ def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     where = str(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            for member in archive.zip.namelist():
+            for info in archive.zip.infolist():
+                member = info.filename
                 where = f"{path}, member {member!r:.80}"
                 if not member.endswith(".npy"):
                     continue
                 if reason := refuse_name(member):
                     raise ValueError(f"its name {reason}")
+                if info.file_size > max(2**30, 100 * path.stat().st_size):
+                    raise ValueError("it is far larger than the file")
                 if isinstance(array := archive[member], bytes):
                     raise ValueError("it is no array")
                 yield member.removesuffix(".npy"), array

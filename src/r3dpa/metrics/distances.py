@@ -58,6 +58,15 @@ class SceneMetric(Metric):
         self._empty: dict[str, Tensor] = {}  # rows of the states that are lists of tensors
         self._add_states("count", torch.zeros((), dtype=torch.int64))
 
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """As torchmetrics does it, but an update that fails leaves the state as it was."""
+        before = self.__dict__ | self._copy_state_dict()
+        try:
+            return super().forward(*args, **kwargs)
+        except Exception:
+            self.__dict__.update(before)
+            raise
+
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distances as rows of a table, with intervals; of this process alone."""
         raise NotImplementedError

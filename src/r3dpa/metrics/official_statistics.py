@@ -7,6 +7,7 @@ of single scans; no features, no range images, and neither names of scans nor ha
 from __future__ import annotations
 
 import io
+import math
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,6 @@ OfficialSplit = Literal["val", "all"]
 #: Official names of the feature spaces; FRID also reads the intensity with other weights.
 _EVALUATORS = {"fld": "liploc", "fsvd": "minkowskinet", "fpvd": "spvcnn"}
 _FRID = {4: "rangevit_wo_i", 5: "rangevit_w_i"}  # by input channels
-_PICKLED = {"numpy": ("dtype", "ndarray"), "numpy._core.multiarray": ("_reconstruct", "scalar")}
 _HISTOGRAM, _CLOUDS = "dataset_bev_hist", "valset_voxelized_bev"
 
 
@@ -132,14 +132,34 @@ class OfficialStatistics:
         return cls(path, chosen, moments, cells, clouds)
 
 
-class _ArraysOnly(pickle.Unpickler):
-    """Unpickler of NumPy arrays and plain containers; refuses everything else by name."""
+class _Array(np.ndarray):
+    """Array that is refused if it claims more elements than its pickled values can have."""
+
+    def __setstate__(self, state: Any) -> None:
+        if math.prod(state[1]) > len(state[4]):
+            raise pickle.UnpicklingError(f"an array of shape {state[1]} is cut short")
+        super().__setstate__(state)
+
+
+_PICKLED: dict[str, Any] = {
+    "numpy.dtype": np.dtype,
+    "numpy.ndarray": None,  # only an argument of the next, which needs none
+    "numpy._core.multiarray._reconstruct": lambda *_: _Array(0),
+    "numpy._core.multiarray.scalar": np.float64().__reduce__()[0],
+}
+
+
+class _ArraysOnly(pickle._Unpickler):
+    """Unpickler of NumPy arrays and plain containers; refuses everything else by name.
+
+    The one written in C allocates its memo by the indices in the file, which may be damaged.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core", "numpy._core")
-        if name in _PICKLED.get(module, ()):
-            return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"{module}.{name} is no array; it is not loaded")
+        full = f"{module}.{name}".replace("numpy.core", "numpy._core")
+        if full not in _PICKLED:
+            raise pickle.UnpicklingError(f"{full} is no array; it is not loaded")
+        return _PICKLED[full]
 
 
 def _numbers(values: np.ndarray, ndim: int) -> Tensor:

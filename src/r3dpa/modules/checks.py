@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import lightning as L
+from lightning.pytorch.callbacks import StochasticWeightAveraging
 
 from r3dpa.data.image_datamodule import ImageDataModule
 from r3dpa.geometry import ScanGeometry
@@ -14,11 +15,21 @@ _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 
 
 def check_trainer(trainer: Any) -> None:
-    """Refuses precisions that the stages cannot train with."""
+    """Refuses precisions and callbacks that the stages cannot train with."""
     if trainer.precision not in _PRECISIONS:
         raise ValueError(
             f"trainer.precision {trainer.precision} is not supported, as weights, statistics and "
             f"prepared scans are float32: give one of {', '.join(_PRECISIONS)}"
+        )
+    if trainer.reload_dataloaders_every_n_epochs:
+        raise ValueError(
+            "trainer.reload_dataloaders_every_n_epochs would break the order of a resumed run: "
+            "leave it out; the loaders shuffle each epoch anew"
+        )
+    if any(isinstance(callback, StochasticWeightAveraging) for callback in trainer.callbacks):
+        raise ValueError(
+            "StochasticWeightAveraging is not supported: leave the callback out; stages that train "
+            "a SiT keep an average of their own, see model.ema_decay"
         )
 
 

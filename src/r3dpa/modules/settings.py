@@ -31,6 +31,8 @@ class LossWeights:
         denoising: Weight of the velocity error.
         sit_alignment: lambda2, weight of the alignment loss that reaches the SiT.
         skip_empty_cells: Leave empty grid cells out of the mean of the alignment loss.
+        centre_features: Align with the difference of each cell from the mean of its scan, which
+            keeps the spatial structure (iREPA).
         alignment_stop: First step without ``sit_alignment``, which helps early and may hold back
             later (HASTE); None: never.
     """
@@ -47,6 +49,7 @@ class LossWeights:
     denoising: float = 1.0
     sit_alignment: float = 0.5
     skip_empty_cells: bool = False
+    centre_features: bool = False
     alignment_stop: int | None = None
 
 

@@ -315,5 +315,7 @@ def align(module: Any, projected: Tensor, features: Tensor | None) -> Tensor:
         raise ValueError(
             f"stage {module.stage} aligns with 3D features, but the batch holds no feature_grid"
         )
+    if module.weights.centre_features:
+        features = losses.centred_features(features)
     skip = module.weights.skip_empty_cells
     return losses.alignment_loss(projected, features, skip_empty_cells=skip)
