@@ -123,6 +123,31 @@ def test_settings_of_the_test_do_not_count(tmp_path):
     assert not set(names[0]) & set(names[2])
 
 
+def test_released_files_stand_for_trainings(tmp_path):
+    weights, samples = tmp_path / "r2dm.pth", tmp_path / "samples"
+    weights.write_bytes(b"weights")
+    samples.mkdir()
+    path = TABLES / "scale" / "demo.yaml"
+    released = {"r2dm": weights, "ultralidar": samples}
+    plan = make_plan(TABLES / "table_1", path, (0,), tmp_path, resolved, None, released)
+    rows = rows_of(plan)
+    assert next(key for _, key in rows) == "0_ultralidar"
+    assert not any(stage.words[0] == "r2dm" for stage in plan.stages)
+    jobs = {job.name: job for job in runner._jobs(plan)}
+    (stage,) = rows["table_1", "3_r2dm"].stages[0]
+    sampled, test = jobs[stage.name], jobs[f"test of {stage.name}"]
+    assert sampled.words[:3] == ["sample", "--ckpt", str(weights)]
+    assert test.words[:3] == ["evaluate", "--samples", sampled.words[4]]
+    assert test.needs == (stage.name, "reference")
+    assert test.makes == stage.evaluation
+    (stage,) = rows["table_1", "0_ultralidar"].stages[0]
+    assert jobs[f"test of {stage.name}"].words[2] == str(samples)
+    assert stage.name not in jobs
+    assert "1 r2flow of 400 steps" in budget_of(plan)
+    with pytest.raises(ValueError, match=r"--released\.r2d2: there is no such row"):
+        make_plan(TABLES / "table_1", path, (0,), tmp_path, resolved, None, {"r2d2": weights})
+
+
 ROW = {"label": "x", "commands": {"a": "fit joint --preset demo"}}
 
 

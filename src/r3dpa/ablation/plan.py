@@ -20,7 +20,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,7 +41,8 @@ class Stage(NamedTuple):
 
     ``name``, also of its run folder, is the experiment and a hash of the resolved ``config``, the
     files of weights in it, the seed, and the stages ``before``. ``words`` are those after ``fit``,
-    and ``config`` what they amount to with seed 0.
+    and ``config`` what they amount to with seed 0. Of released weights or samples, which are given
+    instead, the config is empty and ``words`` is their path alone.
     """
 
     name: str
@@ -53,13 +54,13 @@ class Stage(NamedTuple):
     @property
     def on_scans(self) -> bool:
         """Whether it trains on scans, not on images."""
-        return "grid_size" in self.config["data"]["init_args"]
+        return bool(self.config) and "grid_size" in self.config["data"]["init_args"]
 
     @property
     def on_features(self) -> bool:
         """Whether the scans come with feature grids."""
-        data = self.config["data"]["init_args"]
-        return self.on_scans and bool(data.get("extractor") or data.get("features_dir"))
+        data = self.config["data"]["init_args"] if self.on_scans else {}
+        return bool(data.get("extractor") or data.get("features_dir"))
 
     @property
     def evaluation(self) -> Path:
@@ -153,12 +154,15 @@ def make_plan(
     out: Path,
     resolve: Callable[[str], dict[str, Any]],
     rgb_weights: Path | None = None,
+    released: Mapping[str, Path] | None = None,
 ) -> Plan:
     """Plan of the table in a folder, or of all tables in folders below it.
 
     ``resolve`` gives the whole configuration of an ``r3dpa fit`` command, with ``{names}`` as they
-    are, and ``rgb_weights`` replace the command ``prior`` of the scale. ``ValueError`` if there is
-    no table or scale, a file is invalid, or a seed is negative or occurs twice.
+    are, and ``rgb_weights`` replace the command ``prior`` of the scale. ``released`` are
+    checkpoints to sample from, or folders of samples, in place of the trainings of a row, by its
+    name without the number. ``ValueError`` if there is no table or scale, a file is invalid, or a
+    seed is negative or occurs twice.
     """
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise ValueError(f"--seeds must be different numbers from 0 on, got {list(seeds)}")
@@ -178,28 +182,53 @@ def make_plan(
     folders = [folder] if single else sorted(path.parent for path in folder.glob("*/table.yaml"))
     if not folders:
         raise ValueError(f"{folder}: holds no table.yaml, nor does any folder in it")
-    tables = [_table(path, given, seeds) for path in folders]
+    released = dict(released or {})
+    tables = [_table(path, given, seeds, released) for path in folders]
+    names = {_name_of(row.key) for table in tables for row in table.rows}
+    if unknown := [name for name in released if name not in names]:
+        raise ValueError(f"--released.{unknown[0]}: there is no such row; give one of {names}")
     options = shlex.split(about.get("reference", ""))
     return Plan(out, scale.stem, about["about"], options, tuple(seeds), tables)
 
 
-def _table(folder: Path, scale: _Scale, seeds: Sequence[int]) -> Table:
-    path = folder / "table.yaml"
-    about = _read(path, ("caption",), ("better", "alike"))
+def _table(
+    folder: Path, scale: _Scale, seeds: Sequence[int], released: Mapping[str, Path]
+) -> Table:
+    path_of_table = folder / "table.yaml"
+    about = _read(path_of_table, ("caption",), ("better", "alike"))
     rows: dict[str, Row] = {}
-    for file in sorted(set(folder.glob("*.yaml")) - {path}):
+    for file in sorted(set(folder.glob("*.yaml")) - {path_of_table}):
         row = _read(file, ("label", "commands"), ("published",))
         published = row.get("published", {})
+        path, only_released = released.get(_name_of(file.stem)), row["commands"] == "released"
+        if only_released and path is None:
+            continue
         if not row["commands"] or not published.keys() <= PUBLISHED_SCALES.keys():
             known = ", ".join(PUBLISHED_SCALES)
             raise ValueError(f"{file}: has no command, or published names none of {known}")
-        stages = {seed: scale.stages(row["commands"], seed, file) for seed in seeds}
+        if path is None:
+            stages = {seed: scale.stages(row["commands"], seed, file) for seed in seeds}
+        else:
+            stages = {seed: [_given(path, scale.out)] for seed in seeds}
         rows[file.stem] = Row(file.stem, row["label"], published, stages)
     orders = [(name, *pair) for name in ("better", "alike") for pair in about.get(name, ())]
     for name, *pair in orders:
         if len(pair) != 2 or not rows.keys() >= set(pair):
-            raise ValueError(f"{path}: {name}: {pair} is no pair of {sorted(rows)}")
+            raise ValueError(f"{path_of_table}: {name}: {pair} is no pair of {sorted(rows)}")
     return Table(folder.name, about["caption"], list(rows.values()), orders)
+
+
+def _name_of(key: str) -> str:
+    return re.sub(r"^\d+_", "", key)
+
+
+def _given(path: Path, out: Path) -> Stage:
+    """Stage of released weights or samples."""
+    if not path.exists():
+        raise ValueError(f"--released {path}: there is no such file or folder")
+    content = _digest(path) if path.is_file() else str(path.resolve())
+    name = f"released-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
+    return Stage(name, out / "stages" / name, [str(path)], {}, ())
 
 
 def _read(path: Path, needed: Sequence[str], more: Sequence[str]) -> dict[str, Any]:

@@ -12,11 +12,11 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
-from r3dpa.ablation.plan import Plan
+from r3dpa.ablation.plan import Plan, Stage
 from r3dpa.io import no_follow, only_writer, write_text
 
 _CSV_LOGGER = {
@@ -50,9 +50,11 @@ class Job(NamedTuple):
 
 def budget_of(plan: Plan) -> str:
     """Number and length of all trainings, in a line."""
-    trainings = Counter((s.words[0], s.config["trainer"]["max_steps"]) for s in plan.stages)
+    trainings = Counter(
+        (s.words[0], s.config["trainer"]["max_steps"]) for s in plan.stages if s.config
+    )
     listed = [f"{num} {name} of {steps} steps" for (name, steps), num in trainings.items()]
-    return f"budget: {len(plan.stages)} trainings: {', '.join(listed)}"
+    return f"budget: {trainings.total()} trainings: {', '.join(listed)}"
 
 
 def run_plan(plan: Plan, say: Callable[[str], None], jobs: int = 1) -> dict[str, str]:
@@ -135,7 +137,10 @@ def _jobs(plan: Plan) -> list[Job]:
     """Scans and their reference, trainings, tests; each after the jobs that it needs."""
     out, data, reference = plan.out, plan.out / "data.yaml", plan.out / "reference.safetensors"
     # Baselines see the same scans without features, through sensors of their own.
-    featured = [stage.config["data"] for stage in plan.stages if stage.on_features]
+    trained = [stage.config for stage in plan.stages if stage.on_features]
+    if not trained:
+        raise ValueError("no row is left to train: compare released files by `r3dpa evaluate`")
+    featured, scorer = [config["data"] for config in trained], trained[0]["scorer"]
     sizes = sorted({tuple(block["init_args"]["grid_size"]) for block in featured})
     write_text(data, yaml.safe_dump({"data": featured[0]}))
     scans = json.dumps([featured[0], sizes], sort_keys=True)
@@ -149,6 +154,9 @@ def _jobs(plan: Plan) -> list[Job]:
     tested = {chain[-1].name for chain in plan.chains}
     for stage in plan.stages:
         name, folder = stage.name, stage.folder
+        if not stage.config:
+            jobs += _of_released(stage, reference, of_reference, scorer)
+            continue
         needs = (*stage.before, "features") if stage.on_scans else stage.before
         words = [*stage.words, "--run_dir", str(folder), "--trainer.enable_progress_bar", "false"]
         fit = ["fit", *words, "--ckpt_path", "last", "--trainer.logger", json.dumps([_CSV_LOGGER])]
@@ -163,3 +171,27 @@ def _jobs(plan: Plan) -> list[Job]:
                 Job(f"test of {name}", test, folder / "test", content, needs, stage.evaluation)
             )
     return jobs
+
+
+def _of_released(
+    stage: Stage, reference: Path, of_reference: str, scorer: dict[str, Any]
+) -> list[Job]:
+    """Samples of released weights, as many as of trained ones, and their comparison."""
+    (given,) = stage.words
+    samples, num = stage.folder / "samples", str(scorer["num_scenes"])
+    jobs = []
+    if Path(given).is_file():
+        words = ["sample", "--ckpt", given, "--out", str(samples), "--num", num, "--pictures", "0"]
+        jobs = [Job(stage.name, words, stage.folder / "sample", f"{stage.name} {num}")]
+        given = str(samples)
+    words = ["evaluate", "--samples", given, "--reference", str(reference), "--skip_bad", "true"]
+    words += [
+        "--allow_few",
+        str(scorer["allow_few"]).lower(),
+        "--out",
+        str(stage.evaluation.parent),
+    ]
+    needs = (*(job.name for job in jobs), "reference")
+    content = f"{of_reference} {given}"
+    test = f"test of {stage.name}"
+    return [*jobs, Job(test, words, stage.folder / "test", content, needs, stage.evaluation)]

@@ -87,7 +87,8 @@ def write_table(plan: Plan, table: Table, failed: Mapping[str, str]) -> tuple[st
                 continue
             found = Evaluation.load(path)
             step = found.about["extra"].get("step")
-            if step is not None and step != chain[-1].config["trainer"]["max_steps"]:
+            config = chain[-1].config
+            if config and step is not None and step != config["trainer"]["max_steps"]:
                 lost.append(f"{row.label}, seed {seed}: {path} is of step {step}, not the last")
             else:
                 results[row.key][seed] = found

@@ -95,6 +95,7 @@ def ablate(
     out: Path | None = None,
     jobs: PositiveInt = 1,
     rgb_weights: Path | None = None,
+    released: dict[str, Path] | None = None,
     wandb: Literal["offline", "online", "off"] = "offline",
     budget_only: bool = False,
 ) -> None:
@@ -113,6 +114,8 @@ def ablate(
         out: Folder for everything; default: ``runs/ablation/<scale>``.
         jobs: Trainings and tests at a time; they share the cores, and all use the first GPU.
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, instead of pretraining one.
+        released: Released checkpoint to sample, or folder of released samples, by the name of the
+            row that it stands for, such as ``--released.r2dm r2dm-h-kitti360-300k.pth``.
         wandb: One run for each row and seed, ``offline`` in ``<out>/wandb`` for ``wandb sync``, or
             ``online``.
         budget_only: Print number and length of the trainings, and start nothing.
@@ -131,7 +134,7 @@ def ablate(
         scale_file = folder / "scale" / f"{scale}.yaml"
     folder = out or Path("runs/ablation") / scale_file.stem
     check_folder(folder)
-    plan = ablation.make_plan(tables, scale_file, seeds, folder, _resolved, rgb_weights)
+    plan = ablation.make_plan(tables, scale_file, seeds, folder, _resolved, rgb_weights, released)
     _say(ablation.budget_of(plan))
     if budget_only:
         return
