@@ -133,7 +133,7 @@ class Weather(scene.Weather):
             ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
                 intensities cannot be used.
         """
-        off, wanted = _switched(effects or {})
+        off, wanted, idle = _switched(tuple((effects or {}).items()))
         vehicles = _vehicles(boxes)
         if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
             vehicles += _labelled_vehicles(scan, self.traffic_m_s)
@@ -141,28 +141,29 @@ class Weather(scene.Weather):
         sensor = instrument.sensor_for(scan)
         called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
         if not called - off.keys() - _DETECTION:
-            return _unchanged(scan, wanted, off)
+            every = _numbers(1 << len(scan).bit_length())[: len(scan)]
+            return kept_part(scan, every, idle)
         key = seed if isinstance(seed, tuple) else (seed,)
         sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
         records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
         return _result(scan, sweep, records)
 
 
-def _switched(effects: Mapping[str, str | bool]) -> tuple[dict[str, str], list[Effect]]:
-    """Effects that are off, and those that may run."""
-    off = check_switches(effects)
-    on = {name for name, switch in effects.items() if switch in ("on", True)}
+@cache
+def _switched(
+    effects: tuple[tuple[str, str | bool], ...],
+) -> tuple[dict[str, str], list[Effect], tuple[EffectRecord, ...]]:
+    """Effects that are off, those that may run, and the records where none is called."""
+    off = check_switches(dict(effects))
+    on = {name for name, switch in effects if switch in ("on", True)}
     for name in REFUSED.keys() & on:
         raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
     left_out = {*REFUSED, *_ON_REQUEST} - on
-    return off, [effect for effect in EFFECTS if effect_name(effect) not in left_out]
-
-
-def _unchanged(scan: RecordedScan, wanted: list[Effect], off: Mapping[str, str]) -> WeatheredScan:
-    names = map(effect_name, wanted)
-    records = (EffectRecord(n, "off" if n in off else "not_called", "", 0) for n in names)
-    every = _numbers(1 << len(scan).bit_length())[: len(scan)]
-    return kept_part(scan, every, tuple(records))
+    wanted = {effect_name(effect): effect for effect in EFFECTS}
+    wanted = {name: effect for name, effect in wanted.items() if name not in left_out}
+    why = "nothing calls for it"
+    idle = (EffectRecord(n, "off" if n in off else "not_called", why, 0) for n in wanted)
+    return off, list(wanted.values()), tuple(idle)
 
 
 def kept_part(
