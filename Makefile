@@ -118,10 +118,13 @@ endif
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
 	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/box/data),--data conf/box/data.yaml)
 
-box: $(READY) ## train the weights of the package: days of two cores; stop and repeat at any time
+box: $(READY) ## train the weights of the package: an hour of a GPU, days of two cores; stop and repeat at any time
 	$(BOX_FIT) --config conf/box/vae_alignment.yaml --run_dir runs/box/vae
-	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
+	$(BOX_FIT) --config conf/box/vae_alignment.yaml --config conf/box/vae_more.yaml \
+		--run_dir runs/box/vae_more \
 		--model.init_args.init_from runs/box/vae/checkpoints/last.ckpt
+	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
+		--model.init_args.init_from runs/box/vae_more/checkpoints/last.ckpt
 	$(BIN)/r3dpa convert runs/box/flow/checkpoints/last.ckpt runs/box/r3dpa-s.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
 

@@ -40,12 +40,13 @@ STARTS = {  # each after the YAML of its stage, which test_stages starts alone
     "few_step_demo": "simulated",
     "joint": "folder",
 }
-BOX = {  # stage, and what is given after it
-    "box": ("vae_alignment", "data"),
-    "box_flow": ("flow_matching", "data"),
-    "box_few_step": ("few_step", "data"),
-    "demo": ("vae_alignment", "demo_vae", "data", "demo_data"),
-    "demo_flow": ("flow_matching", "demo_flow", "demo_folder"),
+BOX = {  # in the order given
+    "box": ("data", "vae_alignment"),
+    "box_more": ("data", "vae_alignment", "vae_more"),
+    "box_flow": ("data", "flow_matching"),
+    "box_few_step": ("data", "few_step"),
+    "demo": ("demo_data", "vae_alignment", "demo_vae"),
+    "demo_flow": ("demo_folder", "flow_matching", "demo_flow"),
 }
 VELOCITIES = sorted(path.stem for kind in ("sit", "unet") for path in CONF.glob(f"net/{kind}_*"))
 QUIET = {
@@ -152,8 +153,8 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
 )
 def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
-    stage, *given = BOX[name]
-    tuned = "demo_vae" in given or "demo_flow" in given
+    given = BOX[name]
+    tuned = len(given) == 3
     vae, sit = (
         yaml.safe_load((CONF / f"box/{part}.yaml").read_text())["init_args"]
         for part in ("vae", "sit")
@@ -161,18 +162,18 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     sit["input_size"] = [2, 4]
     settings = {
         "data.init_args.sensor": "{beams: 16, columns: 64}",
-        "data.init_args.grid_size": "[1, 2]",
+        "data.init_args.grid_size": "[2, 2]",
         "model.init_args.sit.init_args.input_size": "[2, 4]",
     }
     if "demo_folder" in given:
         settings["data.init_args.scans"] = smoke_root
     else:
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
-    if tuned or stage != "vae_alignment":
+    if name != "box":
         codec = RangeCodec("log2", return_channel=True)
-        exported = sit if tuned or stage == "few_step" else None
+        exported = None if name == "box_flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
-    configs = ["trainer", "box/trainer", f"box/{stage}", *(f"box/{part}" for part in given)]
+    configs = ["trainer", *(f"box/{part}" for part in ("trainer", *given))]
     start(configs, settings)
 
 
