@@ -154,7 +154,6 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
 def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
     given = BOX[name]
-    tuned = len(given) == 3
     vae, sit = (
         yaml.safe_load((CONF / f"box/{part}.yaml").read_text())["init_args"]
         for part in ("vae", "sit")
