@@ -44,7 +44,7 @@ class RecordedData(L.LightningDataModule):
 class Recording(JointAlignment):
     """Takes the recorded draws and keeps what the official loop logged."""
 
-    def attach(self, case):
+    def use(self, case):
         self.case, self.steps = case, []
 
     def load_previous_stage(self):
@@ -132,7 +132,7 @@ def run(recorded):
         ema_buffers="decay",
     )
     module.load_state_dict({ours(key): value for key, value in recorded.weights().items()})
-    module.attach(recorded)
+    module.use(recorded)
     trainer = L.Trainer(
         **SILENT,
         max_steps=config["steps"],
