@@ -63,7 +63,7 @@ types: $(READY) ## mypy alone
 	$(BIN)/mypy
 
 test: $(READY) ## default tests, a few minutes on two cores
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m "not slow and not gpu and not weights and not bench"
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist worksteal -p no:nbmake -m "not slow and not gpu and not weights and not bench"
 
 test-all: $(READY) ## every test that this machine can run
 	$(BIN)/pytest

@@ -103,6 +103,7 @@ def test_evaluation_joins_the_wandb_run_of_the_training(tmp_path):
 TEACHER = {
     "data.init_args.source.init_args.num_scans": 12,
     "data.init_args.source.init_args.simulation_seed": 0,
+    "data.init_args.source.init_args.limit": 3,
     "data.init_args.batch_size": 1,
     "data.init_args.num_workers": 0,
     "model.init_args.network.init_args.width": 8,

@@ -120,7 +120,7 @@ def test_an_unfinished_request_is_completed(tmp_path):
     labels.write_bytes(labels.read_bytes()[:-4])
     for path in (folder / "timestamps.txt", *tmp_path.rglob("velodyne_to_world.txt")):
         path.unlink()
-    report = simulate(tmp_path, 6, drives=["0003"], workers=2, **SMALL)
+    report = simulate(tmp_path, 6, drives=["0003"], **SMALL)
     assert report.num_written == 6
     assert files_of(tmp_path) == whole
 
