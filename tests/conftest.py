@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 from pathlib import Path
 
 import pytest
 import torch
 
 from r3dpa.cli import main
+from r3dpa.io import only_writer
 
 gc.disable()  # a tenth of the time of collecting is spent on modules that all stay
 
@@ -82,21 +84,35 @@ def smoke_args(smoke_root):
 
 
 @pytest.fixture(scope="session")
-def vae_checkpoint(smoke_args, tmp_path_factory) -> Path:
-    """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
-    run_dir = tmp_path_factory.mktemp("vae_alignment")
-    main(smoke_args("vae_alignment", run_dir, "--trainer.logger=false"))
-    return run_dir / "checkpoints" / "last.ckpt"
+def trained_once(smoke_args, tmp_path_factory):
+    """``trained_once(stage, *more)``: last checkpoint of a stage at smoke size.
+
+    Of the processes of one `pytest -n`, the first to ask trains it for all.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+    def checkpoint(stage: str, *more: str) -> Path:
+        last = folder / stage / "checkpoints" / "last.ckpt"
+        with only_writer(folder / f"{stage}.lock", "trains", wait=True):
+            if not last.exists():
+                main(smoke_args(stage, folder / stage, "--trainer.logger=false", *more))
+        return last
+
+    return checkpoint
 
 
 @pytest.fixture(scope="session")
-def flow_checkpoint(smoke_args, vae_checkpoint, tmp_path_factory) -> Path:
+def vae_checkpoint(trained_once) -> Path:
+    """Checkpoint of the VAE-alignment stage at smoke size, trained for three steps."""
+    return trained_once("vae_alignment")
+
+
+@pytest.fixture(scope="session")
+def flow_checkpoint(trained_once, vae_checkpoint) -> Path:
     """Checkpoint of the flow-matching stage at smoke size, trained for three steps."""
-    run_dir = tmp_path_factory.mktemp("flow_matching")
-    more = ["--trainer.logger=false", "--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
-    more += ["--model.init_args.init_from", str(vae_checkpoint)]
-    main(smoke_args("flow_matching", run_dir, *more))
-    return run_dir / "checkpoints" / "last.ckpt"
+    more = ["--trainer.limit_val_batches=0", "--trainer.callbacks=[]"]
+    return trained_once("flow_matching", *more, "--model.init_args.init_from", str(vae_checkpoint))
 
 
 @pytest.fixture

@@ -243,7 +243,7 @@ def test_archives_and_folders_are_read(tmp_path, baseline_case):
         torch.save(weights, folder / name)
     sensor = {"img_means": [1.0, 2.0, 3.0, 4.0, 5.0], "img_stds": [2.0] * 5}
     (folder / "arch_cfg.yaml").write_text(yaml.safe_dump({"dataset": {"sensor": sensor}}))
-    with tarfile.open(tmp_path / "darknet21.tar.gz", "w:gz") as archive:
+    with tarfile.open(tmp_path / "darknet21.tar.gz", "w:gz", compresslevel=1) as archive:
         archive.add(folder, "darknet21")
     for path in (folder, tmp_path / "darknet21.tar.gz"):
         network = RangeNet.from_checkpoint(path)
