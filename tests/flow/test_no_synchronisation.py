@@ -23,9 +23,9 @@ SOLVERS = get_args(Solver)
 
 def generator(sampler, path="linear", guided=False):
     vae, sit, norm = tiny_networks()
-    weak = tiny_networks()[1].to("meta")
     guidance = None
     if guided:
+        weak = tiny_networks()[1].to("meta")
         shift = torch.zeros(4, device="meta")
         guidance = Autoguidance(weak, 2.0, latent_scale=1.2, latent_shift=shift)
     scenes = SceneGenerator(vae, sit, norm, GEOMETRY, sampler, path, autoguidance=guidance)
