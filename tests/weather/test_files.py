@@ -59,8 +59,6 @@ def npy(path):
 
 def write(path, content):
     """A file of bytes, or of a function that writes it."""
-    if path.suffix == ".pcd":
-        pytest.importorskip("pypcd4")
     path.parent.mkdir(parents=True, exist_ok=True)
     content(path) if callable(content) else path.write_bytes(content)
 

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
@@ -268,7 +268,7 @@ def _read_pcd(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
         from pypcd4 import Encoding, PointCloud
     except ImportError as error:
         raise ScanError(f"{path}: .pcd needs pypcd4: pip install 'r3dpa[pcd]'") from error
-    cloud = PointCloud.from_fileobj(io.BytesIO(data))
+    cloud: Any = PointCloud.from_fileobj(cast(Any, io.BytesIO(data)))
     about, rows = cloud.metadata, cloud.pc_data
     if len(rows) != about.points:
         raise ScanError(f"{path}: is damaged: holds {len(rows)} of {about.points} points")
@@ -277,11 +277,11 @@ def _read_pcd(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     table = rows.view([(name, rows.dtype[n]) for n, name in enumerate(names)])
 
     def pack(table: Table) -> bytes:
-        cloud = PointCloud(about.derive(points=len(table), width=len(table), height=1), table)
+        kept = PointCloud(about.derive(points=len(table), width=len(table), height=1), table)
         if about.data is Encoding.ASCII:  # the package keeps ten decimals
-            return cloud.metadata.compose_header().encode() + _text(table)
+            return kept.metadata.compose_header().encode() + _text(table)
         stream = io.BytesIO()
-        cloud.save(stream, about.data)
+        kept.save(stream, about.data)
         return stream.getvalue()
 
     return f".pcd, {about.data.value}", table, pack
