@@ -141,7 +141,7 @@ bench-training: $(READY) ## one full-size training step of each stage: time and 
 bench-sampling: $(READY) ## what accuracy costs in time, for an exact velocity: minutes
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa bench sampling --quick --out runs/bench_sampling
 
-ablations: $(READY) ## tables II, III and IV at the demo's size: less than an hour on two cores
+ablations: $(READY) ## tables I to IV at the demo's size: hours on two cores; goes on where it stopped
 	OMP_NUM_THREADS=1 $(BIN)/r3dpa ablate conf/ablation --scale demo --jobs 2
 
 # A checkpoint that fits, for the picture of a trained model: make bench-gpu CKPT=...
