@@ -62,6 +62,7 @@ lint: $(READY) ## ruff and mypy
 types: $(READY) ## mypy alone
 	$(BIN)/mypy
 
+# Bytecode is kept, or every process would compile all files again.
 test: $(READY) ## default tests, a few minutes on two cores
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist worksteal -p no:nbmake -m "not slow and not gpu and not weights and not bench"
 

@@ -24,7 +24,7 @@ _LEVELS = 4
 
 
 class Shared(NamedTuple):
-    """What the blocks of a network share: width D, norms and convolutions, heads, ring."""
+    """Settings of all blocks of a network: width D of the time embedding, layers, heads, ring."""
 
     width: int
     norm: Callable[..., nn.GroupNorm]

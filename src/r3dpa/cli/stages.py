@@ -147,14 +147,6 @@ class StageCLI(LightningCLI):
                 delete_unfinished(checkpoints)
             super()._run_subcommand(subcommand)
 
-    def _dump_config(self) -> None:
-        """What checkpoints keep of the arguments; parsing has validated them already."""
-        if not hasattr(self, "config_dump"):
-            text = self.parser.dump(
-                self.config, skip_unset=False, skip_validation=True, skip_link_targets=False
-            )
-            self.config_dump = yaml.safe_load(text)[self.config.subcommand]
-
     def before_fit(self) -> None:
         """Loads the stage before: what does not fit is said before hours of data preparation."""
         if isinstance(self.model, GenerativeModule) and self._ckpt_path is None:

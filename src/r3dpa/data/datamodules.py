@@ -78,7 +78,6 @@ class LidarDataModule(LoaderModule):
     # Also of subclasses that make their batches without __init__.
     augmentation = _AUGMENTATION
     weather_prior: WeatherPrior | None = None
-    images: CachedTensors[Any] | None = None  # range images that the scans are read from
 
     def __init__(
         self,
@@ -138,6 +137,11 @@ class LidarDataModule(LoaderModule):
         if self.extractor is not None or self.features_dir is None:
             return getattr(self.extractor, "name", None)
         return str(any_settings(self.features_dir).extractor["name"])
+
+    @property
+    def images(self) -> CachedTensors[Any] | None:
+        """Cached range images ``(H, W)`` in metres; None where scans are read from their files."""
+        return None
 
     @property
     def geometry(self) -> ScanGeometry:

@@ -105,7 +105,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
                 self._simulate(sorted(lacking), projection, stores)
 
     @cached_property
-    def images(self) -> CachedTensors[Any]:  # type: ignore[override] # an attribute there
+    def images(self) -> CachedTensors[Any]:
         """Cached range images ``(H, W)`` in metres."""
         train, val, _ = self._scans_and_projection()
         return CachedTensors(self._store, sorted(train + val))

@@ -1,7 +1,8 @@
-"""What every stage on range images has: an optimiser, held-out means, and a scan geometry."""
+"""Base of all stages on range images."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import asdict
 from typing import Any
 
@@ -17,8 +18,8 @@ from r3dpa.modules.checks import check_trainer, geometry_of
 from r3dpa.modules.settings import OptimizerConfig, TimeSampling
 
 
-class ScanStage(L.LightningModule):
-    """Base of :class:`GenerativeModule` and of the baselines.
+class ScanStage(L.LightningModule, ABC):
+    """Optimiser, losses of held-out scans, and checkpoints with the geometry of the scans.
 
     Random numbers of a step are a function of ``(seed, batch, sample)`` alone: they do not depend
     on the number of processes or on where a run was interrupted.
@@ -45,12 +46,12 @@ class ScanStage(L.LightningModule):
         self.logged_losses: dict[str, Tensor] = {}  # of the last training batch
         self.step_skipped = False  # set by StepGuard
 
+    @abstractmethod
     def trainable(self) -> dict[str, nn.Module]:
         """Networks that this stage trains, by name; frozen parameters inside stay frozen."""
-        raise NotImplementedError
 
     def attach(self) -> tuple[Any, ScanGeometry]:
-        """Data module, and the geometry of its scans, which is kept; checks the trainer."""
+        """Checks the trainer and keeps the scan geometry; returns data module and geometry."""
         check_trainer(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
         self.geometry = geometry_of(datamodule, self)
