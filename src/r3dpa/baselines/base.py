@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
@@ -89,9 +88,9 @@ class Baseline(ScanStage):
         self.network, self.latent_shape = network, latent_shape
         self.ema: Any = None if decay is None else AveragedNetwork(network, decay)
 
-    @abstractmethod
     def velocity(self, network: nn.Module, x: Tensor, time: Tensor) -> Tensor:
         """Velocity on the interpolant of samples ``(B, C, h, w)`` at times ``(B,)``."""
+        raise NotImplementedError
 
     def decode(self, latents: Tensor) -> Tensor:
         """Encoded range images ``(B, C, H, W)`` of samples ``(B, C, h, w)``."""
@@ -101,9 +100,9 @@ class Baseline(ScanStage):
         """Samples ``(B, C, h, w)`` of encoded range images ``(B, C, H, W)``."""
         return image
 
-    @abstractmethod
     def errors(self, network: nn.Module, data: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Training loss ``(B,)`` of each sample ``(B, C, h, w)`` at a time ``(B,)``."""
+        raise NotImplementedError
 
     def trainable(self) -> dict[str, nn.Module]:
         """Networks that it trains, by name."""
