@@ -9,12 +9,15 @@ from two_roads import WEATHERS, compared, scene_figures
 
 from r3dpa.simulation import Origin, Semantic, Street, load_sensor, simulate_scan
 from r3dpa.simulation import Weather as SimulatedWeather
+from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import EFFECTS, medium
 from r3dpa.simulation.effects.medium import Rain, soft_waveform
 from r3dpa.simulation.scan import effect_name
+from r3dpa.simulation.scene import Primitive, Scene, Shape
 from r3dpa.simulation.sensor import hdl64e
 from r3dpa.weather import ADDED_CLASS, Instrument, RecordedScan, Weather
 from r3dpa.weather.ground import ground_of
+from r3dpa.weather.recorded_sweep import RecordedSweep
 from r3dpa.weather.weather import REFUSED
 
 CALLED = {
@@ -329,3 +332,17 @@ def test_two_roads_lead_to_one_scan(scenes, name):
         assert abs(values["recorded"] - values["simulated"]) <= slack, (figure, values)
     near = [result["intensity"][road][:2] for road in ("recorded", "simulated")]
     assert np.allclose(*near, atol=0.01)
+
+
+def test_a_moving_box_is_shown_where_its_shots_were_taken():
+    # To the left, a quarter of a turn after the middle of it: 25 ms at 10 turns a second.
+    azimuth = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    points = 20 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
+    ring = RecordedScan(points.astype(np.float32), np.full(400, 0.5, np.float32))
+    box = Primitive(
+        Shape.BOX, (0.0, 10.0, 0.0), (2.0, 1.0, 1.0), Semantic.CAR, 0.5, velocity_m_s=(8.0, -4.0)
+    )
+    instrument = Instrument()
+    sensor = replace(instrument.sensor_for(ring), spin_hz=10.0)
+    sweep = RecordedSweep(Scene((box,)), ring, instrument, sensor, Draws(400, 0))
+    assert sweep.scene.primitives[0].centre == pytest.approx((-0.2, 10.1, 0.0), abs=1e-3)
