@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 from two_roads import WEATHERS, compared, scene_figures
 
-from r3dpa.simulation import Origin, Semantic, Street, load_sensor, simulate_scan
+from r3dpa.simulation import Origin, Street, load_sensor, simulate_scan
 from r3dpa.simulation import Weather as SimulatedWeather
-from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import EFFECTS, medium
 from r3dpa.simulation.effects.medium import Rain, soft_waveform
+from r3dpa.simulation.ground import ground_of
 from r3dpa.simulation.scan import effect_name
-from r3dpa.simulation.scene import Primitive, Scene, Shape
 from r3dpa.simulation.sensor import hdl64e
 from r3dpa.weather import ADDED_CLASS, Instrument, RecordedScan, Weather
-from r3dpa.weather.ground import ground_of
-from r3dpa.weather.recorded_sweep import RecordedSweep
 from r3dpa.weather.weather import REFUSED
 
 CALLED = {
@@ -197,26 +194,6 @@ def test_spray_hangs_behind_a_given_box_alone(scan):
     assert np.isin(np.intersect1d(dry.index, np.flatnonzero(behind)), result.index).all()
 
 
-def test_the_ground_is_found(scan):
-    is_ground, normal = ground_of(scan.points)
-    code, range_m = scan.labels & 0xFFFF, np.linalg.norm(scan.points, axis=1)
-    road = np.isin(code, [Semantic.ROAD, Semantic.SIDEWALK]) & (range_m < 40)
-    assert is_ground[road].mean() > 0.95
-    assert is_ground[np.isin(code, [Semantic.BUILDING, Semantic.CAR])].mean() < 0.05
-    assert normal[:, 2].min() > 0.95
-
-
-def test_a_sloping_ground_has_its_normal():
-    generator = np.random.default_rng(0)
-    points = generator.uniform(-20, 20, (4000, 3))
-    points[:3000, 2] = 0.08 * points[:3000, 0] - 1.7 + generator.normal(0, 0.02, 3000)
-    points[3000:, 2] += 22
-    is_ground, normal = ground_of(points.astype(np.float32))
-    assert is_ground[:3000].mean() > 0.99
-    assert is_ground[3000:].mean() < 0.01
-    assert np.allclose(normal[0] / normal[0, 2], [-0.08, 0, 1], atol=0.01)
-
-
 @pytest.mark.parametrize("name", REFUSED)
 def test_effects_that_need_a_scene_are_refused_by_name(scan, name):
     with pytest.raises(ValueError, match=f"effect {name} cannot act on a recorded scan: "):
@@ -332,17 +309,3 @@ def test_two_roads_lead_to_one_scan(scenes, name):
         assert abs(values["recorded"] - values["simulated"]) <= slack, (figure, values)
     near = [result["intensity"][road][:2] for road in ("recorded", "simulated")]
     assert np.allclose(*near, atol=0.01)
-
-
-def test_a_moving_box_is_shown_where_its_shots_were_taken():
-    # To the left, a quarter of a turn after the middle of it: 25 ms at 10 turns a second.
-    azimuth = np.linspace(0, 2 * np.pi, 400, endpoint=False)
-    points = 20 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
-    ring = RecordedScan(points.astype(np.float32), np.full(400, 0.5, np.float32))
-    box = Primitive(
-        Shape.BOX, (0.0, 10.0, 0.0), (2.0, 1.0, 1.0), Semantic.CAR, 0.5, velocity_m_s=(8.0, -4.0)
-    )
-    instrument = Instrument()
-    sensor = replace(instrument.sensor_for(ring), spin_hz=10.0)
-    sweep = RecordedSweep(Scene((box,)), ring, instrument, sensor, Draws(400, 0))
-    assert sweep.scene.primitives[0].centre == pytest.approx((-0.2, 10.1, 0.0), abs=1e-3)

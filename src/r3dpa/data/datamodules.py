@@ -28,7 +28,7 @@ from r3dpa.geometry import (
     SphericalProjection,
 )
 from r3dpa.simulation import Weather, simulate
-from r3dpa.weather.prior import WeatherPrior
+from r3dpa.weather import WeatherPrior
 
 _SENSOR = LidarSensor()
 _CODEC = RangeCodec()

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
 from r3dpa.data.store import CachedTensors, ItemKey
 from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
-from r3dpa.weather.prior import WeatherPrior
+from r3dpa.weather import WeatherPrior
 
 #: Function of the points ``(P, 4)`` of a scan.
 Change = Callable[[np.ndarray], np.ndarray]

@@ -58,12 +58,6 @@ const Cloud = (() => {
     return cloud;
   }
 
-  /** The number that a colour mode shows, as a function of the point. */
-  function valueOf(cloud, mode) {
-    if (mode === "height") return (i) => cloud.xyz[3 * i + 2];
-    return (i) => cloud[mode][i];
-  }
-
   /** Place 0..255 of a value on a scale {low, high, power}; beyond the limits the end colours. */
   function scaleIndex(scale, value) {
     const share = (value - scale.low) / (scale.high - scale.low);
@@ -89,9 +83,8 @@ const Cloud = (() => {
   function colourise(cloud, mode, table, hidden) {
     const colours = new Uint32Array(cloud.count);
     if (mode !== "height" && !cloud[mode]) return colours.fill(GREY);
-    const value = valueOf(cloud, mode);
     for (let i = 0; i < cloud.count; i++) {
-      const v = value(i);
+      const v = mode === "height" ? cloud.xyz[3 * i + 2] : cloud[mode][i];
       if (mode === "instance") colours[i] = instanceColour(v);
       else if (table instanceof Map) colours[i] = hidden.has(v) ? 0 : table.get(v);
       else colours[i] = table.colours[scaleIndex(table, v)];
@@ -141,12 +134,8 @@ const Cloud = (() => {
 
   function newFrame(width, height) {
     const pixels = width * height;
-    const colour = new Uint32Array(pixels);
-    return {
-      ...{ width, height, colour },
-      depth: new Float32Array(pixels),
-      index: new Int32Array(pixels).fill(-1),
-    };
+    const [colour, depth] = [new Uint32Array(pixels), new Float32Array(pixels)];
+    return { width, height, colour, depth, index: new Int32Array(pixels).fill(-1) };
   }
 
   /**
@@ -225,7 +214,7 @@ const Cloud = (() => {
   }
 
   return {
-    ...{ bytesOf, unpack, valueOf, scaleIndex, instanceColour, colourise, countValues },
+    ...{ bytesOf, unpack, scaleIndex, instanceColour, colourise, countValues },
     ...{ projectionOf, project, newFrame, drawPoints, pick, pack, packHex, cssColour },
   };
 })();

@@ -3,6 +3,9 @@
   "use strict";
   const page = JSON.parse(document.getElementById("page").textContent);
   const element = (id) => document.getElementById(id);
+  /** New last child of an element. */
+  const add = (parent, tag, fields) =>
+    Object.assign(parent.appendChild(document.createElement(tag)), fields);
   const MODES = {
     height: "Height", range: "Range", intensity: "Intensity",
     semantic: "Label", instance: "Instance", origin: "Made by",
@@ -45,19 +48,13 @@
 
   class Pane {
     constructor() {
-      const make = (tag, className, parent) => {
-        const made = parent.appendChild(document.createElement(tag));
-        made.className = className;
-        return made;
-      };
-      this.root = make("div", "pane", element("stage"));
-      this.ground = make("canvas", "ground", this.root);
-      this.canvas = make("canvas", "points", this.root);
-      this.marker = make("div", "marker", this.root);
-      this.marker.hidden = true;
-      const caption = make("div", "caption", this.root);
-      this.name = make("b", "", caption);
-      this.note = make("span", "", caption);
+      this.root = add(element("stage"), "div", { className: "pane" });
+      this.ground = add(this.root, "canvas", { className: "ground" });
+      this.canvas = add(this.root, "canvas", { className: "points" });
+      this.marker = add(this.root, "div", { className: "marker", hidden: true });
+      const caption = add(this.root, "div", { className: "caption" });
+      this.name = add(caption, "b");
+      this.note = add(caption, "span");
       this.cloud = null;
     }
 
@@ -233,23 +230,20 @@
     const scale = tables[mode];
     const bar = new ImageData(new Uint8ClampedArray(scale.colours.buffer), 256, 1);
     element("bar").getContext("2d").putImageData(bar, 0, 0);
-    element("ticks").replaceChildren(...scale.ticks.map(([value, text]) => {
-      const tick = document.createElement("span");
+    element("ticks").replaceChildren();
+    for (const [value, textContent] of scale.ticks) {
       const share = ((value - scale.low) / (scale.high - scale.low)) ** scale.power;
-      tick.style.left = `${100 * share}%`;
-      tick.textContent = text;
-      return tick;
-    }));
+      add(element("ticks"), "span", { textContent }).style.left = `${100 * share}%`;
+    }
   }
 
   function showInstances() {
     const counts = Cloud.countValues(panes[0].cloud.instance);
     const rest = counts.get(0) || 0;
     counts.delete(0);
-    const row = (...fields) => Object.assign(entry(...fields), { disabled: true });
-    element("entries").replaceChildren(
-      row(`${counts.size} instances`, panes[0].cloud.count - rest, Cloud.instanceColour(1)),
-      row("no instance", rest, Cloud.instanceColour(0)));
+    const known = panes[0].cloud.count - rest;
+    entry(`${counts.size} instances`, known, Cloud.instanceColour(1)).disabled = true;
+    entry("no instance", rest, Cloud.instanceColour(0)).disabled = true;
   }
 
   function showCategories(mode) {
@@ -277,16 +271,13 @@
       made.setAttribute("aria-pressed", String(!hidden[mode].has(present[place][0])));
     });
     press();
-    element("entries").replaceChildren(...entries);
   }
 
   function entry(name, count, colour) {
-    const made = document.createElement("button");
-    made.className = "entry";
-    const swatch = made.appendChild(document.createElement("i"));
-    swatch.style.background = Cloud.cssColour(colour);
-    made.appendChild(document.createElement("span")).textContent = name;
-    made.appendChild(document.createElement("small")).textContent = count.toLocaleString("en");
+    const made = add(element("entries"), "button", { className: "entry" });
+    add(made, "i").style.background = Cloud.cssColour(colour);
+    add(made, "span", { textContent: name });
+    add(made, "small", { textContent: count.toLocaleString("en") });
     return made;
   }
 
@@ -442,22 +433,16 @@
   /** Strips of range images, grouped under headings; a click shows the cloud. */
   function showFilm() {
     const film = element("film");
-    const add = (parent, tag, text) => {
-      const made = parent.appendChild(document.createElement(tag));
-      if (text) made.textContent = text;
-      return made;
-    };
-    add(film, "h1", document.title);
-    for (const line of page.film.about) add(film, "p", line);
+    add(film, "h1", { textContent: document.title });
+    for (const textContent of page.film.about) add(film, "p", { textContent });
     for (const { title, tiles } of page.film.groups) {
-      add(film, "h2", title);
+      add(film, "h2", { textContent: title });
       for (const { scan, note, pictures } of tiles) {
-        const tile = add(film, "button");
+        const tile = add(film, "button", { onclick: () => showScan(scan) });
         tile.dataset.scan = scan;
-        add(tile, "span", page.scans[scan].name);
-        add(tile, "small", note && ` · ${note}`);
-        for (const [name, data] of pictures) Object.assign(add(tile, "img"), { src: data, alt: name, title: name });
-        tile.onclick = () => showScan(scan);
+        add(tile, "span", { textContent: page.scans[scan].name });
+        add(tile, "small", { textContent: note && ` · ${note}` });
+        for (const [name, src] of pictures) add(tile, "img", { src, alt: name, title: name });
       }
     }
     film.hidden = false;

@@ -1,10 +1,8 @@
 """Weather and faults on scans from files."""
 
-from r3dpa.weather.prior import WeatherPrior
-from r3dpa.weather.recorded import RecordedScan
-from r3dpa.weather.recorded_sweep import Instrument
+from r3dpa.simulation.recorded import Instrument, RecordedScan
 from r3dpa.weather.rings import Rings, rings_of
-from r3dpa.weather.weather import ADDED_CLASS, Weather, WeatheredScan
+from r3dpa.weather.weather import ADDED_CLASS, Weather, WeatheredScan, WeatherPrior
 
 __all__ = [
     "ADDED_CLASS",

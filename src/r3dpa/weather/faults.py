@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from r3dpa.simulation.draws import generator_for
+from r3dpa.simulation.recorded import RecordedScan, angles
 from r3dpa.simulation.scan import EffectRecord
-from r3dpa.weather.recorded import RecordedScan, angles
 from r3dpa.weather.rings import rings_of
 from r3dpa.weather.weather import ADDED_CLASS, WeatheredScan, kept_part
 

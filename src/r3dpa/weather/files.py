@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from r3dpa.data.scans import ScanError, files_below, npz_arrays, ply_table, read_bytes
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line
-from r3dpa.weather.recorded import RecordedScan
+from r3dpa.simulation.recorded import RecordedScan
 from r3dpa.weather.weather import WeatheredScan
 
 Table = NDArray[np.void]  # (P,) rows of named columns, in the order of the file

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from r3dpa.weather.recorded import RecordedScan, angles
+from r3dpa.simulation.recorded import RecordedScan, angles
 
 How = Literal["stored", "order", "inclination"]
 _MOST_BEAMS = 256
@@ -49,7 +50,10 @@ def rings_of(scan: RecordedScan) -> Rings:
     azimuth within the rings.
     """
     inclination, azimuth = angles(scan.points)
-    ring, how, sure = _found(scan, inclination, azimuth)
+    if scan.ring is None:
+        ring, how, sure = _in_order(inclination, azimuth) or _by_inclination(inclination)
+    else:
+        ring, how, sure = np.unique(scan.ring, return_inverse=True)[1], "stored", 1.0
     mean = np.bincount(ring, inclination) / np.bincount(ring)
     ring = np.argsort(np.argsort(-mean))[ring]
     order = np.lexsort((azimuth, ring))
@@ -60,24 +64,10 @@ def rings_of(scan: RecordedScan) -> Rings:
     return Rings(ring, shot, len(mean), num_shots, how, sure)
 
 
-def _found(
-    scan: RecordedScan, inclination: NDArray[np.float64], azimuth: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], How, float]:
-    if scan.ring is not None:
-        return np.unique(scan.ring, return_inverse=True)[1], "stored", 1.0
-    for turned in (azimuth, -azimuth % (2 * np.pi)):
-        ring = _in_order(inclination, turned)
-        if ring is not None:
-            step = np.diff(turned)[np.diff(ring) == 0]
-            sure = float((np.abs(step) < _LARGE_STEP_RAD).mean()) if len(step) else 0.0
-            return ring, "order", sure
-    return _by_inclination(inclination)
-
-
 def _in_order(
     inclination: NDArray[np.float64], azimuth: NDArray[np.float64]
-) -> NDArray[np.int64] | None:
-    """Rings of a file that holds ring after ring; None for another order."""
+) -> tuple[NDArray[np.int64], How, float] | None:
+    """Rings of a file that holds ring after ring, in either direction; None for another order."""
     import torch  # not for the options of the commands
 
     from r3dpa.geometry import LidarSensor
@@ -86,11 +76,14 @@ def _in_order(
     low, high = np.degrees(np.quantile(inclination, [0.001, 0.999]))
     limits = {"inclination_min_deg": low - 0.5, "inclination_max_deg": high + 0.5}
     sensor = LidarSensor(_MOST_BEAMS // 2, **limits)
-    try:
-        ring, _ = rings_in_order(torch.from_numpy(inclination), torch.from_numpy(azimuth), sensor)
-    except ValueError:
-        return None
-    return ring.numpy()
+    for turned in (azimuth, -azimuth % (2 * np.pi)):
+        with suppress(ValueError):
+            angle = torch.from_numpy(inclination), torch.from_numpy(turned)
+            ring = rings_in_order(*angle, sensor)[0].numpy()
+            step = np.diff(turned)[np.diff(ring) == 0]
+            sure = float((np.abs(step) < _LARGE_STEP_RAD).mean()) if len(step) else 0.0
+            return ring, "order", sure
+    return None
 
 
 def _by_inclination(inclination: NDArray[np.float64]) -> tuple[NDArray[np.int64], How, float]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from r3dpa.simulation import scene
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import EFFECTS
+from r3dpa.simulation.recorded import Instrument, RecordedScan, RecordedSweep
 from r3dpa.simulation.scan import (
     SECOND_RETURN_M,
     EffectRecord,
@@ -21,10 +22,8 @@ from r3dpa.simulation.scan import (
     effect_name,
     run_effect,
 )
-from r3dpa.simulation.scene import Pose, Primitive, Scene, Semantic, Shape
+from r3dpa.simulation.scene import Interval, Pose, Primitive, Scene, Semantic, Shape
 from r3dpa.simulation.sweep import Effect, Origin
-from r3dpa.weather.recorded import RecordedScan
-from r3dpa.weather.recorded_sweep import Instrument, RecordedSweep
 
 #: Added points have this class plus their ``Origin``: no data set uses these numbers.
 ADDED_CLASS = 0xFF00
@@ -49,10 +48,12 @@ _ON_REQUEST = ("blooming", "range_noise")
 _DETECTION = {"soft_raydrop", "detection_limit", "dual_return"}
 # Of labels with an instance: KITTI-360, SemanticKITTI.
 _VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
-_CLOUDBURST_MM_H = 300.0
 # A vehicle of fewer points has no box.
 _LEAST_POINTS = 20
 _INSTRUMENT = Instrument()
+# Of priors: equally likely fields, and the deepest film of a road in rain.
+_FIELDS = ("visibility_m", "rain_mm_h", "snow_mm_h")
+_FULL_FILM_MM = 1.5
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,6 @@ class Weather(scene.Weather):
     def __post_init__(self) -> None:
         super().__post_init__()
         scene.check_fields(self, "be 0 or greater", "traffic_m_s")
-        for name in ("rain_mm_h", "snow_mm_h"):
-            if (rate := getattr(self, name)) > _CLOUDBURST_MM_H:
-                raise ValueError(f"{name} must be at most {_CLOUDBURST_MM_H:g}, got {rate:g}")
 
     def apply(
         self,
@@ -159,8 +157,7 @@ def _switched(
     for name in REFUSED.keys() & on:
         raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
     left_out = {*REFUSED, *_ON_REQUEST} - on
-    wanted = {effect_name(effect): effect for effect in EFFECTS}
-    wanted = {name: effect for name, effect in wanted.items() if name not in left_out}
+    wanted = {name: e for e in EFFECTS if (name := effect_name(e)) not in left_out}
     why = "nothing calls for it"
     idle = (EffectRecord(n, "off" if n in off else "not_called", why, 0) for n in wanted)
     return off, list(wanted.values()), tuple(idle)
@@ -198,10 +195,10 @@ def _result(
     """Points of the echoes that are left: the recorded ones, then those of the air."""
     echoes = list(sweep.echoes())
     seen = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
-    if len(echoes) > 1:
-        with np.errstate(invalid="ignore"):
-            seen[1] &= np.abs(echoes[1].range_m - echoes[0].range_m) > SECOND_RETURN_M
-        seen[1] &= seen[0]
+    for second, is_seen in zip(echoes[1:], seen[1:], strict=True):
+        is_seen &= seen[0]
+        apart_m = second.range_m[is_seen] - echoes[0].range_m[is_seen]
+        is_seen[is_seen] = np.abs(apart_m) > SECOND_RETURN_M
     points = scan.points.copy()
     intensity = None if scan.intensity is None else scan.intensity.copy()
     stays = np.ones(len(scan), dtype=bool)
@@ -214,7 +211,7 @@ def _result(
         points[sweep.rays_of[away]] = sweep.at(away, echo.range_m[away])
         weaker = rays[echo.power[rays] != sweep.recorded_power[rays]]
         moved, dimmed = moved + len(away), dimmed + len(weaker)
-        if intensity is not None and sweep.scale.known:
+        if intensity is not None:
             faded = sweep.in_units(echo.power[weaker], echo.range_m[weaker])
             at = sweep.rays_of[weaker]
             intensity[at] = np.minimum(intensity[at], faded.astype(intensity.dtype))
@@ -229,7 +226,6 @@ def _result(
     if labels is not None:
         labels = np.concatenate([labels[kept], ADDED_CLASS + made_by.astype(np.uint32)])
     if intensity is not None:
-        shown = shown if sweep.scale.known else np.full(len(new), intensity[0])
         intensity = np.concatenate([intensity[kept], shown.astype(intensity.dtype)])
     outshone = np.where(seen[0], echoes[0].origin, Origin.SURFACE)[~stays[sweep.rays_of]]
     counts = _by_origin(outshone)
@@ -292,3 +288,56 @@ def _labelled_vehicles(scan: RecordedScan, speed_m_s: float) -> tuple[Primitive,
         heading = math.atan2(ahead[1], ahead[0])
         boxes.append([*(turn.T @ ((low + high) / 2)), *size, heading, speed_m_s])
     return _vehicles(np.array(boxes)) if boxes else ()
+
+
+@dataclass(frozen=True)
+class WeatherPrior:
+    """Weather drawn anew for each training scan and epoch: fog, rain on a wet road, or snow.
+
+    The three are equally likely; visibility and rates are log-uniform.
+
+    Args:
+        probability: Of bad weather; other scans stay as they are.
+        visibility_m: Least and largest visibility in fog.
+        rain_mm_h: Least and largest rate.
+        snow_mm_h: Least and largest rate, as water.
+        instrument: What is assumed of the instrument.
+    """
+
+    probability: float = 0.5
+    visibility_m: Interval = (30.0, 1000.0)
+    rain_mm_h: Interval = (1.0, 30.0)
+    snow_mm_h: Interval = (0.5, 3.0)
+    instrument: Instrument = _INSTRUMENT
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"probability must lie in [0, 1], got {self.probability}")
+        for name in _FIELDS:
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise ValueError(f"{name} must be a positive interval, got {low}..{high}")
+            for limit in (low, high):
+                Weather(**{name: limit})
+
+    def draw(self, generator: np.random.Generator) -> Weather | None:
+        """Weather of one scan; None where it stays as it is."""
+        chance, kind, share, film = generator.random(4)
+        if chance >= self.probability:
+            return None
+        name = _FIELDS[int(3 * kind)]
+        low, high = np.log(getattr(self, name))
+        values: dict[str, Any] = {name: math.exp(low + share * (high - low))}
+        if name == "rain_mm_h":
+            values["water_film_mm"] = _FULL_FILM_MM * film
+        return Weather(**values)
+
+    def points(self, points: NDArray[np.float32], seed: tuple[int, ...]) -> NDArray[np.float32]:
+        """Points ``(P, 4)`` in the weather of a seed, such as that of training, epoch and scan."""
+        weather = self.draw(np.random.default_rng(seed))
+        if weather is None:
+            return points
+        scan = RecordedScan(points[:, :3], points[:, 3])
+        result = weather.apply(scan, ("training", *seed), self.instrument)
+        assert result.intensity is not None
+        return np.column_stack([result.points, result.intensity])

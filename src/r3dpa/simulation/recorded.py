@@ -1,4 +1,4 @@
-"""A recorded scan as a turn that the effects of the simulator can act on.
+"""Recorded scans, and the turn of one on which the effects of the simulator can act.
 
 One ray per point, from the origin of the frame. Of shots without a return nothing is known, so
 that there are no rays for them: no effect gives them an echo.
@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from r3dpa.simulation.draws import Draws
+from r3dpa.simulation.ground import ground_of
 from r3dpa.simulation.scan import damped_intensity, power_of_intensity
 from r3dpa.simulation.scene import Material, Primitive, Scene
 from r3dpa.simulation.sensor import Lasers, SpinningLidar, load_sensor
 from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids
 from r3dpa.simulation.sweep import Echoes, Sweep
-from r3dpa.weather.ground import ground_of
-from r3dpa.weather.recorded import RecordedScan, angles
 
 Returns = Literal["strongest", "dual"]
+# No lidar on a car reaches so far.
+_FARTHEST_M = 1000.0
 # Intensities from this share of the full one on are taken for retro-reflectors.
 _SATURATED = 0.985
 _UNKNOWN_INTENSITY = 0.2
@@ -46,6 +47,61 @@ _DARK = {
 _SUN_RADIUS_RAD = np.radians(0.5)
 # Points whose inclinations show the highest laser, which at most is so high.
 _SOME_POINTS, _HIGHEST_DEG = 256, 80
+
+
+@dataclass(frozen=True)
+class RecordedScan:
+    """One scan of any spinning lidar, in the order of its file.
+
+    Args:
+        points: ``(P, 3)`` float32, x forward, y left, z up in the sensor frame, metres.
+        intensity: ``(P,)`` in the units of the file; None if it has none.
+        ring: ``(P,)`` laser of each point as stored; None if it is not stored.
+        time_s: ``(P,)`` seconds from any moment; None if it is not stored.
+        labels: ``(P,)`` uint32; None without labels.
+
+    Raises:
+        ValueError: If there are no points, a column has another length, or points cannot be used.
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray | None = None
+    ring: NDArray | None = None
+    time_s: NDArray | None = None
+    labels: NDArray[np.uint32] | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.points.shape
+        if len(shape) != 2 or shape[1] != 3 or not len(self.points):
+            raise ValueError(f"points must be (P, 3) with at least one point, got {shape}")
+        for name in ("intensity", "ring", "time_s", "labels"):
+            column = getattr(self, name)
+            if column is not None and column.shape != (len(self),):
+                raise ValueError(
+                    f"{name} must have one value for each of {len(self)} points, "
+                    f"got the shape {column.shape}"
+                )
+        finite = np.isfinite(self.points).all(axis=1)
+        if self.intensity is not None:
+            finite &= np.isfinite(self.intensity)
+        if num_bad := np.count_nonzero(~finite):
+            raise ValueError(
+                f"{num_bad} of {len(self)} points are NaN or infinite: drop them first"
+            )
+        farthest_m = float(np.abs(self.points).max())
+        if farthest_m > _FARTHEST_M:
+            raise ValueError(
+                f"points reach {farthest_m:.0f} m, farther than {_FARTHEST_M:g}: give metres"
+            )
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def angles(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Inclination and azimuth in [0, 2 pi) of points ``(P, 3)``, each ``(P,)`` radians."""
+    x, y, z = points.T.astype(float)
+    return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x) % (2 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -97,7 +153,7 @@ def _with_laser(
 class IntensityScale(NamedTuple):
     """Units of the intensities of a scan."""
 
-    full: float  # of a white surface
+    full: float  # of a white surface; the constant where it is unknown
     step: float  # 0 if they are not on a grid
     known: bool  # False where they are missing or constant
     text: str
@@ -116,7 +172,7 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     if low == high:
         missing = "no intensity" if intensity is None else f"intensity is {low:g} throughout"
         text = f"{missing}: a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
-        return IntensityScale(full or 1.0, 0.0, False, text)
+        return IntensityScale(float(low), 0.0, False, text)
     found, unit = next(
         (pair for pair in ((1.0, "0..1"), (255.0, "0..255")) if high <= pair[0]),
         (float(np.quantile(values, 0.999)), "instrument units"),
@@ -211,6 +267,8 @@ class RecordedSweep(Sweep):
 
     def in_units(self, power: Floats, range_m: Floats) -> Floats:
         """Intensities of powers in the units and steps of the scan; inverse to the recorded."""
+        if not self.scale.known:
+            return np.full(len(power), self.scale.full)
         if self.response == "linear":
             share = power * np.square(range_m)
         else:
@@ -233,7 +291,8 @@ class RecordedSweep(Sweep):
 
     def on_sheets(self) -> NDArray[np.bool_]:
         """Rays of a saturated intensity."""
-        return (self.share >= _SATURATED) & self.scale.known
+        is_saturated: NDArray[np.bool_] = self.share >= _SATURATED
+        return is_saturated
 
     def pairs_around(
         self, rays: NDArray[np.int64], reach_rad: float

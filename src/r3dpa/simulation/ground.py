@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from r3dpa.weather.recorded import angles
-
 _SECTORS = 12
 # Rings of each sector, by their borders in metres: slopes change with the distance.
 _BORDERS_M = (12.0, 25.0)
@@ -29,7 +27,8 @@ def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[n
     or of few points has that of the whole scan.
     """
     away_m = np.hypot(points[:, 0], points[:, 1])
-    sector = (angles(points)[1] / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    azimuth = np.arctan2(points[:, 1].astype(float), points[:, 0]) % (2 * np.pi)
+    sector = (azimuth / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
     part = sector + _SECTORS * np.searchsorted(_BORDERS_M, away_m)
     cell = (away_m / _CELL_M).astype(int) * _SECTORS + sector
     order = np.lexsort((points[:, 2], cell))
