@@ -107,10 +107,7 @@ def renormalised(
         offset = shift.to(there_time.dtype).reshape(-1, *[1] * (x.dim() - 2))
         there_x = scale / length * x + there.alpha * offset
         slope = weak(there_x.to(x.dtype), there_time.flatten())
-        # x' and its slope are two mixtures of data and noise: solved for both.
-        determinant = there.alpha * there.d_sigma - there.sigma * there.d_alpha
-        data = (there.d_sigma * there_x - there.sigma * slope) / determinant
-        noise = (there.alpha * slope - there.d_alpha * there_x) / determinant
+        data, noise = there.data_and_noise(there_x, slope)
         return here.d_alpha * (data - offset) / scale + here.d_sigma * noise
 
     return velocity

@@ -77,13 +77,8 @@ class DiffusionPath(Interpolant):
         turn = -0.5 * self._rate(time) * alpha * sigma
         return PathCoefficients(alpha, sigma, -turn * sigma, turn * alpha)
 
-    def denoise(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Expected data given noisy samples and their velocity."""
-        alpha, sigma, _, d_sigma = self.coefficients(per_sample(time, x))
-        return alpha * x - sigma * velocity * (alpha / d_sigma)
-
     def velocity(self, data: Tensor, x: Tensor, time: Tensor) -> Tensor:
-        """Inverse of :meth:`denoise`."""
+        """Velocity of noisy samples given their expected data, the inverse of :meth:`denoise`."""
         alpha, sigma, _, d_sigma = self.coefficients(per_sample(time, x))
         return (alpha * x - data) / sigma * (d_sigma / alpha)
 

@@ -28,6 +28,12 @@ class PathCoefficients(NamedTuple):
     d_alpha: Tensor
     d_sigma: Tensor
 
+    def data_and_noise(self, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """Both of a state by ``x = alpha data + sigma noise, v = d_alpha data + d_sigma noise``."""
+        determinant = self.alpha * self.d_sigma - self.sigma * self.d_alpha
+        data = (self.d_sigma * x - self.sigma * velocity) / determinant
+        return data, (self.alpha * velocity - self.d_alpha * x) / determinant
+
 
 @dataclass(frozen=True)
 class Interpolant:
@@ -79,8 +85,7 @@ class Interpolant:
         time = per_sample(time, x)
         if self.path == "linear":
             return x - time * velocity
-        alpha, sigma, _, _ = self.coefficients(time)
-        return alpha * x - (2 / math.pi) * sigma * velocity
+        return self.coefficients(time).data_and_noise(x, velocity)[0]
 
     def score(self, velocity: Tensor, x: Tensor, time: Tensor) -> Tensor:
         """Gradient of the log density at times above 0; for inspection only.

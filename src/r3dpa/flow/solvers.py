@@ -22,11 +22,12 @@ import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from r3dpa.flow.interpolant import LINEAR, Interpolant
+from r3dpa.flow.interpolant import LINEAR, Interpolant, PathCoefficients
 from r3dpa.flow.times import batch_time, step_pairs
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
@@ -231,13 +232,16 @@ def _adams_bashforth_weights(nodes: list[float], then: float) -> list[float]:
     return (step * weights).tolist()
 
 
-def _path_nodes(interpolant: Interpolant, times: Tensor) -> list[list[float]]:
-    """Alpha, sigma and their derivatives at each time, and the width of each step in lambda."""
+def _path_nodes(
+    interpolant: Interpolant, times: Tensor
+) -> tuple[list[PathCoefficients], list[float]]:
+    """Coefficients, as numbers, at each time, and the width of each step in lambda."""
     time = times.double().cpu()
     path = interpolant.coefficients(time)
     log_snr = (path.alpha / path.sigma).log()
     log_snr[time == 1] = -math.inf  # on the cosine path rounding keeps it finite
-    return [*(values.tolist() for values in path), log_snr.diff().tolist()]
+    nodes = [PathCoefficients(*row) for row in torch.stack(path, dim=1).tolist()]
+    return nodes, log_snr.diff().tolist()
 
 
 @torch.no_grad()
@@ -255,30 +259,25 @@ def _data_prediction(
     Every step takes the mean of D over the step as ``D_s`` plus a bend: from the step before when
     it predicts, from the next evaluation too when it corrects.
     """
-    steps = step_pairs(times)
-    alpha, sigma, d_alpha, d_sigma, widths = _path_nodes(interpolant, times)
-    ratio = bend_factor = 0.0
+    steps, ratio = step_pairs(times), 0.0
+    nodes, widths = _path_nodes(interpolant, times)
     data = change = bend = torch.zeros_like(x)
+    bend_factor: Any = 0.0
     for index, (now, then) in enumerate(steps):
-        slope = _slope(velocity, x, now)
-        # x = alpha D + sigma N and v = alpha' D + sigma' N, solved for D and N.
-        determinant = alpha[index] * d_sigma[index] - d_alpha[index] * sigma[index]
-        noise = (alpha[index] * slope - d_alpha[index] * x) / determinant
+        here, there = nodes[index : index + 2]
         before, past_change = data, change
-        data = (d_sigma[index] * x - sigma[index] * slope) / determinant
+        data, noise = here.data_and_noise(x, _slope(velocity, x, now))
         change = data - before
         if correct and index > 0:
             corrected = _corrected_bend(widths[index - 1], ratio, past_change, change)
-            noise = noise + bend_factor / sigma[index] * (corrected - bend)
+            noise = noise + bend_factor / here.sigma * (corrected - bend)
         neighbours = widths[max(index - 1, 0) : index + 1]
         known = index > 0 and all(map(math.isfinite, neighbours))
         ratio = neighbours[1] / neighbours[0] if known else 0.0
         bend = ratio / 2 * change
         # From the data itself (sigma = 0) the step is of first order, there is nothing to bend.
-        bend_factor = (
-            alpha[index + 1] - alpha[index] * sigma[index + 1] / sigma[index] if now else 0.0
-        )
-        x = alpha[index + 1] * data + sigma[index + 1] * noise + bend_factor * bend
+        bend_factor = there.alpha - here.alpha * there.sigma / here.sigma if now else 0.0
+        x = there.alpha * data + there.sigma * noise + bend_factor * bend
         x = after_step(x, then, index + 1)
     return x
 
