@@ -173,7 +173,7 @@ class TestErrors:
         torch.testing.assert_close(found, 3 + 0.5 * noise, atol=1e-5, rtol=0)
 
     def test_evaluations_known_beforehand_are_those_that_are_counted(self, model):
-        """So the progress bar ends at its end; a counter stands before the velocity."""
+        """A counter stands before the velocity."""
         for way in settings_of(TINY):
             counted = Mock(wraps=MIXTURE.velocity)
             MixtureProblem(Mock(means=MIXTURE.means, velocity=counted), 2).solve(way, range(2))
@@ -181,10 +181,10 @@ class TestErrors:
         assert model._generator(way).generate([0]).nfe == way.nfe
 
     def test_error_of_the_precision_alone(self, model):
-        exact, _ = reference(model, 16, 3, Work(), lambda n: None)
+        exact, _ = reference(model, 16, 3, Work())
         whole = Setting(SamplerConfig("ab2", 8))
         ways = [whole, replace(whole, precision="bf16")]
-        plain, rounded = errors_of(model, ways, exact, Work(), lambda n: None)
+        plain, rounded = errors_of(model, ways, exact, Work())
         assert plain.precision == 0
         assert 0 < rounded.precision < 0.1
         assert rounded.squared != plain.squared

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
+from tqdm import tqdm
 
 _RESAMPLES = 2000
 _CPU = torch.device("cpu")
@@ -85,7 +86,8 @@ def compare(
         return [found[place] for place in order]
 
     run(0)
-    taken = [keep(number, partial(run, number)) for number in range(1, rounds + 1)]
+    numbers = tqdm(range(1, rounds + 1), "timing", unit="round", disable=None)
+    taken = [keep(number, partial(run, number)) for number in numbers]
     *seconds, again = (list(column) for column in zip(*taken, strict=True))
     return Comparison(dict(zip(cases, seconds, strict=True)), Ratio.of(again, seconds[0]))
 

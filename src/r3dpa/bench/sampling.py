@@ -39,7 +39,7 @@ _SOLVERS: tuple[tuple[Solver, float], ...] = (
 )
 _EVALUATIONS = (2, 4, 8, 16, 32, 64, 128, 256)
 _PRECISION_STEPS = 32
-Advance = Callable[[int], object]  # of a progress bar, by evaluations
+_bar = partial(tqdm, disable=None)  # without a terminal there is none
 
 
 @dataclass(frozen=True)
@@ -162,26 +162,14 @@ def few_step_settings(usual: Setting, thin: bool) -> list[Setting]:
 def run_problem(
     problem: Problem, ways: Sequence[Setting], effort: Effort, work: Work | None = None
 ) -> Finding:
-    """Error and time of each way to sample, with a progress bar of all network evaluations."""
+    """Error and time of each way to sample, with progress bars."""
     work, num, steps = work or Work(), effort.samples, effort.reference_steps
-    solved = {replace(way, precision=p, batch=1) for way in ways for p in (way.precision, "fp32")}
-    solving = sum(way.nfe for way in solved)
-    timing = sum(way.nfe * way.batch for way in ways) * (effort.rounds + 1)
-    total = num * (3 * steps - 2 + solving) + timing
-    # Without a terminal there is no bar.
-    with tqdm(total=total, unit="evaluation", unit_scale=True, desc="bench", disable=None) as bar:
-        exact, self_error = reference(problem, steps, num, work, bar.update)
-        errors = errors_of(problem, ways, exact, work, bar.update)
-
-        def case(way: Setting, run: Callable[[], float]) -> float:
-            seconds = run()
-            bar.update(way.nfe * way.batch)
-            return seconds
-
-        labelled = _labelled(ways, effort.batch)
-        cases = {name: partial(case, way, problem.case(way)) for name, way in labelled.items()}
-        # Complete rounds are kept.
-        measured = compare(cases, effort.rounds, lambda n, run: work.piece(f"round_{n}", run))
+    exact, self_error = reference(problem, steps, num, work)
+    errors = errors_of(problem, ways, exact, work)
+    labelled = _labelled(ways, effort.batch)
+    cases = {name: problem.case(way) for name, way in labelled.items()}
+    # Complete rounds are kept.
+    measured = compare(cases, effort.rounds, lambda n, run: work.piece(f"round_{n}", run))
     flop = {decoder: problem.flop(decoder) for decoder in {way.decoder for way in ways}}
     rows = []
     for (label, way), error in zip(labelled.items(), errors, strict=True):
@@ -191,23 +179,19 @@ def run_problem(
     return Finding(rows, steps, num, self_error, measured, flop["full"])
 
 
-def _solved(
-    num: int, size: int, solve: Callable[[range], Solved], nfe: int, advance: Advance
-) -> Solved:
-    parts = []
-    for first in range(0, num, size):
-        indices = range(first, min(first + size, num))
-        parts.append(solve(indices))
-        advance(nfe * len(indices))
+def _batches(problem: Problem, num: int) -> list[range]:
+    size = problem.batch
+    return [range(first, min(first + size, num)) for first in range(0, num, size)]
+
+
+def _joined(parts: Sequence[Solved]) -> Solved:
     ranges = [part.range_m for part in parts if part.range_m is not None]
     return Solved(
         torch.cat([part.latents for part in parts]), torch.cat(ranges) if ranges else None
     )
 
 
-def reference(
-    problem: Problem, steps: int, num: int, work: Work, advance: Advance
-) -> tuple[Solved, float]:
+def reference(problem: Problem, steps: int, num: int, work: Work) -> tuple[Solved, float]:
     """The converged solution, and the RMSE of its latents from those of half the steps."""
 
     def solve(count: int, indices: range) -> Solved:
@@ -215,22 +199,19 @@ def reference(
         return Solved(*work.piece(name, lambda: tuple(problem.converged(count, indices))))
 
     solved, half = (
-        _solved(num, problem.batch, partial(solve, c), 2 * c - 1, advance)
-        for c in (steps, steps // 2)
+        _joined([solve(count, part) for part in _bar(_batches(problem, num), f"Heun-{count}")])
+        for count in (steps, steps // 2)
     )
     return solved, _rmse(solved.latents, half.latents)
 
 
-def errors_of(
-    problem: Problem, ways: Sequence[Setting], exact: Solved, work: Work, advance: Advance
-) -> list[Errors]:
+def errors_of(problem: Problem, ways: Sequence[Setting], exact: Solved, work: Work) -> list[Errors]:
     """Errors of each setting, and from the same sampler in fp32."""
+    batches = _batches(problem, len(exact.latents))
 
     @lru_cache(maxsize=2)  # settings of one sampler follow each other
     def solve(way: Setting) -> Solved:
-        return _solved(
-            len(exact.latents), problem.batch, partial(problem.solve, way), way.nfe, advance
-        )
+        return _joined([problem.solve(way, part) for part in batches])
 
     def errors(way: Setting) -> tuple[Any, ...]:
         way = replace(way, batch=1)
@@ -243,7 +224,7 @@ def errors_of(
 
     return [
         Errors(*work.piece(f"errors_{index}", partial(errors, way)))
-        for index, way in enumerate(ways)
+        for index, way in enumerate(_bar(ways, "errors"))
     ]
 
 
