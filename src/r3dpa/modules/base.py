@@ -188,9 +188,6 @@ class GenerativeModule(ScanStage):
         """Whether a training batch must hold feature grids."""
         return self.weights.vae_alignment != 0 or self.weights.sit_alignment != 0
 
-    draw_path = steps.draw_path
-    weigh_and_log = steps.weigh_and_log
-
     def vae_losses(
         self, image: Tensor, posterior: Posterior, prediction: Tensor
     ) -> dict[str, Tensor]:

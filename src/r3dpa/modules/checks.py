@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import lightning as L
 from lightning.pytorch.callbacks import StochasticWeightAveraging
 
-from r3dpa.data.image_datamodule import ImageDataModule
 from r3dpa.geometry import ScanGeometry
 from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
 
@@ -91,14 +89,3 @@ def check_geometry(there: ScanGeometry, here: ScanGeometry, source: str) -> None
                 f"{source} was trained on other range images: {name} {theirs} there, {ours} here. "
                 "Set sensor, projection and codec of the data module to those of the checkpoint"
             )
-
-
-def image_datamodule(module: L.LightningModule, vae: ImageVAE) -> ImageDataModule:
-    """Data module of a stage on images, whose size the VAE can encode."""
-    found = getattr(module.trainer, "datamodule", None)
-    if not isinstance(found, ImageDataModule):
-        raise ValueError(
-            f"{type(module).__name__} needs an ImageDataModule, got {type(found).__name__}"
-        )
-    vae.latent_size((found.image_size, found.image_size))
-    return found

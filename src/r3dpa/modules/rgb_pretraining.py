@@ -5,24 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from r3dpa.checkpoints import load_into, read_checkpoint
-from r3dpa.data.image_datamodule import ImageBatch, ImageDataModule, ImageDataset, latent_statistics
+from r3dpa.data.image_datamodule import ImageBatch, ImageDataset, latent_statistics
 from r3dpa.data.images import ImageEntry
 from r3dpa.data.store import CachedTensors
-from r3dpa.flow import Interpolant
 from r3dpa.modules import steps
-from r3dpa.modules.checks import check_latents, check_trainer, image_datamodule
+from r3dpa.modules.checks import check_latents, check_trainer
 from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
+from r3dpa.modules.stage import ImageStage
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
 from r3dpa.nn.backbones import DINOv2
 
 
-class RGBPretraining(L.LightningModule):
+class RGBPretraining(ImageStage):
     """Stage 0: unconditional SiT on image latents, by L_denoise (+ lambda L_align).
 
     The image VAE is frozen: each training image is encoded once, before the first step, and the
@@ -66,7 +65,7 @@ class RGBPretraining(L.LightningModule):
         latents_dir: str | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(optimizer, seed, time_sampling)
         with steps.networks_as_settings():
             self.save_hyperparameters()
         if (teacher is None) != (weights.sit_alignment == 0):
@@ -79,11 +78,8 @@ class RGBPretraining(L.LightningModule):
                 f"sit.feature_dim is {sit.feature_dim}, but the teacher's features have width "
                 f"{teacher.dim}; set the former to the latter"
             )
-        self.vae, self.sit = vae, sit
-        self.weights, self.optimizer_config = weights, optimizer
-        self.time_sampling, self.seed = time_sampling, seed
+        self.vae, self.sit, self.weights = vae, sit, weights
         self.latent_shape = (vae.latent_channels, *sit.input_size)
-        self.interpolant = Interpolant("linear")
         self.latent_norm = LatentNorm(vae.latent_channels)
         self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
         self.vae.requires_grad_(False)
@@ -91,18 +87,12 @@ class RGBPretraining(L.LightningModule):
         # In a tuple, so that checkpoints do not hold weights that never change.
         self._teacher = () if teacher is None else (teacher.eval().requires_grad_(False),)
         self.init_from, self.latents_dir = init_from, latents_dir
-        self.held_out = steps.HeldOutMeans()
-        self.step_skipped = False  # set by StepGuard
         self._resumed = False
-
-    @property
-    def _datamodule(self) -> ImageDataModule:
-        return image_datamodule(self, self.vae)
 
     def setup(self, stage: str) -> None:
         """Checks trainer and data against the networks, and that a teacher has weights."""
         check_trainer(self.trainer)
-        size = self._datamodule.image_size
+        size = self.images.image_size
         check_latents(self.vae, self.sit, (size, size))
         if stage == "fit" and not all(one.trained for one in self._teacher):
             raise ValueError(
@@ -122,7 +112,7 @@ class RGBPretraining(L.LightningModule):
                 )
             load_into({"vae": self.vae}, read_checkpoint(self.init_from), stage=self.stage)
         posteriors = self._encoded()
-        self._datamodule.use_posteriors(posteriors, with_images=bool(self._teacher))
+        self.images.use_posteriors(posteriors, with_images=bool(self._teacher))
         if not self._resumed:
             mean, variance = latent_statistics(posteriors)
             self.latent_norm.running_mean.copy_(mean)
@@ -135,7 +125,7 @@ class RGBPretraining(L.LightningModule):
 
         A ``fast_dev_run`` makes those of its batches alone.
         """
-        trainer, datamodule = self.trainer, self._datamodule
+        trainer, datamodule = self.trainer, self.images
         entries = datamodule.train_set.entries
         if cast(Any, trainer).fast_dev_run:
             batches = int(trainer.limit_train_batches)
@@ -149,17 +139,21 @@ class RGBPretraining(L.LightningModule):
             "image",
         )
 
+    def trainable(self) -> dict[str, nn.Module]:
+        """The SiT alone."""
+        return {"sit": self.sit}
+
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
         posterior, weights = Posterior(batch["posterior_moments"]), self.weights
-        draws = steps.draw_path(self, len(posterior.mean))
+        draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         aligns, features = bool(self._teacher), self._features(batch)
         errors = steps.flow_errors(self, self.sit, normalised, features, draws, alignment=aligns)
         losses = {"denoising": weights.denoising * errors["denoising"].mean()}
         if aligns:
             losses["sit_alignment"] = weights.sit_alignment * errors["alignment"].mean()
-        return steps.weigh_and_log(self, losses)
+        return self.weigh_and_log(losses)
 
     @torch.no_grad()
     def _features(self, batch: ImageBatch) -> Tensor | None:
@@ -180,15 +174,6 @@ class RGBPretraining(L.LightningModule):
         self.held_out.update(batch["index"], **errors)
 
     test_step = validation_step
-    on_validation_epoch_end = on_test_epoch_end = steps.log_held_out
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """AdamW of the SiT."""
-        return steps.adamw(self, {"sit": self.sit}, self.optimizer_config)
-
-    configure_gradient_clipping = steps.clip_per_network
-    on_before_optimizer_step = steps.set_learning_rate
-    on_train_start = steps.fit_optimizer
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Steps the optimiser, then the averages, unless the step was skipped."""
@@ -196,12 +181,7 @@ class RGBPretraining(L.LightningModule):
         if not self.step_skipped:
             self.ema.update(self.sit, self.latent_norm)
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the stage and the images that it was trained with."""
-        steps.describe_stage(checkpoint, self.stage, self.interpolant.path)
-        checkpoint["r3dpa"]["images"] = self._datamodule.settings
-
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses the checkpoint of another stage."""
-        steps.check_stage(self, checkpoint)
+        super().on_load_checkpoint(checkpoint)
         self._resumed = True

@@ -14,11 +14,8 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from r3dpa import __version__, losses
+from r3dpa import losses
 from r3dpa.flow import sample_time
-from r3dpa.geometry import ScanGeometry
-from r3dpa.io import source_commit
-from r3dpa.modules.checks import check_geometry
 from r3dpa.modules.settings import LossWeights, OptimizerConfig
 from r3dpa.nn import VelocityNetwork
 
@@ -247,40 +244,6 @@ def clip_per_network(
     limit = limit if limit > 0 else float("inf")  # 0 and below: no clipping, as in Lightning
     for group in optimizer.param_groups:
         nn.utils.clip_grads_with_norm_(group["params"], limit, norms[group["name"]])
-
-
-def describe_stage(checkpoint: dict[str, Any], stage: str, path: str) -> None:
-    """Adds stage, interpolant and version to a checkpoint."""
-    checkpoint["r3dpa"] = {
-        "stage": stage,
-        "interpolant": path,
-        "version": __version__,
-        "commit": source_commit(),
-    }
-
-
-def check_resumed(module: Any, checkpoint: dict[str, Any]) -> None:
-    """Refuses the checkpoint of another stage or of other range images, and keeps its step."""
-    module.loaded_step = checkpoint.get("global_step", 0)
-    check_stage(module, checkpoint)
-    there = ScanGeometry.from_dict(checkpoint["r3dpa"]["geometry"])
-    if module.geometry is None:
-        module.geometry = there
-    else:
-        check_geometry(there, module.geometry, "the checkpoint")
-
-
-def check_stage(module: Any, checkpoint: dict[str, Any]) -> None:
-    """Refuses the checkpoint of another stage; optimiser settings stay those of this run."""
-    found = checkpoint.get("r3dpa", {}).get("stage")
-    if found != module.stage:
-        raise ValueError(
-            f"the checkpoint is of stage {found!r}, this is {module.stage!r}; to start a stage "
-            "from another one, give model.init_from instead of ckpt_path"
-        )
-    for state in checkpoint.get("optimizer_states", []):
-        for group in state["param_groups"]:
-            group.update(module.optimizer_config.adamw())
 
 
 def flow_errors(
