@@ -137,6 +137,12 @@ class TestFiles:
         more = ["--scan", tmp_path / "sparse.ply", "--empty_beams"]
         edit(files, "complete", tmp_path / "o", *more)
         assert (np.asarray(Image.open(tmp_path / "o" / "mask.png"))[1::2] == 255).all()
+        # Another sensor has the same columns, and half of the beams.
+        more = ["--scan", files / "a.bin", "--other_sensor", "[8, -25, 3]", "--overwrite"]
+        about = edit(files, "complete", tmp_path / "o", *more, num=1)
+        missing = np.asarray(Image.open(tmp_path / "o" / "mask.png")) > 0
+        assert missing.all(axis=1).sum() == missing.any(axis=1).sum() == 8
+        assert about["other_sensor"] == [8, -25.0, 3.0]
 
     def test_vary_and_interpolate(self, files, no_sheet, tmp_path):
         about = edit(files, "vary", tmp_path / "v", "--scan", files / "a.bin", "--start", 0.3)

@@ -18,6 +18,7 @@ from r3dpa.geometry.regions import (
     mask_of_tokens,
     sector,
     sector_weights,
+    sensor_pair,
     token_mask,
 )
 
@@ -26,6 +27,7 @@ COARSE = SphericalProjection(LidarSensor(4, 36, 20.0, -20.0))
 FINE = SphericalProjection(LidarSensor(32, 128, 20.0, -30.0))
 DENSE = SphericalProjection(LidarSensor(16, 72, 20.0, -20.0, range_max_m=25.0))
 DENSE_RINGS = RingProjection(DENSE.sensor, tuple(17.0 - 2 * row - row**2 / 70 for row in range(16)))
+ABOVE = SphericalProjection(LidarSensor(4, 36, 60, 25))
 RINGS = RingProjection(LidarSensor(4, 36, 20.0, -20.0), (18.0, 2.0, -1.0, -19.0))
 
 
@@ -83,6 +85,8 @@ def test_a_sector_and_the_rest_of_the_turn_share_no_pixel_and_leave_none():
         (lambda: box3d(COARSE, (10, 0), (4, 1, 2)), "needs x, y, z"),
         (lambda: dropped_beams(COARSE, range(4)), "selects nothing"),
         (lambda: dropped_beams(COARSE, []), "selects all"),
+        (lambda: sensor_pair(COARSE, COARSE), "selects nothing"),
+        (lambda: sensor_pair(COARSE, ABOVE), "selects all"),
         # Every token has a pixel of every second beam.
         (lambda: token_mask(dropped_beams(FINE, range(0, 32, 2)), (8, 16)), "selects all of 128"),
         (lambda: check_mask(torch.zeros(2, 3, dtype=torch.bool), "mask a.png"), "mask a.png: sel"),
@@ -151,6 +155,19 @@ def test_box_is_what_marching_along_the_rays_finds(projection, seed):
 def test_beams_are_dropped_by_row():
     assert selected(~dropped_beams(COARSE, [1, 3, 3]), 0) == [1, 3]
     assert dropped_beams(FINE, range(0, 32, 4)).sum() == 24 * 128
+
+
+def test_sensor_with_fewer_beams_fills_some_pixels():
+    half = SphericalProjection(LidarSensor(2, 18, 20.0, -20.0))
+    seen = ~sensor_pair(COARSE, half)
+    # Its beams at 10 and -10 lie between two of ours: the upper one is filled. Likewise columns.
+    assert selected(seen, 0) == [0, 2]
+    assert selected(seen, 1) == list(range(0, 36, 2))
+    # 6.67 and 0 degrees down to -13.3: the first two are nearest to ours at 5.
+    narrow = SphericalProjection(LidarSensor(4, 36, 10.0, -16.68))
+    assert selected(~sensor_pair(COARSE, narrow), 0) == [1, 2, 3]
+    wide = SphericalProjection(LidarSensor(2, 36, 85.0, -20.0))  # at 58.8 and 6.2 degrees
+    assert selected(~sensor_pair(COARSE, wide), 0) == [1]
 
 
 def test_tokens_with_any_pixel():

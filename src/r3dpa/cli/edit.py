@@ -126,6 +126,7 @@ def complete(
     sector: tuple[float, float] | None = None,
     keep_every: int | None = None,
     empty_beams: bool = False,
+    other_sensor: tuple[int, float, float] | None = None,
     mask: Path | None = None,
     start: float = 0.3,
     num: PositiveInt = 8,
@@ -141,16 +142,19 @@ def complete(
         sector: Azimuth from and to, counted to the left, degrees.
         keep_every: Keep the first of so many beams: 2 makes 64 of 32, 4 of 16.
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
+        other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
         start: Time at which the completion starts, in (0, 1]; large gaps need more.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
     arguments = dict(locals())
+    from dataclasses import replace
+
     import torch
 
     from r3dpa.cli.edit_session import EditSession, held_out_errors
-    from r3dpa.geometry import regions
+    from r3dpa.geometry import SphericalProjection, regions
 
     session = EditSession(EditOptions(**options), num)
     projection, rows = session.projection, session.sensor.beams
@@ -161,6 +165,12 @@ def complete(
         if not 2 <= keep_every <= rows // 2:
             raise ValueError(f"--keep_every must be 2 to {rows // 2}, got {keep_every}")
         masks.append(regions.dropped_beams(projection, range(0, rows, keep_every)))
+    if other_sensor is not None:
+        count, low, high = other_sensor
+        sensor = replace(
+            session.sensor, beams=count, inclination_min_deg=low, inclination_max_deg=high
+        )
+        masks.append(regions.sensor_pair(projection, SphericalProjection(sensor)))
     if mask is not None:
         masks.append(session.read_mask(mask))
     source = session.read(scan, check=False)
@@ -168,7 +178,10 @@ def complete(
         empty = ~(source.range_m > 0).any(dim=1, keepdim=True)
         masks.append(empty.expand_as(source.range_m))
     if not masks:
-        raise ValueError("nothing is missing: give --sector, --keep_every, --empty_beams or --mask")
+        raise ValueError(
+            "nothing is missing: give --sector, --keep_every, --empty_beams, --other_sensor or "
+            "--mask"
+        )
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))

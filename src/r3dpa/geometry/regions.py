@@ -114,6 +114,29 @@ def dropped_beams(projection: Projection, kept: Sequence[int]) -> Tensor:
     return check_mask(missing, f"{len(set(kept))} of {beams} beams kept: the mask of the others")
 
 
+def sensor_pair(projection: Projection, other: Projection) -> Tensor:
+    """Pixels ``(H, W)`` bool that another sensor at the same place does not fill.
+
+    Each ray of the other sensor in the field of view of ``projection`` fills the pixel whose ray
+    is nearest, the upper and left one at a tie.
+    """
+    sensor = projection.sensor
+    inclination, azimuth = _rays_deg(projection)
+    beams, columns = _rays_deg(other)
+    in_view = (beams < sensor.inclination_max_deg) & (beams >= sensor.inclination_min_deg)
+    seen_rows = torch.zeros(sensor.beams, dtype=torch.bool)
+    if in_view.any():
+        seen_rows[_nearest(beams[in_view, None] - inclination)] = True
+    apart = columns[:, None] - azimuth
+    seen_columns = torch.zeros(sensor.columns, dtype=torch.bool)
+    seen_columns[_nearest((apart + _TURN_DEG / 2) % _TURN_DEG - _TURN_DEG / 2)] = True
+    return check_mask(
+        ~(seen_rows[:, None] & seen_columns),
+        f"what a sensor of {other.sensor.beams} beams and {other.sensor.columns} columns does not "
+        f"see in one of {sensor.beams} beams and {sensor.columns} columns",
+    )
+
+
 def check_mask(mask: Tensor, what: str) -> Tensor:
     """The mask itself; a ValueError that starts with ``what`` if it selects nothing or all."""
     if not mask.any():
@@ -244,6 +267,11 @@ def _missed(projection: Projection, what: str) -> ValueError:
 def _rays_deg(projection: Projection) -> tuple[Tensor, Tensor]:
     inclination, azimuth = projection.ray_angles()
     return _degrees(inclination), _degrees(azimuth)
+
+
+def _nearest(apart_deg: Tensor) -> Tensor:
+    """Index of the smallest angle in each row; the first of those equal up to rounding."""
+    return apart_deg.abs().round(decimals=_DECIMALS).argmin(dim=1)
 
 
 def _degrees(angle: Tensor) -> Tensor:
