@@ -254,25 +254,7 @@ class GenerativeModule(ScanStage):
         alignment = steps.align(self, projected, features).mean()
         return {"vae_alignment": self.weights.vae_alignment * alignment}
 
-    def flow_losses(
-        self, normalised: Tensor, features: Tensor | None, draws: PathDraws
-    ) -> dict[str, Tensor]:
-        """L_denoise + lambda2 L_align on normalised latents without gradient."""
-        denoising, alignment = self.weights.denoising, self.weights.sit_alignment
-        stop = self.weights.alignment_stop
-        aligns = alignment != 0 and (stop is None or self.global_step < stop)
-        errors = steps.flow_errors(
-            self, self.sit, normalised, features, draws, denoising != 0, aligns
-        )
-        if "denoising" in errors:
-            parts = {"denoising": denoising * errors["denoising"].mean()}
-        else:
-            parts = {"denoising": steps.zero_loss(self.sit)}
-        if "alignment" in errors:
-            parts["sit_alignment"] = alignment * errors["alignment"].mean()
-        elif alignment != 0:
-            parts["sit_alignment"] = steps.zero_loss(self.sit.projector)
-        return parts
+    flow_losses = steps.flow_losses
 
     # Optimisation
 

@@ -145,14 +145,10 @@ class RGBPretraining(ImageStage):
 
     def training_step(self, batch: ImageBatch, batch_idx: int) -> Tensor:
         """One step on posterior moments ``(B, 2C, h, w)`` and, with a teacher, images."""
-        posterior, weights = Posterior(batch["posterior_moments"]), self.weights
+        posterior = Posterior(batch["posterior_moments"])
         draws = self.draw_path(len(posterior.mean))
         normalised = self.latent_norm.normalise(posterior.sample(draws.posterior_noise))
-        aligns, features = bool(self._teacher), self._features(batch)
-        errors = steps.flow_errors(self, self.sit, normalised, features, draws, alignment=aligns)
-        losses = {"denoising": weights.denoising * errors["denoising"].mean()}
-        if aligns:
-            losses["sit_alignment"] = weights.sit_alignment * errors["alignment"].mean()
+        losses = steps.flow_losses(self, normalised, self._features(batch), draws)
         return self.weigh_and_log(losses)
 
     @torch.no_grad()

@@ -54,8 +54,13 @@ class Stage(L.LightningModule, ABC):
     weigh_and_log = steps.weigh_and_log
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One AdamW with a parameter group per trained network."""
-        return steps.adamw(self, self.trainable(), self.optimizer_config)
+        """One AdamW with a parameter group per trained network, fused where the device has it."""
+        groups = [
+            {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
+            for name, network in self.trainable().items()
+        ]
+        settings = self.optimizer_config.adamw()
+        return torch.optim.AdamW(groups, **settings, fused=steps.uses_fused(self))
 
     configure_gradient_clipping = steps.clip_per_network
     on_before_optimizer_step = steps.set_learning_rate

@@ -16,7 +16,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa import losses
 from r3dpa.flow import sample_time
-from r3dpa.modules.settings import LossWeights, OptimizerConfig
+from r3dpa.modules.settings import LossWeights
 from r3dpa.nn import VelocityNetwork
 
 
@@ -164,17 +164,6 @@ def weigh_and_log(module: Any, parts: Mapping[str, Tensor]) -> Tensor:
     return total
 
 
-def adamw(
-    module: L.LightningModule, networks: Mapping[str, nn.Module], config: OptimizerConfig
-) -> torch.optim.AdamW:
-    """One AdamW with a parameter group per network, fused where the device has it."""
-    groups = [
-        {"params": [p for p in network.parameters() if p.requires_grad], "name": name}
-        for name, network in networks.items()
-    ]
-    return torch.optim.AdamW(groups, **config.adamw(), fused=uses_fused(module))
-
-
 def uses_fused(module: L.LightningModule) -> bool:
     """Whether one kernel moves all weights.
 
@@ -252,8 +241,8 @@ def flow_errors(
     latents: Tensor,
     features: Tensor | None,
     draws: PathDraws,
-    velocity: bool = True,
-    alignment: bool = True,
+    velocity: bool,
+    alignment: bool,
 ) -> dict[str, Tensor]:
     """L_denoise and L_align, each ``(B,)``, of normalised latents: those requested, by name."""
     noisy, errors = module.interpolant.interpolate(latents, draws.noise, draws.time), {}
@@ -270,6 +259,25 @@ def flow_errors(
     if projected is not None:
         errors["alignment"] = align(module, projected, features)
     return errors
+
+
+def flow_losses(
+    module: Any, normalised: Tensor, features: Tensor | None, draws: PathDraws
+) -> dict[str, Tensor]:
+    """L_denoise + lambda2 L_align on normalised latents without gradient."""
+    denoising, alignment = module.weights.denoising, module.weights.sit_alignment
+    stop = module.weights.alignment_stop
+    aligns = alignment != 0 and (stop is None or module.global_step < stop)
+    errors = flow_errors(module, module.sit, normalised, features, draws, denoising != 0, aligns)
+    if "denoising" in errors:
+        parts = {"denoising": denoising * errors["denoising"].mean()}
+    else:
+        parts = {"denoising": zero_loss(module.sit)}
+    if "alignment" in errors:
+        parts["sit_alignment"] = alignment * errors["alignment"].mean()
+    elif alignment != 0:
+        parts["sit_alignment"] = zero_loss(module.sit.projector)
+    return parts
 
 
 def align(module: Any, projected: Tensor, features: Tensor | None) -> Tensor:
