@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import linregress
 from torch import Tensor
 
 _SMALLEST_SHARE, _NUM_SIZES = 4, 8  # fd_infinity starts from a quarter of the samples
@@ -170,13 +171,8 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
         )
         for size in sizes
     ]
-    over, y = 1 / torch.tensor(sizes).double(), torch.tensor(distances).double()
-    spread = (over - over.mean()).square().sum()
-    slope = ((over - over.mean()) * y).sum() / spread
-    value = y.mean() - slope * over.mean()
-    noise = (y - value - slope * over).square().sum() / (_NUM_SIZES - 2)
-    error = (noise * (1 / _NUM_SIZES + over.mean().square() / spread)).sqrt()
-    return value.item(), error.item()
+    line = linregress([1 / size for size in sizes], distances)
+    return float(line.intercept), float(np.nan_to_num(line.intercept_stderr))  # NaN for equal ones
 
 
 def squared_mmd(real: Tensor, generated: Tensor) -> Tensor:
