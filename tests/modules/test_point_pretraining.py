@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -108,7 +109,7 @@ def data(tmp_path):
 
 def test_training_learns_and_writes_weights_that_extract_the_same(tmp_path, module, data):
     module.edges.fill_(torch.nan)
-    module.warmup, module.lr = 2, 1e-2
+    module.optimizer_config = replace(module.optimizer_config, warmup_steps=2, lr=1e-2)
     trainer = Trainer(max_steps=30, num_sanity_val_steps=0, default_root_dir=tmp_path, **SILENT)
     trainer.fit(module, data)
     assert module.edges.isfinite().all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +13,8 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from r3dpa.data.scans import evenly
+from r3dpa.modules import steps
+from r3dpa.modules.settings import OptimizerConfig
 from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
 from r3dpa.nn.backbones.point_features import save_weights
 from r3dpa.nn.backbones.voxels import NUM_TARGETS, MaskedScan, Masking
@@ -52,7 +53,9 @@ class PointPretraining(LightningModule):
     ) -> None:
         super().__init__()
         self.network = network
-        self.lr, self.weight_decay, self.warmup = lr, weight_decay, warmup
+        self.optimizer_config = OptimizerConfig(
+            lr=lr, weight_decay=weight_decay, warmup_steps=warmup, cosine=True
+        )
         self.hidden_token = nn.Parameter(torch.zeros(network.width))
         self.norm = nn.BatchNorm1d(network.width, affine=False)
         self.head = nn.Linear(network.width, NUM_TARGETS * _NUM_BINS)
@@ -122,25 +125,17 @@ class PointPretraining(LightningModule):
         for name, value in self.losses(batch).items():
             self.log(f"val/{name}", value, batch_size=len(batch), sync_dist=True)
 
-    def configure_optimizers(self) -> Any:
-        """AdamW with warm-up and cosine."""
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """AdamW, whose weight decay spares all but matrices."""
         matrices = [p for p in self.parameters() if p.ndim > 1]
         others = [p for p in self.parameters() if p.ndim <= 1]
         groups: list[dict[str, Any]] = [
             {"params": matrices},
             {"params": others, "weight_decay": 0.0},
         ]
-        optimizer = torch.optim.AdamW(groups, lr=self.lr, weight_decay=self.weight_decay)
-        total = self.trainer.max_steps
+        return torch.optim.AdamW(groups, **self.optimizer_config.adamw())
 
-        def factor(step: int) -> float:
-            if step < self.warmup:
-                return (step + 1) / self.warmup
-            done = (step - self.warmup) / max(1, total - self.warmup)
-            return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
-
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return [optimizer], [{"scheduler": scheduler, "interval": "step"}]
+    on_before_optimizer_step = steps.set_learning_rate
 
     def on_fit_end(self) -> None:
         """Write ``waffleiron_s.safetensors`` for ``WaffleIronS`` into the run's folder."""
