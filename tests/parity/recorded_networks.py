@@ -10,6 +10,29 @@ from r3dpa.nn.sit import SiT
 from r3dpa.nn.vae import VAE
 
 
+def scaled(atol):
+    """Absolute tolerance of a comparison, times the largest value where that is above 1."""
+
+    def tolerance(key, expected):
+        largest = expected.abs().max().item() if expected.numel() else 0
+        return {"atol": atol * max(1.0, largest), "rtol": 0}
+
+    return tolerance
+
+
+def with_outputs(modules, run):
+    """Result of a call, and by name what some modules gave in it."""
+    found = {}
+    hooks = [
+        module.register_forward_hook(lambda *given, name=name: found.update({name: given[-1]}))
+        for name, module in modules.items()
+    ]
+    result = run()
+    for hook in hooks:
+        hook.remove()
+    return result, found
+
+
 def our_name(official: str) -> str:
     return official.replace("projectors.0.", "projector.")
 

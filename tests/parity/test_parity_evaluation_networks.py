@@ -8,7 +8,7 @@ import tarfile
 import pytest
 import torch
 import yaml
-from recorded_networks import weights_of
+from recorded_networks import scaled, weights_of
 from torch.nn.functional import adaptive_avg_pool2d
 
 from r3dpa.geometry import (
@@ -98,10 +98,7 @@ def test_network(network_case, compare):
     compare(
         case,
         {f"out/{key}": value for key, value in compute(case).items()},
-        tolerance=lambda key, expected: {
-            "atol": 2e-5 * max(1.0, expected.abs().max().item()),
-            "rtol": 0,
-        },
+        tolerance=scaled(2e-5),
     )
 
 
@@ -195,7 +192,7 @@ def test_metrics(name, baseline_case, compare):
     def tolerance(key, expected):
         if key in ("out/frechet", "out/mmd", "out/squared_mmd_numpy_seed123"):
             return {"atol": 0, "rtol": 1e-5}
-        return {"atol": 1e-6 * max(1.0, expected.abs().max().item()), "rtol": 0}
+        return scaled(1e-6)(key, expected)
 
     compare(case, {f"out/{key}": value for key, value in results.items()}, tolerance=tolerance)
 

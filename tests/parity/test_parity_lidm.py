@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from recorded_networks import weights_of
+from recorded_networks import scaled, weights_of, with_outputs
 
 from r3dpa.baselines import scene_generator
 from r3dpa.baselines.lidm import LiDM, ReleasedDDIM, released_times
@@ -56,19 +56,11 @@ def lidm(unet_case):
 
 
 def of_network(case, lidm) -> dict:
-    unet, seen, hooks = lidm.network, {}, []
-    for key in case.keys("out/act/"):
-        name = key.removeprefix("out/act/")
-        hooks.append(
-            unet.get_submodule(name).register_forward_hook(
-                lambda *given, key=key: seen.__setitem__(key.removeprefix("out/"), given[2])
-            )
-        )
-    x, time = case["in/x"], case["in/t"]
+    unet, x, time = lidm.network, case["in/x"], case["in/t"]
+    names = [key.removeprefix("out/act/") for key in case.keys("out/act/")]
+    modules = {f"act/{name}": unet.get_submodule(name) for name in names}
     with torch.no_grad():
-        y = unet(x, time)
-        for hook in hooks:
-            hook.remove()
+        y, seen = with_outputs(modules, lambda: unet(x, time))
         stride = 2 ** (len(case.config["channel_mult"]) - 1)
         turned = [
             (unet(x.roll(by, -1), time).roll(-by, -1) - y).abs().max().item() for by in (1, stride)
@@ -205,10 +197,7 @@ def test_unet(unet_case, lidm, compare):
     compare(
         unet_case,
         {f"out/{key}": value for key, value in results.items()},
-        tolerance=lambda key, expected: {
-            "atol": 2e-5 * max(1.0, expected.abs().max().item()),
-            "rtol": 0,
-        },
+        tolerance=scaled(2e-5),
     )
 
 
@@ -361,10 +350,7 @@ def test_first_stage(stage_case, compare):
 
     def tolerance(key, expected):
         of_weight = key.endswith(("d_weight", "total_loss")) or "/grad/" in key
-        return {
-            "atol": (1e-4 if of_weight else 1e-5) * max(1.0, expected.abs().max().item()),
-            "rtol": 0,
-        }
+        return scaled(1e-4 if of_weight else 1e-5)(key, expected)
 
     compare(case, {f"out/{key}": value for key, value in results.items()}, tolerance=tolerance)
 

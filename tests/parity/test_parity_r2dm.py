@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
+from recorded_networks import scaled, with_outputs
 
 from r3dpa.baselines.base import AveragedNetwork
 from r3dpa.baselines.diffusion import (
@@ -74,14 +75,8 @@ def activations(network, image, time) -> dict[str, torch.Tensor]:
         "u_block4": network.up[0],
         "u_block1": network.up[3],
     }
-    found = {}
-    hooks = [
-        module.register_forward_hook(lambda _, __, out, name=name: found.update({name: out}))
-        for name, module in places.items()
-    ]
-    found["y"] = network(image, time)
-    for hook in hooks:
-        hook.remove()
+    y, found = with_outputs(places, lambda: network(image, time))
+    found["y"] = y
     found["time_embedding.0"] = sinusoid(time, network.base_channels)
     found["coords_encoding"] = encode_angles(
         network.coords, network.coords_encoding, network.resolution
@@ -89,7 +84,7 @@ def activations(network, image, time) -> dict[str, torch.Tensor]:
     return found
 
 
-def test_r2dm_unet_forward_and_gradients(unet_case, unet):
+def test_r2dm_unet_forward_and_gradients(unet_case, unet, compare):
     case, network = unet_case, copy.deepcopy(unet)
     image = case["in/x"].requires_grad_()
     found = activations(network, image, case["in/log_snr"])
@@ -133,7 +128,8 @@ def test_r2dm_unet_forward_and_gradients(unet_case, unet):
     without.load_state_dict(state)
     errors = [roll_error(without, image, case["in/log_snr"], columns) for columns in (1, 4, 8)]
     assert errors[2] < 2e-5 < 1e-2 < min(errors[:2])
-    compare_recorded(case, results, 2e-5, OF_NO_FUNCTION)
+    results |= {key: case[key] for key in OF_NO_FUNCTION}
+    compare(case, results, tolerance=scaled(2e-5))
 
 
 #: Angles that nothing uses, and what is compared another way.
@@ -144,20 +140,6 @@ OF_NO_FUNCTION = {
 }
 
 
-def compare_recorded(case, results, atol, left_out=frozenset()):
-    """All recorded outputs but those left out, at a tolerance scaled as the README says."""
-    assert set(results) == set(case.keys("out/")) - set(left_out)
-    for key, found in results.items():
-        want = case[key]
-        torch.testing.assert_close(
-            torch.as_tensor(found).detach().double(),
-            want.double(),
-            atol=atol(key) if callable(atol) else atol * size_of(want),
-            rtol=0,
-            msg=lambda text, key=key: f"{key}: {text}",
-        )
-
-
 def unet_arguments(case):
     return {key: value for key, value in case.config.items() if key != "seed"}
 
@@ -165,11 +147,6 @@ def unet_arguments(case):
 def roll_error(network, image, time, columns) -> float:
     moved = network(image.roll(columns, -1), time)
     return (moved - network(image, time).roll(columns, -1)).abs().max().item()
-
-
-def size_of(want) -> float:
-    """Scale of the README's tolerances: the largest value where that exceeds 1."""
-    return max(1.0, want.abs().max().item()) if want.numel() else 1.0
 
 
 # Diffusion
@@ -192,7 +169,12 @@ def velocity_of(network, path, kind="eps"):
 
 
 def check(case, key, found, atol=1e-5):
-    compare_recorded(case, {key: found}, atol, set(case.keys("out/")) - {key})
+    torch.testing.assert_close(
+        torch.as_tensor(found).detach().double(),
+        case[key].double(),
+        **scaled(atol)(key, case[key]),
+        msg=lambda text: f"{key}: {text}",
+    )
 
 
 @pytest.mark.parametrize("schedule", ["cosine", "linear", "cosine_shifted"])

@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 from dopri5 import dopri5
-from recorded_networks import weights_of
+from recorded_networks import scaled, weights_of, with_outputs
 
 from r3dpa.baselines import ADMUNet, EfficientUNet
 from r3dpa.baselines.diffusion import sample_errors
@@ -26,11 +26,6 @@ from r3dpa.modules.settings import OptimizerConfig
 PATH = Interpolant()
 
 _SCALAR_TIME = 0.82  # 0 is noise
-
-
-def relative(atol):
-    """An absolute tolerance, times the largest value where that is above 1."""
-    return lambda key, expected: {"atol": atol * max(1, expected.abs().max().item()), "rtol": 0}
 
 
 def hdit_of(config):
@@ -58,25 +53,12 @@ def official(network, image, time):
     return -network(image, 1 - time)
 
 
-def recorded_outputs(modules, names):
-    outputs, handles = {}, []
-    for name in names:
-        handles.append(
-            modules[name].register_forward_hook(
-                lambda module, inputs, output, name=name: outputs.__setitem__(name, output.detach())
-            )
-        )
-    return outputs, handles
-
-
 def outputs_of(case, network):
     names = [key.removeprefix("out/act/") for key in case.keys("out/act/")]
     names.remove("spatial_pe")
-    activations, handles = recorded_outputs(dict(network.named_modules()), names)
+    modules = {name: network.get_submodule(name) for name in names}
     image = case["in/x"].requires_grad_()
-    velocity = official(network, image, case["in/t"])
-    for handle in handles:
-        handle.remove()
+    velocity, activations = with_outputs(modules, lambda: official(network, image, case["in/t"]))
     results = {f"out/act/{name}": value for name, value in activations.items()}
     scalar_time = torch.full((len(image),), _SCALAR_TIME)
     results["out/act/spatial_pe"] = network.spatial_pe["embedding"]
@@ -119,7 +101,7 @@ def test_hdit(hdit, compare):
         "out/rope_freqs_w": rope.freqs_w,
         "out/roll_max_err_1_4_32": roll_errors(network, case["in/x"], 1 - case["in/t"], (1, 4, 32)),
     }
-    compare(case, results, tolerance=relative(5e-5))
+    compare(case, results, tolerance=scaled(5e-5))
 
 
 @torch.no_grad()
@@ -160,7 +142,7 @@ def test_unet(kind, baseline_case, compare):
     if kind is ADMUNet:
         block = network.get_submodule("down_blocks.1")
         results["out/block_down_blocks.1"] = block(case["in/block_x"], case["in/block_temb"])
-    compare(case, results, tolerance=relative(2e-5))
+    compare(case, results, tolerance=scaled(2e-5))
 
 
 def unet_of(kind, case):
@@ -224,7 +206,7 @@ def test_flow(hdit, baseline_case, close):
         atol = 1e-3 if "tol1e-5" in key else 1e-4 if of_solver else 1e-5
         expected = case[key]
         try:
-            close(found, expected, **relative(atol)(key, expected.double()))
+            close(found, expected, **scaled(atol)(key, expected.double()))
         except AssertionError as error:
             raise AssertionError(f"{key}: {error}") from None
 

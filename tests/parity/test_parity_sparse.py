@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from recorded_networks import with_outputs
 
 from r3dpa.nn.backbones.minkowski import (
     SPVCNN,
@@ -125,14 +126,10 @@ def test_sparse_layers_of_points(layers, close):
 @torch.no_grad()
 def test_network(case, network, close):
     """Every stage, the features of the voxels, and the feature of each cloud."""
-    seen = {}
     modules = [network.stem[1], *network.encoder, *network.decoder]
-    for name, module in zip(["stem", *STAGES], modules, strict=True):
-        module.register_forward_hook(
-            lambda _, inputs, result, name=name: seen.update({name: result})
-        )
+    stages = dict(zip(["stem", *STAGES], modules, strict=True))
     coordinates, features = case["in/coords_xyzb"], case["in/feats"]
-    actual = network(coordinates, features)
+    actual, seen = with_outputs(stages, lambda: network(coordinates, features))
 
     level, _ = Voxels.from_coordinates(coordinates)
     levels = [level]
