@@ -16,6 +16,9 @@ _WITHIN_M, _FAR_SHARE = (1.0, 0.5, 0.3, 0.2, 0.15), 0.003
 _LEAST_POINTS = 20
 _LEVEL_COS = 0.95  # steeper planes are no ground
 _STEP_M = 0.6  # between the plane of a sector and the one of the whole scan, beside 5 % of slope
+# The lowest points of what stands on the ground are not part of it: cells of this angle and length
+# with a point between these heights above the plane.
+_UPRIGHT_RAD, _UPRIGHT_M, _HEIGHTS_M = np.radians(0.7), 0.2, (0.25, 2.0)
 Plane = NDArray[np.float64]  # slopes along x and y, and height at the origin
 
 
@@ -24,7 +27,7 @@ def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[n
 
     Planes are fitted by least squares to the lowest points of cells, then again and again to the
     points ever nearer to the plane. A sector whose plane is steep, far from that of the whole scan
-    or of few points has that of the whole scan.
+    or of few points has that of the whole scan. The feet of walls, trees and cars are not ground.
     """
     away_m = np.hypot(points[:, 0], points[:, 1])
     azimuth = np.arctan2(points[:, 1].astype(float), points[:, 0]) % (2 * np.pi)
@@ -50,7 +53,10 @@ def ground_of(points: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[n
     plane = planes[part]
     normal = np.stack([-plane[:, 0], -plane[:, 1], np.ones(len(points))], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    near = np.abs(_above(plane.T, points.T)) < _WITHIN_M[-1] + _FAR_SHARE * away_m
+    above_m = _above(plane.T, points.T)
+    near = np.abs(above_m) < _WITHIN_M[-1] + _FAR_SHARE * away_m
+    cell = (away_m / _UPRIGHT_M).astype(int) * 1000 + (azimuth / _UPRIGHT_RAD).astype(int)
+    near &= ~np.isin(cell, cell[(above_m > _HEIGHTS_M[0]) & (above_m < _HEIGHTS_M[1])])
     return near, normal.astype(np.float32)
 
 
