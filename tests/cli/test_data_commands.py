@@ -116,14 +116,16 @@ def test_check_says_the_columns_and_beams_of_other_formats(tmp_path, capsys):
     azimuth = np.linspace(0, 6.2, 100)
     rows = [[5 * np.cos(a), 5 * np.sin(a), z, 0.5, z] for z in (2, 1, 0) for a in azimuth]
     np.save(tmp_path / "a.npy", np.array(rows, "f4"))
-    status, (line,) = check(tmp_path, capsys)
-    assert status == 0
-    assert "(x, y, z, intensity, ring), 300 points, range 5..5.385, intensity 0.5..0.5" in line
-    assert line.endswith("3 beams by stored, 100% of the points sure")
+    (tmp_path / "a.pcd.bin").write_bytes(np.array(rows, "f4").tobytes())
+    status, lines = check(tmp_path, capsys)
+    assert (status, len(lines)) == (0, 2)
+    for line in lines:
+        assert "(x, y, z, intensity, ring), 300 points, range 5..5.385, intensity 0.5..0.5" in line
+        assert line.endswith("3 beams by stored, 100% of the points sure")
     np.save(tmp_path / "b.npy", np.array(rows, "f4") * 100)
     status, lines = check(tmp_path, capsys)
     assert status == 1
-    assert lines[1].startswith(f"bad: {tmp_path / 'b.npy'}: ranges have the median")
+    assert lines[2].startswith(f"bad: {tmp_path / 'b.npy'}: ranges have the median")
 
 
 class TestObjects:

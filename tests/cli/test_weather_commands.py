@@ -116,7 +116,9 @@ class TestWeather:
             (source / f"{name}.bin").write_bytes((folder / "b/2.bin").read_bytes())
         for expected in (2, 0):
             weather(source, out, *FOG)
-            assert f"2 scans in {out}, {expected} of them written now" in capsys.readouterr().out
+            said = capsys.readouterr().out
+            assert f"2 scans in {out}, {expected} of them written now" in said
+            assert "intensity: 0..1, full scale 1, in 2 scans" in said
         time.sleep(0.01)
         (source / "b.bin").write_bytes((folder / "a/velodyne/1.bin").read_bytes())
         weather(source, out, *FOG)
@@ -153,6 +155,7 @@ BAD = {
     "negative": (["--weather.visibility_m", "-5"], "visibility_m must be 1 or greater"),
     "rain": (["--weather.rain_mm_h", "10000"], "rain_mm_h must be at most"),
     "effect": ([*FOG, "--effects.glass", "on"], "effect glass cannot act on a recorded scan"),
+    "sensor": ([*FOG, "--instrument.sensor", "hdl99"], "there is no sensor 'hdl99': give hdl64e"),
     "columns": ([*FOG, "--columns", "x,y,i"], "no rows of 3 float32"),
 }
 

@@ -166,6 +166,10 @@ BAD = {
     "noz.ply": (ply("ascii").replace(b"float z", b"float w"), "has no column z, only x, y, w"),
     "int.ply": (ply("ascii").replace(b"float z", b"int z"), "must"),
     "wide.npy": (lambda path: np.save(path, np.ones((40, 7))), "not rows of 5 floats"),
+    "time.npy": (
+        lambda path: np.save(path, np.column_stack([ROWS[:, :4], RING / 7])),
+        "not rows of 5 floats that can be x, y, z, intensity, ring: name the columns",
+    ),
     "two.npz": (bad_npz, "must hold one scan"),
 }
 

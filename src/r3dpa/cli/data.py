@@ -28,15 +28,15 @@ def check(path: Path) -> None:
     from r3dpa.weather.files import find_files, read_file
 
     files = [file for file in sorted(scan_files(path)) if file.suffix == ".bin"]
+    others: list[Path] = []
     text, usable = "", True
-    if not files:
+    if all(file.name.endswith(".pcd.bin") for file in files):  # none, or those of nuScenes
         with suppress(ScanError):
-            files = find_files(path)[1]
-    if not files or files[0].suffix == ".bin":
+            others = find_files(path)[1]
+    if not others:
         text, usable = check_scans(path)
-        files = evenly(files, 4)
     lines = []
-    for file in files:
+    for file in others or evenly(files, 4):
         try:
             scan = read_file(file)
             rings = rings_of(scan.scan)

@@ -18,7 +18,7 @@ from r3dpa.cli.parser import check_folder
 from r3dpa.io import delete_unfinished, in_processes, only_writer
 from r3dpa.simulation.drive_files import to_json, weather_to_dict, write
 from r3dpa.simulation.drives import differences
-from r3dpa.weather import Instrument, Weather, WeatheredScan
+from r3dpa.weather import Instrument, RecordedScan, Weather, WeatheredScan
 from r3dpa.weather.faults import Fault, Kind
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
@@ -46,6 +46,8 @@ def weather(
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
         **options: See :class:`FolderOptions`.
     """
+    # Errors of the request are none of a scan.
+    weather.apply(RecordedScan(np.ones((1, 3), np.float32)), 0, instrument, effects=effects)
     change = weather, instrument, effects
     about = {"weather": weather_to_dict(weather), "instrument": asdict(instrument)}
     return _run(source, change, about | {"effects": effects}, FolderOptions(**options))
@@ -166,7 +168,8 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
     if bad:
         with suppress(OSError):
             out.rmdir()
-        more = f" ({len(bad)} of {len(paths)} scans cannot be used, see {out / _REPORT})"
+        where = f", see {out / _REPORT}" if len(bad) < len(paths) else ""
+        more = f" ({len(bad)} of {len(paths)} scans cannot be used{where})"
         raise ScanError(bad[0] + (more if len(paths) > 1 else ""))
     if options.show and (todo or not (out / _PAGE).exists()):
         _write_page(job, evenly(files, options.show))
@@ -212,6 +215,8 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
     kinds = {line["file"].partition(")")[0]: line["file"] for line in reversed(lines)}
     num_points = sum(line["points"] for line in lines)
     texts = [f"{len(lines)} scans in {out}, {num_now} of them written now", *kinds.values()]
+    scales = Counter(line["intensity"].split(": ")[1] for line in lines if "intensity" in line)
+    texts += [f"intensity: {scale}, in {num} scans" for scale, num in scales.most_common(4)]
     for key in ("lost", "moved", "dimmed", "added"):
         causes = Counter[str]()
         for line in lines:
@@ -220,7 +225,8 @@ def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
         texts.append(f"{key}: {', '.join(shares) or 'no point'}")
     ran = Counter((name, why) for line in lines for name, why in line["effects"].items())
     texts += [f"{name}: {why}, in {num} scans" for (name, why), num in ran.most_common(12)]
-    return "\n".join([*texts, f"{out / _REPORT} has a line for each; open {out / _PAGE}"])
+    page = f"; open {out / _PAGE}" if (out / _PAGE).exists() else ""
+    return "\n".join([*texts, f"{out / _REPORT} has a line for each{page}"])
 
 
 def _write_page(job: _Job, files: list[Path]) -> None:

@@ -28,6 +28,7 @@ from r3dpa.weather.weather import WeatheredScan
 Table = NDArray[np.void]  # (P,) rows of named columns, in the order of the file
 _Read = tuple[str, Table, Callable[[Table], bytes]]  # format, rows, and file of other rows
 _ROWS = ("x", "y", "z", "intensity", "ring")  # of rows without names
+_ADVICE = "name the columns with --columns, such as x,y,z,intensity,time"
 _NAMES = {
     **{axis: axis for axis in "xyz"},
     "intensity": "intensity i reflectivity reflectance remission scalar_intensity",
@@ -204,28 +205,30 @@ def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Pat
 
 def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
     """Rows ``(P, C)`` of floats as a table."""
-    columns = columns or _ROWS[: rows.shape[-1]]
-    if rows.ndim != 2 or rows.dtype.kind != "f" or rows.shape[1] != len(columns):
+    named = columns or _ROWS[: rows.shape[-1]]
+    is_table = rows.ndim == 2 and rows.dtype.kind == "f" and rows.shape[1] == len(named)
+    if not is_table or not (columns or _can_be_rows(rows)):
         raise ScanError(
-            f"{path}: holds {rows.dtype} of shape {rows.shape}, not rows of {len(columns)} floats: "
-            "name all columns with --columns, such as x,y,z,intensity,ring,time"
+            f"{path}: holds {rows.dtype} of shape {rows.shape}, not rows of {len(named)} floats "
+            f"that can be {', '.join(named)}: {_ADVICE}"
         )
-    return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in columns])[:, 0]
+    return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in named])[:, 0]
+
+
+def _can_be_rows(rows: NDArray) -> bool:
+    """Whether columns ``(P, C)`` without names can be those of ``_ROWS``."""
+    shares, ring = rows[:, 3:], rows[:, 4:]  # NaN is for a later message
+    return not ((shares < 0).any() or (ring > 255).any() or (ring % 1 > 0).any())
 
 
 def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     counts = [len(columns)] if columns else [5] if path.stem.endswith(".pcd") else [4, 5]
     fitting = [np.frombuffer(data, "<f4").reshape(-1, n) for n in counts if not len(data) % (4 * n)]
-    likely = []
-    for rows in fitting:
-        shares, ring = rows[:, 3:], rows[:, 4:]  # NaN is for a later message
-        if columns or not ((shares < 0).any() or (ring > 255).any() or (ring % 1 > 0).any()):
-            likely.append(rows)
+    likely = [rows for rows in fitting if columns or _can_be_rows(rows)]
     if len(likely) != 1:
         raise ScanError(
             f"{path}: its {len(data)} bytes are no rows of {' or '.join(map(str, counts))} float32 "
-            "numbers that can be x, y, z, intensity, ring: name the columns with --columns, such "
-            "as x,y,z,intensity,time"
+            f"numbers that can be {', '.join(_ROWS)}: {_ADVICE}"
         )
     table = _with_names(path, likely[0], columns)
     return f"{likely[0].shape[1]} columns of float32", table, np.ndarray.tobytes
