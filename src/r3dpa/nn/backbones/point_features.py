@@ -93,11 +93,15 @@ class TokenFeatures(FrozenNetwork):
         return self.point_features([self.prepare(points)])[0]
 
     def point_features(self, prepared: Sequence[PreparedScan]) -> list[Tensor]:
-        """Features ``(P_i, F)`` of unit norm of prepared scans, in one pass of the network.
+        """Features ``(P_i, F)`` of unit norm of prepared scans.
 
-        They are on its device; zeros where no point of a scan lies in the field of view.
+        They are on the device of the network; zeros where no point of a scan lies in the field of
+        view. A GPU computes all scans in one pass, a CPU one after the other: the tokens of eight
+        scans do not fit its caches, and take twice as long.
         """
         device = self.network.embedding.merge.weight.device
+        if device.type == "cpu" and len(prepared) > 1:
+            return [self.point_features([scan])[0] for scan in prepared]
         counts = [len(scan.features) for scan in prepared]
         tokens = torch.zeros(0, self.network.width, device=device)
         if any(counts):

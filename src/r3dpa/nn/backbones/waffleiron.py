@@ -20,6 +20,7 @@ from r3dpa.nn.layers import at_least_float32, no_autocast
 _COUNT_EPS = 1e-6
 # Starting value of the layer scales: Touvron et al., "Going deeper with Image Transformers" (2021).
 _SCALE = 0.1
+_BLOCK = 1024  # points
 
 
 class WaffleIron(nn.Module):
@@ -117,9 +118,15 @@ class Embedding(nn.Module):
             others = features.index_select(0, neighbors.flatten())
             offsets = others - features.repeat_interleave(neighbors.shape[1], dim=0)
             around = self._around(offsets).unflatten(0, neighbors.shape).amax(dim=1)
-        else:  # one after the other: a K-th of the memory
-            each = (self._around(features[index] - features) for index in neighbors.unbind(dim=1))
-            around = reduce(torch.maximum, each)
+        else:  # one after the other in blocks that fit the caches: a K-th of the memory
+            around = torch.cat(
+                [
+                    reduce(torch.maximum, (self._around(features[i] - own) for i in others.T))
+                    for own, others in zip(
+                        features.split(_BLOCK), neighbors.split(_BLOCK), strict=True
+                    )
+                ]
+            )
         with no_autocast(features.device):
             own = self.point(features)
             return self.merge(torch.cat([own, around.to(own.dtype)], dim=1))
