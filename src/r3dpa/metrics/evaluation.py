@@ -121,7 +121,10 @@ def evaluate(
     floors: dict[str, MetricResult] = {}
     if isinstance(reference, ReferenceStatistics):
         num_images = len(match.kept("generated")[0])
-        floors = _floors(reference, spaces, len(names), num_images, list(by_name), resampling)
+        key = tuple(by_name), len(names), num_images, resampling
+        if key not in reference.floors:
+            reference.floors[key] = _floors(reference, spaces, *key)
+        floors = reference.floors[key]
         extra["verdict"] = _verdict(rows, floors)
     else:
         extra["left_out"] = reference.left_out
@@ -251,9 +254,9 @@ def reference_spaces(
 def _floors(
     reference: ReferenceStatistics,
     spaces: Sequence[SceneFeatures],
+    metric_names: Sequence[str],
     num_samples: int,
     num_images: int,
-    metric_names: Sequence[str],
     resampling: Resampling,
 ) -> dict[str, MetricResult]:
     """Rows of the first half of the reference as if it were generated, against the second."""

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
 from r3dpa.metrics.distances import SceneMetric
 from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
+from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene import EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -42,6 +43,7 @@ class ReferenceStatistics:
             keep features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
         spaces: Cards of the feature spaces, see :func:`cards_of`.
         num_done: Scans added so far.
+        floors: Distances between the halves that were computed, kept by their settings.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class ReferenceStatistics:
                 + (f"; given twice: {', '.join(twice[:5])}" if twice else "")
             )
         self.protocol, self.spaces, self.about, self.num_done = protocol, spaces, about, 0
+        self.floors: dict[tuple[Any, ...], dict[str, MetricResult]] = {}
         self.names, self._half_of = tuple(names), split_halves(names)
         sizes = [len(self.names_of_half(index)) for index in (0, 1)]
         rows, images = (

@@ -57,6 +57,7 @@ _OFFICIAL_NAMES = {
     r"channel\.(\d+)\.scale": "waffleiron.channel_mix.{}.scale.weight",
     r"head": "classif",
 }
+_CPU_POINTS = 16384  # in one pass
 _SHIPPED = Path(str(files("r3dpa.nn.backbones"))) / "waffleiron_s.safetensors"
 _ABOUT = "waffleiron"  # metadata key of that file: sizes of the network, grid
 
@@ -96,13 +97,14 @@ class TokenFeatures(FrozenNetwork):
         """Features ``(P_i, F)`` of unit norm of prepared scans.
 
         They are on the device of the network; zeros where no point of a scan lies in the field of
-        view. A GPU computes all scans in one pass, a CPU one after the other: the tokens of eight
-        scans do not fit its caches, and take twice as long.
+        view. A GPU computes all scans in one pass, a CPU as many as its caches hold: the tokens of
+        eight scans at once take twice as long.
         """
         device = self.network.embedding.merge.weight.device
-        if device.type == "cpu" and len(prepared) > 1:
-            return [self.point_features([scan])[0] for scan in prepared]
         counts = [len(scan.features) for scan in prepared]
+        if device.type == "cpu" and len(prepared) > 1 and sum(counts) > _CPU_POINTS:
+            half = len(prepared) // 2
+            return [*self.point_features(prepared[:half]), *self.point_features(prepared[half:])]
         tokens = torch.zeros(0, self.network.width, device=device)
         if any(counts):
             tokens = F.normalize(self.tokens(collate_scans(prepared).to(device)), dim=1)
