@@ -33,9 +33,10 @@ def nearest_images(range_m: Tensor, references: Iterable[Tensor]) -> Nearest:
     best = Nearest(torch.full((len(cells),), torch.inf), torch.zeros(len(cells), dtype=torch.long))
     first = 0
     for batch in references:
-        # The default of cdist multiplies matrices, and finds copies at a distance of rounding.
-        apart = torch.cdist(cells, _cells(batch), compute_mode="donot_use_mm_for_euclid_dist")
-        distance, index = apart.min(dim=1)
+        others = _cells(batch)
+        # Products of matrices find the nearest; their rounding must not hide a copy.
+        index = torch.cdist(cells.double(), others.double()).argmin(dim=1)
+        distance = (cells - others[index]).norm(dim=1)
         nearer = distance < best.distance
         best = Nearest(
             torch.where(nearer, distance, best.distance),
