@@ -215,9 +215,9 @@ def _lower_bounds(
     blocks = -(-side // _BLOCK)
     rows = []
     for cells in clouds:
-        found, counts = np.unique(_blocks(cells, side), return_counts=True)
-        rows.append((found, counts / len(cells)))
-    ends = np.cumsum([0, *(len(found) for found, _ in rows)])
+        occupied, counts = np.unique(_blocks(cells, side), return_counts=True)
+        rows.append((occupied, counts / len(cells)))
+    ends = np.cumsum([0, *(len(occupied) for occupied, _ in rows)])
     columns, values = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     shares = csr_array((values, columns, ends), shape=(len(clouds), blocks**2))
 
@@ -227,11 +227,11 @@ def _lower_bounds(
         apart = _BLOCK * distance_transform_edt(free) - math.sqrt(2) * (_BLOCK - 1)
         return np.square(apart.clip(0)).ravel()
 
-    found = [
+    bounds = [
         shares @ np.stack(list(pool.map(table, targets[first : first + _TABLES])), axis=1)
         for first in range(0, len(targets), _TABLES)
     ]
-    return np.hstack(found) * (1 - 1e-9)  # less what rounding may add
+    return np.hstack(bounds) * (1 - 1e-9)  # less what rounding may add
 
 
 def _blocks(cells: Cells, side: int) -> Cells:
