@@ -62,6 +62,17 @@ class TestInpaint:
         assert plain.latents.equal(cosines[0.0].latents)
         assert plain.cosine is None
 
+    def test_a_later_start_lies_on_the_path_of_the_network(self, scan):
+        """At t = 0.5 of the cosine path, where a network of velocity 0 leaves it."""
+        still = SceneGenerator(*tiny_networks(spread=0.0), GEOMETRY, path="cosine")
+        editor = SceneEditor(still, EditSettings("euler", 4))
+        result = editor.inpaint(scan, MASK, [3], seed=1, start=0.5)
+        latents, noise = editor.encode(scan[None]), still.noise([3], 1)
+        edited = token_mask(MASK, (2, 8)).view(2, 8)
+        edited = edited.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        expected = torch.where(edited, (latents + noise) * 2**-0.5, latents)
+        torch.testing.assert_close(result.latents, expected)
+
     def test_the_weights_get_no_gradients(self, generator, scan):
         generator.sit.requires_grad_(True)
         SceneEditor(generator, EditSettings(steps=2)).inpaint(scan, MASK, [0], feature=FEATURE)

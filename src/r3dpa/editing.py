@@ -181,7 +181,8 @@ class SceneEditor:
             if feature is not None:
                 target = feature.to(noise).expand(len(noise), tokens.numel(), -1)
                 guidance = self._guidance(FeatureTarget(target, tokens.expand(len(noise), -1)))
-            velocity, state = guidance or self._sit.velocity, renoised(own, edited, noise)
+            state = renoised(own, edited, noise, self.generator.interpolant)
+            velocity = guidance or self._sit.velocity
             return self._solve(velocity, state, times, kept(own, edited)), guidance
 
         made, cosine = self._each(indices, seed, solve)
