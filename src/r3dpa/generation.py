@@ -36,12 +36,14 @@ class SceneBatch:
         latents: ``(B, C, h, w)`` normalised latents.
         nfe: Network evaluations per scene.
         projection: Maps pixels to points.
+        intensity: ``(B, H, W)`` in [0, 1], of networks that generate it.
     """
 
     range_m: Tensor
     latents: Tensor
     nfe: int
     projection: Projection
+    intensity: Tensor | None = None
 
     def __len__(self) -> int:
         """Number of scenes B."""

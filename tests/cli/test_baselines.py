@@ -12,6 +12,7 @@ from r3dpa.baselines import BASELINES, baseline_of, scene_generator
 from r3dpa.baselines.lidm_networks import VQAutoencoder
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.cli import main
+from r3dpa.data.scans import read_scan
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.simulation import simulate
 
@@ -161,6 +162,35 @@ def test_sample_and_convert(trained, tmp_path):
     assert first.shape == (2, 16, 64)
     np.testing.assert_array_equal(first, second)
     assert json.loads((tmp_path / "b/metadata.json").read_text())["stage"] == stage
+    points = read_scan(tmp_path / "a/bin/000000.bin")
+    scenes = scene_generator(path, SamplerConfig("euler", 2), device="cpu").generate(2)
+    if stage == "lidm":
+        assert scenes.intensity is None
+        assert not points[:, 3].any()
+    else:
+        assert 0 <= scenes.intensity.min() < scenes.intensity.max() <= 1
+        np.testing.assert_allclose(
+            points[:, 3], scenes.intensity[0][scenes.range_m[0] > 0], atol=1e-5
+        )
+
+
+def test_edit_complete(trained, smoke_root, tmp_path):
+    """What is known of a scan stays, with its intensity; no other edit takes a baseline."""
+    stage, path = trained
+    scan = next((smoke_root / "data_3d_raw").rglob("*.bin"))
+    words = ["--scan", str(scan), "--ckpt", str(path), "--num", "2", "--pictures", "0"]
+    words += ["--steps", "4", "--out", str(tmp_path / "out"), "--batch_size", "1"]
+    more = [] if stage == "lidm" else ["--resamplings", "2"]
+    main(["edit", "complete", "--keep_every", "2", *words, *more])
+    before, made = (np.load(tmp_path / "out" / name) for name in ("before.npy", "range_m.npy"))
+    np.testing.assert_array_equal(made[:, ::2], np.broadcast_to(before[0, ::2], (2, 8, 64)))
+    assert (made[0] != made[1]).any()
+    about = json.loads((tmp_path / "out/metadata.json").read_text())
+    assert about["nfe"] == (4 if stage == "lidm" else 3 * 2 + 1)
+    with pytest.raises(ValueError, match=f"stage {stage}, which can only complete scans"):
+        main(["edit", "vary", *words])
+    with pytest.raises(ValueError, match=f"stage {stage} starts from noise"):
+        main(["edit", "complete", "--keep_every", "2", "--start", "0.5", *words])
 
 
 def test_the_published_sampler_is_the_default(trained):
@@ -192,9 +222,9 @@ def test_test_scores_scenes(trained, smoke_root, tmp_path, monkeypatch):
 def test_known_pixels_of_a_completion_stay(trained):
     _, path = trained
     generator = scene_generator(path, SamplerConfig("ddpm", 3), device="cpu")
-    image = generator.generate([0]).latents.clamp(-1, 1)
-    known = torch.zeros(1, 1, *image.shape[2:], dtype=torch.bool)
-    known[..., ::2, :] = True
+    image = generator.generate([0]).latents[0].clamp(-1, 1)
+    known = torch.zeros(image.shape[1:], dtype=torch.bool)
+    known[::2] = True
     found = generator.complete(image, known, seed=1, resamplings=2)
     assert found.nfe == 2 * 2 + 1
     # The last state holds the known part at the least noise of the path, 5.5e-4.
@@ -234,9 +264,9 @@ def test_a_step_at_full_size(stage, smoke_root, tmp_path, caplog):
 def test_latents_are_completed(trained):
     _, path = trained
     generator = scene_generator(path, SamplerConfig("ddim", 4), device="cpu")
-    image, other = torch.rand(2, 1, 1, 16, 64, generator=torch.Generator().manual_seed(0)) - 0.5
-    known = torch.zeros(1, 1, 16, 64, dtype=torch.bool)
-    known[..., 16:48] = True
+    image, other = torch.rand(2, 1, 16, 64, generator=torch.Generator().manual_seed(0)) - 0.5
+    known = torch.zeros(16, 64, dtype=torch.bool)
+    known[:, 16:48] = True
     found = generator.complete(image, known, seed=1)
     assert (found.nfe, found.range_m.shape) == (4, (1, 16, 64))
     assert not torch.equal(found.latents, generator.complete(other, known, seed=1).latents)

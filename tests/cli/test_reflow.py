@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from r3dpa.baselines import ReflowPairs, scene_generator
 from r3dpa.baselines.reflow import as_scanned
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
+from r3dpa.data.store import StoreError
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import euler
 from r3dpa.flow.times import ode_times
@@ -35,14 +37,33 @@ def pairs_root(tmp_path_factory):
     return tmp_path_factory.mktemp("pairs")
 
 
-def pairs_of(flow, root, num_pairs=7):
-    return ReflowPairs(
-        str(root), str(flow), num_pairs, SAMPLER, num_held_out=2, device="cpu", generation_batch=3
+def pairs_of(flow, root, num_pairs=7, rank=0, processes=1):
+    pairs = ReflowPairs(str(root), str(flow), num_pairs, SAMPLER, 2, generation_batch=3)
+    strategy = SimpleNamespace(barrier=lambda name: None, root_device=torch.device("cpu"))
+    pairs.trainer = SimpleNamespace(
+        strategy=strategy,
+        datamodule=pairs,
+        global_rank=rank,
+        local_rank=rank,
+        world_size=processes,
+        num_devices=processes,
     )
+    return pairs
+
+
+def test_processes_share_the_generation(flow, tmp_path):
+    for rank, missing in ((0, "and 2 more in"), (1, "")):
+        pairs = pairs_of(flow, tmp_path, rank=rank, processes=2)
+        if missing:
+            with pytest.raises(StoreError, match=missing):
+                pairs.setup("fit")
+        else:
+            pairs.setup("fit")
+    assert len(pairs.train_set) == 5
 
 
 def test_a_pair_is_noise_and_what_the_flow_makes_of_it(flow, pairs_root, monkeypatch):
-    pairs_of(flow, pairs_root, 5).prepare_data()
+    pairs_of(flow, pairs_root, 5).setup("fit")
     generator = scene_generator(flow, SAMPLER, device="cpu")
     made = []
     generate = type(generator).generate
@@ -52,9 +73,8 @@ def test_a_pair_is_noise_and_what_the_flow_makes_of_it(flow, pairs_root, monkeyp
         lambda self, indices, seed=0: made.extend(indices) or generate(self, indices, seed),
     )
     pairs = pairs_of(flow, pairs_root)
-    pairs.prepare_data()
-    assert made == [5, 6]  # only those that were missing
     pairs.setup("fit")
+    assert made == [5, 6]  # only those that were missing
     assert (len(pairs.train_set), len(pairs.val_set)) == (5, 2)
     for index in (0, 4):
         pair = pairs.train_set[index]

@@ -14,6 +14,7 @@ from r3dpa.metrics.functional import (
     fd_infinity,
     frechet_distance,
     frechet_distance_of,
+    frechet_of_draws,
     polynomial_mmd,
     shared_balls,
     squared_mmd,
@@ -46,6 +47,17 @@ def test_frechet_against_the_root_of_the_product():
     expected = (a.trace() + b.trace()).item() - 2 * np.trace(sqrtm((a @ b).numpy())).real
     zero = torch.zeros(12)
     assert frechet_distance(zero, a, zero, b).item() == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize(("count", "width"), [(40, 12), (12, 40)])
+def test_frechet_of_draws_is_that_of_their_moments(count, width):
+    rows, real = draw(count, width), Moments.of(draw(60, width, seed=1))
+    covariance = real.covariance("real")
+    drawn = torch.randint(count, (count,), generator=torch.Generator().manual_seed(0))
+    own = Moments.of(rows[drawn])
+    expected = frechet_distance(real.mean, covariance, own.mean, own.covariance("drawn")).item()
+    found = frechet_of_draws(real.mean, covariance, rows)(drawn)
+    assert found == pytest.approx(expected, rel=1e-10)
 
 
 # Moments

@@ -489,11 +489,13 @@ def test_ema(baseline_case):
     )
     for step, weight in enumerate(case["in/online_weights"]):
         network.weight.data.copy_(weight)
+        network.seen.fill_(step)
         decay = ema_decay_at(step, beta, 1, after)
         assert decay == pytest.approx(case["out/decay"][step].item(), abs=1e-6)
         average.update(network, step)
         expected = case["out/ema_weights"][step]
         torch.testing.assert_close(average.network.weight, expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(average.network.seen, case["out/ema_buffer"][step])
 
 
 def official_checkpoint(listing, path):

@@ -87,35 +87,47 @@ class BaselineGenerator:
         draws = (filled(noise, size).to(self.device) for noise in noises)
         path = self.baseline.interpolant
         latents = self.sampler.solve(self.velocity, next(draws), draws, path)[: len(indices)]
-        return SceneBatch(self.decode(latents), latents, self.calls, self.geometry.projection)
+        return self._scenes(latents)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Range images ``(B, H, W)``, metres, as in :class:`r3dpa.SceneBatch`, of samples."""
+        return self._scenes(latents).range_m
+
+    def _scenes(self, latents: Tensor) -> SceneBatch:
         image = self.baseline.decode(latents).float().clamp(-1, FULL_SCALE)
-        range_m = self.geometry.codec.ranges_of(image, self.geometry.projection.sensor)
-        finite = image.flatten(1).isfinite().all(dim=1)
-        return torch.where(finite[:, None, None], range_m, torch.nan)
+        projection, codec = self.geometry.projection, self.geometry.codec
+        finite = image.flatten(1).isfinite().all(dim=1)[:, None, None]
+        range_m = torch.where(finite, codec.ranges_of(image, projection.sensor), torch.nan)
+        intensity = (image[:, 1] + 1) / 2 if codec.reflectance else None
+        return SceneBatch(range_m, latents, self.calls, projection, intensity)
 
     @torch.inference_mode()
     def complete(
-        self, image: Tensor, known: Tensor, seed: int = 0, *, resamplings: int = 10, jump: int = 1
+        self,
+        image: Tensor,
+        known: Tensor,
+        indices: int | Sequence[int] = 1,
+        seed: int = 0,
+        *,
+        resamplings: int = 10,
+        jump: int = 1,
     ) -> SceneBatch:
-        """Completes encoded range images ``(B, C, H, W)``.
+        """Completes an encoded range image ``(C, H, W)``, once per index.
 
-        Pixels that are True in ``known`` ``(B, 1, H, W)`` are kept; other arguments and steps as
-        of :func:`r3dpa.flow.diffusion.repaint`, with the number of steps of the sampler.
+        Pixels that are True in ``known`` ``(H, W)`` are kept; other arguments and steps as of
+        :func:`r3dpa.flow.diffusion.repaint`, with the number of steps of the sampler.
         Latents are completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
         """
-        self.calls, baseline = 0, self.baseline
-        noises = scene_noise(baseline.latent_shape, range(len(image)), seed)
+        self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
+        noises = scene_noise(baseline.latent_shape, indices, seed)
         draws = (noise.to(self.device) for noise in noises)
-        data = baseline.encode(image.to(self.device))
+        data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)
         # A latent pixel is known where all of its pixels are.
-        mask = -F.adaptive_max_pool2d(-known.to(data), data.shape[-2:])
+        mask = -F.adaptive_max_pool2d(-known[None, None].to(data), data.shape[-2:])
         options = {"resamplings": resamplings, "jump": jump}
         found = baseline.complete(self.velocity, data, mask, draws, self.sampler, **options)
-        return SceneBatch(self.decode(found), found, self.calls, self.geometry.projection)
+        return self._scenes(found)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:
         """First noise ``(B, C, h, w)`` of scenes, on the device of the network."""

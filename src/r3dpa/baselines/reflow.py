@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
@@ -20,7 +20,7 @@ from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.geometry import ScanGeometry
-from r3dpa.io import only_writer
+from r3dpa.modules.encoding import filled
 
 _SAMPLER = SamplerConfig("heun", 82)
 
@@ -46,8 +46,9 @@ class Pair:
 class ReflowPairs(LoaderModule):
     """Scenes of a trained flow with the noise that each was made of, as training data.
 
-    Scenes that are missing are generated before training; runs with the same checkpoint and
-    sampler share them. The noise of a pair follows from its number and is not kept.
+    Scenes that are missing are generated before training, a share by each process; runs with the
+    same checkpoint and sampler use the same. The noise of a pair follows from its number and is
+    not kept.
 
     Args:
         root: Folder of the scenes: 524 kB each at 2 x 64 x 1024.
@@ -56,7 +57,8 @@ class ReflowPairs(LoaderModule):
         sampler: Solver and steps. Official: dopri5 with a tolerance of 1e-5, about 160 evaluations.
         num_held_out: Pairs, the last ones, for validation and test alone.
         generation_batch: Scenes that are generated together.
-        device: Where they are generated: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
+        device: Where they are generated: ``cpu``, ``cuda``, ``cuda:1``, or ``auto`` for the device
+            of the training process.
         batch_size: Pairs per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of the order of training; the pairs do not depend on it.
@@ -85,27 +87,10 @@ class ReflowPairs(LoaderModule):
         self.sampler, self.num_held_out = sampler, num_held_out
         self.generation_batch, self.device = generation_batch, device
 
-    def prepare_data(self) -> None:
-        """Generates the scenes that are missing."""
-        store, pairs = self._store()
-        with only_writer(Path(self.root) / ".lock", f"generates into {self.root}", wait=True):
-            missing = store.missing(pairs)
-            if not missing:
-                return
-            rank_zero_info(f"generating {len(missing)} of {len(pairs)} scenes into {store.folder}")
-            generator = scene_generator(self.checkpoint, self.sampler, device=self.device)
-            parts = range(0, len(missing), self.generation_batch)
-            with store.writer() as writer:
-                for first in tqdm(parts, "generate", unit="batch", disable=None):
-                    part = missing[first : first + self.generation_batch]
-                    scenes = generator.generate([pair.number for pair in part])
-                    images = as_scanned(scenes.latents, generator.geometry)
-                    writer.add([pair.cache_key for pair in part], images)
-
     def setup(self, stage: str) -> None:
-        """Opens the cache."""
+        """Generates the scenes that are missing, and opens the cache."""
         store, pairs = self._store()
-        images = CachedTensors(store, pairs)
+        images = filled(self.trainer, store, pairs, self._generated)
         split = len(pairs) - self.num_held_out
         self.train_set = PairDataset(pairs[:split], images)
         self.val_set = PairDataset(pairs[split:], images)
@@ -119,6 +104,16 @@ class ReflowPairs(LoaderModule):
         return self.loader(self.val_set, train=False)
 
     test_dataloader = val_dataloader
+
+    def _generated(self, pairs: list[Pair]) -> Iterator[Tensor]:
+        """Images ``(B, C, H, W)`` of pairs, in order."""
+        auto = str(cast(Any, self.trainer).strategy.root_device)
+        device = auto if self.device == "auto" else self.device
+        generator = scene_generator(self.checkpoint, self.sampler, device=device)
+        parts = range(0, len(pairs), self.generation_batch)
+        for first in tqdm(parts, "generate", unit="batch", disable=None):
+            numbers = [pair.number for pair in pairs[first : first + self.generation_batch]]
+            yield as_scanned(generator.generate(numbers).latents, generator.geometry)
 
     def _store(self) -> tuple[Store, list[Pair]]:
         checkpoint = read_checkpoint(self.checkpoint)

@@ -184,8 +184,10 @@ class SceneScorer(L.Callback):
             indices = range(first, min(first + self.batch_size, self.num_scenes))
             scenes = generator.generate(indices, self.seed)
             nfe = scenes.nfe
+            images = {"range_m": scenes.range_m, "intensity": scenes.intensity}
+            kept = {name: x.cpu().contiguous() for name, x in images.items() if x is not None}
             with atomic_path(_part(folder, first)) as temporary:
-                save_file({"range_m": scenes.range_m.cpu().contiguous()}, temporary)
+                save_file(kept, temporary)
         return nfe
 
     def _made_with(
@@ -211,13 +213,16 @@ class SceneScorer(L.Callback):
         """Scenes of all processes, in order; as points where the reference has other pixels."""
         projection = module.scan_geometry.projection
         for first in range(0, self.num_scenes, self.batch_size):
-            images = load_file(_part(folder, first))["range_m"]
-            for index, range_m in enumerate(images, first):
+            kept = load_file(_part(folder, first))
+            intensities = kept.get("intensity", [None] * len(kept["range_m"]))
+            images = zip(kept["range_m"], intensities, strict=True)
+            for index, (range_m, intensity) in enumerate(images, first):
                 name = f"{index:06d}"
                 if projection == statistics.protocol.projection:
-                    yield EvaluationScene(name, None, range_m)
+                    yield EvaluationScene(name, None, range_m, intensity)
                 else:
-                    yield EvaluationScene(name, points_of(range_m, projection))
+                    points = points_of(range_m, projection, intensity=intensity)
+                    yield EvaluationScene(name, points)
 
 
 def _stamp(scans: Sequence[Scan]) -> str:

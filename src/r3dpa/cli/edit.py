@@ -128,14 +128,17 @@ def complete(
     empty_beams: bool = False,
     other_sensor: tuple[int, float, float] | None = None,
     mask: Path | None = None,
-    start: float = 0.3,
+    start: float | None = None,
+    resamplings: PositiveInt | None = None,
     num: PositiveInt = 8,
     **options: Any,
 ) -> str:
     """Fill a missing sector, dropped beams, or any pixels of a scan.
 
     All named gaps are filled; where the scan has returns in them, the result is compared with
-    these. Azimuth 0 looks forward and grows to the left; 180 is behind.
+    these. Azimuth 0 looks forward and grows to the left; 180 is behind. R2DM and R2Flow complete by
+    RePaint, LiDM its latents, all in ``--steps`` intervals from noise; they read no other option
+    of the solver.
 
     Args:
         scan: Scan to complete: ``.bin``, ``.ply``, or ``.npz`` of one scan.
@@ -144,7 +147,8 @@ def complete(
         empty_beams: Rows without a return are missing, as in a scan of fewer beams.
         other_sensor: Keep what so many beams between two inclinations (degrees) see: ``32 -25 3``.
         mask: Picture of H x W pixels as the range image, bright where it is missing.
-        start: Time at which the completion starts, in (0, 1]; large gaps need more.
+        start: Time at which R3DPA starts, in (0, 1], default 0.3; large gaps need more.
+        resamplings: How often RePaint crosses each interval; default: 10.
         num: Number of results, one per seed index.
         **options: See :class:`EditOptions`.
     """
@@ -156,7 +160,12 @@ def complete(
     from r3dpa.cli.edit_session import EditSession, held_out_errors
     from r3dpa.geometry import SphericalProjection, regions
 
-    session = EditSession(EditOptions(**options), num)
+    session = EditSession(EditOptions(**options), num, baselines=True)
+    stage = session.checkpoint.stage
+    if start is not None and session.baseline is not None:
+        raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")
+    if resamplings is not None and stage not in ("r2dm", "r2flow"):
+        raise ValueError(f"--resamplings is for R2DM and R2Flow, not for stage {stage}")
     projection, rows = session.projection, session.sensor.beams
     masks = []
     if sector is not None:
@@ -185,8 +194,11 @@ def complete(
     missing = regions.check_mask(torch.stack(masks).any(dim=0), "all that is missing")
     session.check(source, missing)
     known = source._replace(range_m=torch.where(missing, -1.0, source.range_m))
-    run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
-    run = partial(run, start=start)
+    if session.baseline is not None:
+        run = partial(session.complete, source, missing, resamplings or 10)
+    else:
+        run = partial(session.editor.complete, source.range_m, missing, num, session.options.seed)
+        run = partial(run, start=0.3 if start is None else start)
     scans = {f"scan {scan.stem}": source, "known part": known}
     measure = partial(held_out_errors, range_m=source.range_m, missing=missing)
     names = ("kept", "missing")

@@ -17,6 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from r3dpa import viz
+from r3dpa.baselines import BASELINES, scene_generator
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli.parser import EditOptions
 from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
@@ -25,7 +26,9 @@ from r3dpa.data.images import read_mask
 from r3dpa.data.scans import out_of_range
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
+from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import evaluations
+from r3dpa.generation import SceneBatch
 from r3dpa.geometry import in_range, range_image
 from r3dpa.geometry.gaps import check_view, filled, range_error_m
 from r3dpa.geometry.regions import check_mask
@@ -36,15 +39,19 @@ _SHOWN = 8  # results on the sheet and the page
 
 
 class ScanView(NamedTuple):
-    """A scan: its file, points ``(P, 4)`` and range image ``(H, W)``."""
+    """A scan: its file, points ``(P, 4)``, range image and intensity ``(H, W)``."""
 
     path: Path
     points: Tensor
     range_m: Tensor
+    intensity: Tensor
 
 
 class EditSession:
-    """A checkpoint opened for one edit with ``num`` results; None is the default guidance."""
+    """A checkpoint opened for one edit with ``num`` results; None is the default guidance.
+
+    Baselines can only complete scans, which they must be allowed to by ``baselines``.
+    """
 
     def __init__(
         self,
@@ -52,23 +59,34 @@ class EditSession:
         num: int,
         strength: float | None = None,
         window: tuple[float, float] | None = None,
+        baselines: bool = False,
     ) -> None:
         self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
         self.settings = EditSettings(options.solver, options.steps, options.shift, strength, window)
         self.device = usable_device(options.device)
         self.checkpoint = read_checkpoint(options.ckpt)
-        self.editor = SceneEditor.from_checkpoint(
-            self.checkpoint,
-            self.settings,
-            weights=options.weights,
-            device=self.device,
-            batch_size=options.batch_size,
-        )
-        generator = self.editor.generator
+        shared: Any = {"weights": options.weights, "device": self.device}
+        generator: Any
+        self.baseline: Any = None
+        if self.checkpoint.stage in BASELINES:
+            if not baselines:
+                raise ValueError(
+                    f"{options.ckpt} is of stage {self.checkpoint.stage}, which can only complete "
+                    "scans: `r3dpa edit complete`"
+                )
+            sampler = SamplerConfig("ddpm", options.steps)
+            self.baseline = generator = scene_generator(self.checkpoint, sampler, **shared)
+            self._called = generator.network
+        else:
+            self.editor = SceneEditor.from_checkpoint(
+                self.checkpoint, self.settings, batch_size=options.batch_size, **shared
+            )
+            generator = self.editor.generator
+            self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
+            self._called = next(generator.sit.children())  # once in each evaluation
         self.geometry, self.projection = generator.geometry, generator.geometry.projection
         self.sensor = self.projection.sensor
-        self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
 
     def read(self, path: Path, check: bool = True) -> ScanView:
         """A scan; with ``check``, one that fills the field of view."""
@@ -83,7 +101,9 @@ class EditSession:
             raise ScanError(f"{path}: has NaN or infinite values")
         if not in_range(points[:, :3], self.sensor).any():
             raise out_of_range(path, self.sensor)
-        scan = ScanView(path, points, range_image(points[:, :3], self.projection)[0])
+        range_m, values = range_image(points[:, :3], self.projection, points[:, 3:])
+        assert values is not None
+        scan = ScanView(path, points, range_m, values[0])
         if check:
             self.check(scan)
         return scan
@@ -95,6 +115,29 @@ class EditSession:
         except ValueError as error:
             raise ScanError(f"{scan.path}: {error}") from error
 
+    def complete(self, scan: ScanView, missing: Tensor, resamplings: int) -> EditResult:
+        """Completions of a scan by a baseline; pixels that are not missing stay."""
+        image, size = self.geometry.codec.to_image(scan.range_m, scan.intensity), self.num
+        made: list[SceneBatch] = [
+            self.baseline.complete(
+                image,
+                ~missing,
+                range(first, min(first + self.options.batch_size, size)),
+                self.options.seed,
+                resamplings=resamplings,
+            )
+            for first in range(0, size, self.options.batch_size)
+        ]
+
+        def joined(name: str) -> Tensor:
+            return torch.cat([getattr(batch, name) for batch in made]).cpu()
+
+        intensity = None
+        if self.geometry.codec.reflectance:
+            intensity = torch.where(missing, joined("intensity"), scan.intensity)
+        ranges = torch.where(missing, joined("range_m"), scan.range_m)
+        return EditResult(ranges, joined("latents"), made[0].nfe, self.projection, intensity)
+
     def read_mask(self, path: Path) -> Tensor:
         """Mask ``(H, W)`` of a picture; refused if it selects nothing or all."""
         return check_mask(read_mask(path, self.sensor), str(path))
@@ -104,7 +147,7 @@ class EditSession:
         source = feature_source_of(self.checkpoint)
         extractor: Any = feature_source(source, ckpt, self.feature_dim).to(self.device)
         grids = []
-        for path, points, _ in scans:
+        for path, points, *_ in scans:
             file = Scan(path.parent.name, path.stem, path)
             sample = PointSample(file, file.cache_key, points, extractor.prepare(points))
             found = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
@@ -131,6 +174,8 @@ class EditSession:
         options, settings = self.options, asdict(self.settings)
         if not guided:
             del settings["strength"], settings["window"]
+        if self.baseline is not None:
+            settings = {"steps": options.steps}
         own = {name: value for name, value in arguments.items() if name not in ("options", "num")}
         request = own | provenance(self.checkpoint, options, self.num, self.device, self.geometry)
         request |= {"command": command, "guided": guided, "settings": settings}
@@ -143,7 +188,10 @@ class EditSession:
             with self._progress(command):
                 result = run()
             seconds = time.perf_counter() - start
-            writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe)
+            intensity = result.intensity
+            if intensity is not None:
+                intensity = intensity[writer.num_done :]
+            writer.put(result.range_m[writer.num_done :].contiguous(), result.nfe, intensity)
             writer.close()
             self._show(command, scans, result.range_m, parts, part_names)
             measured = ("nfe", "vae_error_m", "round_trip_m")
@@ -163,14 +211,15 @@ class EditSession:
         """Bar of network evaluations of whole batches; the total is that of a full way and back."""
         steps = evaluations(self.options.solver, self.options.steps)
         batches = math.ceil(self.num / self.options.batch_size)
-        total = self.num * self.options.steps if command == "complete" else steps * (batches + 1)
-        first = next(self.editor.generator.sit.children())  # called once in each evaluation
+        total: int | None = steps * (batches + 1)
+        if command == "complete":
+            total = None if self.baseline is not None else self.num * self.options.steps
         with tqdm(total=total, unit="evaluation", desc=command, disable=None) as bar:
 
             def count(*_: Any) -> None:  # what a hook returns would become the output
                 bar.update()
 
-            with first.register_forward_hook(count):
+            with self._called.register_forward_hook(count):
                 yield
 
     def _show(

@@ -108,7 +108,7 @@ def generate_all(
         for first in range(first_index, writer.num, batch_size):
             indices = range(first, min(first + batch_size, writer.num))
             batch = generator.generate(indices, seed)
-            writer.put(batch.range_m, batch.nfe)
+            writer.put(batch.range_m, batch.nfe, batch.intensity)
             progress.update(len(indices))
     writer.close()
     elapsed, drawn = time.perf_counter() - start, writer.num - first_index

@@ -36,7 +36,7 @@ class SceneWriter:
     ===================== =====================================================================
     ``range_m.npy``       ``(num, H, W)`` float32 metres, -1 without a return
     ``bin/000000.bin``    points of each scene, if asked for; ``ply/000000.ply`` likewise
-    ``scenes.npz``        all of them, if asked for
+    ``scenes.npz``        all of them without intensity, if asked for
     ``metadata.json``     written last: a folder without it is unfinished
     ===================== =====================================================================
 
@@ -107,15 +107,17 @@ class SceneWriter:
         """Range images of all scenes, complete after :meth:`close`."""
         return self.out / "range_m.npy"
 
-    def put(self, range_m: Tensor, nfe: int = 0) -> None:
+    def put(self, range_m: Tensor, nfe: int = 0, intensity: Tensor | None = None) -> None:
         """Write the next scenes beside the caller; waits for those before them.
 
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
             nfe: Network evaluations of each of them.
+            intensity: ``(B, H, W)`` of the points; 0 in ``.bin`` files without.
         """
         self._wait()
-        self._batch = self._thread.submit(self._write, range_m.cpu(), nfe)
+        values = None if intensity is None else intensity.cpu()
+        self._batch = self._thread.submit(self._write, range_m.cpu(), nfe, values)
 
     def close(self) -> None:
         """Wait until all scenes are written, and give ``range_m.npy`` its name."""
@@ -196,14 +198,15 @@ class SceneWriter:
         file.seek(end)
         return file
 
-    def _write(self, range_m: Tensor, nfe: int) -> None:
-        for index, scene in enumerate(range_m, self.num_done):
+    def _write(self, range_m: Tensor, nfe: int, intensity: Tensor | None) -> None:
+        values = [None] * len(range_m) if intensity is None else intensity
+        for index, (scene, value) in enumerate(zip(range_m, values, strict=True), self.num_done):
             if scene.isnan().any():
                 raise ValueError(
                     f"scene {index:06d} of {self.out} holds NaN: the networks diverged; check the "
                     "checkpoint, or sample in fp32"
                 )
-            points = points_of(scene, self._projection)
+            points = points_of(scene, self._projection, intensity=value)
             for name in self._formats:
                 if name in _CLOUD_WRITERS:
                     _CLOUD_WRITERS[name](self.out / name / f"{index:06d}.{name}", points)

@@ -179,8 +179,12 @@ def unproject(range_m: Tensor, projection: Projection, corner: bool = False) -> 
     return range_m.clamp(min=0).unsqueeze(-1) * directions
 
 
-def points_of(range_m: Tensor, projection: Projection, corner: bool = False) -> Tensor:
+def points_of(
+    range_m: Tensor, projection: Projection, corner: bool = False, intensity: Tensor | None = None
+) -> Tensor:
     """Points ``(P, 3)`` of the pixels ``(H, W)`` that hold a return, row after row.
+
+    ``(P, 4)`` with the intensity ``(H, W)``.
 
     Within a row the order is that of the image, or for rings that of a scan, whose azimuth grows
     from 0, so that a written file can be read with the same projection. Otherwise as
@@ -189,7 +193,10 @@ def points_of(range_m: Tensor, projection: Projection, corner: bool = False) -> 
     if range_m.ndim != 2:
         raise ValueError(f"images must be (H, W), one by one, got {tuple(range_m.shape)}")
     columns = projection.column_order().to(range_m.device)
-    return unproject(range_m, projection, corner)[:, columns][range_m[:, columns] > 0]
+    points = unproject(range_m, projection, corner)
+    if intensity is not None:
+        points = torch.cat([points, intensity[..., None].to(points)], dim=-1)
+    return points[:, columns][range_m[:, columns] > 0]
 
 
 def pool_cells(

@@ -24,6 +24,7 @@ from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
     frechet_distance,
+    frechet_of_draws,
     merge_packed,
     polynomial_mmd,
     shared_balls,
@@ -117,20 +118,21 @@ class FrechetDistance(FeatureMetric):
     def results(self, resampling: Resampling) -> list[MetricResult]:
         """The distance, with a bootstrap interval over the generated scenes that are kept."""
         rows, width = self.rows("generated"), self.num_features
-        ends = resampling.interval(
-            lambda drawn: self._distance(Moments.of(rows[drawn])).item(), len(rows)
-        )
+        ends = None
+        if resampling.num_resamples and len(rows) > 1:
+            ends = resampling.interval(frechet_of_draws(*self._real, rows), len(rows))
         fewest = min(self.count(side) or math.inf for side in SIDES)
         few = f"{fewest} scenes for {width} features: dominated by their small number"
-        value = self._distance(self.moments("generated")).item()
+        generated = self.moments("generated")
+        covariance = generated.covariance("generated features")
+        value = frechet_distance(*self._real, generated.mean, covariance).item()
         return [self._row(self.label, value, interval=ends, note=few * (fewest <= width))]
 
-    def _distance(self, generated: Moments) -> Tensor:
+    @property
+    def _real(self) -> tuple[Tensor, Tensor]:
+        """Mean and covariance of the real features."""
         real = self.moments("real")
-        mean, covariance = self.reference or (real.mean, real.covariance("real features"))
-        return frechet_distance(
-            mean, covariance, generated.mean, generated.covariance("generated features")
-        )
+        return self.reference or (real.mean, real.covariance("real features"))
 
 
 class FrechetInfinity(FeatureMetric):

@@ -7,7 +7,7 @@ is left out in silence. Letters: N samples, F feature width.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from typing import Self
@@ -126,6 +126,27 @@ def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tenso
     common = torch.linalg.svdvals(_root(cov_a) @ _root(cov_b)).sum()
     distance = (mean_a - mean_b).square().sum() + cov_a.trace() + cov_b.trace() - 2 * common
     return distance.clamp(min=0)
+
+
+def frechet_of_draws(mean: Tensor, covariance: Tensor, rows: Tensor) -> Callable[[Tensor], float]:
+    """Fréchet distance of a normal distribution to drawn rows of ``(N, F)`` features, by indices.
+
+    As :func:`frechet_distance`, but the root of the covariance is taken once, and the other one
+    never: the rows themselves, centred, have the same singular values. For 4096 features that
+    saves minutes per draw.
+    """
+    mean, rows = mean.double(), rows.double()
+    rotated, own = rows @ _root(covariance.double()), covariance.double().trace()
+
+    def distance(drawn: Tensor) -> float:
+        x, y = rows[drawn], rotated[drawn]
+        root = (len(x) - 1) ** 0.5
+        common = torch.linalg.svdvals((y - y.mean(dim=0)) / root).sum()
+        spread = ((x - x.mean(dim=0)) / root).square().sum()
+        found = (mean - x.mean(dim=0)).square().sum() + own + spread - 2 * common
+        return max(found.item(), 0.0)
+
+    return distance
 
 
 def _root(covariance: Tensor) -> Tensor:
