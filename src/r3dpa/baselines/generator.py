@@ -109,14 +109,12 @@ class BaselineGenerator:
         known: Tensor,
         indices: int | Sequence[int] = 1,
         seed: int = 0,
-        *,
-        resamplings: int = 10,
-        jump: int = 1,
+        **how: int,
     ) -> SceneBatch:
         """Completes an encoded range image ``(C, H, W)``, once per index.
 
-        Pixels that are True in ``known`` ``(H, W)`` are kept; other arguments and steps as of
-        :func:`r3dpa.flow.diffusion.repaint`, with the number of steps of the sampler.
+        Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings``, 10 by default, and
+        ``jump`` are those of :func:`r3dpa.flow.diffusion.repaint`, the steps those of the sampler.
         Latents are completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
         """
         self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
@@ -125,8 +123,8 @@ class BaselineGenerator:
         data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)
         # A latent pixel is known where all of its pixels are.
         mask = -F.adaptive_max_pool2d(-known[None, None].to(data), data.shape[-2:])
-        options = {"resamplings": resamplings, "jump": jump}
-        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, **options)
+        how = {"resamplings": 10, **how}
+        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, **how)
         return self._scenes(found)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,8 +57,7 @@ class ReflowPairs(LoaderModule):
         sampler: Solver and steps. Official: dopri5 with a tolerance of 1e-5, about 160 evaluations.
         num_held_out: Pairs, the last ones, for validation and test alone.
         generation_batch: Scenes that are generated together.
-        device: Where they are generated: ``cpu``, ``cuda``, ``cuda:1``, or ``auto`` for the device
-            of the training process.
+        device: Where they are generated: ``cpu``, ``auto``, or ``cuda`` for that of the process.
         batch_size: Pairs per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of the order of training; the pairs do not depend on it.
@@ -107,9 +106,7 @@ class ReflowPairs(LoaderModule):
 
     def _generated(self, pairs: list[Pair]) -> Iterator[Tensor]:
         """Images ``(B, C, H, W)`` of pairs, in order."""
-        auto = str(cast(Any, self.trainer).strategy.root_device)
-        device = auto if self.device == "auto" else self.device
-        generator = scene_generator(self.checkpoint, self.sampler, device=device)
+        generator = scene_generator(self.checkpoint, self.sampler, device=self.device)
         parts = range(0, len(pairs), self.generation_batch)
         for first in tqdm(parts, "generate", unit="batch", disable=None):
             numbers = [pair.number for pair in pairs[first : first + self.generation_batch]]
