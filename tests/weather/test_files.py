@@ -200,6 +200,7 @@ def test_columns_can_be_named_and_points_without_return_dropped(tmp_path):
     ("scan", "labels", "written"),
     [
         ("s/a.bin", "s/a.label", "s/a.label"),
+        ("s/a.bin", "s/labels/a.label", "s/labels/a.label"),
         ("velodyne/a.pcd.bin", "labels/a.label", "labels/a.label"),
         ("a.bin", "../labels/a.label", "a.label"),
     ],

@@ -3,7 +3,7 @@
 ``.bin`` holds float32 rows x, y, z, intensity (KITTI), the ring as fifth (nuScenes, ``.pcd.bin``),
 or other columns that are named; ``.pcd`` needs the package pypcd4; ``.ply`` is ASCII or binary, of
 vertices alone; ``.npy`` and ``.npz`` hold such rows, or columns with names. Labels lie in a
-``.label`` of SemanticKITTI, beside the scan or in ``labels`` beside its folder.
+``.label`` of SemanticKITTI: beside the scan, or in ``labels`` in or beside its folder.
 """
 
 from __future__ import annotations
@@ -191,7 +191,11 @@ def _known_columns(path: Path, table: Table) -> dict[str, str]:
 
 def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
     name = f"{path.name.split('.')[0]}.label"
-    for place in (path.with_name(name), path.absolute().parents[1] / "labels" / name):
+    folder = path.absolute().parent
+    for place in (
+        path.with_name(name),
+        *(top / "labels" / name for top in (folder, folder.parent)),
+    ):
         if place.is_file():
             data = read_bytes(place)
             if len(data) != 4 * num_points:
