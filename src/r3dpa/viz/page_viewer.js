@@ -248,9 +248,8 @@
 
   function showCategories(mode) {
     const counts = Cloud.countValues(panes[0].cloud[mode]);
-    if (panes[1] && panes[1].cloud[mode]) {
-      for (const id of panes[1].cloud[mode]) if (!counts.has(id)) counts.set(id, 0);
-    }
+    const beside = panes[1] ? Cloud.countValues(panes[1].cloud[mode] || []) : [];
+    for (const [id, count] of beside) if (!counts.has(id)) counts.set(id, count);
     const present = [...counts].sort((a, b) => b[1] - a[1]);
     const entries = present.map(([id, count]) => {
       const made = entry(names[mode].get(id), count, tables[mode].get(id));
