@@ -155,6 +155,8 @@ def test_sample_and_convert(trained, tmp_path):
     main(["convert", str(path), str(exported)])
     with pytest.raises(ValueError, match=f"stage {stage}, which has no official R3DPA layout"):
         main(["convert", str(path), str(tmp_path / "back.pt"), "--to", "official"])
+    with pytest.raises(ValueError, match=r"weights\.safetensors is no \.ckpt of a run; scenes of"):
+        main(["test", stage, "--preset", "demo", "--ckpt_path", str(exported)])
     words = ["--num", "2", "--pictures", "0", "--solver", "euler", "--steps", "2"]
     for source, out in ((path, tmp_path / "a"), (exported, tmp_path / "b")):
         main(["sample", "--ckpt", str(source), "--out", str(out), *words])

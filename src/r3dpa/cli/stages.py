@@ -127,6 +127,11 @@ class StageCLI(LightningCLI):
             config.ckpt_path = _newest(Path(config.run_dir))
         if config.get("ckpt_path"):
             read_checkpoint(config.ckpt_path)
+            if Path(config.ckpt_path).suffix != ".ckpt":  # released or exported
+                raise ValueError(
+                    f"--ckpt_path {config.ckpt_path} is no .ckpt of a run; scenes of other files "
+                    "are made by `r3dpa sample` and scored by `r3dpa evaluate`"
+                )
         if config.get("weights_only") is False:
             raise ValueError("weights_only: false would run code of the checkpoint: leave it out")
         config.weights_only = True
