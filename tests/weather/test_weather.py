@@ -103,6 +103,26 @@ def test_each_effect_changes_the_scan_and_keeps_what_stays(scan, name):
         assert cosine.min() > 1 - 1e-5
 
 
+def test_blooming_puts_halos_around_saturated_points(scan):
+    """Beside a bright sheet, and at its range, in place of the points of a dark wall behind it."""
+    azimuth, height = (grid.ravel() for grid in np.meshgrid(np.arange(-40, 41), np.arange(9)))
+    azimuth, inclination = np.radians(0.17 * azimuth), np.radians(0.4 * height - 1)
+    is_sheet = np.abs(azimuth) < np.radians(1)
+    away = np.where(is_sheet, 15.0, 30.0)
+    towards = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(inclination)])
+    points = (away * towards).T.astype(np.float32)
+    wall = RecordedScan(points, np.where(is_sheet, 0.99, 0.05).astype(np.float32))
+    off = Weather().apply(wall)
+    on = Weather().apply(wall, effects={"blooming": "on"})
+    assert "blooming" not in ran(off)
+    assert "blooming" in ran(on)
+    assert np.isin(np.flatnonzero(is_sheet), on.index).all()
+    halo = on.origins == Origin.BLOOMING
+    assert 0 < halo.sum() == on.report["lost"]["blooming"] < 9 * 8
+    assert np.linalg.norm(on.points[halo, :2], axis=1) == pytest.approx(15, abs=0.2)
+    assert (np.abs(azimuth[on.shot[halo]]) < np.radians(1 + 2.5 * 0.2 + 0.01)).all()
+
+
 def test_effects_that_are_not_called_for_do_nothing(scan, monkeypatch):
     for effect in EFFECTS:
         if effect_name(effect) not in {"fog", *DETECTION}:

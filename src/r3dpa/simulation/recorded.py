@@ -43,6 +43,8 @@ _DARK = {
     50.0: (-0.85, -0.5, -0.2, 0.05, 0.45, 0.75, 1.1, 1.5, 2.3),
     65.0: (-0.9, -0.6, -0.35, -0.15, 0.2, 0.5, 0.85, 1.35, 2.25),
 }
+# Shares of saturated points of simulated scans, and ln of their power over the least one.
+_BRIGHT = (0.0, 0.3, 0.5, 0.6, 0.7, 0.95, 1.0), (0.0, 0.0, 0.5, 2.1, 4.0, 5.4, 6.2)
 # A sun with a return within this angle is hidden.
 _SUN_RADIUS_RAD = np.radians(0.5)
 # Points whose inclinations show the highest laser, which at most is so high.
@@ -185,14 +187,29 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
     return IntensityScale(found, step, True, text)
 
 
+def _shares(scan: RecordedScan, scale: IntensityScale) -> Floats:
+    """Intensities ``(P,)`` over that of a white surface, at most 1."""
+    if scan.intensity is None or not scale.known:
+        return np.full(len(scan), _UNKNOWN_INTENSITY, dtype=np.float32)
+    shares: Floats = (scan.intensity / scale.full).astype(np.float32).clip(max=1)
+    return shares
+
+
+def num_saturated(scan: RecordedScan, instrument: Instrument) -> int:
+    """Number of points whose intensity is that of sheeting."""
+    shares = _shares(scan, scale_of(scan.intensity, instrument.full_intensity))
+    return int(np.count_nonzero(shares >= _SATURATED))
+
+
 class RecordedSweep(Sweep):
     """The turn in which a scan was recorded, with one ray for each point.
 
     Powers are those that give the recorded intensities. An intensity of 0 stands for any power
-    below about six times the detection limit; it is drawn from the distribution that such points
-    of simulated scans have at their range. Saturated ones have the power from which on they
-    saturate. Rays start at the mean height of the instrument's optical centres. The time of a shot
-    is that of its column of the file, or else grows with the azimuth.
+    below about six times the detection limit; it is drawn from the distribution that such points of
+    simulated scans have at their range. Saturated ones have the power from which on they saturate,
+    or with blooming one drawn from that of sheeting. Rays start at the mean height of the
+    instrument's optical centres. The time of a shot is that of its column of the file, or else
+    grows with the azimuth.
 
     Args:
         scene: Weather, and boxes of moving vehicles as the scan shows them.
@@ -237,10 +254,7 @@ class RecordedSweep(Sweep):
 
         self.scale = scale_of(scan.intensity, instrument.full_intensity)
         self.response = instrument.response
-        share = np.full_like(range_m, _UNKNOWN_INTENSITY)
-        if self.scale.known and scan.intensity is not None:
-            share = (scan.intensity[self.rays_of] / self.scale.full).astype(np.float32)
-        self.share = share.clip(max=1)
+        self.share = _shares(scan, self.scale)[self.rays_of]
         self.recorded_m = range_m
         self.recorded_power: Floats = self._power(range_m, draws)
         surface = np.full(len(range_m), NO_SURFACE, dtype=np.int32)
@@ -258,6 +272,9 @@ class RecordedSweep(Sweep):
         for number, logarithms in enumerate(_DARK.values()):
             rays = dark[row == number]
             power[rays] = least * np.exp(np.interp(draws.uniform(rays), _SHARES, logarithms))
+        if self.scene.sheet_points:
+            bright = np.flatnonzero(self.on_sheets())
+            power[bright] *= np.exp(np.interp(draws.uniform(bright), *_BRIGHT))
         # Weaker ones could not have been detected.
         return np.maximum(power, least * np.exp(np.float32(-3 * self.sensor.threshold_spread)))
 

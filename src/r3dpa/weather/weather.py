@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from r3dpa.simulation import scene
 from r3dpa.simulation.draws import Draws
 from r3dpa.simulation.effects import EFFECTS
-from r3dpa.simulation.recorded import Instrument, RecordedScan, RecordedSweep
+from r3dpa.simulation.effects.instrument import Blooming
+from r3dpa.simulation.recorded import Instrument, RecordedScan, RecordedSweep, num_saturated
 from r3dpa.simulation.scan import (
     SECOND_RETURN_M,
     EffectRecord,
@@ -135,7 +136,9 @@ class Weather(scene.Weather):
         vehicles = _vehicles(boxes)
         if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
             vehicles += _labelled_vehicles(scan, self.traffic_m_s)
-        world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3)
+        blooms = any(isinstance(effect, Blooming) for effect in wanted)
+        bright = num_saturated(scan, instrument) if blooms else 0
+        world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3, sheet_points=bright)
         sensor = instrument.sensor_for(scan)
         called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
         if not called - off.keys() - _DETECTION:

@@ -112,7 +112,9 @@ class SurfaceTexture(Effect):
 
 
 def sheets(scene: Scene) -> str | None:
-    """Number of retro-reflecting sheets as a text; None without any."""
+    """Number of retro-reflecting sheets, or of their recorded points, as a text; None without."""
+    if scene.sheet_points:
+        return f"{scene.sheet_points} points as bright as sheeting"
     count = sum(p.material is Material.RETROREFLECTOR for p in scene.primitives)
     return f"{count} retro-reflecting sheets" if count else None
 
