@@ -123,6 +123,19 @@ def test_blooming_puts_halos_around_saturated_points(scan):
     assert (np.abs(azimuth[on.shot[halo]]) < np.radians(1 + 2.5 * 0.2 + 0.01)).all()
 
 
+def test_saturated_points_may_be_sheeting():
+    """At 15 m in fog of 15 m, only what is far brighter than a white surface is seen."""
+    azimuth = np.linspace(0, 6.28, 2000)
+    points = 15 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+    bright = RecordedScan(points.astype(np.float32), np.append(np.full(1999, 0.99), 0.5))
+    seen = {
+        response: Weather(visibility_m=15).apply(bright, 1, Instrument(response=response)).index
+        for response in ("root", "linear")
+    }
+    assert 0.3 < (seen["root"] >= 0).sum() / 2000 < 0.6
+    assert (seen["linear"] < 0).all()
+
+
 def test_effects_that_are_not_called_for_do_nothing(scan, monkeypatch):
     for effect in EFFECTS:
         if effect_name(effect) not in {"fog", *DETECTION}:

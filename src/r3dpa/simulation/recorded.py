@@ -206,10 +206,9 @@ class RecordedSweep(Sweep):
 
     Powers are those that give the recorded intensities. An intensity of 0 stands for any power
     below about six times the detection limit; it is drawn from the distribution that such points of
-    simulated scans have at their range. Saturated ones have the power from which on they saturate,
-    or with blooming one drawn from that of sheeting. Rays start at the mean height of the
-    instrument's optical centres. The time of a shot is that of its column of the file, or else
-    grows with the azimuth.
+    simulated scans have at their range; likewise the power of saturated points, unless the response
+    is linear. Rays start at the mean height of the instrument's optical centres. The time of a shot
+    is that of its column of the file, or else grows with the azimuth.
 
     Args:
         scene: Weather, and boxes of moving vehicles as the scan shows them.
@@ -272,7 +271,7 @@ class RecordedSweep(Sweep):
         for number, logarithms in enumerate(_DARK.values()):
             rays = dark[row == number]
             power[rays] = least * np.exp(np.interp(draws.uniform(rays), _SHARES, logarithms))
-        if self.scene.sheet_points:
+        if self.response == "root":
             bright = np.flatnonzero(self.on_sheets())
             power[bright] *= np.exp(np.interp(draws.uniform(bright), *_BRIGHT))
         # Weaker ones could not have been detected.
