@@ -170,7 +170,9 @@ def test_sample_and_convert(trained, tmp_path):
         assert scenes.intensity is None
         assert not points[:, 3].any()
     else:
-        assert 0 <= scenes.intensity.min() < scenes.intensity.max() <= 1
+        assert scenes.intensity.min() < scenes.intensity.max()
+        reflectance = (scenes.latents[:, 1].clamp(-1, 1) + 1) / 2
+        np.testing.assert_allclose(scenes.intensity, reflectance, atol=1e-6)
         np.testing.assert_allclose(
             points[:, 3], scenes.intensity[0][scenes.range_m[0] > 0], atol=1e-5
         )

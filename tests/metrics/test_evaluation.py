@@ -226,6 +226,12 @@ def test_floors_are_of_as_many_scenes_as_the_values():
     assert more["TOY KID"].note.endswith("floor of 20 and 20 scans")
 
 
+def test_floors_of_few_scenes_are_not_kept_for_more():
+    reference = reference_of(list(scenes()), replace(PROTOCOL, num_mmd_samples=8))
+    notes = [rows_of(scenes(1, count), reference)["JSD"].note for count in (8, 20)]
+    assert notes == ["floor of 8 and 20 scans", "floor of 20 and 20 scans"]
+
+
 def test_the_verdict_is_one_line_above_the_table(reference):
     assert fresh().about["extra"]["verdict"].startswith("near the floor in JSD")
     lost = evaluated(scenes(1, noise=12.0), reference)

@@ -35,6 +35,15 @@ def test_a_sloping_ground_has_its_normal():
     assert np.allclose(normal[0] / normal[0, 2], [-0.08, 0, 1], atol=0.01)
 
 
+def test_the_feet_of_a_wall_are_no_ground():
+    across, away, height = np.arange(-15, 15, 0.05), np.arange(3, 10, 0.25), np.arange(0, 2, 0.05)
+    ground = np.stack([*map(np.ravel, np.meshgrid(away, across)), np.full(600 * 28, -1.7)], 1)
+    wall = np.stack(np.meshgrid([10.1], across, height - 1.7), 3).reshape(-1, 3)
+    is_ground, _ = ground_of(np.concatenate([ground, wall]).astype(np.float32))
+    assert is_ground[: len(ground)].mean() > 0.95
+    assert not is_ground[len(ground) :].any()
+
+
 def test_a_moving_box_is_shown_where_its_shots_were_taken():
     # To the left, a quarter of a turn after the middle of it: 25 ms at 10 turns a second.
     azimuth = np.linspace(0, 2 * np.pi, 400, endpoint=False)
