@@ -336,7 +336,13 @@ class SceneEditor:
     ) -> EditResult:
         projection = self.generator.geometry.projection
         return EditResult(
-            range_m, latents.cpu(), nfe, projection, None, vae_error_m, round_trip_m, cosine
+            range_m,
+            latents.cpu(),
+            nfe,
+            projection,
+            vae_error_m=vae_error_m,
+            round_trip_m=round_trip_m,
+            cosine=cosine,
         )
 
     def _inverted(self, latents: Tensor, times: Tensor) -> Trajectory:

@@ -115,10 +115,10 @@ class Baseline(ScanStage):
         mask: Tensor,
         draws: Iterator[Tensor],
         sampler: SamplerConfig,
-        **resampling: int,
+        resamplings: int,
     ) -> Tensor:
         """Samples ``(B, C, h, w)`` that are ``known`` where the mask ``(B, 1, h, w)`` is 1."""
-        return repaint(velocity, known, mask, draws, self.interpolant, sampler.steps, **resampling)
+        return repaint(velocity, known, mask, draws, self.interpolant, sampler.steps, resamplings)
 
     def settings(self) -> dict[str, Any]:
         """Plain values of the constructor arguments that sampling depends on, but for networks."""

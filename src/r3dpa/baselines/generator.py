@@ -109,13 +109,14 @@ class BaselineGenerator:
         known: Tensor,
         indices: int | Sequence[int] = 1,
         seed: int = 0,
-        **how: int,
+        *,
+        resamplings: int = 10,
     ) -> SceneBatch:
         """Completes an encoded range image ``(C, H, W)``, once per index.
 
-        Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings``, 10 by default, and
-        ``jump`` are those of :func:`r3dpa.flow.diffusion.repaint`, the steps those of the sampler.
-        Latents are completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
+        Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` is that of
+        :func:`r3dpa.flow.diffusion.repaint`, the steps are those of the sampler. Latents are
+        completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
         """
         self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
         noises = scene_noise(baseline.latent_shape, indices, seed)
@@ -123,8 +124,7 @@ class BaselineGenerator:
         data = baseline.encode(image.to(self.device)[None]).expand(len(indices), -1, -1, -1)
         # A latent pixel is known where all of its pixels are.
         mask = -F.adaptive_max_pool2d(-known[None, None].to(data), data.shape[-2:])
-        how = {"resamplings": 10, **how}
-        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, **how)
+        found = baseline.complete(self.velocity, data, mask, draws, self.sampler, resamplings)
         return self._scenes(found)
 
     def noise(self, indices: Sequence[int], seed: int = 0) -> Tensor:

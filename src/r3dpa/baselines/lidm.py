@@ -155,7 +155,7 @@ class LiDM(Baseline):
         mask: Tensor,
         draws: Iterator[Tensor],
         sampler: SamplerConfig,
-        **resampling: int,
+        resamplings: int,
     ) -> Tensor:
         """Completes latents by :func:`inpaint`, as released: without resampling."""
         times = released_times(sampler.steps)

@@ -69,7 +69,7 @@ def inpaint(
     feature = None
     if objects is not None and object is not None:
         library = ObjectLibrary.load(objects)
-        library.check_source(feature_source_of(session.checkpoint), session.feature_dim)
+        library.check_source(feature_source_of(session.checkpoint), session.sit.feature_dim)
         feature = library.feature(object)
     run = partial(session.editor.inpaint, source.range_m, region, num, session.options.seed)
     run = partial(run, feature=feature, start=start, dilation=dilation)
@@ -113,9 +113,9 @@ def mix(
     paths = enumerate((left, right))
     scans = {f"{number}: {path.stem}": session.read(path) for number, path in paths}
     grids = session.feature_grids(scans.values(), features_ckpt)
-    weights = sector_weights([(split, 0), (split + 180, 1)], session.grid_size, blend)
+    weights = sector_weights([(split, 0), (split + 180, 1)], session.sit.grid_size, blend)
     size = session.sensor.beams, session.sensor.columns
-    numbers = mask_of_tokens(weights.argmax(dim=0), session.grid_size, size)
+    numbers = mask_of_tokens(weights.argmax(dim=0), session.sit.grid_size, size)
     run = partial(session.editor.mix, grids, weights, num, session.options.seed)
     return session.write("mix", arguments, scans, run, numbers, list(scans), guided=True)
 
@@ -160,7 +160,7 @@ def complete(
     from r3dpa.cli.edit_session import EditSession, held_out_errors
     from r3dpa.geometry import SphericalProjection, regions
 
-    session = EditSession(EditOptions(**options), num, baselines=True)
+    session = EditSession(EditOptions(**options), num)
     stage = session.checkpoint.stage
     if start is not None and session.baseline is not None:
         raise ValueError(f"--start is for R3DPA: stage {stage} starts from noise")

@@ -33,6 +33,7 @@ from r3dpa.geometry import in_range, range_image
 from r3dpa.geometry.gaps import check_view, filled, range_error_m
 from r3dpa.geometry.regions import check_mask
 from r3dpa.io import atomic_path, usable_device, write_text
+from r3dpa.nn import VelocityNetwork
 from r3dpa.nn.backbones import feature_source
 
 _SHOWN = 8  # results on the sheet and the page
@@ -50,7 +51,7 @@ class ScanView(NamedTuple):
 class EditSession:
     """A checkpoint opened for one edit with ``num`` results; None is the default guidance.
 
-    Baselines can only complete scans, which they must be allowed to by ``baselines``.
+    Baselines can only complete scans: for them, ``editor`` is a ``ValueError``.
     """
 
     def __init__(
@@ -59,7 +60,6 @@ class EditSession:
         num: int,
         strength: float | None = None,
         window: tuple[float, float] | None = None,
-        baselines: bool = False,
     ) -> None:
         self.options, self.num = options, num
         strength, window = 0.5 if strength is None else strength, window or (0.0, 1.0)
@@ -70,23 +70,32 @@ class EditSession:
         generator: Any
         self.baseline: Any = None
         if self.checkpoint.stage in BASELINES:
-            if not baselines:
-                raise ValueError(
-                    f"{options.ckpt} is of stage {self.checkpoint.stage}, which can only complete "
-                    "scans: `r3dpa edit complete`"
-                )
             sampler = SamplerConfig("ddpm", options.steps)
             self.baseline = generator = scene_generator(self.checkpoint, sampler, **shared)
             self._called = generator.network
         else:
-            self.editor = SceneEditor.from_checkpoint(
+            self._editor = SceneEditor.from_checkpoint(
                 self.checkpoint, self.settings, batch_size=options.batch_size, **shared
             )
-            generator = self.editor.generator
-            self.grid_size, self.feature_dim = generator.sit.grid_size, generator.sit.feature_dim
+            generator = self._editor.generator
             self._called = next(generator.sit.children())  # once in each evaluation
         self.geometry, self.projection = generator.geometry, generator.geometry.projection
         self.sensor = self.projection.sensor
+
+    @property
+    def editor(self) -> SceneEditor:
+        """Editor of a model of R3DPA."""
+        if self.baseline is not None:
+            raise ValueError(
+                f"{self.options.ckpt} is of stage {self.checkpoint.stage}, which can only complete "
+                "scans: `r3dpa edit complete`"
+            )
+        return self._editor
+
+    @property
+    def sit(self) -> VelocityNetwork:
+        """Velocity network of the editor."""
+        return self.editor.generator.sit
 
     def read(self, path: Path, check: bool = True) -> ScanView:
         """A scan; with ``check``, one that fills the field of view."""
@@ -145,13 +154,13 @@ class EditSession:
     def feature_grids(self, scans: Iterable[ScanView], ckpt: Path | None) -> list[Tensor]:
         """Feature grid ``(N, F)`` of each scan, as ``r3dpa features`` writes them."""
         source = feature_source_of(self.checkpoint)
-        extractor: Any = feature_source(source, ckpt, self.feature_dim).to(self.device)
+        extractor: Any = feature_source(source, ckpt, self.sit.feature_dim).to(self.device)
         grids = []
         for path, points, *_ in scans:
             file = Scan(path.parent.name, path.stem, path)
             sample = PointSample(file, file.cache_key, points, extractor.prepare(points))
-            found = pooled_grids(extractor, [sample], self.projection, [self.grid_size])
-            grids.append(found[self.grid_size][0].clone())
+            found = pooled_grids(extractor, [sample], self.projection, [self.sit.grid_size])
+            grids.append(found[self.sit.grid_size][0].clone())
         return grids
 
     def write(

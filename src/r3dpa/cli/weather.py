@@ -46,7 +46,7 @@ def weather(
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
         **options: See :class:`FolderOptions`.
     """
-    # Errors of the request are none of a scan.
+    # An error in the request must not be reported as one in the first scan.
     weather.apply(RecordedScan(np.ones((1, 3), np.float32)), 0, instrument, effects=effects)
     change = weather, instrument, effects
     about = {"weather": weather_to_dict(weather), "instrument": asdict(instrument)}

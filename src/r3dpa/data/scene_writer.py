@@ -36,7 +36,7 @@ class SceneWriter:
     ===================== =====================================================================
     ``range_m.npy``       ``(num, H, W)`` float32 metres, -1 without a return
     ``bin/000000.bin``    points of each scene, if asked for; ``ply/000000.ply`` likewise
-    ``scenes.npz``        all of them without intensity, if asked for
+    ``scenes.npz``        all scenes in one file, without intensity; only if asked for
     ``metadata.json``     written last: a folder without it is unfinished
     ===================== =====================================================================
 

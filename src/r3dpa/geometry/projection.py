@@ -182,10 +182,9 @@ def unproject(range_m: Tensor, projection: Projection, corner: bool = False) -> 
 def points_of(
     range_m: Tensor, projection: Projection, corner: bool = False, intensity: Tensor | None = None
 ) -> Tensor:
-    """Points ``(P, 3)`` of the pixels ``(H, W)`` that hold a return, row after row.
+    """Points of the pixels ``(H, W)`` that hold a return, row after row.
 
-    ``(P, 4)`` with the intensity ``(H, W)``.
-
+    They are ``(P, 3)`` metres, or ``(P, 4)`` with the ``intensity`` ``(H, W)`` of the pixels.
     Within a row the order is that of the image, or for rings that of a scan, whose azimuth grows
     from 0, so that a written file can be read with the same projection. Otherwise as
     :func:`unproject`.
