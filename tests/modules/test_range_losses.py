@@ -11,7 +11,7 @@ from tiny_stages import QUIET, SENSOR, STAGES, TinyData, stage_module, tiny_sit,
 from r3dpa.geometry import RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.losses import centred_features, masked_mean, return_loss
 from r3dpa.modules import LossWeights, OptimizerConfig
-from r3dpa.nn import VAE
+from r3dpa.nn import VAE, PatchDiscriminator
 
 pytestmark = QUIET
 
@@ -30,11 +30,12 @@ class RangeData(TinyData):
             batch["range_image"] = self.codec.to_image(range_m)
 
 
-def range_module(modes, **kwargs):
+def range_module(modes, discriminator=None, **kwargs):
     torch.manual_seed(0)
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes)
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings = {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
+    settings["discriminator"] = discriminator
     return STAGES["vae_alignment"](vae=vae, sit=tiny_sit(), **settings)
 
 
@@ -44,6 +45,18 @@ def test_ranges_and_returns_are_learned_without_discriminator(modes):
     assert set(module.parts[0]) == {"reconstruction", "returns", "kl"}
     for name in ("reconstruction", "returns"):
         assert module.parts[-1][name] < module.parts[0][name] - 0.01, name
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_the_adversarial_loss_reaches_ranges_and_returns(modes):
+    module = range_module(modes, PatchDiscriminator(2, channels=4, num_layers=1), adversarial=1.0)
+    module.separates_losses = True
+    train(module, RangeData(1))
+    outputs = module.reached[0]["adversarial"]["vae.decoder.conv_out.bias"]
+    outputs = outputs.view(-1, 4)  # of each output, those of 2 x 2 pixels
+    assert outputs[0].count_nonzero()
+    assert outputs[-1].count_nonzero()
+    assert "discriminator.main.0.weight" not in module.reached[0]["adversarial"]
 
 
 def test_a_range_without_return_gets_no_gradient():

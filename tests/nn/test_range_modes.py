@@ -56,6 +56,21 @@ def test_the_mode_of_the_higher_density_is_decoded_never_a_mean():
     assert mixture(-0.5, 0.5, 0.3, 0.1, 0.1).mode().item() == 0.5  # narrower
 
 
+@pytest.mark.parametrize("modes", [1, 2])
+def test_a_discriminator_sees_images_with_the_values_of_scans(modes):
+    torch.manual_seed(0)
+    vae = VAE(**STEM | {"modes": modes})
+    latents = vae.encode(torch.randn(2, 2, 16, 64)).mean
+    prediction = (3 * vae.predict(latents)).detach().requires_grad_()
+    image, scan = vae.image_of(prediction), vae.scan_of(prediction)
+    seen = image[:, 1] > 0
+    assert 0 < seen.sum() < seen.numel()
+    torch.testing.assert_close(scan[:, 1], torch.where(seen, 1.0, -1.0))
+    torch.testing.assert_close(scan[:, 0], torch.where(seen, image[:, 0], -1.0))
+    scan[:, 1].sum().backward()
+    assert (prediction.grad[:, -1] > 0).all()
+
+
 def test_likelihood_is_finite_for_any_output():
     outputs = torch.tensor([0.0, 0.0, -1e4, 1e4, 1e4]).view(1, 5, 1, 1).requires_grad_()
     loss = RangeMixture(outputs).nll(torch.zeros(1, 1, 1, 1)).sum()

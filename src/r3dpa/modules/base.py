@@ -197,7 +197,7 @@ class GenerativeModule(ScanStage):
             parts["kl"] = weights.kl * posterior.kl().mean()
         adversarial = weights.adversarial != 0 and self.global_step >= weights.adversarial_start
         if self.discriminator is not None and adversarial:
-            made = self.vae.image_of(prediction)
+            made = self.vae.scan_of(prediction)
             if weights.adversarial_ratio is not None:
                 made = losses.balanced_gradient(made, weights.adversarial_ratio)
             with frozen(self.discriminator):
@@ -238,7 +238,7 @@ class GenerativeModule(ScanStage):
         if weights.discriminator == 0 or self.global_step < weights.adversarial_start:
             return {"discriminator": steps.zero_loss(self.discriminator)}
         real = self.discriminator(image)
-        fake = self.discriminator(self.vae.image_of(prediction).detach())
+        fake = self.discriminator(self.vae.scan_of(prediction).detach())
         loss = losses.discriminator_loss(real, fake)
         return {"discriminator": weights.discriminator * loss}
 

@@ -253,6 +253,20 @@ class VAE(Autoencoder):
             return prediction
         return torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
 
+    def scan_of(self, prediction: Tensor) -> Tensor:
+        """Images for a discriminator: those of two channels hold the two values of returns.
+
+        The logit of a return would give every reconstruction away. Its gradient passes the
+        threshold as that of a sigmoid.
+        """
+        image = self.image_of(prediction)
+        if self.in_channels == 1:
+            return image
+        logit = at_least_float32(image[:, 1:])
+        soft = torch.sigmoid(logit)
+        seen = (logit > 0).to(soft) + soft - soft.detach()
+        return torch.cat([seen * (image[:, :1] + 1) - 1, 2 * seen - 1], dim=1)
+
     def halve_decoder_(self) -> Self:
         """Casts the convolutions of the decoder, but for the last, to bfloat16 for sampling.
 
