@@ -48,15 +48,19 @@ def test_ranges_and_returns_are_learned_without_discriminator(modes):
 
 
 @pytest.mark.parametrize("modes", [1, 2])
-def test_the_adversarial_loss_reaches_ranges_and_returns(modes):
-    module = range_module(modes, PatchDiscriminator(2, channels=4, num_layers=1), adversarial=1.0)
+def test_a_discriminator_never_sees_the_logit_of_a_return(modes):
+    discriminator, seen = PatchDiscriminator(2, channels=4, num_layers=1), []
+    discriminator.register_forward_pre_hook(lambda _, images: seen.append(images[0].detach()))
+    module = range_module(modes, discriminator, adversarial=1.0)
     module.separates_losses = True
     train(module, RangeData(1))
+    assert len(seen) == 3  # for the decoder, and for the discriminator a scan and a reconstruction
+    for images in seen:
+        torch.testing.assert_close(images[:, 1].abs(), torch.ones(2, 8, 16))
     outputs = module.reached[0]["adversarial"]["vae.decoder.conv_out.bias"]
     outputs = outputs.view(-1, 4)  # of each output, those of 2 x 2 pixels
-    assert outputs[0].count_nonzero()
-    assert outputs[-1].count_nonzero()
-    assert "discriminator.main.0.weight" not in module.reached[0]["adversarial"]
+    assert outputs[0].count_nonzero()  # ranges
+    assert outputs[-1].count_nonzero()  # returns
 
 
 def test_a_range_without_return_gets_no_gradient():

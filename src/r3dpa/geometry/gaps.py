@@ -16,8 +16,7 @@ from r3dpa.geometry.sensor import EMPTY_RANGE_M, angles_of
 Gaps = Literal["inverse", "linear", "nearest"]
 _LEAST_ROWS = 0.5  # of the field of view, that a scan of the same sensor fills
 _LEAST_COLUMNS = 0.75
-_LEAST_DENSE = 0.6  # of the returns have one right below: 0.76 and more where nothing lacks in the
-# densest images and fog, at most 0.52 of scans with half of the beams
+_LEAST_DENSE = 0.6  # of the returns have one right below: all beams 0.76 or more, half of them 0.52
 _MOST_OUTSIDE = 0.2  # share of points beyond the vertical field of view
 _MARGIN_DEG = 1.5  # that some lasers of a real sensor look further up or down than its limits
 _NEAR_ROWS = 4  # how far known beams tell of missing ones
@@ -84,8 +83,7 @@ def filled(range_m: Tensor, missing: Tensor, how: Gaps = "inverse") -> Tensor:
     range_m = torch.where(missing & found.T, between.mean(how).T, range_m)
     known = ~missing | found.T
     width = range_m.shape[1]
-    turns = range_m.repeat(1, 3), known.repeat(1, 3)  # as columns wrap around
-    between, _ = _neighbours(*turns)
+    between, _ = _neighbours(range_m.repeat(1, 3), known.repeat(1, 3))  # columns wrap around
     return torch.where(known, range_m, between.mean(how)[:, width : 2 * width])
 
 
@@ -140,10 +138,8 @@ class _Neighbours(NamedTuple):
         nearest = torch.where(self.share <= 0.5, self.first, self.second)
         if how == "nearest":
             return nearest
-        if how == "linear":
-            mean = self.first.lerp(self.second, self.share)
-        else:
-            mean = 1 / (1 / self.first).lerp(1 / self.second, self.share)
+        power = 1 if how == "linear" else -1
+        mean = self.first.pow(power).lerp(self.second.pow(power), self.share).pow(power)
         return torch.where((self.first > 0) & (self.second > 0), mean, nearest)
 
 

@@ -254,10 +254,11 @@ class VAE(Autoencoder):
         return torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
 
     def scan_of(self, prediction: Tensor) -> Tensor:
-        """Images for a discriminator: those of two channels hold the two values of returns.
+        """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees those of scans.
 
-        The logit of a return would give every reconstruction away. Its gradient passes the
-        threshold as that of a sigmoid.
+        Where the second channel is the logit of a return, it becomes 1 or -1, and the range -1
+        without one: the logit would give every reconstruction away. The threshold has the gradient
+        of a sigmoid (straight-through, Bengio et al. 2013).
         """
         image = self.image_of(prediction)
         if self.in_channels == 1:
