@@ -1,8 +1,12 @@
+from collections import Counter
+from itertools import pairwise
+
 import pytest
 import torch
-from tiny_stages import QUIET, TinyData, stage_module
+from tiny_stages import QUIET, TinyData, stage_module, train
 
 from r3dpa.flow import average_times
+from r3dpa.modules import FewStep
 from r3dpa.modules.steps import PathDraws
 
 pytestmark = QUIET
@@ -23,3 +27,40 @@ def test_the_velocity_of_straight_paths_is_their_average(time):
     module.sit.average_velocity = lambda x, start, end: 0 * noise
     module.training_step(TinyData().batches[0], 0)
     torch.testing.assert_close(logged["train/denoising"], noise.square().mean())
+
+
+def test_steps_of_1_2_4_and_8_are_learned_equally_often():
+    """Of 32 equal times: each step that a sampler takes, the single one 8 times."""
+    module, asked = stage_module("few_step"), Counter()
+    module.on_fit_start()
+    points = torch.randn(32, 9, 4, 4, 8)
+    draws = PathDraws(torch.zeros(32, 4, 4, 8), torch.arange(32) / 32, points)
+    module.draw_path, module.log_dict = lambda *_: draws, lambda *_, **__: None
+
+    def average(x, time, target):
+        asked.update(zip(time.tolist(), target.tolist(), strict=True))
+        return x
+
+    module.sit.average_velocity = average
+    batch = TinyData().batches[0]
+    module.draw_latents = lambda _: (torch.zeros(32, 4, 4, 8), draws)
+    module.training_step(batch, 0)
+    expected = Counter()
+    for steps in (1, 2, 4, 8):
+        times = average_times(steps).float().tolist()
+        expected.update(dict.fromkeys(pairwise(times), 8 // steps))
+    assert asked == expected
+
+
+def test_trajectories_have_the_precision_of_the_steps(tmp_path):
+    module, data = stage_module("few_step", trajectories=2), TinyData()
+    module.on_fit_start = lambda: FewStep.on_fit_start(module)
+    module.parts, module.grads, module.clipped, module.states = [], [], [], []
+    data.batch_size = 2
+    train(module, data, precision="bf16-mixed", default_root_dir=tmp_path)
+    cached = module._cached
+    found = torch.stack([cached.read(item) for item in cached.items])
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = module.solve([0, 1])
+    torch.testing.assert_close(found, rounded, rtol=1e-3, atol=1e-3)  # stored in float16
+    assert (found - module.solve([0, 1])).abs().max() > 0.01

@@ -20,7 +20,6 @@ from r3dpa.flow.times import ode_times, sde_times
 OdeSolverName = Literal["euler", "heun", "midpoint", "ab2", "ab3", "dpmpp_2m", "unipc"]
 Solver = Literal[OdeSolverName, "euler_maruyama", "ddpm", "ddim", "average_velocity"]
 Quality = Literal["instant", "draft", "good", "best"]
-_INSTANT = {"solver": "average_velocity", "steps": 2, "shift": 1.0}
 _READS: dict[str, tuple[str, ...]] = {
     "euler_maruyama": ("eta", "sde_last", "sde_last_time"),
     "ddpm": ("shift", "eta"),
@@ -87,17 +86,13 @@ class SamplerConfig:
     @classmethod
     def of_quality(cls, quality: Quality) -> Self:
         """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
-        level = _qualities()["levels"].get(quality, _INSTANT)
+        level = _qualities()["levels"][quality]
         return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
 
     @staticmethod
     def quality_line(quality: Quality) -> str:
         """One line of text about the sampler of :meth:`of_quality`."""
         table = _qualities()
-        if quality not in table["levels"]:
-            return (
-                f"quality {quality}: {_INSTANT['solver']}, {_INSTANT['steps']} steps: not measured"
-            )
         level = table["levels"][quality]
         return (
             f"quality {quality}: {level['solver']}, {level['steps']} steps, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +16,7 @@ from r3dpa.checkpoints import Checkpoint, weights_sha256
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
-from r3dpa.flow.average_velocity import TIME_SHIFT
+from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
 from r3dpa.modules.encoding import filled
@@ -30,7 +29,15 @@ from r3dpa.nn.layers import num_processes
 _POINTS = 8  # of a trajectory after the noise, see average_times
 _EVERY = 2  # AB3 steps between two points
 _DECODED = 4  # every 4th latents are decoded: two decoders cost more than the SiT
-_PAIRS = torch.tensor(list(combinations(range(_POINTS + 1), 2)))
+# First and last point of each step that a sampler takes; as many of 1 step as of 2, 4 and 8.
+_PAIRS = torch.tensor(
+    [
+        (first, first + length)
+        for length in (_POINTS // num for num in AVERAGE_STEPS)
+        for first in range(0, _POINTS, length)
+        for _ in range(length)
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -56,18 +63,18 @@ class FewStep(FlowMatching):
 
     Args:
         vae: Range-image autoencoder; fixed.
-        sit: SiT with ``average_blocks``, a third of its blocks as a rule. The flow in ``init_from``
-            has none.
+        sit: SiT with ``average_blocks``, a third of its blocks as a rule. Those of ``init_from``
+            are not used.
         thin_decoder: Decoder to distil; None trains none.
-        trajectories: Number of trajectories, 16 evaluations each.
-        **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching or
-            joint, whose averaged SiT is taken; its loss weights ``denoising`` (average velocity),
-            ``reconstruction`` and ``returns`` (thin decoder) count here.
+        trajectories: Number of trajectories, 16 evaluations each in the precision of the steps.
+        **kwargs: See :class:`FlowMatching`. ``init_from`` is a checkpoint of stage flow_matching,
+            joint or few_step, whose averaged SiT is taken; its loss weights ``denoising`` (average
+            velocity), ``reconstruction`` and ``returns`` (thin decoder) count here.
     """
 
     stage = "few_step"
     default_init = ("vae", "latent_norm", "sit")
-    starts_from = "flow_matching or joint"
+    starts_from = "flow_matching, joint or few_step"
 
     def __init__(
         self,
@@ -113,22 +120,27 @@ class FewStep(FlowMatching):
     def on_fit_start(self) -> None:
         """Loads the flow, and computes the trajectories that are not there yet."""
         super().on_fit_start()
-        if cast(Any, self.trainer).fast_dev_run:
+        trainer = cast(Any, self.trainer)
+        if trainer.fast_dev_run:
             return
         flow = {k: v for k, v in self.sit.state_dict().items() if not k.startswith("average.")}
         settings = {"sit": weights_sha256(flow), "seed": self.seed, "every": _EVERY}
+        settings["precision"] = trainer.precision
         shape = (_POINTS + 1, *self.latent_shape)
-        root = Path(self.latents_dir or Path(self.trainer.default_root_dir) / "latents")
+        root = Path(self.latents_dir or Path(trainer.default_root_dir) / "latents")
         cache = tensor_cache(root, "trajectory", settings, shape, "float16")
         names = [f"trajectory_{index:07d}" for index in range(self.trajectories)]
         items = [_Noise(i, name, cache.folder, (name, 0, 0)) for i, name in enumerate(names)]
-        size = cast(Any, self.trainer).datamodule.batch_size
+        size = trainer.datamodule.batch_size
 
         def points(own: list[_Noise]) -> Iterator[Tensor]:
             for first in range(0, len(own), size):
-                yield self.solve([item.index for item in own[first : first + size]])
+                indices = [item.index for item in own[first : first + size]]
+                with trainer.precision_plugin.forward_context():
+                    rows = self.solve(indices)
+                yield rows
 
-        self._cached = filled(self.trainer, cache, items, points)
+        self._cached = filled(trainer, cache, items, points)
 
     @torch.no_grad()
     def solve(self, indices: list[int]) -> Tensor:
