@@ -105,8 +105,11 @@ def test_rate_rises_stays_and_falls_by_step_alone():
     assert OptimizerConfig(lr=2.0).rate(5, 10) == 2.0
     cosine = OptimizerConfig(lr=2.0, warmup_steps=2, cosine=True)
     assert [cosine.rate(step, 10) for step in (2, 6, 10)] == pytest.approx([2.0, 1.0, 0.0])
-    config = replace(config, discriminator_rate=0.5)
-    module = stage_module("joint", optimizer=config, weights=LossWeights(adversarial_ratio=0.5))
-    train(module, TinyData([False] * 5))
-    rates = {group["name"]: group["lr"] for group in module.optimizers().param_groups}
-    assert rates == {"vae": 0.25, "discriminator": 0.125, "sit": 0.25}
+    config = replace(config, discriminator_rate=0.5, thin_decoder_rate=2.0)
+    joint = stage_module("joint", optimizer=config, weights=LossWeights(adversarial_ratio=0.5))
+    expected = {"vae": 0.25, "discriminator": 0.125, "sit": 0.25}
+    few_step = stage_module("few_step", optimizer=config)
+    for module, wanted in ((joint, expected), (few_step, {"sit": 0.25, "thin_decoder": 0.5})):
+        train(module, TinyData([False] * 5))
+        rates = {group["name"]: group["lr"] for group in module.optimizers().param_groups}
+        assert rates == wanted

@@ -63,6 +63,7 @@ class OptimizerConfig:
         weight_decay: Applied to every trained parameter, as officially.
         eps: Added to the root of the second moment.
         discriminator_rate: Rate of the discriminator, relative to ``lr``.
+        thin_decoder_rate: Rate of the thin decoder, which starts untrained, relative to ``lr``.
         warmup_steps: First steps, over which the rate rises linearly.
         decay_steps: Last steps before ``trainer.max_steps``, over which the rate falls linearly to
             0. A run that goes on to more steps starts from a checkpoint before the decay.
@@ -75,6 +76,7 @@ class OptimizerConfig:
     weight_decay: float = 0.03
     eps: float = 1e-8
     discriminator_rate: float = 1.0
+    thin_decoder_rate: float = 1.0
     warmup_steps: int = 0
     decay_steps: int = 0
     cosine: bool = False

@@ -193,9 +193,9 @@ def set_learning_rate(module: Any, optimizer: torch.optim.Optimizer) -> None:
     """Sets the rate of the coming step, a function of its number alone."""
     config = module.optimizer_config
     rate = config.rate(module.global_step, module.trainer.max_steps)
+    own = {"discriminator": config.discriminator_rate, "thin_decoder": config.thin_decoder_rate}
     for group in optimizer.param_groups:
-        slower = config.discriminator_rate if group.get("name") == "discriminator" else 1.0
-        group["lr"] = slower * rate
+        group["lr"] = own.get(group.get("name"), 1.0) * rate
 
 
 def gradient_norms(
