@@ -130,7 +130,7 @@ box: $(READY) ## train the weights of the package: an hour of a GPU, days of two
 		--model.init_args.init_from runs/box/flow/checkpoints/last.ckpt \
 		--model.init_args.latents_dir runs/box/flow/latents
 	$(BIN)/r3dpa convert runs/box/few_step/checkpoints/last.ckpt runs/box/r3dpa-s.safetensors \
-		--networks vae ema ema_latent_norm thin_decoder --half --overwrite
+		--networks vae ema ema_latent_norm --half --overwrite
 
 box-scores: $(READY) ## measure the weights of the package on 2,000 scenes: hours; notebooks/results/box
 	BOX_SCENES=2000 nice -n 19 $(BIN)/pytest --nbmake --nbmake-timeout=86400 --overwrite \

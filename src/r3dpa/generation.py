@@ -167,7 +167,7 @@ class SceneGenerator:
             sampler: Solver and steps, or a quality that selects them.
             weights: Averaged or last weights of the SiT.
             decoder: That of the VAE or the thin one of stage few_step; default: thin for the
-                quality ``instant``, full otherwise.
+                quality ``instant`` where the checkpoint has one, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
             precision: As for the constructor, like all other arguments.
             autoguidance: Weak model, on the same device.
@@ -188,8 +188,9 @@ class SceneGenerator:
         geometry = _geometry_of(checkpoint)
         names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
         device = usable_device(device)
-        thin = decoder == "thin" or (decoder is None and sampler == "instant")
-        decoding = "thin_decoder" if thin else "vae"
+        if decoder is None:
+            decoder = default_decoder(checkpoint, sampler)
+        decoding = "thin_decoder" if decoder == "thin" else "vae"
         vae, sit, norm = (checkpoint.network(n).build().to(device) for n in (decoding, *names))
         if not (
             isinstance(vae, VAE)
@@ -309,6 +310,13 @@ class SceneGenerator:
             self._weak, guidance.latent_scale, guidance.latent_shift, self.interpolant
         )
         return autoguided(self._strong, weak, guidance.scale, guidance.interval)
+
+
+def default_decoder(
+    checkpoint: Checkpoint, sampler: SamplerConfig | Quality | None
+) -> Literal["full", "thin"]:
+    """The thin decoder for the quality ``instant`` where there is one."""
+    return "thin" if sampler == "instant" and "thin_decoder" in checkpoint.networks else "full"
 
 
 class SceneVAE:

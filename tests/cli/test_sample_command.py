@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from tiny_networks import tiny_checkpoint
 
+from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
 from r3dpa.cli.sample import sample as sample_command
@@ -137,7 +138,14 @@ class TestSample:
         assert full["decoder"] == "full"
         ranges = [np.load(tmp_path / name / "range_m.npy") for name in ("thin", "full")]
         assert not np.array_equal(*ranges)
+        only = ["vae", "ema", "ema_latent_norm"]
+        convert(few, tmp_path / "without.safetensors", networks=only)
+        without = sample(tmp_path / "without.safetensors", tmp_path / "no", *words, steps=())
+        assert without["decoder"] == "full"
+        assert np.array_equal(np.load(tmp_path / "no" / "range_m.npy"), ranges[1])
         with pytest.raises(ValueError, match="is of stage 'joint' and has no thin_decoder"):
+            sample(tiny_file, tmp_path / "joint", *words, "--decoder", "thin", steps=())
+        with pytest.raises(ValueError, match="a checkpoint of stage few_step"):
             sample(tiny_file, tmp_path / "joint", *words, steps=())
 
     def test_a_quality_chooses_the_sampler_and_says_so(self, tiny_file, tmp_path, capsys):

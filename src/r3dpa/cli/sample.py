@@ -47,7 +47,7 @@ def sample(
         guidance_scale: Strength of autoguidance, 1 for none; default: 2.
         guidance_interval: Guided times, such as ``0.2 0.8``; 0 is data, 1 noise; default: all.
         decoder: Decoder of the VAE or the thin one of stage few_step; default: thin for
-            ``--quality instant``, else full.
+            ``--quality instant`` where the checkpoint has one, else full.
         precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
         compile: Compile the networks: a minute or more at first, then faster.
         **options: See :class:`SceneOptions`.
@@ -59,7 +59,7 @@ def sample(
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
-    from r3dpa.generation import Autoguidance, SamplerConfig
+    from r3dpa.generation import Autoguidance, SamplerConfig, default_decoder
     from r3dpa.io import usable_device
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last")
@@ -67,12 +67,12 @@ def sample(
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
     sampler = SamplerConfig(**given) if given else quality
-    decoder = decoder or ("thin" if quality == "instant" else "full")
     if autoguidance is None and (guidance_scale or guidance_interval):
         raise ValueError("--guidance_scale and --guidance_interval need --autoguidance")
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
+    decoder = decoder or default_decoder(checkpoint, quality)
     guidance, about_guide = None, None
     if autoguidance is not None:
         weak = read_snapshot(autoguidance, checkpoint, files.weights)

@@ -195,7 +195,7 @@ def set_learning_rate(module: Any, optimizer: torch.optim.Optimizer) -> None:
     rate = config.rate(module.global_step, module.trainer.max_steps)
     own = {"discriminator": config.discriminator_rate, "thin_decoder": config.thin_decoder_rate}
     for group in optimizer.param_groups:
-        group["lr"] = own.get(group.get("name"), 1.0) * rate
+        group["lr"] = own.get(group.get("name", ""), 1.0) * rate
 
 
 def gradient_norms(
