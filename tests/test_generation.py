@@ -21,7 +21,6 @@ from r3dpa.checkpoints import (
     Checkpoint,
     NetworkState,
     convert,
-    load_into,
     read_checkpoint,
     save_checkpoint,
 )
@@ -395,13 +394,6 @@ class TestFewSteps:
         few = made.with_sampler(SamplerConfig("average_velocity", 4))
         assert not torch.allclose(few.generate([0]).latents, first)
         assert few.generate([0]).nfe == 4
-
-    def test_other_stages_start_without_the_copied_blocks(self, few_step):
-        _, sit, _ = tiny_networks()
-        load_into({"sit": sit}, few_step, stage="flow_matching")
-        saved = few_step.network("ema").state_dict
-        for name, value in sit.state_dict().items():
-            assert torch.equal(value, saved[name]), name
 
     def test_what_makes_no_sense_is_refused_by_name(self, few_step):
         sampler = SamplerConfig("average_velocity", 2)

@@ -188,9 +188,9 @@ class SceneGenerator:
         geometry = _geometry_of(checkpoint)
         names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
         device = usable_device(device)
-        if decoder is None:
-            decoder = default_decoder(checkpoint, sampler)
-        decoding = "thin_decoder" if decoder == "thin" else "vae"
+        has_thin = "thin_decoder" in checkpoint.networks
+        thin = decoder == "thin" or (decoder is None and sampler == "instant" and has_thin)
+        decoding = "thin_decoder" if thin else "vae"
         vae, sit, norm = (checkpoint.network(n).build().to(device) for n in (decoding, *names))
         if not (
             isinstance(vae, VAE)
@@ -310,13 +310,6 @@ class SceneGenerator:
             self._weak, guidance.latent_scale, guidance.latent_shift, self.interpolant
         )
         return autoguided(self._strong, weak, guidance.scale, guidance.interval)
-
-
-def default_decoder(
-    checkpoint: Checkpoint, sampler: SamplerConfig | Quality | None
-) -> Literal["full", "thin"]:
-    """The thin decoder for the quality ``instant`` where there is one."""
-    return "thin" if sampler == "instant" and "thin_decoder" in checkpoint.networks else "full"
 
 
 class SceneVAE:

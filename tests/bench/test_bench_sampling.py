@@ -134,7 +134,7 @@ class TestQuality:
             "best": 32,
         }
 
-    def test_instant_is_the_best_thin_row_in_a_fifth_of_the_time_of_good(self):
+    def test_instant_is_the_best_row_of_few_steps_in_a_fifth_of_the_time_of_good(self):
         few = [
             row("average_velocity 2", 0.6, 0.07, decoder="thin"),
             row("average_velocity 4", 0.8, 0.05, decoder="thin"),
@@ -144,6 +144,7 @@ class TestQuality:
         levels = quality_levels([*self.ROWS, *few])
         assert levels["instant"]["steps"] == 4
         assert levels["good"] == quality_levels(self.ROWS)["good"]
+        assert quality_levels([*self.ROWS, few[3]])["instant"]["error"] == pytest.approx(0.01)
         slow = [row("average_velocity 8", 1.2, 0.04, decoder="thin")]
         assert quality_levels([*self.ROWS, *slow])["instant"]["steps"] == 8
 

@@ -3,11 +3,14 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tiny_stages import QUIET, TinyData, stage_module, train
+from tiny_networks import SIT_ARGS, tiny_checkpoint
+from tiny_stages import QUIET, Observed, TinyData, stage_module, train
 
+from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
 from r3dpa.modules import FewStep
 from r3dpa.modules.steps import PathDraws
+from r3dpa.nn import SiT
 
 pytestmark = QUIET
 
@@ -54,8 +57,7 @@ def test_steps_of_1_2_4_and_8_are_learned_equally_often():
 
 def test_trajectories_have_the_precision_of_the_steps(tmp_path):
     module, data = stage_module("few_step", trajectories=2), TinyData()
-    module.on_fit_start = lambda: FewStep.on_fit_start(module)
-    module.parts, module.grads, module.clipped, module.states = [], [], [], []
+    module.on_fit_start = lambda: (Observed.on_fit_start(module), FewStep.on_fit_start(module))
     data.batch_size = 2
     train(module, data, precision="bf16-mixed", default_root_dir=tmp_path)
     cached = module._cached
@@ -64,3 +66,24 @@ def test_trajectories_have_the_precision_of_the_steps(tmp_path):
         rounded = module.solve([0, 1])
     torch.testing.assert_close(found, rounded, rtol=1e-3, atol=1e-3)  # stored in float16
     assert (found - module.solve([0, 1])).abs().max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("stage", "blocks"), [("flow_matching", 1), ("few_step", 1), ("few_step", 2)]
+)
+def test_stages_start_from_the_flow_of_few_steps(stage, blocks, tmp_path):
+    """Its copied blocks, whose weights differ, are left out or made again."""
+    settings = {"spread": 0.3, "sit_args": {"average_blocks": blocks}, "stage": "few_step"}
+    before = read_checkpoint(
+        tiny_checkpoint(tmp_path / "few.safetensors", TinyData.geometry, **settings)
+    )
+    module = stage_module(stage)
+    module.sit = sit = SiT(**SIT_ARGS, average_blocks=int(stage == "few_step"))
+    load_into({"sit": sit}, module.previous_networks(before), stage)
+    flow = before.network("ema").build()
+    x, time = torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])
+    velocity = flow.velocity(x, time)
+    assert torch.equal(sit.velocity(x, time), velocity)
+    assert not torch.allclose(flow.average_velocity(x, time, 0 * time), velocity)
+    if stage == "few_step":
+        assert torch.equal(sit.average_velocity(x, time, 0 * time), velocity)

@@ -40,14 +40,6 @@ def test_before_training_the_average_velocity_is_the_velocity_bit_for_bit(blocks
     assert torch.equal(network.average_velocity_at(x, rows), velocity)
 
 
-def test_a_copy_that_is_there_is_made_again_from_the_flow():
-    before = few_step(2)
-    for parameter in before.average.parameters():
-        nn.init.normal_(parameter, std=0.3)
-    network, x, time = few_step(1, before), torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])
-    assert torch.equal(network.average_velocity(x, time, 0 * time), flow().velocity(x, time))
-
-
 def test_training_moves_the_average_velocity_alone():
     network = few_step()
     x, time = torch.randn(2, 4, 4, 16), torch.tensor([0.3, 0.9])

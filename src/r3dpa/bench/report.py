@@ -181,13 +181,14 @@ def quality_levels(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     larger of the error of bf16 (0.01 if no row has it) and the smallest error, ``best`` has an
     error of at most ``small``, ``good`` of 4 and ``draft`` of 10 times that. It is the cheapest
     such row, or the one with the smallest error among those that take at most a tenth longer. With
-    a thin decoder ``instant`` is the smallest error of its rows in at most a fifth of the time of
-    ``good``, or the fastest of them.
+    average velocities ``instant`` is the smallest error of their rows, by the thin decoder if there
+    is one, in at most a fifth of the time of ``good``, or the fastest of them.
     """
     kinds = [(row.way.precision, row.way.batch) for row in rows]
     usual = max(kinds, key=kinds.count)
     usable = [row for row, kind in zip(rows, kinds, strict=True) if kind == usual]
-    thin = [row for row in usable if row.way.decoder == "thin"]
+    few = [row for row in usable if row.way.sampler.solver == "average_velocity"]
+    few = [row for row in few if row.way.decoder == "thin"] or few
     usable = [row for row in usable if row.way.sampler.solver != "average_velocity"]
     bf16 = [r.precision_error for r in rows if r.way.precision == "bf16" and r.precision_error]
     small = max(min(bf16) if bf16 else _SMALL_ERROR, min(row.error for row in usable))
@@ -198,9 +199,9 @@ def quality_levels(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         return min((r for r in enough if r.seconds <= longest), key=lambda row: row.error)
 
     levels = {level: chosen(factor * small) for level, factor in _LEVELS.items()}
-    if thin:
-        longest = max(levels["good"].seconds / 5, min(row.seconds for row in thin))
-        quick = [row for row in thin if row.seconds <= longest]
+    if few:
+        longest = max(levels["good"].seconds / 5, min(row.seconds for row in few))
+        quick = [row for row in few if row.seconds <= longest]
         levels = {"instant": min(quick, key=lambda row: row.error), **levels}
     return {
         level: {

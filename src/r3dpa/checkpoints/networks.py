@@ -8,7 +8,7 @@ import inspect
 import itertools
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -192,26 +192,19 @@ class Checkpoint:
 def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: str) -> None:
     """Copies the weights of a checkpoint into the networks of those names, all of them or none.
 
-    Exported files hold averages alone, which ``sit`` and ``latent_norm`` then start from. A SiT
-    without average velocities leaves those of stage few_step out.
+    Exported files hold averages alone, which ``sit`` and ``latent_norm`` then start from.
 
     Raises:
         ValueError: Listing for ``stage`` what is absent or does not fit; nothing is changed then.
     """
     problems: list[str] = []
-    states: dict[str, NetworkState] = {}
+    sources = {n: n if n in checkpoint.networks else _AVERAGES.get(n, n) for n in networks}
     for name, network in networks.items():
         try:
-            state = checkpoint.network(
-                name if name in checkpoint.networks else _AVERAGES.get(name, name)
-            )
+            state = checkpoint.network(sources[name])
         except ValueError as error:
             problems.append(f"{error}; {stage} needs: {', '.join(networks)}")
             continue
-        if getattr(network, "average", None) is None:
-            kept = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
-            state = replace(state, state_dict=kept)
-        states[name] = state
         differences = _different_settings(state, network) + state.problems(network)
         problems += [f"{name}: {line}" for line in _shortened(differences)]
     if problems:
@@ -221,7 +214,7 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
             + "\nGive the networks of this run the arguments of the checkpoint, or another file"
         )
     for name, network in networks.items():
-        network.load_state_dict(states[name].state_dict, strict=True)
+        network.load_state_dict(checkpoint.network(sources[name]).state_dict, strict=True)
 
 
 def weights_sha256(state: Mapping[str, Tensor]) -> str:

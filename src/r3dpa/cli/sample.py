@@ -59,8 +59,9 @@ def sample(
     from r3dpa.checkpoints import read_checkpoint, read_snapshot
     from r3dpa.cli.scene_files import draw_all, generate_all, provenance, written
     from r3dpa.data.scene_writer import SceneWriter
-    from r3dpa.generation import Autoguidance, SamplerConfig, default_decoder
+    from r3dpa.generation import Autoguidance, SamplerConfig
     from r3dpa.io import usable_device
+    from r3dpa.nn import ThinDecoder
 
     of_solver = ("solver", "steps", "shift", "eta", "sde_last")
     given = {name: arguments[name] for name in of_solver if arguments[name] is not None}
@@ -72,7 +73,6 @@ def sample(
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
-    decoder = decoder or default_decoder(checkpoint, quality)
     guidance, about_guide = None, None
     if autoguidance is not None:
         weak = read_snapshot(autoguidance, checkpoint, files.weights)
@@ -100,7 +100,8 @@ def sample(
     )
     generator.prepare()
     request = provenance(checkpoint, files, num, device, generator.geometry)
-    request |= {"precision": precision, "compile": compile, "decoder": decoder}
+    thin = isinstance(getattr(generator, "vae", None), ThinDecoder)  # a baseline has no VAE
+    request |= {"precision": precision, "compile": compile, "decoder": "thin" if thin else "full"}
     request |= {"sampler": asdict(generator.sampler), "autoguidance": about_guide}
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:

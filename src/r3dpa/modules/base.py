@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import torch
@@ -179,8 +180,15 @@ class GenerativeModule(ScanStage):
         self._has_weights = True
 
     def previous_networks(self, before: Checkpoint) -> Checkpoint:
-        """Checkpoint of the stage before, with its networks by the names of this stage."""
-        return before
+        """Checkpoint of the stage before, with the networks that this stage has.
+
+        Average velocities of stage few_step are left out.
+        """
+        networks = {}
+        for name, state in before.networks.items():
+            kept = {k: v for k, v in state.state_dict.items() if not k.startswith("average.")}
+            networks[name] = replace(state, state_dict=kept)
+        return replace(before, networks=networks)
 
     # Training
 

@@ -111,6 +111,7 @@ class FewStep(FlowMatching):
             raise ValueError(
                 f"{before.path} was trained on the {before.interpolant} path: set model.path to it"
             )
+        before = super().previous_networks(before)
         flow = before.network("ema")
         networks = dict(before.networks) | {"latent_norm": before.network("ema_latent_norm")}
         weights = cast(SiT, self.sit).with_average(flow.state_dict)
@@ -124,8 +125,12 @@ class FewStep(FlowMatching):
         if trainer.fast_dev_run:
             return
         flow = {k: v for k, v in self.sit.state_dict().items() if not k.startswith("average.")}
-        settings = {"sit": weights_sha256(flow), "seed": self.seed, "every": _EVERY}
-        settings["precision"] = trainer.precision
+        settings = {
+            "sit": weights_sha256(flow),
+            "seed": self.seed,
+            "every": _EVERY,
+            "precision": trainer.precision,
+        }
         shape = (_POINTS + 1, *self.latent_shape)
         root = Path(self.latents_dir or Path(trainer.default_root_dir) / "latents")
         cache = tensor_cache(root, "trajectory", settings, shape, "float16")

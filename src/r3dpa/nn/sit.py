@@ -241,7 +241,7 @@ class SiT(VelocityNetwork):
         return self._output(head.final_layer, tokens, modulations)
 
     def with_average(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Weights of a trained SiT and a copy of its last blocks, in place of one that it has."""
+        """Weights of a network without ``average_blocks``, completed to those of this one."""
         head, own = self._average_head(), self.state_dict()
         first = len(self.blocks) - len(head.blocks)
         added = {key: own[key] for key in own if key.startswith("average.embedder.")}
@@ -252,7 +252,7 @@ class SiT(VelocityNetwork):
                 added[f"average.{key}"] = value
             elif kind == "blocks" and int(index) >= first:
                 added[f"average.blocks.{int(index) - first}.{name}"] = value
-        return {k: v for k, v in weights.items() if not k.startswith("average.")} | added
+        return {**weights, **added}
 
     def _average_head(self) -> _AverageHead:
         if self.average is None:
