@@ -9,7 +9,7 @@ import torch
 
 from r3dpa.geometry import LidarSensor, RangeCodec
 from r3dpa.nn import VAE
-from r3dpa.nn.vae import RangeMixture
+from r3dpa.nn.vae import RangeMixture, without_flying_pixels
 
 STEM = {"in_channels": 2, "latent_channels": 4, "stem": (4, 8), "channels": 32}
 STEM |= {"channel_multipliers": (1, 2), "strides": ((2, 2),), "num_res_blocks": 1, "modes": 2}
@@ -54,6 +54,41 @@ def test_the_mode_of_the_higher_density_is_decoded_never_a_mean():
     assert mixture(-0.5, 0.5, 0.1, 0.1, 0.1).mode().item() == -0.5
     assert mixture(-0.5, 0.5, 0.1, 0.1, -0.1).mode().item() == 0.5
     assert mixture(-0.5, 0.5, 0.3, 0.1, 0.1).mode().item() == 0.5  # narrower
+
+
+@pytest.mark.parametrize(
+    ("row", "result"),
+    [
+        ([0.0, 0.0, 0.3, 0.8, 0.8, 0.8], [0.0, 0.0, 0.0, 0.8, 0.8, 0.8]),
+        ([0.0, 0.0, 0.5, 0.8, 0.8, 0.8], [0.0, 0.0, 0.8, 0.8, 0.8, 0.8]),
+        ([0.0, 0.2, 0.5, 0.8, 0.8, 0.0], [0.0, 0.0, 0.8, 0.8, 0.8, 0.0]),  # a wider ramp
+        ([0.5, 0.8, 0.8, 0.8, 0.0, 0.0], [0.8, 0.8, 0.8, 0.8, 0.0, 0.0]),  # columns wrap around
+        ([0.8, 0.8, 0.2, 0.8, 0.8, 0.8], [0.8, 0.8, 0.2, 0.8, 0.8, 0.8]),  # a thin pole
+        ([0.0, 0.0, 0.005, 0.8, 0.8, 0.8], [0.0, 0.0, 0.005, 0.8, 0.8, 0.8]),  # part of a surface
+        ([0.0, 0.03, 0.06, 0.09, 0.8, 0.8], [0.03, 0.03, 0.06, 0.06, 0.8, 0.8]),  # ends of a wall
+        ([0.0, 0.03, 0.06, 0.09, 0.12, 0.15], [0.0, 0.03, 0.06, 0.09, 0.12, 0.15]),  # a grazing one
+    ],
+)
+def test_flying_pixels_move_to_the_nearer_surface(row, result):
+    image = torch.tensor([row, [1.0] * 6]).view(1, 2, 1, 6)
+    found = without_flying_pixels(image)
+    assert found[0, 0, 0].tolist() == pytest.approx(result)
+    assert torch.equal(found[:, 1], image[:, 1])
+    image[0, 1] = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])  # every neighbour has no return
+    found = without_flying_pixels(image)
+    seen = image[0, 1, 0] > 0
+    assert torch.equal(found[0, 0, 0][seen], image[0, 0, 0][seen])
+
+
+def test_decoding_leaves_few_flying_pixels_to_two_modes():
+    prediction = torch.randn(2, 6, 16, 64, generator=torch.Generator().manual_seed(0))
+    chosen = RangeMixture(prediction).mode()
+    chosen = torch.cat([chosen, prediction[:, -1:]], dim=1)
+    image = VAE(**STEM).image_of(prediction)
+    assert not torch.equal(image, chosen)
+    torch.testing.assert_close(image, without_flying_pixels(chosen))
+    one = prediction[:, :2]
+    assert torch.equal(VAE(**STEM | {"modes": 1}).image_of(one), one)
 
 
 @pytest.mark.parametrize("modes", [1, 2])

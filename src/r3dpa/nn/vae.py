@@ -28,6 +28,7 @@ from r3dpa.nn.layers import (
 
 Size = tuple[int, int]
 _LEAST_LOG_SCALE = -6.0
+_FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
@@ -108,6 +109,30 @@ class RangeMixture:
         distance = (image - self.centres).abs() * torch.exp(-self.log_scales)
         density = self.log_weights - self.log_scales - math.log(2.0) - distance
         return -density.logsumexp(dim=1, keepdim=True)
+
+
+def without_flying_pixels(image: Tensor) -> Tensor:
+    """Images with the flying pixels on the nearer of the surfaces that they lie between.
+
+    A pixel flies if its left and right neighbours have a return, are on two surfaces, and are both
+    farther from it than the flatter surface is inclined there. A second pass moves what is left
+    of wider ramps. Thin poles stay, since there is one surface behind them, and so do walls at a
+    grazing angle but for their last pixels.
+
+    Args:
+        image: ``(B, 2, H, W)`` encoded ranges, and logits of a return.
+    """
+    ranges, logit = image[:, :1], image[:, 1:]
+    between = (logit.roll(1, -1) > 0) & (logit.roll(-1, -1) > 0)
+    for _ in range(2):
+        left, right = ranges.roll(1, -1), ranges.roll(-1, -1)
+        to_left = (ranges - left).abs()
+        to_right = to_left.roll(-1, -1)
+        inclination = torch.minimum(to_left.roll(1, -1), to_right.roll(-1, -1))
+        flying = torch.minimum(to_left, to_right) > _FLYING_GAP + inclination
+        flying &= between & ((left - right).abs() > 2 * _FLYING_GAP)
+        ranges = torch.where(flying, torch.where(to_left < to_right, left, right), ranges)
+    return torch.cat([ranges, logit], dim=1)
 
 
 class Autoencoder(nn.Module):
@@ -248,10 +273,14 @@ class VAE(Autoencoder):
         self.modes = modes
 
     def image_of(self, prediction: Tensor) -> Tensor:
-        """Images ``(B, in_channels, H, W)``; of two modes, the one of the higher density."""
+        """Images ``(B, in_channels, H, W)``; of two modes, the one of the higher density.
+
+        A choice for each pixel alone still leaves some that fly, which are moved to a surface.
+        """
         if self.modes == 1:
             return prediction
-        return torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
+        image = torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
+        return without_flying_pixels(image)
 
     def scan_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees those of scans.
