@@ -120,7 +120,8 @@ def without_flying_pixels(image: Tensor) -> Tensor:
     grazing angle but for their last pixels.
 
     Args:
-        image: ``(B, 2, H, W)`` encoded ranges, and logits of a return.
+        image: ``(B, 2, H, W)`` encoded ranges, and logits of a return, above 0 with one. Columns
+            wrap around.
     """
     ranges, logit = image[:, :1], image[:, 1:]
     between = (logit.roll(1, -1) > 0) & (logit.roll(-1, -1) > 0)
