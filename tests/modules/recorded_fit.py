@@ -5,19 +5,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from r3dpa.callbacks import StepGuard
+from lightning.pytorch import LightningModule
+
 from r3dpa.cli import main
 
-begin = StepGuard.on_train_batch_start
 
-
-def begin_and_note(self, trainer, module, batch, batch_idx):
-    path = Path(trainer.default_root_dir) / f"seen_{trainer.global_rank}.txt"
+def note(self, batch, batch_idx):
+    path = Path(self.trainer.default_root_dir) / f"seen_{self.global_rank}.txt"
     with path.open("a") as file:
         file.writelines(f"{name}\n" for name in batch["name"])
-    begin(self, trainer, module, batch, batch_idx)
 
 
 if __name__ == "__main__":
-    StepGuard.on_train_batch_start = begin_and_note
+    LightningModule.on_train_batch_start = note
     main(sys.argv[1:])
