@@ -124,8 +124,11 @@ box: $(READY) ## train the weights of the package: an hour of a GPU, days of two
 	$(BOX_FIT) --config conf/box/vae_alignment.yaml --config conf/box/vae_more.yaml \
 		--run_dir runs/box/vae_more \
 		--model.init_args.init_from runs/box/vae/checkpoints/last.ckpt
-	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
+	$(BOX_FIT) --config conf/box/vae_alignment.yaml --config conf/box/vae_decoder.yaml \
+		--run_dir runs/box/vae_decoder \
 		--model.init_args.init_from runs/box/vae_more/checkpoints/last.ckpt
+	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
+		--model.init_args.init_from runs/box/vae_decoder/checkpoints/last.ckpt
 	$(BOX_FIT) --config conf/box/few_step.yaml --run_dir runs/box/few_step \
 		--model.init_args.init_from runs/box/flow/checkpoints/last.ckpt \
 		--model.init_args.latents_dir runs/box/flow/latents

@@ -43,6 +43,7 @@ STARTS = {  # each after the YAML of its stage, which test_stages starts alone
 BOX = {  # in the order given
     "box": ("data", "vae_alignment"),
     "box_more": ("data", "vae_alignment", "vae_more"),
+    "box_decoder": ("data", "vae_alignment", "vae_decoder"),
     "box_flow": ("data", "flow_matching"),
     "box_few_step": ("data", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),

@@ -30,12 +30,12 @@ class RangeData(TinyData):
             batch["range_image"] = self.codec.to_image(range_m)
 
 
-def range_module(modes, discriminator=None, **kwargs):
+def range_module(modes, discriminator=None, train_encoder=True, **kwargs):
     torch.manual_seed(0)
     vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes)
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings = {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
-    settings["discriminator"] = discriminator
+    settings |= {"discriminator": discriminator, "train_encoder": train_encoder}
     return STAGES["vae_alignment"](vae=vae, sit=tiny_sit(), **settings)
 
 
@@ -45,6 +45,16 @@ def test_ranges_and_returns_are_learned_without_discriminator(modes):
     assert set(module.parts[0]) == {"reconstruction", "returns", "kl"}
     for name in ("reconstruction", "returns"):
         assert module.parts[-1][name] < module.parts[0][name] - 0.01, name
+
+
+def test_a_decoder_is_trained_on_for_the_latents_of_a_fixed_encoder():
+    module = range_module(2, train_encoder=False)
+    before = {name: value.clone() for name, value in module.vae.state_dict().items()}
+    train(module, RangeData(2))
+    changed = {
+        n for n, value in module.vae.state_dict().items() if not torch.equal(value, before[n])
+    }
+    assert changed == {n for n in before if n.startswith(("decoder.", "post_quant_conv."))}
 
 
 @pytest.mark.parametrize("modes", [1, 2])

@@ -41,7 +41,7 @@ def test_two_modes_need_a_return_channel():
 
 def mixture(first, second, scale_1, scale_2, logit):
     raw = [math.log(math.expm1(math.log(scale) + 6)) - 6 for scale in (scale_1, scale_2)]
-    return RangeMixture(torch.tensor([first, second, *raw, logit]).view(1, 5, 1, 1))
+    return RangeMixture(torch.tensor([first, second, *raw, logit]).view(1, 5, 1, 1), math.exp(-6))
 
 
 def test_likelihood_of_a_mixture_by_hand():
@@ -54,6 +54,19 @@ def test_the_mode_of_the_higher_density_is_decoded_never_a_mean():
     assert mixture(-0.5, 0.5, 0.1, 0.1, 0.1).mode().item() == -0.5
     assert mixture(-0.5, 0.5, 0.1, 0.1, -0.1).mode().item() == 0.5
     assert mixture(-0.5, 0.5, 0.3, 0.1, 0.1).mode().item() == 0.5  # narrower
+
+
+def test_errors_below_the_least_scale_count_by_their_size():
+    prediction = torch.tensor([0.0, 0.0, -9.0, -9.0, 0.0, 1.0]).view(1, 6, 1, 1)
+    distribution = VAE(**STEM | {"least_scale": 0.1}).mixture_of(prediction)
+    torch.testing.assert_close(
+        distribution.log_scales.exp(), torch.full((1, 2, 1, 1), 0.1), rtol=1e-2, atol=0
+    )
+    errors = torch.tensor([0.0, 0.03, 0.06]).view(3, 1, 1, 1)
+    rises = distribution.nll(errors).flatten().diff()
+    torch.testing.assert_close(rises, torch.full((2,), 0.3), rtol=1e-2, atol=0)
+    with pytest.raises(ValueError, match="least_scale must be above 0, got 0"):
+        VAE(**STEM | {"least_scale": 0})
 
 
 @pytest.mark.parametrize(
@@ -82,7 +95,7 @@ def test_flying_pixels_move_to_the_nearer_surface(row, result):
 
 def test_decoding_leaves_few_flying_pixels_to_two_modes():
     prediction = torch.randn(2, 6, 16, 64, generator=torch.Generator().manual_seed(0))
-    chosen = RangeMixture(prediction).mode()
+    chosen = VAE(**STEM).mixture_of(prediction).mode()
     chosen = torch.cat([chosen, prediction[:, -1:]], dim=1)
     image = VAE(**STEM).image_of(prediction)
     assert not torch.equal(image, chosen)
@@ -108,7 +121,7 @@ def test_a_discriminator_sees_images_with_the_values_of_scans(modes):
 
 def test_likelihood_is_finite_for_any_output():
     outputs = torch.tensor([0.0, 0.0, -1e4, 1e4, 1e4]).view(1, 5, 1, 1).requires_grad_()
-    loss = RangeMixture(outputs).nll(torch.zeros(1, 1, 1, 1)).sum()
+    loss = RangeMixture(outputs, 0.01).nll(torch.zeros(1, 1, 1, 1)).sum()
     loss.backward()
     assert loss.isfinite()
     assert outputs.grad.isfinite().all()

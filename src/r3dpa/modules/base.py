@@ -28,7 +28,6 @@ from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeS
 from r3dpa.modules.stage import ScanStage
 from r3dpa.modules.steps import PathDraws, frozen
 from r3dpa.nn import EMA, VAE, LatentNorm, PatchDiscriminator, Posterior, SiT, VelocityNetwork
-from r3dpa.nn.vae import RangeMixture
 
 
 class GenerativeModule(ScanStage):
@@ -230,7 +229,7 @@ class GenerativeModule(ScanStage):
         """Losses ``(B,)`` of images of range and return: of ranges at returns, and of returns."""
         ranges, returns = image[:, :1], image[:, 1:] > 0
         if self.vae.modes == 2:
-            error = RangeMixture(prediction).nll(ranges)
+            error = self.vae.mixture_of(prediction).nll(ranges)
         else:
             error = losses.pixel_error(prediction[:, :1], ranges, self.weights.reconstruction_norm)
         return {

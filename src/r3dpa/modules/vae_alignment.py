@@ -26,6 +26,8 @@ class VAEAlignment(GenerativeModule):
         vae: Range-image autoencoder, trained from scratch.
         sit: Velocity network, frozen but for projector and input layer (patch embedding).
         discriminator: Patch discriminator; without it, no adversarial term.
+        train_encoder: False keeps the encoder, and with it the latents that a flow has learned,
+            while the decoder is trained on.
         train_patch_embed: Train the patch embedding (paper); False freezes it (official code).
         keep_projector: Keep the RGB model's projection head where its shape fits, as officially.
         **kwargs: See :class:`GenerativeModule`.
@@ -40,11 +42,14 @@ class VAEAlignment(GenerativeModule):
         vae: VAE,
         sit: VelocityNetwork,
         discriminator: PatchDiscriminator | None = None,
+        train_encoder: bool = True,
         train_patch_embed: bool = True,
         keep_projector: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(vae, sit, discriminator, keep_projector=keep_projector, **kwargs)
+        for part in (self.vae.encoder, self.vae.quant_conv):
+            part.requires_grad_(train_encoder)
         self.sit.requires_grad_(False)
         if self.weights.vae_alignment != 0:
             self.sit.projector.requires_grad_(True)

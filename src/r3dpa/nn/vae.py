@@ -27,7 +27,6 @@ from r3dpa.nn.layers import (
 )
 
 Size = tuple[int, int]
-_LEAST_LOG_SCALE = -6.0
 _FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
@@ -80,22 +79,24 @@ class Posterior:
 class RangeMixture:
     """Two Laplacians for the encoded range of each pixel, near and far at an edge.
 
-    The scales are at least ``exp(-6)``, some millimetres at 1 m in a ``log2`` image: without a
-    limit the likelihood of a flat wall has none.
+    Without a least scale the likelihood of a flat wall would have no limit. Errors smaller than it
+    count linearly instead of by their logarithm, so that large errors count more beside them.
 
     Source: Tosi et al., "SMD-Nets: stereo mixture density networks" (CVPR 2021).
 
     Args:
         outputs: ``(B, 5 or more, H, W)`` of a decoder: two centres, two logarithms of scales, and
             the logit of the first centre.
+        least_scale: Positive, in units of the encoded range.
     """
 
     num_outputs = 5
 
-    def __init__(self, outputs: Tensor) -> None:
+    def __init__(self, outputs: Tensor, least_scale: float) -> None:
         outputs = at_least_float32(outputs)
+        least = math.log(least_scale)
         self.centres = outputs[:, :2]
-        self.log_scales = F.softplus(outputs[:, 2:4] - _LEAST_LOG_SCALE) + _LEAST_LOG_SCALE
+        self.log_scales = F.softplus(outputs[:, 2:4] - least) + least
         logit = outputs[:, 4:5]
         self.log_weights = torch.cat([F.logsigmoid(logit), F.logsigmoid(-logit)], dim=1)
 
@@ -229,6 +230,8 @@ class VAE(Autoencoder):
         legacy_upsample: Interpolation of the official weights, see :class:`Upsample`.
         stem: Rows and columns of a block of pixels, which the strides come on top of.
         modes: 1 or, for images of two channels, 2.
+        least_scale: Of two modes, see :class:`RangeMixture`; the default is 0.5 % of the range in
+            a ``log2`` image.
     """
 
     def __init__(
@@ -243,7 +246,10 @@ class VAE(Autoencoder):
         legacy_upsample: bool = False,
         stem: Size = (1, 1),
         modes: Literal[1, 2] = 1,
+        least_scale: float = math.exp(-6),
     ) -> None:
+        if least_scale <= 0:
+            raise ValueError(f"least_scale must be above 0, got {least_scale}")
         if modes == 2 and in_channels != 2:
             raise ValueError(f"two modes need in_channels 2 (range and return), got {in_channels}")
         num_levels = len(channel_multipliers)
@@ -271,7 +277,11 @@ class VAE(Autoencoder):
             latent_channels,
             (math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)),
         )
-        self.modes = modes
+        self.modes, self.least_scale = modes, least_scale
+
+    def mixture_of(self, prediction: Tensor) -> RangeMixture:
+        """Distribution of the encoded ranges, of outputs of a decoder of two modes."""
+        return RangeMixture(prediction, self.least_scale)
 
     def image_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)``; of two modes, the one of the higher density.
@@ -280,7 +290,7 @@ class VAE(Autoencoder):
         """
         if self.modes == 1:
             return prediction
-        image = torch.cat([RangeMixture(prediction).mode(), prediction[:, -1:]], dim=1)
+        image = torch.cat([self.mixture_of(prediction).mode(), prediction[:, -1:]], dim=1)
         return without_flying_pixels(image)
 
     def scan_of(self, prediction: Tensor) -> Tensor:
