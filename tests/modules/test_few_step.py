@@ -4,13 +4,13 @@ from itertools import pairwise
 import pytest
 import torch
 from tiny_networks import SIT_ARGS, tiny_checkpoint
-from tiny_stages import QUIET, Observed, TinyData, stage_module, train
+from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny_sit, train
 
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
 from r3dpa.modules import FewStep
 from r3dpa.modules.steps import PathDraws
-from r3dpa.nn import SiT
+from r3dpa.nn import VAE, SiT, ThinDecoder
 
 pytestmark = QUIET
 
@@ -53,6 +53,16 @@ def test_steps_of_1_2_4_and_8_are_learned_equally_often():
         times = average_times(steps).float().tolist()
         expected.update(dict.fromkeys(pairwise(times), 8 // steps))
     assert asked == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "theirs"), [("latent_channels", 8, 4), ("least_scale", 0.5, 0.25)]
+)
+def test_a_thin_decoder_that_does_not_fit_the_vae_is_refused(name, own, theirs):
+    vae = VAE(**ARGUMENTS["vae"] | {"least_scale": 0.25})
+    thin = ThinDecoder(**ARGUMENTS["thin_decoder"] | {"least_scale": 0.25, name: own})
+    with pytest.raises(ValueError, match=f"{name} is {own}, but {theirs} of the VAE"):
+        FewStep(vae, tiny_sit(average_blocks=1), thin)
 
 
 def test_trajectories_have_the_precision_of_the_steps(tmp_path):

@@ -280,7 +280,7 @@ class VAE(Autoencoder):
         self.modes, self.least_scale = modes, least_scale
 
     def mixture_of(self, prediction: Tensor) -> RangeMixture:
-        """Distribution of the encoded ranges, of outputs of a decoder of two modes."""
+        """Distribution of the encoded ranges, of outputs ``(B, 6, H, W)`` for two modes."""
         return RangeMixture(prediction, self.least_scale)
 
     def image_of(self, prediction: Tensor) -> Tensor:
