@@ -35,6 +35,7 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
+from r3dpa.nn import VAE
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -62,6 +63,25 @@ def test_a_scene_does_not_depend_on_its_batch(sampler):
         torch.testing.assert_close(range_m, whole.range_m, atol=1e-3, rtol=0)
     shuffled = scenes.generate([5, 2], seed=3)
     torch.testing.assert_close(shuffled.latents, whole.latents[[5, 2]], atol=1e-5, rtol=0)
+
+
+def test_single_returns_of_a_scene_are_dropped_by_its_number_and_seed():
+    codec = RangeCodec("log2", return_channel=True)
+    geometry = ScanGeometry(SphericalProjection(SENSOR), codec, (2, 8))
+    _, sit, norm = tiny_networks()
+    vae = VAE(**VAE_ARGS | {"in_channels": 2})
+    with torch.no_grad():
+        vae.decoder.conv_out.weight[1] = 0.0
+        vae.decoder.conv_out.bias[:] = torch.tensor([0.0, 2.0])  # returns are kept 88 % of the time
+    scenes = SceneGenerator(vae, sit, norm, geometry, ODE)
+    found = scenes.generate([0, 1], seed=3)
+    whole = scenes.decode(found.latents)
+    holes = (whole > 0) & (found.range_m < 0)
+    assert holes.float().mean().item() == pytest.approx(0.12, abs=0.03)
+    assert torch.equal(found.range_m, torch.where(holes, -1.0, whole))
+    assert not torch.equal(holes[0], holes[1])
+    assert torch.equal(scenes.generate([1], seed=3).range_m < 0, found.range_m[1:] < 0)
+    assert not torch.equal(scenes.generate([1], seed=4).range_m < 0, found.range_m[1:] < 0)
 
 
 def test_global_random_state_is_neither_read_nor_moved():

@@ -16,7 +16,7 @@ from torch import Tensor
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
 from r3dpa.flow.autoguidance import autoguided, renormalised
 from r3dpa.flow.interpolant import Interpolant
-from r3dpa.flow.noise import scene_noise
+from r3dpa.flow.noise import scene_noise, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
 from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
@@ -269,20 +269,29 @@ class SceneGenerator:
             filled(x, size).to(self.device) for x in scene_noise(self.latent_shape, indices, seed)
         )
         latents = self._solve(next(draws), draws)[: len(indices)]
-        range_m = self.decode(latents)
+        sensor = self.geometry.projection.sensor
+        uniform = scene_uniform((sensor.beams, sensor.columns), indices, seed)
+        range_m = self.decode(latents, uniform.to(self.device))
         nfe = sum(network.calls for network in self._networks)
         return SceneBatch(range_m, latents, nfe, self.geometry.projection)
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> Tensor:
-        """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents."""
+    def decode(self, latents: Tensor, uniform: Tensor | None = None) -> Tensor:
+        """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents.
+
+        With numbers ``uniform`` ``(B, H, W)`` in [0, 1), single returns are dropped at random where
+        images have a return channel, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
+        """
         size = self.batch_size or len(latents)
         sensor = self.geometry.projection.sensor
-        parts = []
-        for part in self.latent_norm.denormalise(latents).split(size):
-            image = self._decode(filled(part, size))[: len(part)]
-            range_m = self.geometry.codec.ranges_of(image.float(), sensor)
+        codec, parts = self.geometry.codec, []
+        for first in range(0, len(latents), size):
+            part = self.latent_norm.denormalise(latents[first : first + size])
+            image = self._decode(filled(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
+            if uniform is not None and codec.return_channel:
+                image = codec.drop_returns(image, uniform[first : first + size])
+            range_m = codec.ranges_of(image, sensor)
             parts.append(torch.where(finite[:, None, None], range_m, torch.nan))
         return torch.cat(parts)
 

@@ -16,7 +16,12 @@ def scene_noise(shape: tuple[int, int, int], indices: Sequence[int], seed: int) 
         yield torch.stack([torch.randn(shape, generator=g) for g in generators])
 
 
-def scene_random(seed: int, index: int) -> torch.Generator:
-    """Random numbers of a scene, on the CPU; its noise comes first."""
-    key = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
+def scene_uniform(shape: tuple[int, int], indices: Sequence[int], seed: int) -> Tensor:
+    """Numbers ``(B, H, W)`` in [0, 1) for the pixels of scenes, on the CPU; not of the noise."""
+    return torch.stack([torch.rand(shape, generator=scene_random(seed, i, 1)) for i in indices])
+
+
+def scene_random(seed: int, index: int, *stream: int) -> torch.Generator:
+    """Random numbers of a scene, on the CPU; those without a stream are of its noise."""
+    key = np.random.SeedSequence([seed, index, *stream]).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(key[0]) >> 1)

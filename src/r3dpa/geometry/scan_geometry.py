@@ -14,6 +14,7 @@ from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
 _ROUNDING_M = 1e-3
+_LIKELY_RETURN = 0.7
 _DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
 _LOG_OFFSET_M = 1e-4
 _LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
@@ -152,6 +153,21 @@ class RangeCodec:
         if self.return_channel:
             return image[..., 1:, :, :] > 0
         return self.valid_mask(image[..., :1, :, :] if self.reflectance else image)
+
+    def drop_returns(self, image: Tensor, uniform: Tensor) -> Tensor:
+        """Images with single returns dropped at random, as often as a decoder expects.
+
+        Sensors lose single shots; no latent tells which, so the most likely image has no such
+        holes. Only pixels that are likely to have a return are drawn: drawn for each pixel alone,
+        borders of large holes would fray.
+
+        Args:
+            image: ``(..., 2, H, W)``, whose second channel is the logit of a return.
+            uniform: ``(..., H, W)`` in [0, 1).
+        """
+        returns = image[..., 1, :, :].sigmoid()
+        dropped = (returns > _LIKELY_RETURN) & (uniform > returns)
+        return image.masked_fill(dropped.unsqueeze(-3), -1.0)
 
     def informative(self, image: Tensor) -> Tensor:
         """Values, bool ``(..., C, H, W)``, that a decoder has to match: no range without return."""
