@@ -157,9 +157,9 @@ class RangeCodec:
     def drop_returns(self, image: Tensor, uniform: Tensor) -> Tensor:
         """Images with single returns dropped at random, as often as a decoder expects.
 
-        Sensors lose single shots; no latent tells which, so the most likely image has no such
-        holes. Only pixels that are likely to have a return are drawn: drawn for each pixel alone,
-        borders of large holes would fray.
+        Sensors lose single shots. Latents do not tell which, so the most likely image has no such
+        holes. Only pixels with a likely return are drawn, since independent draws would fray the
+        borders of large holes.
 
         Args:
             image: ``(..., 2, H, W)``, whose second channel is the logit of a return.
