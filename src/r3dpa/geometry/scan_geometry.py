@@ -155,7 +155,7 @@ class RangeCodec:
         return self.valid_mask(image[..., :1, :, :] if self.reflectance else image)
 
     def drop_returns(self, image: Tensor, uniform: Tensor) -> Tensor:
-        """Images of the same shape, single returns dropped at random, as often as a decoder expects.
+        """Images of that shape with single returns dropped, as often as a decoder expects.
 
         Sensors lose single shots. Latents do not tell which, so the most likely image has no such
         holes. Only pixels with a likely return are drawn, since independent draws would fray the
