@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_networks import tiny_checkpoint, tiny_networks
+from tiny_networks import VAE_ARGS, tiny_checkpoint, tiny_networks
 
 from r3dpa.editing import EditSettings, SceneEditor
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
 from r3dpa.geometry.regions import angle_box, dropped_beams, sector_weights, token_mask
+from r3dpa.nn import VAE
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -113,6 +114,31 @@ def test_a_scene_does_not_depend_on_its_batch(generator, scan):
         several, single = edit(together, [0, 2]), edit(alone, [2])
         torch.testing.assert_close(several.latents[1:], single.latents, atol=rounding, rtol=0)
         assert not several.latents[0].allclose(several.latents[1], atol=1e-1)
+
+
+def test_scenes_made_anew_lose_single_returns_by_number_and_seed(scan):
+    """88 % of the returns are kept by a decoder that gives each the logit 2."""
+    codec = RangeCodec("log2", return_channel=True)
+    _, sit, norm = tiny_networks(spread=0.05)
+    vae = VAE(**VAE_ARGS | {"in_channels": 2})
+    with torch.no_grad():
+        vae.decoder.conv_out.weight.zero_()
+        vae.decoder.conv_out.bias[:] = torch.tensor([0.0, 2.0])
+    geometry = ScanGeometry(GEOMETRY.projection, codec, GEOMETRY.grid_size)
+    generator, few = SceneGenerator(vae, sit, norm, geometry), EditSettings(steps=2)
+    together = SceneEditor(generator, few, batch_size=2)
+    alone = SceneEditor(generator, few, batch_size=1)
+    grids, weights = [torch.ones(16, 8)] * 2, sector_weights([(0, 0), (180, 1)], (2, 8))
+    for edit in (
+        lambda by, indices, seed: by.inpaint(scan, MASK, indices, seed),
+        lambda by, indices, seed: by.vary(scan, indices, seed),
+        lambda by, indices, seed: by.mix(grids, weights, indices, seed),
+    ):
+        holes = edit(together, [0, 2, 3], 5).range_m[:, MASK] < 0
+        assert holes.float().mean().item() == pytest.approx(0.12, abs=0.05)
+        assert not holes[0].equal(holes[1])
+        assert (edit(alone, [2, 3], 5).range_m[:, MASK] < 0).equal(holes[1:])
+        assert not (edit(alone, [2], 6).range_m[0, MASK] < 0).equal(holes[1])
 
 
 class TestMix:

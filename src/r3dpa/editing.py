@@ -186,7 +186,7 @@ class SceneEditor:
             return self._solve(velocity, state, times, kept(own, edited)), guidance
 
         made, cosine = self._each(indices, seed, solve)
-        pasted = torch.where(pixel_mask, self._decoded(made), range_m)
+        pasted = torch.where(pixel_mask, self._decoded(made, indices, seed), range_m)
         errors = self._errors(range_m[None], latents, trajectory)
         return self._result(pasted, made, 2 * self._nfe, *errors, cosine)
 
@@ -216,7 +216,7 @@ class SceneEditor:
             return self._solve(guidance, noise, times), guidance
 
         made, cosine = self._each(indices, seed, solve)
-        return self._result(self._decoded(made), made, self._nfe, cosine=cosine)
+        return self._result(self._decoded(made, indices, seed), made, self._nfe, cosine=cosine)
 
     @torch.no_grad()
     def complete(
@@ -302,7 +302,7 @@ class SceneEditor:
 
         made, _ = self._each(indices, seed, solve)
         error = self._errors(range_m[None], latents, None)[0]
-        return self._result(self._decoded(made), made, self._nfe, error)
+        return self._result(self._decoded(made, indices, seed), made, self._nfe, error)
 
     @torch.no_grad()
     def interpolate(self, first_m: Tensor, second_m: Tensor, frames: int) -> EditResult:
@@ -389,9 +389,15 @@ class SceneEditor:
                 cosines.append(-guidance.energy(made, batch_time(0.0, made)).cpu())
         return torch.cat(parts), torch.cat(cosines) if cosines else None
 
-    def _decoded(self, latents: Tensor) -> Tensor:
-        """Range images ``(B, H, W)`` on the CPU."""
-        parts = [self.generator.decode(part).cpu() for part in latents.split(self.batch_size)]
+    def _decoded(
+        self, latents: Tensor, indices: int | Sequence[int] | None = None, seed: int = 0
+    ) -> Tensor:
+        """Range images ``(B, H, W)`` on the CPU; numbered scenes lose single returns."""
+        numbers, size = None if indices is None else scene_indices(indices), self.batch_size
+        parts = []
+        for first in range(0, len(latents), size):
+            own = None if numbers is None else numbers[first : first + size]
+            parts.append(self.generator.decode(latents[first : first + size], own, seed).cpu())
         return torch.cat(parts)
 
     def _fitted(self, latents: Tensor, image: Tensor, known: Tensor) -> Tensor:

@@ -269,18 +269,18 @@ class SceneGenerator:
             filled(x, size).to(self.device) for x in scene_noise(self.latent_shape, indices, seed)
         )
         latents = self._solve(next(draws), draws)[: len(indices)]
-        sensor = self.geometry.projection.sensor
-        uniform = scene_uniform((sensor.beams, sensor.columns), indices, seed)
-        range_m = self.decode(latents, uniform.to(self.device))
+        range_m = self.decode(latents, indices, seed)
         nfe = sum(network.calls for network in self._networks)
         return SceneBatch(range_m, latents, nfe, self.geometry.projection)
 
     @torch.no_grad()
-    def decode(self, latents: Tensor, uniform: Tensor | None = None) -> Tensor:
+    def decode(
+        self, latents: Tensor, indices: Sequence[int] | None = None, seed: int = 0
+    ) -> Tensor:
         """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents.
 
-        With numbers ``uniform`` ``(B, H, W)`` in [0, 1), single returns are dropped at random where
-        images have a return channel, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
+        Where images have a return channel, scenes with numbers ``indices`` of the collection
+        ``seed`` lose single returns at random, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
         """
         size = self.batch_size or len(latents)
         sensor = self.geometry.projection.sensor
@@ -289,8 +289,9 @@ class SceneGenerator:
             part = self.latent_norm.denormalise(latents[first : first + size])
             image = self._decode(filled(part, size))[: len(part)].float()
             finite = image.flatten(1).isfinite().all(dim=1)
-            if uniform is not None and codec.return_channel:
-                image = codec.drop_returns(image, uniform[first : first + size])
+            if indices is not None and codec.return_channel:
+                uniform = scene_uniform(image.shape[2:], indices[first : first + size], seed)
+                image = codec.drop_returns(image, uniform.to(image.device))
             range_m = codec.ranges_of(image, sensor)
             parts.append(torch.where(finite[:, None, None], range_m, torch.nan))
         return torch.cat(parts)

@@ -16,7 +16,7 @@ def scene_noise(shape: tuple[int, int, int], indices: Sequence[int], seed: int) 
         yield torch.stack([torch.randn(shape, generator=g) for g in generators])
 
 
-def scene_uniform(shape: tuple[int, int], indices: Sequence[int], seed: int) -> Tensor:
+def scene_uniform(shape: Sequence[int], indices: Sequence[int], seed: int) -> Tensor:
     """Numbers ``(B, H, W)`` in [0, 1) for the pixels of scenes, on the CPU; not of the noise."""
     return torch.stack([torch.rand(shape, generator=scene_random(seed, i, 1)) for i in indices])
 
