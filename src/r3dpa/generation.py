@@ -120,23 +120,18 @@ class SceneGenerator:
         if compile and batch_size is None:
             raise ValueError("compiled networks have one shape: give SceneGenerator a batch_size")
         _check_average(sampler, sit, autoguidance)
-        self.vae = vae.eval()
-        self.sit = sit.eval()
+        self.vae, self.sit = vae.eval(), sit.eval()
         weak = None if autoguidance is None else autoguidance.weak.eval()
         if precision == "bf16":
             self.vae = copy.deepcopy(vae).halve_decoder_()
             self.sit = copy.deepcopy(sit).halve_()
             weak = copy.deepcopy(weak).halve_() if weak is not None else None
         if self.device.type == "cuda":  # its half-precision kernels expect this layout
-            self.vae = copy.deepcopy(self.vae).to(  # type: ignore[call-overload]
-                memory_format=torch.channels_last
-            )
-        self.latent_norm = latent_norm.eval()
-        self.geometry = geometry
-        self.sampler = sampler
-        self.interpolant = Interpolant(path)
-        self.precision = precision
-        self.batch_size = batch_size
+            self.vae = copy.deepcopy(self.vae)
+            self.vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.latent_norm, self.geometry = latent_norm.eval(), geometry
+        self.sampler, self.interpolant = sampler, Interpolant(path)
+        self.precision, self.batch_size = precision, batch_size
         graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
         self._strong = _ScheduledNetwork(self.sit, compile, graphs)
         self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
@@ -169,10 +164,8 @@ class SceneGenerator:
             decoder: That of the VAE or the thin one of stage few_step; default: thin for the
                 quality ``instant`` where the checkpoint has one, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-            precision: As for the constructor, like all other arguments.
-            autoguidance: Weak model, on the same device.
-            batch_size: See the constructor.
-            compile: See the constructor.
+            precision, autoguidance, batch_size, compile: As for the constructor; the weak model is
+                on the same device.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -265,9 +258,8 @@ class SceneGenerator:
         self.prepare()
         for network in self._networks:
             network.calls = 0
-        draws = (
-            filled(x, size).to(self.device) for x in scene_noise(self.latent_shape, indices, seed)
-        )
+        noise = scene_noise(self.latent_shape, indices, seed)
+        draws = (filled(x, size).to(self.device) for x in noise)
         latents = self._solve(next(draws), draws)[: len(indices)]
         range_m = self.decode(latents, indices, seed)
         nfe = sum(network.calls for network in self._networks)
@@ -316,9 +308,8 @@ class SceneGenerator:
         guidance = self._autoguidance
         if guidance is None or self._weak is None:
             return self._strong
-        weak = renormalised(
-            self._weak, guidance.latent_scale, guidance.latent_shift, self.interpolant
-        )
+        scale, shift = guidance.latent_scale, guidance.latent_shift
+        weak = renormalised(self._weak, scale, shift, self.interpolant)
         return autoguided(self._strong, weak, guidance.scale, guidance.interval)
 
 
@@ -349,9 +340,8 @@ class SceneVAE:
         checkpoint = _opened(checkpoint)
         vae = checkpoint.network("vae").build().to(usable_device(device))
         if not isinstance(vae, VAE):
-            raise ValueError(
-                f"{checkpoint.path} holds a {type(vae).__name__} for a range-image VAE"
-            )
+            kind = type(vae).__name__
+            raise ValueError(f"{checkpoint.path} holds a {kind} for a range-image VAE")
         return cls(vae, _geometry_of(checkpoint))
 
     from_pretrained = from_checkpoint  # names of `r3dpa models`
