@@ -164,8 +164,10 @@ class SceneGenerator:
             decoder: That of the VAE or the thin one of stage few_step; default: thin for the
                 quality ``instant`` where the checkpoint has one, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-            precision, autoguidance, batch_size, compile: As for the constructor; the weak model is
-                on the same device.
+            precision: As for the constructor, like all other arguments.
+            autoguidance: Weak model, on the same device.
+            batch_size: See the constructor.
+            compile: See the constructor.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -261,9 +263,8 @@ class SceneGenerator:
         noise = scene_noise(self.latent_shape, indices, seed)
         draws = (filled(x, size).to(self.device) for x in noise)
         latents = self._solve(next(draws), draws)[: len(indices)]
-        range_m = self.decode(latents, indices, seed)
-        nfe = sum(network.calls for network in self._networks)
-        return SceneBatch(range_m, latents, nfe, self.geometry.projection)
+        nfe, projection = sum(one.calls for one in self._networks), self.geometry.projection
+        return SceneBatch(self.decode(latents, indices, seed), latents, nfe, projection)
 
     @torch.no_grad()
     def decode(
@@ -275,8 +276,7 @@ class SceneGenerator:
         ``seed`` lose single returns at random, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
         """
         size = self.batch_size or len(latents)
-        sensor = self.geometry.projection.sensor
-        codec, parts = self.geometry.codec, []
+        sensor, codec, parts = self.geometry.projection.sensor, self.geometry.codec, []
         for first in range(0, len(latents), size):
             part = self.latent_norm.denormalise(latents[first : first + size])
             image = self._decode(filled(part, size))[: len(part)].float()
