@@ -1,4 +1,4 @@
-"""``r3dpa simulate``, ``check``, ``view``, ``objects`` and ``realism``."""
+"""``r3dpa data simulate``, ``check``, ``view``, ``objects`` and ``realism``."""
 
 import json
 import math
@@ -83,7 +83,7 @@ class TestSimulate:
 
 
 def check(root, capsys):
-    """Exit status, and lines, of ``r3dpa check``."""
+    """Exit status, and lines, of ``r3dpa data check``."""
     capsys.readouterr()
     status = 0
     try:

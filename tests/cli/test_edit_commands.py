@@ -1,4 +1,4 @@
-"""``r3dpa inpaint`` and its like: files they write, and what they refuse before networks run."""
+"""``r3dpa edit``: files that its commands write, and what they refuse before networks run."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""``r3dpa features`` from the outside: forms of the command, refusals, several processes.
+"""``r3dpa data features`` from the outside: forms of the command, refusals, several processes.
 
 Interrupts and kills are in tests/faults.
 """

@@ -141,7 +141,7 @@ def refused(made, projection, extractor, words):
     ):
         with pytest.raises(StoreError) as caught:
             attempt()
-        for word in [*words, "features_dir", "r3dpa features --data"]:
+        for word in [*words, "features_dir", "r3dpa data features --data"]:
             assert word in str(caught.value)
 
 
@@ -168,7 +168,7 @@ def test_other_grid_size_is_named_by_the_reader(made, projection, scaled_points)
     write_feature_grids(scans, scaled_points(), projection, [(1, 1)], root)
     with pytest.raises(StoreError) as caught:
         FeatureGrids(root, scans, projection, (4, 4))
-    for words in ("grid_size [1, 1], [2, 4]", "grid_size [4, 4]", "r3dpa features --data"):
+    for words in ("grid_size [1, 1], [2, 4]", "grid_size [4, 4]", "r3dpa data features --data"):
         assert words in str(caught.value)
 
 
@@ -196,7 +196,7 @@ def test_an_error_keeps_what_was_made(tmp_path, made, projection, scaled_points,
     with pytest.raises(error, match=reason):
         write_feature_grids(scans, extractor, projection, [GRID], root)
     FeatureGrids(root, scans[:4], projection, GRID)
-    with pytest.raises(StoreError, match=r"No feature grids of .*\.bin.*r3dpa features"):
+    with pytest.raises(StoreError, match=r"No feature grids of .*\.bin.*r3dpa data features"):
         FeatureGrids(root, scans, projection, GRID)
     scans[4].path.write_bytes(data)
     assert write_feature_grids(scans, scaled_points(), projection, [GRID], root) == 1
@@ -258,7 +258,7 @@ def test_damaged_settings_are_named(made, projection, text):
     scans, root = made
     path = root / "2x4/settings.json"
     path.write_text(text or path.read_text().replace("4", "8"))
-    with pytest.raises(StoreError, match=r"2x4/settings\.json is damaged .*r3dpa features"):
+    with pytest.raises(StoreError, match=r"2x4/settings\.json is damaged .*r3dpa data features"):
         FeatureGrids(root, scans, projection, GRID)
 
 
@@ -269,11 +269,11 @@ def test_other_settings_are_refused_when_writing(made, projection, scaled_points
     def planned(scans, size=GRID, precision="bf16-mixed"):
         return len(plan(scans, scaled_points(), projection, [size], root, precision).missing)
 
-    words = "precision 32-true, but precision bf16-mixed.*features_dir .*r3dpa features"
+    words = "precision 32-true, but precision bf16-mixed.*features_dir .*r3dpa data features"
     with pytest.raises(StoreError, match=words):
         planned([*scans, new])
     assert planned(scans) == 0  # complete grids serve any precision
     assert planned(scans, (4, 4)) == 5  # another size may be made otherwise
     assert any_settings(root).extractor["name"] == "scaled"
-    with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa features"):
+    with pytest.raises(StoreError, match=r"No feature grids in .*r3dpa data features"):
         any_settings(root / "nothing")

@@ -243,7 +243,7 @@ def test_missing_folders_are_named(tmp_path, make_scans):
     (raw / drives[-2]).mkdir()
     missing = (raw / drives[-2] / "velodyne_points/data", raw / drives[-1])
     assert problems(tmp_path) == [f"missing: {folder}" for folder in missing]
-    with pytest.raises(ValueError, match="r3dpa check"):
+    with pytest.raises(ValueError, match="r3dpa data check"):
         kitti360_scans(tmp_path / "none", "train")
 
 

@@ -1,4 +1,4 @@
-"""The page of ``r3dpa view``: what it holds, and its script run in node."""
+"""The page of ``r3dpa data view``: what it holds, and its script run in node."""
 
 import base64
 import html

@@ -87,7 +87,7 @@ class Table(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Tables to be made in a folder at a scale, and options of ``r3dpa reference``."""
+    """Tables to be made in a folder at a scale, and options of ``r3dpa data reference``."""
 
     out: Path
     scale: str

@@ -54,9 +54,9 @@ class SceneScorer(L.Callback):
         sampler: Solver and steps.
         precision: Of the networks that sample.
         seed: Of the scenes, see :class:`SceneGenerator`.
-        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``. Without it,
-            all scans of the data module are the reference, training and held-out; their statistics
-            are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
+        reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``. Without
+            it, all scans of the data module are the reference, training and held-out; their
+            statistics are computed once and kept in ``<run_dir>/evaluation/reference.safetensors``.
         split: Of ``data_statistics.npy`` alone; ``val`` where it holds both and none is given.
         spaces: Feature spaces; where None, those that need no file or have one in ``ckpt``.
         ckpt: Official weights by space.
@@ -108,7 +108,7 @@ class SceneScorer(L.Callback):
             if not isinstance(datamodule, LidarDataModule) or not hasattr(datamodule, "all_set"):
                 raise ValueError(
                     f"scorer.reference: {type(datamodule).__name__} does not list its scans: give "
-                    "a file of `r3dpa reference`, or --scorer.num_scenes 0 to score no scenes"
+                    "a file of `r3dpa data reference`, or --scorer.num_scenes 0 to score no scenes"
                 )
             scans = datamodule.all_set.scans
             setting = replace(PROTOCOLS[self.protocol or "default"], sensor=datamodule.sensor)

@@ -73,7 +73,7 @@ def view(source: Path, *, out: Path | None = None, num: PositiveInt = 8) -> str:
     paths = [
         viz.save(strips, out / "range_images.png"),
         viz.save(viz.birds_eye_sheet(drawn), out / "birds_eye.png"),
-        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa view"),
+        write_page(out / "view.html", scans, f"{resolved.name} - r3dpa data view"),
     ]
     line = f"{len(scans)} of {len(readers)} scans in {source}"
     return "\n".join([line, *map(str, paths), "open the .html file in a browser"])
@@ -91,7 +91,7 @@ def objects(
     """Write the mean feature of each class of labelled scans, for ``r3dpa edit inpaint``.
 
     Args:
-        data: Folder, file or glob of scans with labels beside them: of ``r3dpa simulate``,
+        data: Folder, file or glob of scans with labels beside them: of ``r3dpa data simulate``,
             KITTI-360 or SemanticKITTI.
         ckpt: Checkpoint of the model that the objects are for; gives feature source, its width,
             sensor and grid.

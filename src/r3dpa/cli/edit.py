@@ -55,7 +55,9 @@ def inpaint(
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
     if (objects is None) != (object is None):
-        raise ValueError("--objects FILE and --object NAME go together; `r3dpa objects` writes one")
+        raise ValueError(
+            "--objects FILE and --object NAME go together; `r3dpa data objects` writes one"
+        )
     if objects is None and (strength, window) != (None, None):
         raise ValueError("--strength and --window need --object")
     session = EditSession(EditOptions(**options), num, strength, window)

@@ -152,7 +152,7 @@ class EditSession:
         return check_mask(read_mask(path, self.sensor), str(path))
 
     def feature_grids(self, scans: Iterable[ScanView], ckpt: Path | None) -> list[Tensor]:
-        """Feature grid ``(N, F)`` of each scan, as ``r3dpa features`` writes them."""
+        """Feature grid ``(N, F)`` of each scan, as ``r3dpa data features`` writes them."""
         source = feature_source_of(self.checkpoint)
         extractor: Any = feature_source(source, ckpt, self.sit.feature_dim).to(self.device)
         grids = []

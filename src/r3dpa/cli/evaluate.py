@@ -91,7 +91,7 @@ def evaluate(
     Args:
         samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
             or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
-        reference: File of ``r3dpa reference``, or R3DPA's own ``data_statistics.npy``.
+        reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``.
         spaces: Feature spaces; default: those of the reference that need no file or have one in
             ``ckpt``.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.

@@ -37,7 +37,7 @@ _SCALR_DIM = 768  # width of the published feature grids
 _SCANS_TO_FIT = 8  # scans that the ring inclinations are measured in
 _EMPTY_SPLIT = (
     "all scans are of the other split. Look at val_every and val_drives, or, in the KITTI-360 "
-    "layout, for missing drives with `r3dpa check`."
+    "layout, for missing drives with `r3dpa data check`."
 )
 
 

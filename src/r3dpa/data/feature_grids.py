@@ -26,7 +26,7 @@ from r3dpa.data.store import CachedTensors, Store, StoreError, writing
 from r3dpa.geometry import Projection, pool_cells, projection_to_dict
 from r3dpa.io import only_writer
 
-REMEDY = "with `r3dpa features --data <data YAML or folder>`"
+REMEDY = "with `r3dpa data features --data <data YAML or folder>`"
 
 
 class Extractor(Protocol):

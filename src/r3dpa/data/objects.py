@@ -57,7 +57,7 @@ _SEMANTIC_KITTI = {0: 0, 1: 0} | {
 def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
     """Class and object of each of the P points of a ``.bin`` scan, from the file beside it.
 
-    ``velodyne_points/labels/F.label`` of KITTI-360, as ``r3dpa simulate`` writes them, for
+    ``velodyne_points/labels/F.label`` of KITTI-360, as ``r3dpa data simulate`` writes them, for
     ``velodyne_points/data/F.bin``; ``labels/F.label`` of SemanticKITTI for ``velodyne/F.bin``.
 
     Returns:
@@ -73,7 +73,7 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
         return _semantic_kitti(path, num_points)
     raise ScanError(
         f"{scan} has no labels: looked for labels/{scan.stem}.label beside its folder, "
-        "velodyne_points/data as KITTI-360 and `r3dpa simulate` have it, or velodyne as "
+        "velodyne_points/data as KITTI-360 and `r3dpa data simulate` have it, or velodyne as "
         "SemanticKITTI"
     )
 

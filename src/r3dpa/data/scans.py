@@ -112,8 +112,8 @@ def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
     }
     if not any(scans.values()):
         raise ValueError(
-            f"No scan of the {split} split in {root}, nor of the other one: `r3dpa check {root}` "
-            "names what is missing; use LidarDataModule for scans in other folders."
+            f"No scan of the {split} split in {root}, nor of the other one: `r3dpa data check "
+            f"{root}` names what is missing; use LidarDataModule for scans in other folders."
         )
     return sorted(scans[split])
 

@@ -57,7 +57,8 @@ def check_view(
                 f"the scan fills {share:.0%} of the {int(required.sum())} {name} that the "
                 f"checkpoint was trained on ({sensor.beams} x {sensor.columns} pixels, "
                 f"{lowest:.1f} to {highest:.1f} degrees above the horizon): it is of another "
-                "sensor, a part of a scan, which `r3dpa complete` fills, or not in its own frame"
+                "sensor, a part of a scan, which `r3dpa edit complete` fills, or not in its own "
+                "frame"
             )
     above = returns[:-1] & expected[1:]
     dense = returns[1:][above].double().mean().item()

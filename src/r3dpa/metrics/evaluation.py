@@ -242,7 +242,7 @@ def reference_spaces(
     if protocol not in (None, given):
         raise ValueError(
             f"the reference is of the protocol {given}, not {protocol}: compute another one "
-            f"with `r3dpa reference --protocol {protocol}`, or ask for no protocol"
+            f"with `r3dpa data reference --protocol {protocol}`, or ask for no protocol"
         )
     if names is None:
         names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
@@ -322,7 +322,7 @@ def _other_sensor(match: MinimumMatchingDistance) -> str:
         return ""
     return (
         f"{made:,} returns in a scene (median), but {real:,} in a real scan: scenes of another "
-        "sensor need a reference for it, `r3dpa reference --data` with a YAML of that sensor"
+        "sensor need a reference for it, `r3dpa data reference --data` with a YAML of that sensor"
     )
 
 

@@ -199,7 +199,7 @@ class ReferenceStatistics:
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
                 f"{path} holds no reference statistics ({first_line(error)}): give the "
-                "file that `r3dpa reference` wrote"
+                "file that `r3dpa data reference` wrote"
             ) from error
         return reference
 
