@@ -35,7 +35,7 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.nn import VAE
+from r3dpa.nn import VAE, SiT
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
@@ -203,6 +203,50 @@ def test_autoguidance_is_the_written_out_formula():
     half_way = Autoguidance(weak, 2.0, (0.0, 0.5))
     scenes = SceneGenerator(*tiny_networks(), GEOMETRY, sampler, autoguidance=half_way)
     assert scenes.generate([0]).nfe == 6 + 3  # of the times 1, 5/6, ..., 1/6
+
+
+def guided_networks(**sit_args):
+    vae, sit, norm = tiny_networks()
+    guided = SiT(**SIT_ARGS, **sit_args)
+    guided.load_state_dict(sit.state_dict())
+    return vae, guided.eval(), norm
+
+
+def test_scenes_are_guided_away_from_the_network_without_one_attention_map():
+    sampler, networks = SamplerConfig("ab2", 6), guided_networks(guidance_block=1)
+    sit = networks[1]
+    found = SceneGenerator(*networks, GEOMETRY, sampler, guidance_scale=1.5).generate([0, 1])
+    assert found.nfe == 12
+    start = torch.stack([torch.randn(LATENT_SHAPE, generator=scene_random(0, i)) for i in (0, 1)])
+
+    def guided(x, time):
+        strong, weak = sit.velocity_pair_at(x, sit.modulations(time[:1]))
+        return 1.5 * strong - 0.5 * weak
+
+    with torch.no_grad():
+        expected = ode_solver("ab2")(guided, start, ode_times(6))
+    torch.testing.assert_close(found.latents, expected, atol=1e-5, rtol=0)
+
+
+def test_the_scale_of_the_network_is_the_default():
+    networks = guided_networks(guidance_block=1, guidance_scale=1.5)
+    plain, guided = (
+        SceneGenerator(*networks, GEOMETRY, ODE, guidance_scale=scale).generate([0])
+        for scale in (1.0, 1.5)
+    )
+    found = SceneGenerator(*networks, GEOMETRY, ODE).generate([0])
+    assert torch.equal(found.latents, guided.latents)
+    assert torch.equal(plain.latents, generator(ODE).generate([0]).latents)
+    assert not torch.allclose(plain.latents, guided.latents, atol=1e-3)
+    auto = Autoguidance(tiny_networks()[1], 1.0)  # replaces it
+    found = SceneGenerator(*networks, GEOMETRY, ODE, autoguidance=auto).generate([0])
+    assert torch.equal(found.latents, plain.latents)
+
+
+@pytest.mark.parametrize("scale", [0.5, float("nan"), float("inf")])
+def test_a_scale_of_guidance_below_one_is_refused(scale):
+    with pytest.raises(ValueError, match="scale of guidance must be a number of 1 or more"):
+        SceneGenerator(*guided_networks(guidance_block=1), GEOMETRY, ODE, guidance_scale=scale)
 
 
 @pytest.mark.slow

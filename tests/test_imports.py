@@ -25,6 +25,7 @@ ALLOWED = {
     "pretrained": set(),
     "checkpoints": {"nn", "pretrained"},
     "generation": {"geometry", "nn", "flow", "checkpoints"},
+    "scene_vae": {"geometry", "nn", "generation", "checkpoints"},
     "editing": {"geometry", "nn", "flow", "generation", "checkpoints"},
     "modules": CORE | {"data", "checkpoints", "generation", "editing"},
     "baselines": METHOD,

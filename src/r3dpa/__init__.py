@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from r3dpa.editing import SceneEditor
-    from r3dpa.generation import SceneGenerator, SceneVAE
+    from r3dpa.generation import SceneGenerator
+    from r3dpa.scene_vae import SceneVAE
     from r3dpa.simulation import Simulator
 
 __version__ = "0.1.0"
@@ -14,7 +15,7 @@ __all__ = ["SceneEditor", "SceneGenerator", "SceneVAE", "Simulator", "__version_
 _MODULES = {
     "SceneEditor": "r3dpa.editing",
     "SceneGenerator": "r3dpa.generation",
-    "SceneVAE": "r3dpa.generation",
+    "SceneVAE": "r3dpa.scene_vae",
     "Simulator": "r3dpa.simulation",
 }
 

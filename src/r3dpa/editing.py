@@ -89,8 +89,9 @@ class SceneEditor:
     """Edits scans with the networks of a generator.
 
     The random numbers of a scene are a function of (seed, index) alone, as in the generator. The
-    solver of the generator is not used. Where images have a return channel, inpainted parts,
-    mixtures and variations lose single returns at random, as its scenes do; completions do not.
+    solver and the guidance scale of the generator are not used. Where images have a return channel,
+    inpainted parts, mixtures and variations lose single returns at random, as its scenes do;
+    completions do not.
 
     Args:
         generator: Networks and geometry; float32. Their weights no longer require gradients, which

@@ -8,18 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Self, cast
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint, read_checkpoint
-from r3dpa.flow.autoguidance import autoguided, renormalised
+from r3dpa.flow.autoguidance import autoguided, check_scale, extrapolated, renormalised
 from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.noise import scene_noise, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
-from r3dpa.geometry import Projection, ScanGeometry, points_of, range_image
+from r3dpa.geometry import Projection, ScanGeometry, points_of
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
@@ -86,14 +85,18 @@ class SceneGenerator:
         precision: ``bf16`` runs copies of the networks with bfloat16 weights, see
             :meth:`VelocityNetwork.halve_` and :meth:`VAE.halve_decoder_`; state and solver stay
             float32.
-        autoguidance: Weak model and strength; no guidance where None.
+        guidance_scale: Strength of the guidance away from the SiT without one attention map, see
+            :meth:`r3dpa.nn.SiT.velocity_pair_at`; 1 for none. Default: that of the SiT, or 1 with
+            autoguidance. Average velocities are never guided.
+        autoguidance: Weak model and strength.
         batch_size: Pad smaller batches with zeros, so that the networks see a single shape.
         compile: Compile the networks: minutes before the first scene. Needs ``batch_size``. On a
             GPU batches of at most 8 scenes are replayed as CUDA graphs.
 
     Raises:
         ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1,
-            ``compile`` comes without it, or the network or autoguidance does not fit the sampler.
+            ``compile`` comes without it, a scale is below 1, or network, guidance and sampler do
+            not fit each other.
     """
 
     def __init__(
@@ -106,6 +109,7 @@ class SceneGenerator:
         path: Literal["linear", "cosine"] = "linear",
         precision: Literal["fp32", "bf16"] = "fp32",
         *,
+        guidance_scale: float | None = None,
         autoguidance: Autoguidance | None = None,
         batch_size: int | None = None,
         compile: bool = False,
@@ -133,7 +137,16 @@ class SceneGenerator:
         self.sampler, self.interpolant = sampler, Interpolant(path)
         self.precision, self.batch_size = precision, batch_size
         graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
-        self._strong = _ScheduledNetwork(self.sit, compile, graphs)
+        if guidance_scale is None:
+            guidance_scale = 1.0 if autoguidance else sit.guidance_scale
+        check_scale(guidance_scale)
+        self.guidance_scale = guidance_scale
+        if guidance_scale != 1 and not sit.guidance_block:
+            raise ValueError(
+                f"guidance_scale {guidance_scale:g} needs a network with guidance_block, such as "
+                "that of r3dpa-s, or a weaker model (autoguidance)"
+            )
+        self._strong = _ScheduledNetwork(self.sit, compile, graphs, guidance_scale)
         self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
@@ -150,6 +163,7 @@ class SceneGenerator:
         decoder: Literal["full", "thin"] | None = None,
         device: str = "auto",
         precision: Literal["fp32", "bf16"] = "fp32",
+        guidance_scale: float | None = None,
         autoguidance: Autoguidance | None = None,
         batch_size: int | None = None,
         compile: bool = False,
@@ -165,6 +179,7 @@ class SceneGenerator:
                 quality ``instant`` where the checkpoint has one, full otherwise.
             device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
             precision: As for the constructor, like all other arguments.
+            guidance_scale: See the constructor.
             autoguidance: Weak model, on the same device.
             batch_size: See the constructor.
             compile: See the constructor.
@@ -174,13 +189,13 @@ class SceneGenerator:
             ValueError: If it cannot be read, or a network, the latent statistics or the scan
                 geometry is missing.
         """
-        checkpoint = _opened(checkpoint)
+        checkpoint = opened(checkpoint)
         if checkpoint.stage == "vae_alignment":
             raise ValueError(
                 f"{checkpoint.path} is of stage vae_alignment, which trains no velocity; sample "
                 "from a checkpoint of stage joint or flow_matching"
             )
-        geometry = _geometry_of(checkpoint)
+        geometry = geometry_of(checkpoint)
         names = ("ema", "ema_latent_norm") if weights == "ema" else ("sit", "latent_norm")
         device = usable_device(device)
         has_thin = "thin_decoder" in checkpoint.networks
@@ -203,6 +218,7 @@ class SceneGenerator:
             SamplerConfig.of_quality(sampler) if isinstance(sampler, str) else sampler,
             checkpoint.interpolant,
             precision,
+            guidance_scale=guidance_scale,
             autoguidance=autoguidance,
             batch_size=batch_size,
             compile=compile,
@@ -263,7 +279,7 @@ class SceneGenerator:
         noise = scene_noise(self.latent_shape, indices, seed)
         draws = (filled(x, size).to(self.device) for x in noise)
         latents = self._solve(next(draws), draws)[: len(indices)]
-        nfe, projection = sum(one.calls for one in self._networks), self.geometry.projection
+        nfe, projection = sum(one.evaluations for one in self._networks), self.geometry.projection
         return SceneBatch(self.decode(latents, indices, seed), latents, nfe, projection)
 
     @torch.no_grad()
@@ -313,61 +329,13 @@ class SceneGenerator:
         return autoguided(self._strong, weak, guidance.scale, guidance.interval)
 
 
-class SceneVAE:
-    """Scans to raw latents and back, with the VAE and the geometry of a checkpoint of any stage.
-
-    Args:
-        vae: Encoder and decoder.
-        geometry: Projection and range encoding of its training data.
-
-    Example:
-        >>> vae = SceneVAE.from_checkpoint("last.ckpt")  # doctest: +SKIP
-        >>> latents = vae.encode(read_scan("scan.bin"))  # doctest: +SKIP
-        >>> points = vae.decode(latents).points(0)  # doctest: +SKIP
-    """
-
-    def __init__(self, vae: VAE, geometry: ScanGeometry) -> None:
-        self.vae, self.geometry = vae.eval(), geometry
-
-    @classmethod
-    def from_checkpoint(cls, checkpoint: str | Path | Checkpoint, device: str = "auto") -> Self:
-        """Rebuilds the VAE of a checkpoint.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If it cannot be read, or holds no range-image VAE or no scan geometry.
-        """
-        checkpoint = _opened(checkpoint)
-        vae = checkpoint.network("vae").build().to(usable_device(device))
-        if not isinstance(vae, VAE):
-            kind = type(vae).__name__
-            raise ValueError(f"{checkpoint.path} holds a {kind} for a range-image VAE")
-        return cls(vae, _geometry_of(checkpoint))
-
-    from_pretrained = from_checkpoint  # names of `r3dpa models`
-
-    @torch.no_grad()
-    def encode(self, points: Tensor | np.ndarray) -> Tensor:
-        """Posterior means ``(1, C, h, w)`` of one scan ``(P, 3)`` or ``(P, 4)`` in metres."""
-        xyz = torch.as_tensor(points)[:, :3].float()
-        range_m = range_image(xyz, self.geometry.projection)[0]
-        image = self.geometry.codec.to_image(range_m.to(next(self.vae.parameters()).device))
-        return self.vae.encode(image[None]).mean
-
-    @torch.no_grad()
-    def decode(self, latents: Tensor) -> SceneBatch:
-        """Scenes of raw latents ``(B, C, h, w)``."""
-        projection = self.geometry.projection
-        image = self.vae.decode(latents).float()
-        range_m = self.geometry.codec.ranges_of(image, projection.sensor)
-        return SceneBatch(range_m, latents, 0, projection)
-
-
-def _opened(checkpoint: str | Path | Checkpoint) -> Checkpoint:
+def opened(checkpoint: str | Path | Checkpoint) -> Checkpoint:
+    """Content of a checkpoint that may be given as its file or name."""
     return checkpoint if isinstance(checkpoint, Checkpoint) else read_checkpoint(checkpoint)
 
 
-def _geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
+def geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
+    """Projection and range encoding of a checkpoint; ``ValueError`` if it records none."""
     if checkpoint.geometry is None:
         raise ValueError(
             f"{checkpoint.path} does not record which sensor it was trained for; convert it from "
@@ -398,11 +366,13 @@ class _ScheduledNetwork:
         times: Those of the trial run, each ``(1,)``.
         targets: Target times of average velocities, likewise.
         table: ``(T, M)`` their modulations, after the trial run.
-        calls: Evaluations since it was set to 0.
+        calls: Velocities since it was set to 0.
     """
 
-    def __init__(self, sit: VelocityNetwork, compile: bool, graphs: bool) -> None:
-        self.sit = sit
+    def __init__(
+        self, sit: VelocityNetwork, compile: bool, graphs: bool, guidance_scale: float = 1.0
+    ) -> None:
+        self.sit, self.guidance_scale = sit, guidance_scale
         self.times: list[Tensor] = []
         self.targets: list[Tensor] = []
         self.table: Tensor | None = None
@@ -415,7 +385,17 @@ class _ScheduledNetwork:
     @property
     def _networks(self) -> list[Callable[[Tensor, Tensor], Tensor]]:
         average = [self.sit.average_velocity_at] if isinstance(self.sit, SiT) else []
-        return [self.sit.velocity_at, *average]
+        return [self.sit.velocity_at if self.guidance_scale == 1 else self._guided, *average]
+
+    @property
+    def evaluations(self) -> int:
+        """Network evaluations since ``calls`` was set to 0, two of each guided velocity."""
+        guided = self.guidance_scale != 1 and not self.targets
+        return self.calls * (2 if guided else 1)
+
+    def _guided(self, latents: Tensor, modulations: Tensor) -> Tensor:
+        pair = self.sit.velocity_pair_at(latents, modulations)
+        return extrapolated(*pair, self.guidance_scale)
 
     def fill_table(self) -> None:
         """Ends the trial run."""

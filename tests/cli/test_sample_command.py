@@ -176,7 +176,9 @@ class TestSample:
         """Not even with --overwrite in a folder that holds scenes."""
         (tmp_path / "metadata.json").write_text("{}")
         (tmp_path / "range_m.npy").write_bytes(b"scenes")
-        with pytest.raises(ValueError, match=r"--guidance_scale and .* need --autoguidance"):
+        with pytest.raises(ValueError, match=r"--guidance_interval needs --autoguidance"):
+            sample(tiny_file, tmp_path, "--guidance_interval", 0, 0.5, "--overwrite", "true")
+        with pytest.raises(ValueError, match=r"guidance_scale 2 needs a network with guidance_b"):
             sample(tiny_file, tmp_path, "--guidance_scale", 2, "--overwrite", "true")
         assert (tmp_path / "range_m.npy").read_bytes() == b"scenes"
         assert len(list(tmp_path.iterdir())) == 2

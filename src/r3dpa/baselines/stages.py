@@ -53,8 +53,8 @@ def scene_generator(
             f"quality {sampler} is not measured for stage {checkpoint.stage}: give --solver and "
             "--steps, or neither for its published sampler"
         )
-    for name in ("autoguidance", "decoder"):
-        if options.pop(name, None) not in (None, "full"):
+    for name in ("autoguidance", "decoder", "guidance_scale"):
+        if options.pop(name, None) not in (None, "full", 1.0):
             raise ValueError(f"{name} is not for stage {checkpoint.stage}; leave it out")
     if checkpoint.geometry is None:
         raise ValueError(f"{checkpoint.path} does not record which sensor it was trained for")

@@ -140,7 +140,9 @@ class ModelProblem:
     """Networks of a checkpoint; where nothing is timed ``batch`` scenes are solved together."""
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
-        read = partial(scene_generator, checkpoint, SamplerConfig(), device=device)
+        read = partial(
+            scene_generator, checkpoint, SamplerConfig(), device=device, guidance_scale=1.0
+        )
         self.batch = batch
         has_thin = "thin_decoder" in checkpoint.networks
         decoders: tuple[Decoder, ...] = ("full", "thin") if has_thin else ("full",)

@@ -44,8 +44,10 @@ def sample(
         eta: Noise strength of the SDE; default: 1, as published.
         sde_last: Last SDE step: ``denoise`` (default) or ``mean`` as in the official sampler.
         autoguidance: Snapshot of a weaker model to be guided away from; doubles the evaluations.
-        guidance_scale: Strength of autoguidance, 1 for none; default: 2.
-        guidance_interval: Guided times, such as ``0.2 0.8``; 0 is data, 1 noise; default: all.
+        guidance_scale: Strength of guidance, 1 for none; default: that of the weights, which are
+            guided away from themselves without one attention map; 2 with ``--autoguidance``.
+        guidance_interval: Times of autoguidance, such as ``0.2 0.8``; 0 is data, 1 noise; default:
+            all.
         decoder: Decoder of the VAE or the thin one of stage few_step; default: thin for
             ``--quality instant`` where the checkpoint has one, else full.
         precision: Weights of the networks; ``bf16`` needs a processor or GPU that computes in it.
@@ -68,15 +70,15 @@ def sample(
     if quality is not None and given:
         raise ValueError(f"--quality {quality} chooses what --{next(iter(given))} gives; drop one")
     sampler = SamplerConfig(**given) if given else quality
-    if autoguidance is None and (guidance_scale or guidance_interval):
-        raise ValueError("--guidance_scale and --guidance_interval need --autoguidance")
+    if autoguidance is None and guidance_interval:
+        raise ValueError("--guidance_interval needs --autoguidance")
     files = SceneOptions(**options)
     device = usable_device(files.device)
     checkpoint = read_checkpoint(files.ckpt)
     guidance, about_guide = None, None
     if autoguidance is not None:
         weak = read_snapshot(autoguidance, checkpoint, files.weights)
-        scale = 2.0 if guidance_scale is None else guidance_scale
+        scale, guidance_scale = 2.0 if guidance_scale is None else guidance_scale, 1.0
         interval = guidance_interval or (0.0, 1.0)
         sit, latent_shift = weak.sit.to(device), weak.shift.to(device)
         guidance = Autoguidance(sit, scale, interval, weak.scale, latent_shift)
@@ -94,6 +96,7 @@ def sample(
         decoder=decoder,
         precision=precision,
         device=device,
+        guidance_scale=guidance_scale,
         autoguidance=guidance,
         batch_size=files.batch_size if compile else None,
         compile=compile,
@@ -103,6 +106,7 @@ def sample(
     thin = isinstance(getattr(generator, "vae", None), ThinDecoder)  # a baseline has no VAE
     request |= {"precision": precision, "compile": compile, "decoder": "thin" if thin else "full"}
     request |= {"sampler": asdict(generator.sampler), "autoguidance": about_guide}
+    request["guidance_scale"] = getattr(generator, "guidance_scale", 1.0)
     projection = generator.geometry.projection
     with SceneWriter(files.out, num, projection, files.formats, request, files.overwrite) as writer:
         measured = generate_all(generator, writer, files.batch_size, files.seed)

@@ -35,11 +35,7 @@ def autoguided(
             waits for a GPU.
     """
     first, last = interval
-    if not (math.isfinite(scale) and scale >= 1):
-        raise ValueError(
-            f"the scale of autoguidance must be a number of 1 or more, got {scale}; 1 is no "
-            "guidance, and less would move towards the weak model"
-        )
+    check_scale(scale)
     check_interval(interval, "the interval of autoguidance")
     if scale == 1:
         return velocity
@@ -56,11 +52,25 @@ def autoguided(
                 f"the weak model answers {tuple(weaker.shape)}, the model {tuple(strong.shape)}; "
                 "both must be of the same latents"
             )
-        dtype = torch.promote_types(strong.dtype, torch.float32)  # a small difference, magnified
-        pushed = torch.lerp(weaker.to(dtype), strong.to(dtype), scale)
-        return pushed if everywhere else torch.where(inside, pushed, strong.to(dtype))
+        pushed = extrapolated(strong, weaker, scale)
+        return pushed if everywhere else torch.where(inside, pushed, strong.to(pushed.dtype))
 
     return guided
+
+
+def check_scale(scale: float) -> None:
+    """Raises a ``ValueError`` for a strength of guidance below 1 or not finite."""
+    if not (math.isfinite(scale) and scale >= 1):
+        raise ValueError(
+            f"the scale of guidance must be a number of 1 or more, got {scale}; 1 is no "
+            "guidance, and less would move towards the weak model"
+        )
+
+
+def extrapolated(velocity: Tensor, weak: Tensor, scale: float) -> Tensor:
+    """``weak + scale (velocity - weak)``, in float32 or wider: a small difference, magnified."""
+    dtype = torch.promote_types(velocity.dtype, torch.float32)
+    return torch.lerp(weak.to(dtype), velocity.to(dtype), scale)
 
 
 def renormalised(

@@ -220,15 +220,17 @@ class SelfAttention(nn.Module):
         self.k_norm = nn.LayerNorm(width // num_heads) if qk_norm else nn.Identity()
         self.proj = linear(width, width)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """``(B, N, D)`` to the same shape."""
+    def forward(self, tokens: Tensor, mixed: bool = True) -> Tensor:
+        """``(B, N, D)`` to the same shape; with ``mixed`` False each token attends to itself."""
+        if not mixed:
+            return self.proj(self.qkv(tokens).chunk(3, dim=-1)[2])
         query, key, value = rearrange(
             self.qkv(tokens), "B N (three head d) -> three B head N d", three=3, head=self.num_heads
         )
         # Layer norm returns float32 under autocast; attention needs one dtype.
         query, key = self.q_norm(query).to(value.dtype), self.k_norm(key).to(value.dtype)
-        mixed = F.scaled_dot_product_attention(query, key, value)
-        return self.proj(rearrange(mixed, "B head N d -> B N (head d)"))
+        attended = F.scaled_dot_product_attention(query, key, value)
+        return self.proj(rearrange(attended, "B head N d -> B N (head d)"))
 
 
 class Mlp(nn.Module):

@@ -97,6 +97,9 @@ class SiT(VelocityNetwork):
             et al. 2025), which takes neither ``projector_dim`` nor official weights.
         average_blocks: Number of last blocks with a second copy, which predicts average velocities,
             see :meth:`average_velocity`; 0 for none.
+        guidance_block: Block that does without attention in :meth:`velocity_pair_at`, counted
+            from 1; 0 for none.
+        guidance_scale: Strength of that guidance for generated scenes, at least 1; 1 for none.
     """
 
     pos_embed: Tensor
@@ -120,6 +123,8 @@ class SiT(VelocityNetwork):
         periodic_columns: bool = False,
         projector: Literal["mlp", "conv"] = "mlp",
         average_blocks: int = 0,
+        guidance_block: int = 0,
+        guidance_scale: float = 1.0,
     ) -> None:
         super().__init__()
         rows, columns = input_size
@@ -141,6 +146,14 @@ class SiT(VelocityNetwork):
             raise ValueError(
                 f"average_blocks must lie in 0..depth = 0..{depth}, got {average_blocks}"
             )
+        if not 0 <= guidance_block <= depth or guidance_scale < 1:
+            raise ValueError(
+                f"guidance_block must lie in 0..depth = 0..{depth} and guidance_scale be at least "
+                f"1, got {guidance_block} and {guidance_scale}"
+            )
+        if guidance_scale != 1 and not guidance_block:
+            raise ValueError(f"guidance_scale {guidance_scale:g} needs a guidance_block")
+        self.guidance_block, self.guidance_scale = guidance_block, guidance_scale
         self.input_size = (rows, columns)
         self.in_channels = in_channels
         self.hidden_size = hidden_size
@@ -186,6 +199,26 @@ class SiT(VelocityNetwork):
         if average_blocks:
             last = copy.deepcopy(self.blocks[depth - average_blocks :])
             self.average = _AverageHead(hidden_size, last, copy.deepcopy(self.final_layer))
+
+    def velocity_pair_at(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocities ``(B, C, h, w)``, as of :meth:`velocity_at` and without one attention map.
+
+        In block ``guidance_block`` of the second each token attends to itself alone. The blocks
+        before it are evaluated once, those behind it on both.
+
+        Source: perturbed-attention guidance (Ahn et al. 2024).
+        """
+        before, width = self.guidance_block - 1, 6 * self.hidden_size
+        tokens = self.x_embedder(latents) + self.pos_embed
+        tokens = self._through(self.blocks[:before], tokens, modulations)
+        rows = modulations[:, before * width : (before + 1) * width]
+        block, later = self.blocks[before], modulations[:, (before + 1) * width :]
+        both = torch.cat([block(tokens, rows), block(tokens, rows, mixed=False)])
+        if len(later) > 1:  # one row per sample
+            later = later.repeat(2, 1)
+        both = self._through(self.blocks[before + 1 :], both, later)
+        strong, weak = self._output(self.final_layer, both, later).chunk(2)
+        return strong, weak
 
     @property
     def input_layer(self) -> nn.Module:
@@ -358,11 +391,14 @@ class _Block(nn.Module):
         self.mlp = Mlp(hidden_size, int(hidden_size * mlp_ratio), _xavier_linear, "tanh")
         self.adaLN_modulation = _modulation(hidden_size, 6)
 
-    def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
-        """Tokens ``(B, N, D)`` after the block; ``(B, 6 D)`` or, for all samples, ``(1, 6 D)``."""
+    def forward(self, tokens: Tensor, modulation: Tensor, mixed: bool = True) -> Tensor:
+        """Tokens ``(B, N, D)`` after the block; ``(B, 6 D)`` or, for all samples, ``(1, 6 D)``.
+
+        With ``mixed`` False each token attends to itself alone.
+        """
         shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp = modulation.chunk(6, 1)
         narrow = self.mlp.fc1.weight.dtype  # bfloat16 after SiT.halve_
-        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn).to(narrow))
+        attended = self.attn(_modulated_norm(tokens, shift_attn, scale_attn).to(narrow), mixed)
         tokens = tokens + gate_attn[:, None] * attended
         hidden = self.mlp(_modulated_norm(tokens, shift_mlp, scale_mlp).to(narrow))
         return tokens + gate_mlp[:, None] * hidden

@@ -49,6 +49,8 @@ class VelocityNetwork(nn.Module, ABC):
         feature_dim: Width F of the features.
         num_classes: Number of classes.
         projector: Head of the features.
+        guidance_block: Block that :meth:`velocity_pair_at` changes; 0 where it is not supported.
+        guidance_scale: Default strength of the guidance by that pair; 1 for none.
     """
 
     input_size: tuple[int, int]
@@ -57,6 +59,8 @@ class VelocityNetwork(nn.Module, ABC):
     feature_dim: int
     num_classes: int
     projector: nn.Sequential
+    guidance_block: int = 0
+    guidance_scale: float = 1.0
 
     def forward(
         self, latents: Tensor, time: Tensor, labels: Tensor | None = None
@@ -108,6 +112,10 @@ class VelocityNetwork(nn.Module, ABC):
         whole schedule are computed once.
         """
         return self._finish(self._begin(latents, modulations), modulations)
+
+    def velocity_pair_at(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity as of :meth:`velocity_at`, and a worse one to be guided away from."""
+        raise NotImplementedError
 
     @property
     @abstractmethod
