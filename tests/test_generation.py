@@ -208,7 +208,7 @@ def test_autoguidance_is_the_written_out_formula():
 def guided_networks(**sit_args):
     vae, sit, norm = tiny_networks()
     guided = SiT(**SIT_ARGS, **sit_args)
-    guided.load_state_dict(sit.state_dict())
+    guided.load_state_dict(guided.state_dict() | sit.state_dict())
     return vae, guided.eval(), norm
 
 
@@ -241,6 +241,17 @@ def test_the_scale_of_the_network_is_the_default():
     auto = Autoguidance(tiny_networks()[1], 1.0)  # replaces it
     found = SceneGenerator(*networks, GEOMETRY, ODE, autoguidance=auto).generate([0])
     assert torch.equal(found.latents, plain.latents)
+
+
+def test_average_velocities_are_not_guided():
+    networks = guided_networks(guidance_block=1, guidance_scale=1.5, average_blocks=1)
+    sampler = SamplerConfig("average_velocity", 2)
+    scenes = SceneGenerator(*networks, GEOMETRY, sampler)
+    assert (scenes.generate([0]).nfe, scenes.guidance_scale) == (2, 1)
+    scenes = scenes.with_sampler(ODE)
+    assert (scenes.generate([0]).nfe, scenes.guidance_scale) == (10, 1.5)
+    with pytest.raises(ValueError, match=r"never guided: drop guidance_scale 2"):
+        SceneGenerator(*networks, GEOMETRY, sampler, guidance_scale=2.0)
 
 
 @pytest.mark.parametrize("scale", [0.5, float("nan"), float("inf")])

@@ -137,16 +137,8 @@ class SceneGenerator:
         self.sampler, self.interpolant = sampler, Interpolant(path)
         self.precision, self.batch_size = precision, batch_size
         graphs = compile and self.device.type == "cuda" and (batch_size or 0) <= _GRAPH_BATCH
-        if guidance_scale is None:
-            guidance_scale = 1.0 if autoguidance else sit.guidance_scale
-        check_scale(guidance_scale)
-        self.guidance_scale = guidance_scale
-        if guidance_scale != 1 and not sit.guidance_block:
-            raise ValueError(
-                f"guidance_scale {guidance_scale:g} needs a network with guidance_block, such as "
-                "that of r3dpa-s, or a weaker model (autoguidance)"
-            )
-        self._strong = _ScheduledNetwork(self.sit, compile, graphs, guidance_scale)
+        scale = _checked_scale(guidance_scale, sampler, sit, autoguidance)
+        self._strong = _ScheduledNetwork(self.sit, compile, graphs, scale)
         self._weak = None if weak is None else _ScheduledNetwork(weak, compile, graphs)
         self._autoguidance = autoguidance
         self._decode = torch.compile(self.vae.decode, dynamic=False) if compile else self.vae.decode
@@ -230,6 +222,12 @@ class SceneGenerator:
     def device(self) -> torch.device:
         """Device of the networks."""
         return next(self.sit.parameters()).device
+
+    @property
+    def guidance_scale(self) -> float:
+        """Strength of the guidance of the SiT away from itself; 1 for none."""
+        averages = self.sampler.solver == "average_velocity"
+        return 1.0 if averages else self._strong.guidance_scale
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
@@ -354,6 +352,28 @@ def _check_average(
             "checkpoint of stage few_step, and no autoguidance: drop autoguidance, or take another "
             "solver or quality"
         )
+
+
+def _checked_scale(
+    given: float | None,
+    sampler: SamplerConfig,
+    sit: VelocityNetwork,
+    autoguidance: Autoguidance | None,
+) -> float:
+    usual = 1.0 if autoguidance else sit.guidance_scale
+    scale = usual if given is None else given
+    check_scale(scale)
+    if scale != 1 and not sit.guidance_block:
+        raise ValueError(
+            f"guidance_scale {scale:g} needs a network with guidance_block, such as that of "
+            "r3dpa-s, or a weaker model (autoguidance)"
+        )
+    if given not in (None, 1) and sampler.solver == "average_velocity":
+        raise ValueError(
+            f"average velocities are never guided: drop guidance_scale {scale:g}, or take another "
+            "solver or quality"
+        )
+    return scale
 
 
 class _ScheduledNetwork:
