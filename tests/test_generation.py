@@ -261,11 +261,14 @@ def test_a_scale_of_guidance_below_one_is_refused(scale):
 
 
 @pytest.mark.slow
-def test_compiled_networks_draw_the_same_scenes():
+@pytest.mark.parametrize("scale", [1.0, 1.5], ids=["plain", "guided"])
+def test_compiled_networks_draw_the_same_scenes(scale):
     """Fused kernels round in another order; no shape is met twice, so nothing recompiles."""
-    options = {"batch_size": 3, "compile": True}
-    scenes = SceneGenerator(*tiny_networks(), GEOMETRY, ODE, **options)
-    plain = generator(ODE).generate(range(3))
+    options = {"batch_size": 3, "compile": True, "guidance_scale": scale}
+    networks = guided_networks(guidance_block=1)
+    scenes = SceneGenerator(*networks, GEOMETRY, ODE, **options)
+    plain = SceneGenerator(*networks, GEOMETRY, ODE, guidance_scale=scale).generate(range(3))
+    torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     for part in (slice(0, 3), slice(0, 2), slice(2, 3)):
         found = scenes.generate(range(3)[part])
