@@ -53,7 +53,8 @@ def row(label, seconds, error, precision="fp32", batch=4, precision_error=0.0, d
 @pytest.fixture(scope="module")
 def ckpt(tmp_path_factory):
     path = tmp_path_factory.mktemp("ckpt") / "tiny.safetensors"
-    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7)
+    guided = {"guidance_block": 1, "guidance_scale": 1.5}  # which is not measured
+    return tiny_checkpoint(path, GEOMETRY, stage="few_step", step=7, sit_args=guided)
 
 
 @pytest.fixture(scope="module")

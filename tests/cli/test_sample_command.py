@@ -172,6 +172,15 @@ class TestSample:
         for folder in (tiny_file.parent, tmp_path, Path.home()):
             assert str(folder) not in (tmp_path / "metadata.json").read_text()
 
+    def test_the_guidance_of_the_weights_is_recorded_and_can_be_turned_off(self, tmp_path):
+        geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
+        settings = {"guidance_block": 1, "guidance_scale": 1.5}
+        path = tiny_checkpoint(tmp_path / "guided.safetensors", geometry, sit_args=settings)
+        guided = sample(path, tmp_path / "guided")
+        assert (guided["guidance_scale"], guided["nfe"]) == (1.5, 6)
+        plain = sample(path, tmp_path / "plain", "--guidance_scale", 1)
+        assert (plain["guidance_scale"], plain["nfe"]) == (1, 3)
+
     def test_options_that_say_nothing_are_refused_and_nothing_is_touched(self, tiny_file, tmp_path):
         """Not even with --overwrite in a folder that holds scenes."""
         (tmp_path / "metadata.json").write_text("{}")
