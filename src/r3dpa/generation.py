@@ -414,7 +414,7 @@ class _ScheduledNetwork:
         return self.calls * (2 if guided else 1)
 
     def _guided(self, latents: Tensor, modulations: Tensor) -> Tensor:
-        pair = self.sit.velocity_pair_at(latents, modulations)
+        pair = cast(SiT, self.sit).velocity_pair_at(latents, modulations)
         return extrapolated(*pair, self.guidance_scale)
 
     def fill_table(self) -> None:

@@ -63,6 +63,8 @@ def test_halved_networks_have_them_in_float32():
 def test_a_block_that_is_not_there_is_refused():
     with pytest.raises(ValueError, match=r"guidance_block must lie in 0..depth = 0..3.*got 4 and"):
         network(4)
+    with pytest.raises(ValueError, match="names no guidance_block"):
+        network(0).velocity_pair_at(torch.randn(1, 4, 4, 16), torch.zeros(1, 1))
     with pytest.raises(ValueError, match=r"guidance_scale 2 needs a guidance_block"):
         SiT(**SIT_ARGS, guidance_scale=2.0)
     with pytest.raises(ValueError, match=r"guidance_scale be at least 1, got 1 and 0.5"):

@@ -137,7 +137,10 @@ class MixtureProblem:
 
 
 class ModelProblem:
-    """Networks of a checkpoint; where nothing is timed ``batch`` scenes are solved together."""
+    """Networks of a checkpoint without guidance, whose flow is the one that solvers are judged by.
+
+    Where nothing is timed ``batch`` scenes are solved together.
+    """
 
     def __init__(self, checkpoint: Checkpoint, device: str, batch: int) -> None:
         read = partial(

@@ -204,10 +204,12 @@ class SiT(VelocityNetwork):
         """Velocities ``(B, C, h, w)``, as of :meth:`velocity_at` and without one attention map.
 
         In block ``guidance_block`` of the second each token attends to itself alone. The blocks
-        before it are evaluated once, those behind it on both.
+        before it are evaluated once, those behind it on both. A ``ValueError`` without the block.
 
         Source: perturbed-attention guidance (Ahn et al. 2024).
         """
+        if not self.guidance_block:
+            raise ValueError("the network names no guidance_block, so there is no pair to guide by")
         before, width = self.guidance_block - 1, 6 * self.hidden_size
         tokens = self.x_embedder(latents) + self.pos_embed
         tokens = self._through(self.blocks[:before], tokens, modulations)

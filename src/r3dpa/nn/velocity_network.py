@@ -49,7 +49,7 @@ class VelocityNetwork(nn.Module, ABC):
         feature_dim: Width F of the features.
         num_classes: Number of classes.
         projector: Head of the features.
-        guidance_block: Block that :meth:`velocity_pair_at` changes; 0 where it is not supported.
+        guidance_block: Block that :meth:`SiT.velocity_pair_at` changes; 0 in other networks.
         guidance_scale: Default strength of the guidance by that pair; 1 for none.
     """
 
@@ -112,10 +112,6 @@ class VelocityNetwork(nn.Module, ABC):
         whole schedule are computed once.
         """
         return self._finish(self._begin(latents, modulations), modulations)
-
-    def velocity_pair_at(self, latents: Tensor, modulations: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocity as of :meth:`velocity_at`, and a worse one to be guided away from."""
-        raise NotImplementedError
 
     @property
     @abstractmethod
