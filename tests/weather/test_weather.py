@@ -12,6 +12,7 @@ from r3dpa.simulation import Weather as SimulatedWeather
 from r3dpa.simulation.effects import EFFECTS, medium
 from r3dpa.simulation.effects.medium import Rain, soft_waveform
 from r3dpa.simulation.ground import ground_of
+from r3dpa.simulation.recorded import scale_of
 from r3dpa.simulation.scan import effect_name
 from r3dpa.simulation.sensor import hdl64e
 from r3dpa.weather import ADDED_CLASS, Instrument, RecordedScan, Weather
@@ -181,6 +182,25 @@ def test_intensities_of_either_scale_give_the_same(scan):
         assert (one.index == other.index).all()
         assert np.allclose(one.points, other.points, atol=1e-3)
         assert np.abs(one.intensity - other.intensity / factor).max() < 0.0051
+
+
+@pytest.mark.parametrize(("full", "unit"), [(1, "0..1"), (255, "0..255"), (4000, "instrument")])
+@pytest.mark.parametrize("factor", [1.001, 1.5, 200, 256, 1e6])
+def test_a_single_intensity_does_not_set_the_scale(scan, full, unit, factor):
+    """The others keep the share of a white surface that they have without it."""
+    values = np.minimum(scan.intensity, np.float32(0.99)) * np.float32(full)
+    plain = scale_of(values)
+    values[7] = factor * full
+    odd = scale_of(values)
+    assert unit in odd.text
+    assert odd.full == pytest.approx(plain.full, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["u1", "i4"])
+def test_integers_are_never_shares_of_1(scan, kind):
+    dark = (scan.intensity > 0.5).astype(kind)
+    assert scale_of(dark).full == 255
+    assert scale_of(dark.astype("f4")).full == 1
 
 
 @pytest.mark.parametrize("intensity", [None, 0.0, 1.0])

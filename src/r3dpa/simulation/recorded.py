@@ -114,8 +114,8 @@ class Instrument:
         sensor: Its detection limit, beam, pulse and noise: ``hdl64e``, ``hdl32e``, ``vls128``, a
             calibration file or a :class:`SpinningLidar`; its lasers are not used.
         returns: Which echoes of a shot it reports.
-        full_intensity: Intensity of a white surface in front of it; None: 1, 255, or the largest
-            in instrument units, by the values of each scan.
+        full_intensity: Intensity of a white surface in front of it; None: by the 99.9 % quantile of
+            each scan: 1 up to 1 unless the intensities are integers, 255 up to 255, else itself.
         response: ``root``: intensity is the root of the power, corrected for range and damped for
             weak echoes as in KITTI's scans; ``linear``: proportional to the power, corrected for
             range, as in calibrated reflectivities.
@@ -162,7 +162,9 @@ class IntensityScale(NamedTuple):
 
 
 def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityScale:
-    """Scale of intensities ``(P,)``: 1 up to 1, 255 up to 255, else the 99.9 % quantile.
+    """Scale of intensities ``(P,)`` by their 99.9 % quantile, so that single points do not set it.
+
+    1 up to 1, 255 up to 255, else the quantile itself. Integers are never shares of 1.
 
     Raises:
         ValueError: If some are negative.
@@ -175,10 +177,14 @@ def scale_of(intensity: NDArray | None, full: float | None = None) -> IntensityS
         missing = "no intensity" if intensity is None else f"intensity is {low:g} throughout"
         text = f"{missing}: a white share of {_UNKNOWN_INTENSITY:g} is assumed of every point"
         return IntensityScale(float(low), 0.0, False, text)
-    found, unit = next(
-        (pair for pair in ((1.0, "0..1"), (255.0, "0..255")) if high <= pair[0]),
-        (float(np.quantile(values, 0.999)), "instrument units"),
-    )
+    is_integer = intensity is not None and intensity.dtype.kind in "iu"
+    largest = high if high <= 1 else float(np.quantile(values, 0.999))
+    if largest <= 1 and not is_integer:
+        found, unit = 1.0, "0..1"
+    elif largest <= 255:
+        found, unit = 255.0, "0..255"
+    else:
+        found, unit = largest, "instrument units"
     found = full or found
     off_grid = {s: np.abs(values / s - np.round(values / s)).max() for s in (found / 100, 1.0)}
     step = next((s for s, most in off_grid.items() if found > s and most < 1e-3), 0.0)
