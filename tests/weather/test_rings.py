@@ -1,8 +1,11 @@
+"""Rings by the order, the inclination and the column of a file."""
+
 import numpy as np
 import pytest
 
 from r3dpa.simulation import Street, Weather, load_sensor, simulate_scan
 from r3dpa.weather import RecordedScan, rings_of
+from r3dpa.weather.faults import Fault
 
 
 def simulated(model, shots):
@@ -43,6 +46,31 @@ def test_a_shuffled_scan_of_lasers_at_different_heights_is_said_to_be_unsure():
     found = rings_of(RecordedScan(points[np.random.default_rng(0).permutation(len(points))]))
     assert found.how == "inclination"
     assert found.sure < 0.9
+
+
+@pytest.mark.parametrize("model", ["hdl64e", "hdl32e"])
+def test_stored_rings_are_sure_also_in_the_frame_of_the_vehicle(model):
+    points, ring = simulated(model, 520)
+    for shift in ([0, 0, 0], [0, 0, 1.8], [1.4, 0, 2.1]):
+        moved = points + np.array(shift, dtype=np.float32)
+        assert rings_of(RecordedScan(moved, ring=ring)).sure == 1
+
+
+@pytest.mark.parametrize("most", [64, 256, 10**6])
+def test_numbers_by_chance_are_no_rings(most):
+    points, _ = simulated("hdl64e", 520)
+    ring = np.random.default_rng(0).integers(-5, most, len(points))
+    scan = RecordedScan(points, ring=ring)
+    assert rings_of(scan).sure == 0
+    with pytest.raises(ValueError, match=r"only 0% of the points are sure of one .* by stored"):
+        Fault("missing_beams").apply(scan)
+
+
+def test_more_than_256_rings_are_not_sure():
+    points, ring = simulated("hdl64e", 520)
+    split = 5 * ring + np.arange(len(ring)) % 5
+    found = rings_of(RecordedScan(points, ring=split))
+    assert (found.num_rings, found.sure) == (320, 0)
 
 
 def test_one_point_has_a_ring():

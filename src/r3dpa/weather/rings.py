@@ -20,6 +20,9 @@ _BIN_DEG, _BLUR_BINS, _PROMINENCE = 0.01, 3.0, 0.1
 # Points farther from the middle of their ring than this share of the pitch are not sure.
 _SURE_SHARE = 0.25
 _LARGE_STEP_RAD = math.radians(5)
+# Median step of inclination along stored rings, over the standard deviation of all: at most 0.01 in
+# scans of three sensors, in the frame of the vehicle too, and at least 0.4 in rings by chance.
+_MOST_STEP_SHARE = 0.25
 
 
 class Rings(NamedTuple):
@@ -37,7 +40,8 @@ def rings_of(scan: RecordedScan) -> Rings:
     """Laser and shot of every point: stored, by the order of the file, or by the inclination.
 
     ``stored``
-        The column of the file. All points are sure.
+        The column of the file. All points are sure; none is if there are more than 256 rings, or
+        if points of a ring with almost the same azimuth have unrelated inclinations.
     ``order``
         Files that hold ring after ring: a ring ends where the azimuth wraps, in either direction.
         Points that follow their predecessor by at most 5 degrees are sure.
@@ -57,7 +61,12 @@ def rings_of(scan: RecordedScan) -> Rings:
     mean = np.bincount(ring, inclination) / np.bincount(ring)
     ring = np.argsort(np.argsort(-mean))[ring]
     order = np.lexsort((azimuth, ring))
-    step = np.diff(azimuth[order])[np.diff(ring[order]) == 0]
+    is_beside = np.diff(ring[order]) == 0
+    if how == "stored":
+        along = np.abs(np.diff(inclination[order]))[is_beside]
+        by_chance = len(along) and np.median(along) > _MOST_STEP_SHARE * inclination.std()
+        sure = 0.0 if by_chance or len(mean) > _MOST_BEAMS else 1.0
+    step = np.diff(azimuth[order])[is_beside]
     step = step[step > 1e-5]
     num_shots = round(2 * math.pi / float(np.median(step))) if len(step) else 1
     shot = np.floor(azimuth / (2 * np.pi) * num_shots).astype(np.int64) % num_shots
