@@ -1,4 +1,5 @@
 import json
+import os
 import struct
 
 import numpy as np
@@ -20,6 +21,7 @@ from r3dpa.data.scans import (
 )
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import atomic_path
+from r3dpa.weather.files import read_file
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
 
@@ -110,6 +112,21 @@ def test_broken_scan_is_named_with_its_reason(tmp_path, data, reason):
     elif "multiple" in reason:
         with pytest.raises(ValueError, match=r"^cannot reshape array"):  # of which file?
             np.fromfile(file, np.float32).reshape(-1, 4)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_pipes_and_devices_are_not_read(tmp_path):
+    """A pipe would be waited for, and a device may never end."""
+    device, pipe, archive = (tmp_path / name for name in ("a.bin", "b.bin", "c.npz"))
+    device.symlink_to(os.devnull)
+    os.mkfifo(pipe)
+    os.mkfifo(archive)
+    for file, read in ((device, read_scan), (device, read_file), (pipe, read_scan)):
+        with pytest.raises(ScanError, match=rf"{file.name}: is no regular file"):
+            read(file)
+    with pytest.raises(ScanError, match=r"c\.npz: is no regular file"):
+        read_npz(archive)
+    assert problems(tmp_path) == [f"bad: {file}: is no regular file" for file in (device, pipe)]
 
 
 @pytest.mark.parametrize("width", [3, 4])

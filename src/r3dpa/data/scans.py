@@ -282,17 +282,19 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
 def npz_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Name and content of each array of a ``.npz`` file; ``ScanError`` if it is damaged."""
     where = str(path)
+    _refuse_devices(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            for info in archive.zip.infolist():
+            members = archive.zip.infolist()
+            if sum(info.file_size for info in members) > max(2**28, 100 * path.stat().st_size):
+                raise ValueError("its arrays are far larger than the file")
+            for info in members:
                 member = info.filename
                 where = f"{path}, member {member!r:.80}"
                 if not member.endswith(".npy"):
                     continue
                 if reason := refuse_name(member):
                     raise ValueError(f"its name {reason}")
-                if info.file_size > max(2**30, 100 * path.stat().st_size):
-                    raise ValueError("it is far larger than the file")
                 if isinstance(array := archive[member], bytes):
                     raise ValueError("it is no array")
                 yield member.removesuffix(".npy"), array
@@ -339,9 +341,16 @@ def _is_scan(file: Path) -> bool:
 def read_bytes(path: Path) -> bytes:
     """Content of a file; ``ScanError`` if it cannot be read."""
     try:
+        _refuse_devices(path)
         return path.read_bytes()
     except OSError as error:
         raise _unreadable(path, error) from error
+
+
+def _refuse_devices(path: Path) -> None:
+    """Refuse pipes, which would be waited for, and devices, which may never end."""
+    if path.exists() and not path.is_file():
+        raise ScanError(f"{path}: is no regular file")
 
 
 def _unreadable(path: Path, error: OSError) -> ScanError:

@@ -244,8 +244,9 @@ def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
     if {one.shape for one in (array, *others)} != {array.shape[:1] if others else array.shape}:
         raise ScanError(f"{path}: must hold one scan: one array of rows, or columns of one length")
     if others:
-        layout = [(name, one.dtype) for name, one in arrays.items()]
-        array = np.array(list(zip(*arrays.values(), strict=True)), layout)
+        array = np.empty(len(array), [(name, one.dtype) for name, one in arrays.items()])
+        for name, one in arrays.items():
+            array[name] = one
     table = array if array.dtype.names else _with_names(path, array, columns)
 
     def pack(table: Table) -> bytes:
