@@ -1,6 +1,7 @@
 """``r3dpa data weather`` and ``data corrupt`` on files and folders."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -135,6 +136,114 @@ class TestWeather:
         assert (tmp_path / "out/a.ply").read_bytes() == source.read_bytes()
 
 
+@pytest.fixture
+def pair(folder, tmp_path):
+    """A finished run on ``in``: scan ``a`` with labels, and ``b`` without."""
+    source = tmp_path / "in"
+    source.mkdir()
+    (source / "a.bin").write_bytes((folder / "a/velodyne/0.bin").read_bytes())
+    (source / "a.label").write_bytes((folder / "a/labels/0.label").read_bytes())
+    (source / "b.bin").write_bytes((folder / "b/2.bin").read_bytes())
+    weather(source, tmp_path / "out", *FOG, "--show", 0)
+    return source, tmp_path / "out"
+
+
+def replace_in_place(path, data):
+    """Another content with the time of the old one, as ``cp -p`` and ``tar`` leave older files."""
+    before = path.stat()
+    path.write_bytes(data)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns - 10**9))
+
+
+def relabel(source, out):
+    labels = np.fromfile(source / "a.label", "u4")
+    (source / "a.label").write_bytes((labels ^ 1).tobytes())
+
+
+CHANGES = {
+    "older scan": lambda source, out: replace_in_place(
+        source / "b.bin", (source / "a.bin").read_bytes()
+    ),
+    "other labels": relabel,
+    "labels gone": lambda source, out: (source / "a.label").unlink(),
+    "labels added": lambda source, out: (source / "b.label").write_bytes(
+        bytes((source / "b.bin").stat().st_size // 4)
+    ),
+    "result of labels gone": lambda source, out: (out / "a.label").unlink(),
+    "result cut": lambda source, out: os.truncate(out / "b.bin", 32),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_has_changed_is_made_again(pair, tmp_path, capsys, name):
+    source, out = pair
+    CHANGES[name](source, out)
+    capsys.readouterr()
+    weather(source, out, *FOG, "--show", 0)
+    assert "1 of them written now" in capsys.readouterr().out
+    weather(source, tmp_path / "fresh", *FOG, "--show", 0)
+    assert content(out) == content(tmp_path / "fresh")
+
+
+def test_results_of_scans_that_are_gone_are_refused(pair):
+    source, out = pair
+    before = content(out)
+    (source / "b.bin").unlink()
+    with pytest.raises(ValueError, match=r"1 scans that .*in does not hold any more, .*out/b\.bin"):
+        weather(source, out, *FOG)
+    assert content(out) == before
+    (out / "b.bin").unlink()
+    weather(source, out, *FOG, "--show", 0)
+    assert [line["scan"] for line in report(out)] == ["a.bin"]
+
+
+def test_scans_one_by_one_share_a_report(pair, tmp_path):
+    source, whole = pair
+    for name in ("a.bin", "b.bin"):
+        weather(source / name, tmp_path / "out", *FOG, "--show", 0)
+    assert content(tmp_path / "out") == content(whole)
+
+
+def test_results_of_another_folder_are_refused(pair, tmp_path):
+    source, out = pair
+    other = tmp_path / "other"
+    other.mkdir()
+    for name, swapped in (("a.bin", "b.bin"), ("b.bin", "a.bin")):
+        (other / name).write_bytes((source / swapped).read_bytes())
+        os.utime(other / name, (0, 0))
+    before = content(out)
+    with pytest.raises(ValueError, match=r"another request \(source '.*in' there, '.*other' now\)"):
+        weather(other, out, *FOG)
+    assert content(out) == before
+
+
+def test_scans_that_share_labels_are_refused(pair, tmp_path):
+    source, _ = pair
+    np.save(source / "a.npy", np.fromfile(source / "a.bin", "f4").reshape(-1, 4)[::-1])
+    out = tmp_path / "new"
+    with pytest.raises(
+        ScanError, match=r"a\.label: would be the labels of .*a\.bin and of .*a\.npy"
+    ):
+        weather(source, out, *FOG)
+    assert not out.exists()
+    weather(source / "a.bin", out, *FOG, "--show", 0)
+    before = content(out)
+    with pytest.raises(ScanError, match=r"a\.label: would be the labels of"):
+        weather(source / "a.npy", out, *FOG)
+    assert content(out) == before
+
+
+def test_a_link_in_place_of_the_report_is_not_written_to(pair, tmp_path):
+    source, out = pair
+    victim = tmp_path / "victim.txt"
+    victim.write_text("notes\n")
+    (out / ".unfinished.jsonl").symlink_to(victim)
+    (out / "b.bin").unlink()
+    with pytest.raises(OSError, match=r"\.unfinished\.jsonl"):
+        weather(source, out, *FOG)
+    assert victim.read_text() == "notes\n"
+
+
 def test_faults_act_on_every_file(folder, tmp_path, capsys):
     words = ["--fault", "crosstalk", "--severity", "3", "--show", "1"]
     main(["corrupt", str(folder), "--out", str(tmp_path / "out"), *words])
@@ -143,11 +252,15 @@ def test_faults_act_on_every_file(folder, tmp_path, capsys):
         assert line["moved"] == round(0.01 * line["points"])
 
 
-def test_a_fault_may_leave_nothing(folder, tmp_path):
+def test_a_scan_without_a_point_left_is_not_written(folder, tmp_path):
     words = ["--fault", "dropped_sectors", "--strength", "360"]
-    main(["corrupt", str(folder / "b"), "--out", str(tmp_path / "out"), *words])
-    assert sorted(content(tmp_path / "out")) == ["2.bin", "report.jsonl", "request.json"]
-    assert (tmp_path / "out/2.bin").read_bytes() == b""
+    with pytest.raises(ScanError, match=r"2\.bin: none of its \d+ points is left"):
+        main(["corrupt", str(folder / "b"), "--out", str(tmp_path / "out"), *words])
+    far = np.full((30, 4), 0.2, "f4") * [200, 200, 0, 1]
+    (tmp_path / "far.bin").write_bytes(far.astype("f4").tobytes())
+    with pytest.raises(ScanError, match=r"far\.bin: none of its 30 points is left"):
+        weather(tmp_path / "far.bin", tmp_path / "out", "--weather.visibility_m", 1)
+    assert not (tmp_path / "out").exists()
 
 
 BAD = {

@@ -202,6 +202,7 @@ def test_columns_can_be_named_and_points_without_return_dropped(tmp_path):
         ("s/a.bin", "s/a.label", "s/a.label"),
         ("s/a.bin", "s/labels/a.label", "s/labels/a.label"),
         ("velodyne/a.pcd.bin", "labels/a.label", "labels/a.label"),
+        ("velodyne/100.1.bin", "labels/100.1.label", "labels/100.1.label"),
         ("a.bin", "../labels/a.label", "a.label"),
     ],
 )
@@ -219,6 +220,15 @@ def test_labels_go_with_their_scan(tmp_path, scan, labels, written):
     (root / labels).resolve().write_bytes(values[:-1].tobytes())
     with pytest.raises(ScanError, match=r"holds 39 labels but .* 40 points: delete the one"):
         read_file(path)
+
+
+def test_labels_of_another_time_stamp_are_not_taken(tmp_path):
+    for name in ("100.1.bin", "100.2.bin"):
+        (tmp_path / name).write_bytes(ROWS.tobytes())
+    for name in ("100.label", "100.2.label"):
+        (tmp_path / name).write_bytes(bytes(4 * NUM))
+    assert read_file(tmp_path / "100.1.bin").labels is None
+    assert read_file(tmp_path / "100.2.bin").label_path == tmp_path / "100.2.label"
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
 from r3dpa.cli.parser import check_folder
-from r3dpa.io import delete_unfinished, in_processes, only_writer
+from r3dpa.io import delete_unfinished, in_processes, no_follow, only_writer
 from r3dpa.simulation.drive_files import to_json, weather_to_dict, write
 from r3dpa.simulation.drives import differences
 from r3dpa.weather import Instrument, RecordedScan, Weather, WeatheredScan
@@ -115,42 +115,58 @@ class _Job:
         key, scan = (self.options.seed, self.name(path)), file.scan
         try:
             if isinstance(self.change, Fault):
-                return file, self.change.apply(scan, key)
-            weather, instrument, effects = self.change
-            return file, weather.apply(scan, key, instrument, effects=effects)
+                result = self.change.apply(scan, key)
+            else:
+                weather, instrument, effects = self.change
+                result = weather.apply(scan, key, instrument, effects=effects)
         except ValueError as error:
             raise ScanError(f"{path}: {error}") from error
+        if not len(result.points):
+            raise ScanError(
+                f"{path}: none of its {len(scan)} points is left, and no reader takes an empty "
+                "scan: give milder weather or a smaller strength"
+            )
+        return file, result
 
     def __call__(self, path: Path) -> dict[str, Any]:
         from r3dpa.data.scans import ScanError
-        from r3dpa.weather.files import write_file
+        from r3dpa.weather.files import inputs_of, write_file
 
+        inputs = inputs_of(path, self.root)  # before they are read
         try:
             file, result = self.read(path)
         except ScanError as error:
             return {"scan": self.name(path), "error": str(error)}
-        write_file(file.changed(result), self.root, self.options.out)
+        results = write_file(file.changed(result), self.root, self.options.out)
         ran = {effect.name: effect.reason for effect in result.effects if effect.status == "ran"}
-        about = {"scan": self.name(path), "file": file.describe(), "effects": ran}
-        return about | result.report | {"written": len(result.points)}
+        files = {"scan": self.name(path), "inputs": inputs, "results": results}
+        about = {"file": file.describe(), "effects": ran, **result.report}
+        return files | about | {"written": len(result.points)}
 
 
 def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
     from r3dpa.data.scans import ScanError, evenly
-    from r3dpa.weather.files import find_files
+    from r3dpa.weather.files import find_files, inputs_of
 
     root, files = find_files(source)
     out, job = options.out, _Job(root, change, options)
     paths = {job.name(path): path for path in files}
-    request |= {"seed": options.seed, "columns": options.columns, "drop_nan": options.drop_nan}
-    _check_out(root, out, len(files), json.loads(json.dumps(request)))
+    request |= {"source": str(root.resolve()), "seed": options.seed}
+    request |= {"columns": options.columns, "drop_nan": options.drop_nan}
+    _check_out(root, out, files, json.loads(json.dumps(request)))
     with only_writer(out / ".lock", f"writes scans to {out}", wait=True):
         write(out / _REQUEST, to_json(request))
-        lines = {name: line for name, line in _lines(out) if _is_done(line, paths.get(name), out)}
+        lines = {
+            name: line for name, line in _lines(out) if name in paths or (out / name).is_file()
+        }
+        for name in lines.keys() & paths.keys():
+            if not _is_done(lines[name], inputs_of(paths[name], root), out):
+                _delete_results(lines.pop(name), out)
         todo = [path for name, path in paths.items() if name not in lines]
+        num_done = len(paths) - len(todo)
         with (
-            (out / _LINES).open("a") as unfinished,
-            tqdm(total=len(paths), initial=len(lines), unit="scan", disable=None) as bar,
+            open(out / _LINES, "a", opener=no_follow) as unfinished,
+            tqdm(total=len(paths), initial=num_done, unit="scan", disable=None) as bar,
         ):
             for line in in_processes(job, todo, options.workers):
                 lines[line["scan"]] = line
@@ -162,13 +178,14 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
         (out / _LINES).unlink()
         delete_unfinished(out)  # at the end: workers of a killed run may outlive it
         bad = [lines[name]["error"] for name in paths if "error" in lines[name]]
-        if len(bad) == len(paths):
+        has_results = len(bad) < len(lines)
+        if not has_results:
             (out / _REPORT).unlink()
             (out / _REQUEST).unlink()
     if bad:
         with suppress(OSError):
             out.rmdir()
-        where = f", see {out / _REPORT}" if len(bad) < len(paths) else ""
+        where = f", see {out / _REPORT}" if has_results else ""
         more = f" ({len(bad)} of {len(paths)} scans cannot be used{where})"
         raise ScanError(bad[0] + (more if len(paths) > 1 else ""))
     if options.show and (todo or not (out / _PAGE).exists()):
@@ -176,11 +193,13 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
     return _summary([lines[name] for name in paths], len(todo), out)
 
 
-def _check_out(root: Path, out: Path, num: int, request: dict[str, Any]) -> None:
-    """Refuse a folder of other files, before anything is written."""
+def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]) -> None:
+    """Refuse a folder of other files or results, before anything is written."""
+    from r3dpa.weather.files import refuse_shared_labels
+
     check_folder(out)
     place, above = out.resolve(), root.resolve()
-    if place == above or (place.is_relative_to(above) and num > 1):
+    if place == above or (place.is_relative_to(above) and len(files) > 1):
         raise ValueError(f"--out {out} is the folder of the scans, or in it: give another one")
     if (out / _REQUEST).is_file():
         before = json.loads((out / _REQUEST).read_text())
@@ -191,6 +210,13 @@ def _check_out(root: Path, out: Path, num: int, request: dict[str, Any]) -> None
             )
     elif out.is_dir() and any(out.iterdir()):
         raise ValueError(f"{out} holds other files: give a new folder as --out")
+    earlier = {root / name: out / name for name, _ in _lines(out) if (out / name).is_file()}
+    if gone := [result for path, result in earlier.items() if not path.is_file()]:
+        raise ValueError(
+            f"{out} holds results of {len(gone)} scans that {root} does not hold any more, such as "
+            f"{gone[0]}: delete them, or give another --out"
+        )
+    refuse_shared_labels({*files, *earlier})
 
 
 def _lines(out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -202,12 +228,21 @@ def _lines(out: Path) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield line["scan"], line
 
 
-def _is_done(line: dict[str, Any], path: Path | None, out: Path) -> bool:
-    """Whether the result of a scan is there and newer than the scan."""
-    written = out / line["scan"]
-    if path is None or "error" in line or not written.is_file():
+def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> bool:
+    """Whether the results of a scan are whole, and those of the inputs as they are now."""
+    if "error" in line or line.get("inputs") != inputs:
         return False
-    return written.stat().st_mtime_ns >= path.stat().st_mtime_ns
+    results = {name: out / name for name in line["results"]}
+    sizes = {name: path.stat().st_size for name, path in results.items() if path.is_file()}
+    return bool(sizes == line["results"])
+
+
+def _delete_results(line: dict[str, Any], out: Path) -> None:
+    """Delete the files of an earlier run, since new ones may have no labels in their place."""
+    for name in line.get("results", ()):
+        path = out / name
+        if path.parent.resolve().is_relative_to(out.resolve()):
+            path.unlink(missing_ok=True)
 
 
 def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:
@@ -238,8 +273,6 @@ def _write_page(job: _Job, files: list[Path]) -> None:
     after: list[viz.PageScan] = []
     for path in files:
         file, result = job.read(path)
-        if not len(result.points):
-            continue
         scan = file.scan
         index = result.index[result.index >= 0]
         fate = np.full(len(scan), _LOST, dtype=np.uint8)
@@ -256,5 +289,4 @@ def _write_page(job: _Job, files: list[Path]) -> None:
             scans.append(viz.PageScan(f"{job.name(path)}{note}", points, origins=origins))
     more = {_LOST: viz.Category("lost", "#ff5c5c"), _MOVED: viz.Category("moved", "#ffb000")}
     title = f"{job.root.resolve().name} - r3dpa"
-    if before:
-        write_page(job.options.out / _PAGE, before, title, more, beside=after, mode="origin")
+    write_page(job.options.out / _PAGE, before, title, more, beside=after, mode="origin")

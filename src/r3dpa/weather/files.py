@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, cast
@@ -160,19 +160,51 @@ def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -
     return ScanFile(path, kind, table, known, pack, None if num_bad else data, labels, label_path)
 
 
-def write_file(file: ScanFile, root: Path, out: Path) -> None:
+def write_file(file: ScanFile, root: Path, out: Path) -> dict[str, int]:
     """Write a scan, its labels first, to the place below ``out`` that it has below ``root``.
 
     Labels from outside ``root`` are written beside the scan.
+
+    Returns:
+        Size of each written file by its name below ``out``.
     """
     path = out / file.path.relative_to(root)
+    contents: dict[Path, bytes] = {}
     if file.labels is not None and file.label_path is not None:
-        place = Path(os.path.relpath(file.label_path.absolute(), root.absolute()))
+        place = Path(os.path.relpath(file.label_path, root))
         beside = place.parts[0] == ".."
-        with atomic_path(path.with_name(place.name) if beside else out / place) as temporary:
-            temporary.write_bytes(file.labels.astype("<u4").tobytes())
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(file.pack(file.table) if file.data is None else file.data)
+        label_path = path.with_name(place.name) if beside else out / place
+        contents[label_path] = file.labels.astype("<u4").tobytes()
+    contents[path] = file.pack(file.table) if file.data is None else file.data
+    for written, content in contents.items():
+        with atomic_path(written) as temporary:
+            temporary.write_bytes(content)
+    return {written.relative_to(out).as_posix(): len(data) for written, data in contents.items()}
+
+
+def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
+    """Size and time of change in ns of a scan and its labels, by their names from ``root``."""
+    stats = {file: file.stat() for file in (path, label_path_of(path)) if file and file.is_file()}
+    return {
+        Path(os.path.relpath(file, root)).as_posix(): [about.st_size, about.st_mtime_ns]
+        for file, about in stats.items()
+    }
+
+
+def refuse_shared_labels(paths: Iterable[Path]) -> None:
+    """Refuse scans of which two have the same file of labels, also in their results.
+
+    Raises:
+        ScanError: With the names of two such scans.
+    """
+    scan_of: dict[Path, Path] = {}
+    for path in sorted(paths):
+        label_path = label_path_of(path)
+        if label_path is not None and scan_of.setdefault(label_path, path) != path:
+            raise ScanError(
+                f"{label_path}: would be the labels of {scan_of[label_path]} and of {path}: keep "
+                "one of these scans, or its labels in another folder"
+            )
 
 
 def _known_columns(path: Path, table: Table) -> dict[str, str]:
@@ -189,22 +221,25 @@ def _known_columns(path: Path, table: Table) -> dict[str, str]:
     return known
 
 
-def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
-    name = f"{path.name.split('.')[0]}.label"
+def label_path_of(path: Path) -> Path | None:
+    """File of the labels of a scan, if there is one."""
+    name = f"{path.stem.removesuffix('.pcd')}.label"
     folder = path.absolute().parent
-    for place in (
-        path.with_name(name),
-        *(top / "labels" / name for top in (folder, folder.parent)),
-    ):
-        if place.is_file():
-            data = read_bytes(place)
-            if len(data) != 4 * num_points:
-                raise ScanError(
-                    f"{place}: holds {len(data) / 4:g} labels but {path} {num_points} points: "
-                    "delete the one that does not belong"
-                )
-            return np.frombuffer(data, "<u4"), place
-    return None, None
+    places = (folder / name, folder / "labels" / name, folder.parent / "labels" / name)
+    return next((place for place in places if place.is_file()), None)
+
+
+def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Path | None]:
+    place = label_path_of(path)
+    if place is None:
+        return None, None
+    data = read_bytes(place)
+    if len(data) != 4 * num_points:
+        raise ScanError(
+            f"{place}: holds {len(data) / 4:g} labels but {path} {num_points} points: "
+            "delete the one that does not belong"
+        )
+    return np.frombuffer(data, "<u4"), place
 
 
 def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
