@@ -1,4 +1,5 @@
 from contextlib import nullcontext
+from functools import partial
 
 import numpy as np
 import pytest
@@ -7,10 +8,12 @@ from torch.utils.data import DataLoader
 
 from r3dpa.data import Augmentation, FeatureGrids, LidarDataset, find_scans
 from r3dpa.data.augmentation import View
+from r3dpa.data.datasets import DrawnPoints
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
 from r3dpa.data.store import CachedTensors, tensor_cache
 from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection
+from r3dpa.weather import WeatherPrior
 
 
 def write(folder, points):
@@ -65,6 +68,28 @@ def test_a_scan_out_of_range_is_named(tmp_path, projection):
     scans = write(tmp_path, [[0, 0, 0.5, 1], [90, 0, 0, 1]])
     with pytest.raises(ScanError, match=r"000000\.bin: has no point within .* 1\.\.56 m"):
         LidarDataset(scans, projection, RangeCodec())[0]
+
+
+def test_weather_that_leaves_no_point_is_blamed_and_not_the_file(tmp_path, projection):
+    """A wall at 50 m in fog that ends before; and at 90 m, out of range in clear air too."""
+    wall = np.full((30, 4), 0.1, "f4")
+    wall[:, 0], wall[:, 1] = 50, np.arange(30)
+    fog = WeatherPrior(probability=1, visibility_m=(1, 1.5))
+    epoch = next(
+        n for n in range(40) if fog.draw(np.random.default_rng((0, n, 0))).visibility_m < 2
+    )
+    scans = write(tmp_path, wall)
+    points = DrawnPoints(scans, projection.sensor, lambda points, generator: points, 0, fog)
+    images = LidarDataset(scans, projection, RangeCodec())
+    in_fog = partial(fog.points, seed=(0, epoch, 0))
+    for sample in (lambda: points[epoch, 0], lambda: images.sample(0, in_fog)):
+        with pytest.raises(ScanError, match=r"no point .* in the weather drawn for it: give the"):
+            sample()
+    wall[:, 0] = 90
+    write(tmp_path, wall)
+    for sample in (lambda: points[epoch, 0], lambda: images.sample(0, in_fog)):
+        with pytest.raises(ScanError, match=r"no point within the sensor's range 1\.\.56 m$"):
+            sample()
 
 
 def test_posteriors_turn_with_the_scan(tmp_path, make_scans, projection):

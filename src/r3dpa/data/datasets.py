@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch.utils.data import Dataset
 
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
 from r3dpa.data.store import CachedTensors, ItemKey
-from r3dpa.geometry import LidarSensor, Projection, RangeCodec, range_image
+from r3dpa.geometry import LidarSensor, Projection, RangeCodec, in_range, range_image
 from r3dpa.weather import WeatherPrior
 
 #: Function of the points ``(P, 4)`` of a scan.
@@ -93,7 +94,10 @@ class LidarDataset(Dataset[dict[str, Any]]):
         except ValueError as error:
             raise ScanError(f"{scan.path}: cannot be projected: {error}") from error
         if not (range_m > 0).any():
-            raise out_of_range(scan.path, self.projection.sensor)
+            if change is None:
+                raise out_of_range(scan.path, self.projection.sensor)
+            self._project(scan)  # without the change, to blame a file that shows nothing by itself
+            raise _lost_in_weather(scan.path, self.projection.sensor)
         return range_m, None if values is None else values[0]
 
 
@@ -143,5 +147,15 @@ class DrawnPoints(PointDataset):
         read = read_scan(self.scans[index].path, self.sensor)
         if self.weather is not None and isinstance(key, tuple):
             read = self.weather.points(read, (self.seed, epoch, index))
+            if not in_range(torch.from_numpy(read[:, :3]), self.sensor).any():
+                raise _lost_in_weather(self.scans[index].path, self.sensor)
         points = torch.from_numpy(read)
         return self.prepare(points, np.random.default_rng((self.seed, epoch, index)))
+
+
+def _lost_in_weather(path: Path, sensor: LidarSensor) -> ScanError:
+    """Error of a sound scan in a weather that leaves no point within the range limits."""
+    return ScanError(
+        f"{out_of_range(path, sensor)} in the weather drawn for it: give the WeatherPrior a "
+        "greater visibility_m"
+    )
