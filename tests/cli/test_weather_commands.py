@@ -244,6 +244,22 @@ def test_a_link_in_place_of_the_report_is_not_written_to(pair, tmp_path):
     assert victim.read_text() == "notes\n"
 
 
+@pytest.mark.parametrize("is_fresh", [True, False])
+def test_a_linked_folder_in_the_results_is_not_written_to(folder, tmp_path, is_fresh):
+    """Neither a new scan, nor one whose result has another size."""
+    out, private = tmp_path / "out", tmp_path / "private"
+    weather(folder / "a", out, *FOG, "--show", 0)
+    (out / "velodyne").rename(tmp_path / "moved")
+    private.mkdir()
+    if not is_fresh:
+        (private / "0.bin").write_text("notes")
+    (out / "velodyne").symlink_to(private)
+    before = content(private)
+    with pytest.raises(ScanError, match=r"velodyne/.\.bin: leads out of .*out: give another --out"):
+        weather(folder / "a", out, *FOG)
+    assert content(private) == before
+
+
 def test_faults_act_on_every_file(folder, tmp_path, capsys):
     words = ["--fault", "crosstalk", "--severity", "3", "--show", "1"]
     main(["corrupt", str(folder), "--out", str(tmp_path / "out"), *words])

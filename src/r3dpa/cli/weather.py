@@ -37,7 +37,8 @@ def weather(
 
     Points that stay keep their coordinates and order, added ones come last. ``report.jsonl`` has
     one line per scan, ``scans.html`` shows some beside their results. The same command completes
-    an interrupted run; its files do not depend on the number of workers.
+    an interrupted run, and makes again what has changed: a scan, its labels or their results. Files
+    do not depend on the number of workers.
 
     Args:
         source: Scan or folder of scans: .bin, .pcd.bin, .pcd, .ply, .npy, .npz, with .label files.
@@ -239,10 +240,11 @@ def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> b
 
 def _delete_results(line: dict[str, Any], out: Path) -> None:
     """Delete the files of an earlier run, since new ones may have no labels in their place."""
+    from r3dpa.weather.files import refuse_outside
+
     for name in line.get("results", ()):
-        path = out / name
-        if path.parent.resolve().is_relative_to(out.resolve()):
-            path.unlink(missing_ok=True)
+        refuse_outside(out / name, out)
+        (out / name).unlink(missing_ok=True)
 
 
 def _summary(lines: list[dict[str, Any]], num_now: int, out: Path) -> str:

@@ -167,6 +167,9 @@ def write_file(file: ScanFile, root: Path, out: Path) -> dict[str, int]:
 
     Returns:
         Size of each written file by its name below ``out``.
+
+    Raises:
+        ScanError: If a link leads out of ``out``.
     """
     path = out / file.path.relative_to(root)
     contents: dict[Path, bytes] = {}
@@ -177,9 +180,20 @@ def write_file(file: ScanFile, root: Path, out: Path) -> dict[str, int]:
         contents[label_path] = file.labels.astype("<u4").tobytes()
     contents[path] = file.pack(file.table) if file.data is None else file.data
     for written, content in contents.items():
+        refuse_outside(written, out)
         with atomic_path(written) as temporary:
             temporary.write_bytes(content)
     return {written.relative_to(out).as_posix(): len(data) for written, data in contents.items()}
+
+
+def refuse_outside(path: Path, out: Path) -> None:
+    """Refuse a file to write or delete that is not below ``out``, once links are followed.
+
+    Raises:
+        ScanError: With the name of the file.
+    """
+    if not path.parent.resolve().is_relative_to(out.resolve()):
+        raise ScanError(f"{path}: leads out of {out}: give another --out")
 
 
 def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
