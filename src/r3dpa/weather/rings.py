@@ -63,8 +63,9 @@ def rings_of(scan: RecordedScan) -> Rings:
     order = np.lexsort((azimuth, ring))
     is_beside = np.diff(ring[order]) == 0
     if how == "stored":
-        along = np.abs(np.diff(inclination[order]))[is_beside]
-        by_chance = len(along) and np.median(along) > _MOST_STEP_SHARE * inclination.std()
+        is_apart = np.abs(np.diff(inclination[order])) > _MOST_STEP_SHARE * inclination.std()
+        num_apart = np.count_nonzero(is_apart & is_beside)
+        by_chance = 2 * num_apart > np.count_nonzero(is_beside)
         sure = 0.0 if by_chance or len(mean) > _MOST_BEAMS else 1.0
     step = np.diff(azimuth[order])[is_beside]
     step = step[step > 1e-5]
