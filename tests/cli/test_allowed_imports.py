@@ -33,6 +33,60 @@ def test_functions_that_run_commands_or_code_are_refused(command, name, tmp_path
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("words", [[], ["--allow_import", "torch.distributed"]])
+@pytest.mark.parametrize("command", ["fit", "features", "convert"])
+def test_no_argument_of_any_type_starts_a_shell(command, words, tmp_path, monkeypatch):
+    """Not even a class that may be named: an argument without a base class gets plain values."""
+    shell = {
+        "class_path": "torch.distributed.elastic.multiprocessing.subprocess_handler."
+        "SubprocessHandler",
+        "init_args": {
+            "entrypoint": "/bin/sh",
+            "args": ["-c", f"echo > {tmp_path / 'run'}"],
+            "env": {},
+            "stdout": None,
+            "stderr": None,
+            "local_rank_id": 0,
+            "numa_options": None,
+        },
+    }
+    size = {"in_features": 1, "out_features": 1, "device": shell}
+    extractor = {"class_path": "torch.nn.Linear", "init_args": size}
+    data = {"root": str(tmp_path / "data"), "num_scans": 2, "extractor": extractor}
+    content = {"data": {"class_path": "r3dpa.data.SimulatedDataModule", "init_args": data}}
+    if command == "fit":
+        content["model"] = {"class_path": "lightning.pytorch.demos.BoringModel"}
+    if command == "convert":
+        content = {"sit_args": {"alignment_depth": shell}}
+        words = [str(tmp_path / "official.pt"), str(tmp_path / "out.safetensors"), *words]
+    path = tmp_path / "hostile.yaml"
+    path.write_text(yaml.safe_dump(content))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, OSError, SystemExit)):
+        main([command, "--config", str(path), *words])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_package_is_imported_only_if_the_command_line_allows_it(tmp_path, monkeypatch, capsys):
+    package, path = "package_of_a_user", tmp_path / "own.yaml"
+    text = "from r3dpa.data import LidarDataModule\nclass Own(LidarDataModule): ..."
+    (tmp_path / f"{package}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    content = {"data": {"class_path": f"{package}.Own", "init_args": {"scans": "scans"}}}
+    for more in ({}, {"allow_import": [package]}):
+        path.write_text(yaml.safe_dump(content | more))
+        with pytest.raises(SystemExit) as stop:
+            main(["fit", "--config", str(path)])
+        assert stop.value.code == 2
+        assert package not in sys.modules
+    path.write_text(yaml.safe_dump(content))
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--config", str(path), "--print_config", "--allow_import", package])
+    assert stop.value.code == 0
+    assert f"{package}.Own" in capsys.readouterr().out
+
+
 class TestCheckpoints:
     """Class paths stored in checkpoints: networks of ``r3dpa.nn`` and nothing else."""
 

@@ -63,7 +63,8 @@ def _help(group: str) -> str:
     shown = {name: command for name, command in COMMANDS.items() if name.startswith(group)}
     lines = [f"  {name:<17}{command.summary}" for name, command in shown.items()]
     title = [] if group else ["Generate LiDAR scenes (R3DPA).", ""]
-    end = "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out."
+    end = "r3dpa COMMAND --help lists the options. `data` and `edit` may be left out.\n"
+    end += "--allow_import PACKAGE lets a configuration name classes of a package that you trust."
     usage = " ".join(filter(None, ("usage: r3dpa", group, "COMMAND [options]")))
     return "\n".join([usage, "", *title, *lines, "", end])
 
@@ -91,10 +92,11 @@ def _run(args: list[str]) -> None:
         return
     name, words = _find(args)
     prog = f"r3dpa {' '.join(args[: len(args) - len(words)])}"  # as it was typed
-    from r3dpa.cli.parser import load, run_function
+    from r3dpa.cli.parser import allow_imports, load, run_function
 
     command = COMMANDS[name]
     try:
+        words = allow_imports(words)
         function = load(command.target)
         if command.target in OWN_PARSER:
             result = function([name, *words])

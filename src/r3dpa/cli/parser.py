@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -18,8 +19,15 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from r3dpa.pretrained import DEFAULT_WEIGHTS
 
-# jsonargparse denies os.system and its like already when a YAML file names them.
-set_parsing_settings(import_path_denylist=["torch.hub", "torch.load", "torch.package"])
+# Packages whose classes a configuration may name. An argument of any type gets plain values alone:
+# the classes of other packages, and those that nothing restricts to a base, can start a shell.
+_ALLOWED = ("r3dpa", "lightning", "torch.nn", "torch.optim")
+set_parsing_settings(
+    instantiate_subclass_spec_in_any=False,
+    import_path_denylist=["*"],
+    import_path_allowlist=list(_ALLOWED),
+)
+_DENIED = re.compile(r"Importing '([\w.]+)' is not allowed, .* set_parsing_settings to allow it")
 
 
 class Parser(ArgumentParser):
@@ -43,6 +51,12 @@ class Parser(ArgumentParser):
 
 def _short(message: str) -> str:
     """An error of jsonargparse in one line, without the types that a union tried."""
+    denied = _DENIED.search(message)
+    if denied is not None:
+        return (
+            f"{denied[1]} is not allowed: a configuration may name classes of "
+            f"{', '.join(_ALLOWED)}, and of a package of yours after --allow_import PACKAGE"
+        )
     head, _, tail = message.partition("Does not validate against any of the Union subtypes")
     causes = re.search(r"Errors:\s*(.*?)\s*Given value type:", tail, re.DOTALL)
     if causes is not None:
@@ -88,6 +102,18 @@ def _item_types(kind: Any) -> set[Any]:
         return set(get_args(kind))
     union = get_origin(kind) in (Union, UnionType)
     return set().union(*map(_item_types, get_args(kind))) if union else set()
+
+
+def allow_imports(words: Sequence[str]) -> list[str]:
+    """Let configurations name the packages after ``--allow_import``; return the other words.
+
+    These are words of the command line alone: no configuration can allow itself anything.
+    """
+    parser = argparse.ArgumentParser(prog="r3dpa", add_help=False, allow_abbrev=False)
+    parser.add_argument("--allow_import", action="append", default=[], metavar="PACKAGE")
+    given, others = parser.parse_known_args(list(words))
+    set_parsing_settings(import_path_allowlist=given.allow_import)
+    return others
 
 
 def load(target: str) -> Callable[..., Any]:
