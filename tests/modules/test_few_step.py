@@ -8,7 +8,7 @@ from tiny_stages import ARGUMENTS, QUIET, Observed, TinyData, stage_module, tiny
 
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.flow import average_times
-from r3dpa.modules import FewStep
+from r3dpa.modules import FewStep, few_step
 from r3dpa.modules.steps import PathDraws
 from r3dpa.nn import VAE, SiT, ThinDecoder
 
@@ -63,6 +63,24 @@ def test_a_thin_decoder_that_does_not_fit_the_vae_is_refused(name, own, theirs):
     thin = ThinDecoder(**ARGUMENTS["thin_decoder"] | {"least_scale": 0.25, name: own})
     with pytest.raises(ValueError, match=f"{name} is {own}, but {theirs} of the VAE"):
         FewStep(vae, tiny_sit(average_blocks=1), thin)
+
+
+@pytest.mark.parametrize(("size", "world"), [(1, 1), (3, 1), (8, 1), (5, 2), (1, 3)])
+def test_losses_of_the_thin_decoder_are_means_at_any_batch_size(size, world, monkeypatch):
+    """Of equal latents, the mean over processes is the loss of one of them."""
+    module = stage_module("few_step")
+    one = torch.randn(1, 4, 4, 8, generator=torch.Generator().manual_seed(0))
+    expected = module.reconstruction_losses(
+        module.vae.decode(one), module.thin_decoder.predict(one)
+    )
+    monkeypatch.setattr(few_step, "num_processes", lambda: world)
+    total = Counter()
+    for rank in range(world):
+        monkeypatch.setattr(FewStep, "global_rank", rank)
+        losses = module._decoder_losses(one.expand(size, -1, -1, -1))
+        total.update({name: loss.item() for name, loss in losses.items()})
+    for name, loss in expected.items():
+        assert total[name] / world == pytest.approx(loss.item(), rel=1e-5)
 
 
 def test_trajectories_have_the_precision_of_the_steps(tmp_path):

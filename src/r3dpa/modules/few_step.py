@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -235,5 +236,6 @@ class FewStep(FlowMatching):
         with torch.no_grad():
             image = self.vae.decode(torch.stack(part))
         found = self.reconstruction_losses(image, self.thin_decoder.predict(torch.stack(part)))
-        weight = _DECODED * len(part) / len(latents)  # the mean over processes is one over the part
+        num_decoded = math.ceil(world * len(latents) / _DECODED)  # of all processes
+        weight = world * len(part) / num_decoded  # the mean over processes is one over the part
         return {name: weight * loss for name, loss in found.items()}
