@@ -20,7 +20,7 @@ from r3dpa.data.scans import (
     write_ply,
 )
 from r3dpa.geometry import LidarSensor
-from r3dpa.io import atomic_path
+from r3dpa.io import atomic_path, refuse_name
 from r3dpa.weather.files import read_file
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
@@ -46,7 +46,7 @@ def test_five_columns_are_told_from_their_values(tmp_path, count, times):
 def test_four_columns_of_a_size_that_fits_five(tmp_path):
     generator = np.random.default_rng(0)
     points = np.column_stack([generator.uniform(-40, 40, (40, 3)), generator.random(40)])
-    for intensity in (points[:, 3], np.zeros(40), 255 * points[:, 3]):
+    for intensity in (points[:, 3], np.zeros(40)):
         points[:, 3] = intensity
         points.astype("<f4").tofile(tmp_path / "a.bin")
         assert np.array_equal(read_scan(tmp_path / "a.bin"), points.astype("<f4"))
@@ -61,14 +61,33 @@ def problems(path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "says"), [(1, "intensity: 0..1\n"), (255, "0..255 (expected 0..1: divide by 255)\n")]
+    ("change", "says"),
+    [(0, "intensity: 0..1\n"), (-0.25, "intensity: -0.25..0.75 (expected 0..1)\n")],
 )
-def test_check_says_the_intensity_scale(tmp_path, scale, says):
-    write_bin(tmp_path / "a.bin", POINTS * [1, 1, 1, scale])
+def test_check_says_the_intensities(tmp_path, change, says):
+    write_bin(tmp_path / "a.bin", POINTS + np.float32([0, 0, 0, change]))
     text, usable = check(tmp_path)
     assert usable
     assert says in text
     assert "1 scans in 1 drives, all usable" in text
+
+
+def test_intensities_of_another_full_scale_are_refused(tmp_path):
+    """Features and reflectance of 0..255 would be wrong in silence; single bright returns stay."""
+    intensity = np.tile(POINTS[1], (2000, 1))
+    intensity[:, 3] = np.linspace(0, 255, 2000)
+    write_bin(tmp_path / "a.bin", intensity)
+    with pytest.raises(ScanError, match=r"a\.bin: has intensities up to 255 .* not 0\.\.1: divide"):
+        read_scan(tmp_path / "a.bin")
+    (problem,) = problems(tmp_path)
+    assert "has intensities up to 255" in problem
+    intensity[:, 3] = np.where(np.arange(2000) < 2, 1.5, 1.0)
+    write_bin(tmp_path / "a.bin", intensity)
+    assert read_scan(tmp_path / "a.bin")[:, 3].max() == 1.5
+    intensity[2, 3] = 1.5
+    write_bin(tmp_path / "a.bin", intensity)
+    with pytest.raises(ScanError, match=r"up to 1\.5 and above 1 in 3 of 2000 points"):
+        read_scan(tmp_path / "a.bin")
 
 
 def test_points_are_little_endian_float32_rows(tmp_path):
@@ -212,6 +231,45 @@ def test_find_scans_in_folder_glob_list_and_file(tmp_path, make_scans):
         find_scans(str(tmp_path / "nowhere"))
     with pytest.raises(ValueError, match=r"given twice: .*kitti/0000000000\.bin"):
         find_scans([f"{tmp_path}/kitti", f"{tmp_path}/**/*.bin"])
+
+
+@pytest.mark.parametrize(
+    ("source", "names"),
+    [
+        (["a", "a/../b"], ["a/0000000000", "b/0000000000"]),
+        (["below/c", "below/../../b"], ["b/0000000000", "run/below/c/0000000000"]),
+        ("a/../*/*.bin", ["a/0000000000", "b/0000000000"]),
+        ("below/link/../d", ["d/0000000000"]),  # as the system reads it: the one beside far/e
+        (["below/link/../d", "../far/e"], ["d/0000000000", "e/0000000000"]),
+    ],
+)
+def test_dots_in_a_source_lead_no_name_out_of_its_folder(
+    source, names, tmp_path, make_scans, monkeypatch
+):
+    for folder in ("a", "b", "run/a", "run/b", "run/below/c", "run/below/d", "far/e", "far/d"):
+        make_scans(tmp_path / folder, 1)
+    (tmp_path / "run/below/link").symlink_to(tmp_path / "far/e")
+    monkeypatch.chdir(tmp_path / "run")
+    scans = find_scans(source)
+    assert [scan.name for scan in scans] == names
+    assert all(refuse_name(scan.name) is None for scan in scans)
+    if "link" in str(source):
+        assert scans[0].path.samefile(tmp_path / "far/d/0000000000.bin")
+
+
+def test_one_file_under_two_names_is_given_twice(tmp_path, make_scans, monkeypatch):
+    make_scans(tmp_path / "a", 1)
+    monkeypatch.chdir(tmp_path)
+    for other in ("a/../a", f"../{tmp_path.name}/a/*.bin", tmp_path / "a"):
+        with pytest.raises(ValueError, match=r"given twice: .*a/0000000000\.bin"):
+            find_scans(["a", other])
+
+
+def test_names_that_no_file_can_have_everywhere_are_refused(tmp_path, make_scans):
+    make_scans(tmp_path, 1)
+    (tmp_path / "0000000000.bin").rename(tmp_path / "b\\0.bin")
+    with pytest.raises(ValueError, match=r"name of the scan leads out of its folder.* rename"):
+        find_scans(tmp_path)
 
 
 def make_kitti360(root, make_scans, drives):

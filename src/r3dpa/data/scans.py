@@ -82,22 +82,36 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
     to the given folder, or to the common parent of a glob or list. ``ValueError`` if nothing is
-    found, or one file is named twice.
+    found, one file is named twice, or a name could not be that of an output file.
     """
-    entries = [source] if isinstance(source, str | Path) else list(source)
+    given = [source] if isinstance(source, str | Path) else list(source)
+    entries = [_without_dots(Path(entry).absolute()) for entry in given]
     single = len(entries) == 1 and Path(entries[0]).is_dir()
     files = sorted(file.absolute() for entry in entries for file in scan_files(entry))
     if not files:
         raise ValueError(
-            f"No scan found in {', '.join(str(e) for e in entries)}: give a folder that holds .bin "
+            f"No scan found in {', '.join(str(e) for e in given)}: give a folder that holds .bin "
             "files, a .bin file, a glob such as 'drives/**/*.bin', or a list of these."
         )
     twice = [str(file) for file, count in Counter(files).items() if count > 1]
     if twice:
         raise ValueError(f"Scans given twice: {', '.join(twice[:5])}. Name every file once.")
     parent = os.path.commonpath([file.parent for file in files])
-    root = Path(entries[0] if single else parent).absolute()
-    return sorted(Scan(_drive_name(file.parent, root), file.stem, file) for file in files)
+    root = entries[0] if single else Path(parent)
+    scans = sorted(Scan(_drive_name(file.parent, root), file.stem, file) for file in files)
+    for scan in scans:  # they become names of reconstructions and of feature grids
+        if reason := refuse_name(scan.name):
+            raise ValueError(f"{scan.path}: the name of the scan {reason}; rename the file")
+    return scans
+
+
+def _without_dots(path: Path) -> Path:
+    """The path without ``..``, which leads out of the folder that a link before it points to."""
+    parts = path.parts
+    if ".." not in parts:
+        return path
+    last = max(place for place, part in enumerate(parts) if part == "..")
+    return Path(*parts[: last + 1]).resolve().joinpath(*parts[last + 1 :])
 
 
 def kitti360_scans(root: str | Path, split: Split) -> list[Scan]:
@@ -128,7 +142,8 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     """Points ``(P, 4)`` of one KITTI ``.bin`` scan: float32 x, y, z (metres), intensity 0..1.
 
     ``ScanError`` names a file that is unreadable, empty, of another layout, holds NaN or infinite
-    values, or has no point within the range limits of ``sensor``.
+    values, has intensities above 1 in more than a thousandth of its points, or has no point within
+    the range limits of ``sensor``.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -152,6 +167,13 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
     bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
     if bad:
         raise ScanError(f"{path}: has NaN or infinite values in {bad} of {len(points)} points")
+    bright = np.count_nonzero(points[:, 3] > 1)
+    if bright > len(points) / 1000:  # of some sensors, single returns exceed their full scale
+        raise ScanError(
+            f"{path}: has intensities up to {points[:, 3].max():g} and above 1 in {bright} of "
+            f"{len(points)} points, not 0..1: divide the fourth column by its full scale, such as "
+            "255"
+        )
     if sensor is not None and not in_range(torch.from_numpy(points[:, :3]), sensor).any():
         raise out_of_range(path, sensor)
     return points
@@ -400,7 +422,7 @@ def check(path: str | Path) -> tuple[str, bool]:
     lines = [*(f"{drive}: {count} scans" for drive, count in counts.items()), *problems]
     if limits := [result for result in results if not isinstance(result, str)]:
         low, high = min(low for low, _ in limits), max(high for _, high in limits)
-        outside = " (expected 0..1: divide by 255)" if low < 0 or high > 1 else ""
+        outside = " (expected 0..1)" if low < 0 or high > 1 else ""
         lines.append(f"intensity: {low:.3g}..{high:.3g}{outside}")
     verdict = f"problems: {len(problems)}" if problems else "all usable"
     lines.append(f"{root}: {len(scans)} scans in {len(counts)} drives, {verdict}")
