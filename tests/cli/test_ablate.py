@@ -48,6 +48,14 @@ def names_of(stages):
     return [stage.name for stage in stages]
 
 
+def test_a_process_of_a_job_imports_nothing_of_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "r3dpa.py").write_text("open('run', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    job = runner.Job("version", ["--version"], tmp_path / "version", "")
+    assert asyncio.run(runner._run(job, 1)) is None
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("scale", ["demo", pytest.param("small", marks=pytest.mark.slow), "paper"])
 def test_a_training_of_several_rows_is_run_once(scale):
     """Table II ends as table III begins, whose last row is that of table I, but in the demo.

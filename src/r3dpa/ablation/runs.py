@@ -110,7 +110,8 @@ async def _run(job: Job, cores: int) -> str | None:
             *(sys.executable, "-m", "r3dpa", *job.words),
             stdout=log,
             stderr=log,
-            env={"OMP_NUM_THREADS": str(cores)} | os.environ,
+            # Else `python -m` and its own processes would import files of the current folder.
+            env={"OMP_NUM_THREADS": str(cores), "PYTHONSAFEPATH": "1"} | os.environ,
             process_group=0,  # Ctrl-C reaches it once, by way of this process
             preexec_fn=_end_with_parent,
         )
