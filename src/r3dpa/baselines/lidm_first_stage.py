@@ -70,9 +70,16 @@ class LiDMFirstStage(Baseline):
         self.curve_length = curve_length
 
     def image_shape(self) -> tuple[int, ...]:
-        """Images of any size that the strides divide."""
+        """Images of any size that the strides divide and that hold a patch."""
         sensor = self.scan_geometry.projection.sensor
         self.network.latent_size((sensor.beams, sensor.columns))
+        least = self.discriminator.least_size
+        if min(sensor.beams, sensor.columns) < least:
+            raise ValueError(
+                f"images of {sensor.beams} x {sensor.columns} pixels are smaller than a patch of "
+                f"the discriminator: give them {least} rows and columns, or the discriminator "
+                "fewer num_layers"
+            )
         return self.network.in_channels, sensor.beams, sensor.columns
 
     def coordinates(self, image: Tensor) -> Tensor:

@@ -39,6 +39,7 @@ class PatchDiscriminator(nn.Module):
                 nn.LeakyReLU(0.2),
             ]
         layers.append(nn.Conv2d(width, 1, 4, 1, 1))
+        self.least_size = 3 * 2**num_layers  # rows and columns of one patch
         self.main = nn.Sequential(*layers)
         self.main.apply(_initialise)
 
