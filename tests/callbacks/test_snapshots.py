@@ -116,18 +116,6 @@ def test_a_snapshot_is_the_average_with_all_that_describes_it(tmp_path):
         found.network("vae")
 
 
-def test_an_existing_snapshot_stays_as_it_is(tmp_path):
-    """As after a resume from before it, or with several batches per step."""
-    made = module()
-    run(EMASnapshots(steps=[1]), made, tmp_path, [1])
-    path = tmp_path / "snapshots" / "step_0000001.safetensors"
-    before = path.read_bytes()
-    with torch.no_grad():
-        made.ema.sit.pos_embed.add_(1)
-    run(EMASnapshots(steps=[1]), made, tmp_path, [1, 1], resumed=True)
-    assert path.read_bytes() == before
-
-
 def test_snapshots_of_an_earlier_run_are_refused(tmp_path):
     """They would be taken for weak models of the new one."""
     run(EMASnapshots(steps=[1]), module(), tmp_path, [1])
@@ -151,6 +139,23 @@ def test_a_stage_without_average_says_that_it_keeps_none(tmp_path, caplog):
     with caplog.at_level("INFO", "lightning.pytorch.utilities.rank_zero"):
         assert run(EMASnapshots(steps=[1]), made, tmp_path, [1]) == []
     assert "vae_alignment averages no SiT" in caplog.text
+
+
+def test_a_resumed_run_replaces_what_an_abandoned_one_left_after_its_checkpoint(tmp_path):
+    """Killed after step 3 with a checkpoint of step 2, whose own snapshot stays."""
+    run(EMASnapshots(steps=[2, 3]), module(), tmp_path, [1, 2, 3])
+    other, callback = module(), EMASnapshots(steps=[2, 3])
+    with torch.no_grad():
+        other.ema.sit.pos_embed.add_(1)
+    second, third = sorted(tmp_path.rglob("*.safetensors"))
+    before, resumed = second.read_bytes(), trainer(tmp_path, 2, resumed=True)
+    callback.on_fit_start(resumed, other)
+    callback.on_train_start(resumed, other)
+    for step in (2, 3, 3):  # the first batch is accumulated
+        callback.on_train_batch_end(trainer(tmp_path, step), other, None, None, 0)
+    found = read_checkpoint(third).network("ema").state_dict["pos_embed"]
+    assert torch.equal(found, other.ema.sit.pos_embed)
+    assert second.read_bytes() == before
 
 
 def test_what_cannot_be_written_is_refused_before_training(tmp_path):

@@ -21,7 +21,7 @@ class EMASnapshots(L.Callback):
 
     Each step makes ``<run_dir>/snapshots/step_<step>.safetensors`` with its ``.yaml``: average,
     latent statistics, geometry, and a hash of the VAE, which is not kept. SiT-B/2 takes 550 MB. A
-    file that exists is never replaced. A stage without average keeps none.
+    run that is resumed from an earlier step replaces them. A stage without average keeps none.
 
     Source: Karras et al. 2024 guide EDM2-S best by a model after 1/16 of its training.
 
@@ -38,6 +38,7 @@ class EMASnapshots(L.Callback):
         self.fractions = tuple(fractions)
         self.steps = None if steps is None else frozenset(steps)
         self._due: frozenset[int] = frozenset()
+        self._step = 0  # after the last batch
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Works out the steps, and refuses early what could not be written."""
@@ -67,18 +68,24 @@ class EMASnapshots(L.Callback):
                 f"{trainer.max_steps}: set it, or give the callback steps"
             )
 
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Notes the step that the training goes on from, whose snapshot stays."""
+        self._step = trainer.global_step
+
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any, **kwargs: Any
     ) -> None:
-        """Writes the snapshot of this step if one is due and not there yet."""
-        if trainer.global_step not in self._due or not trainer.is_global_zero:
+        """Writes the snapshot of this step if one is due."""
+        step = trainer.global_step
+        if step == self._step:  # with accumulated gradients, several batches end at one step
+            return
+        self._step = step
+        if step not in self._due or not trainer.is_global_zero:
             return
         assert isinstance(pl_module, GenerativeModule)
-        step = trainer.global_step
         path = Path(trainer.default_root_dir) / "snapshots" / f"step_{step:07d}.safetensors"
-        if not path.exists():  # with accumulated gradients, several batches end at one step
-            # A description without weights may be left of a run that was killed: overwrite.
-            save_checkpoint(_checkpoint(pl_module, path, step), path, overwrite=True)
+        # Of a run that was killed, one may be left of steps after its last checkpoint: overwrite.
+        save_checkpoint(_checkpoint(pl_module, path, step), path, overwrite=True)
 
 
 def _checkpoint(module: GenerativeModule, path: Path, step: int) -> Checkpoint:
