@@ -194,3 +194,13 @@ def test_files_of_somebody_else_are_never_removed(tmp_path):
         with pytest.raises(ValueError, match="is in the way and no scenes of this command"):
             writer(tmp_path, 2, overwrite=overwrite)
     assert theirs.read_bytes() == b"a scan"
+
+
+def test_a_linked_folder_is_refused_before_anything_is_removed(tmp_path):
+    write(tmp_path / "out", scenes(2))
+    (tmp_path / "out/bin").rename(tmp_path / "disk")
+    (tmp_path / "out/bin").symlink_to(tmp_path / "disk")
+    before = files(tmp_path)
+    with pytest.raises(ValueError, match=r"out/bin is a link: remove it, or give another --out"):
+        writer(tmp_path / "out", 2, overwrite=True)
+    assert files(tmp_path) == before

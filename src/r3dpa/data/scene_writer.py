@@ -162,6 +162,9 @@ class SceneWriter:
     def _clear(self) -> None:
         """Remove the output of earlier runs, and nothing else."""
         metadata = self.out / "metadata.json"
+        for name in _WRITTEN:
+            if (self.out / name).is_symlink():
+                raise ValueError(f"{self.out / name} is a link: remove it, or give another --out")
         written = [path for name in _WRITTEN if (path := self.out / name).exists()]
         if written and not metadata.exists() and not self._state.exists():
             raise ValueError(
