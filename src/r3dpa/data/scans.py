@@ -164,8 +164,9 @@ def read_scan(path: str | Path, sensor: LidarSensor | None = None) -> np.ndarray
         expected = "a multiple of 16 (x, y, z, intensity as float32)"
         raise ScanError(f"{path}: has {len(data)} bytes, not {expected}")
     points = np.frombuffer(data, dtype="<f4").reshape(-1, 4).copy()
-    bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
-    if bad:
+    finite = np.isfinite(points)
+    if not finite.all():
+        bad = np.count_nonzero(~finite.all(axis=1))
         raise ScanError(f"{path}: has NaN or infinite values in {bad} of {len(points)} points")
     bright = np.count_nonzero(points[:, 3] > 1)
     if bright > len(points) / 1000:  # of some sensors, single returns exceed their full scale
