@@ -1,6 +1,7 @@
 """``r3dpa fit | validate`` with stages other than those of range images; presets, wandb."""
 
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import yaml
 from lightning.pytorch.demos.boring_classes import BoringModel
 
 from r3dpa.cli import main
+from r3dpa.cli.stages import ignore_harmless_warnings
 from r3dpa.nn.backbones import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -26,7 +28,19 @@ class LoggingModel(BoringModel):
 def words(model, data, run_dir):
     fixed = ["--trainer.accelerator=cpu", "--trainer.logger=false", "--trainer.max_steps=2"]
     fixed += ["--trainer.enable_progress_bar=false", "--trainer.limit_val_batches=2"]
+    fixed += ["--allow_import", __name__]
     return ["--model", model, "--data", data, "--run_dir", str(run_dir), *fixed]
+
+
+@pytest.mark.parametrize(("name", "shown"), [("val/reconstruction", 0), ("mine", 1)])
+def test_means_of_all_processes_need_no_advice(name, shown):
+    """Those of Lightning about the means of a single process stay."""
+    advice = f"It is recommended to use `self.log({name!r}, ..., sync_dist=True)` when logging on"
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        ignore_harmless_warnings()
+        warnings.warn(advice, stacklevel=1)
+    assert len(found) == shown
 
 
 def test_any_lightning_module_is_trained_resumed_and_evaluated(tmp_path, capsys):

@@ -23,14 +23,15 @@ from r3dpa.io import delete_unfinished, only_writer, source_commit, write_text
 from r3dpa.modules import GenerativeModule
 
 _STAGES = ("experiment", "baseline")  # folders of their configurations
-# Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, and
-# a process may have no scan.
+# Intended here: averages and frozen networks stay in evaluation mode, feature grids go to disk, a
+# process may have no scan, and the means of held-out scans are already those of all processes.
 _HARMLESS = (
     r"Found \d+ module\(s\) in eval mode",
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
     r"The number of training batches .* is smaller than the logging interval",
     r"The '.*_dataloader' does not have many workers",
     r"predict returned None",
+    r"It is recommended to use `self\.log\('(val|test)/.*', \.\.\., sync_dist=True\)`",
     r"You have overridden `transfer_batch_to_device`",
     r"Total length of .* across ranks is zero",
 )
