@@ -39,6 +39,7 @@ from r3dpa.nn import VAE, SiT
 
 SENSOR = LidarSensor(beams=16, columns=64, range_min_m=2.0, range_max_m=40.0)
 GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
+WIDE = SphericalProjection(replace(SENSOR, columns=128))
 LATENT_SHAPE = (4, 4, 16)
 ODE, SDE = SamplerConfig("heun", steps=3), SamplerConfig("euler_maruyama", steps=4)
 
@@ -282,6 +283,20 @@ def test_options_that_do_not_fit_are_refused():
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, compile=True)
     with pytest.raises(ValueError, match="batch_size must be at least 1, got 0"):
         SceneGenerator(*tiny_networks(), GEOMETRY, ODE, batch_size=0)
+    with pytest.raises(ValueError, match="unknown precision 'fp16'; choose from fp32, bf16"):
+        generator(precision="fp16")
+    with pytest.raises(ValueError, match="unknown quality 'GOOD'; choose from instant, draft"):
+        SamplerConfig.of_quality("GOOD")
+
+
+@pytest.mark.parametrize("none", [0, [], -1])
+def test_a_request_for_no_scene_is_refused(none):
+    with pytest.raises(ValueError, match="no scene is asked for"):
+        generator().generate(none)
+
+
+def test_a_number_of_scenes_may_be_one_of_numpy():
+    assert len(generator(SamplerConfig("euler", steps=1)).generate(np.int64(2))) == 2
 
 
 def test_every_quality_is_a_sampler_and_better_ones_take_longer():
@@ -407,6 +422,10 @@ def test_a_checkpoint_is_sampled_with_the_weights_asked_for(checkpoint, weights)
         ({"stage": "vae_alignment"}, "trains no velocity; sample from .* joint or flow_matching"),
         ({"geometry": None}, "does not record which sensor"),
         ({"networks": {}}, "has no vae"),
+        (
+            {"geometry": replace(GEOMETRY, projection=WIDE).to_dict()},
+            "make images of 16 x 64 pixels, but their geometry has 16 beams and 128 columns",
+        ),
     ],
 )
 def test_checkpoints_that_cannot_be_sampled_are_refused(checkpoint, change, message):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 from typing import Literal, Self, cast
 
@@ -95,8 +96,8 @@ class SceneGenerator:
 
     Raises:
         ValueError: If the latent statistics were never fitted, ``batch_size`` is below 1,
-            ``compile`` comes without it, a scale is below 1, or network, guidance and sampler do
-            not fit each other.
+            ``compile`` comes without it, a scale is below 1, or networks, geometry, guidance and
+            sampler do not fit each other.
     """
 
     def __init__(
@@ -123,6 +124,14 @@ class SceneGenerator:
             raise ValueError(f"batch_size must be at least 1, got {batch_size}")
         if compile and batch_size is None:
             raise ValueError("compiled networks have one shape: give SceneGenerator a batch_size")
+        check_precision(precision)
+        sensor = geometry.projection.sensor
+        if vae.latent_size((sensor.beams, sensor.columns)) != tuple(sit.input_size):
+            raise ValueError(
+                f"the networks make images of {sit.input_size[0] * vae.stride[0]} x "
+                f"{sit.input_size[1] * vae.stride[1]} pixels, but their geometry has "
+                f"{sensor.beams} beams and {sensor.columns} columns"
+            )
         _check_average(sampler, sit, autoguidance)
         self.vae, self.sit = vae.eval(), sit.eval()
         weak = None if autoguidance is None else autoguidance.weak.eval()
@@ -342,6 +351,12 @@ def geometry_of(checkpoint: Checkpoint) -> ScanGeometry:
     return ScanGeometry.from_dict(dict(checkpoint.geometry))
 
 
+def check_precision(precision: str) -> None:
+    """Refuses a precision that no generator has."""
+    if precision not in ("fp32", "bf16"):
+        raise ValueError(f"unknown precision {precision!r}; choose from fp32, bf16")
+
+
 def _check_average(
     sampler: SamplerConfig, sit: VelocityNetwork, autoguidance: Autoguidance | None
 ) -> None:
@@ -446,5 +461,8 @@ def filled(values: Tensor, size: int) -> Tensor:
 
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
-    """Numbers of scenes; a number stands for that many from 0 on."""
-    return range(indices) if isinstance(indices, int) else indices
+    """Numbers of scenes; a number stands for that many from 0 on. ``ValueError`` for none."""
+    numbers = range(int(indices)) if isinstance(indices, Integral) else indices
+    if len(numbers) == 0:
+        raise ValueError("no scene is asked for: give a number of at least 1, or their indices")
+    return numbers

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from r3dpa.flow.noise import scene_noise
 from r3dpa.flow.sampler import SamplerConfig
-from r3dpa.generation import SceneBatch, filled, scene_indices
+from r3dpa.generation import SceneBatch, check_precision, filled, scene_indices
 from r3dpa.geometry import ScanGeometry
 
 FULL_SCALE = 1 - 1e-6  # of images: a saturated pixel is a return just below the largest range
@@ -46,6 +46,7 @@ class BaselineGenerator:
         batch_size: int | None = None,
         compile: bool = False,
     ) -> None:
+        check_precision(precision)
         if compile and batch_size is None:
             raise ValueError("compiled networks have one shape: give the generator a batch_size")
         self.baseline, self.network = baseline, network.eval()

@@ -86,7 +86,10 @@ class SamplerConfig:
     @classmethod
     def of_quality(cls, quality: Quality) -> Self:
         """The cheapest sampler of a quality, from the table ``quality.json`` of this package."""
-        level = _qualities()["levels"][quality]
+        levels = _qualities()["levels"]
+        if quality not in levels:
+            raise ValueError(f"unknown quality {quality!r}; choose from {', '.join(levels)}")
+        level = levels[quality]
         return cls(solver=level["solver"], steps=level["steps"], shift=level["shift"])
 
     @staticmethod
