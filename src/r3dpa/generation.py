@@ -5,10 +5,10 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from numbers import Integral
 from pathlib import Path
 from typing import Literal, Self, cast
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -462,7 +462,7 @@ def filled(values: Tensor, size: int) -> Tensor:
 
 def scene_indices(indices: int | Sequence[int]) -> Sequence[int]:
     """Numbers of scenes; a number stands for that many from 0 on. ``ValueError`` for none."""
-    numbers = range(int(indices)) if isinstance(indices, Integral) else indices
+    numbers = range(int(indices)) if isinstance(indices, int | np.integer) else indices
     if len(numbers) == 0:
         raise ValueError("no scene is asked for: give a number of at least 1, or their indices")
     return numbers

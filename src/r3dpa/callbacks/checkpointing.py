@@ -44,7 +44,8 @@ class RunCheckpoint(ModelCheckpoint):
     second Ctrl-C ends a single process at once, without saving.
 
     Processes that resume from different checkpoints are refused, and a run resumed at the end of an
-    epoch starts the next one.
+    epoch starts the next one. After a resume within an epoch, Lightning's ``epoch`` counts one
+    more; steps, weights and the end of the training do not depend on it.
     """
 
     _signal = 0  # received by this process, 0 for none
