@@ -25,7 +25,7 @@ def folder(tmp_path):
     folder = tmp_path / "scans"
     folder.mkdir()
     for index in range(4):
-        points = generator.uniform(2, 20, (200, 4)).astype(np.float32)
+        points = generator.uniform((2, 2, 2, 0), (20, 20, 20, 1), (200, 4)).astype(np.float32)
         (folder / f"{index:06d}.bin").write_bytes(points.tobytes())
     return folder
 

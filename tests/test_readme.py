@@ -20,6 +20,7 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "_FOLDER", tmp_path)
     tiny_checkpoint(tmp_path / "r3dpa-s.safetensors", geometry)
     points = np.random.default_rng(0).normal(size=(4000, 4)).astype(np.float32) * 10
+    points[:, 3] = 0.5
     for place in ("scan.bin", "scans/0.bin", "runs/demo/scenes/bin/0.bin"):
         write_bin(tmp_path / place, points)
     monkeypatch.chdir(tmp_path)

@@ -59,7 +59,7 @@ def _mount(*words):
 def write_scans(folder):
     folder.mkdir()
     generator = np.random.default_rng(0)
-    points = generator.uniform(2, 20, (8, 200, 4)).astype(np.float32)
+    points = generator.uniform((2, 2, 2, 0), (20, 20, 20, 1), (8, 200, 4)).astype(np.float32)
     for index, scan in enumerate(points):
         (folder / f"{index:06d}.bin").write_bytes(scan.tobytes())
     return folder
