@@ -141,6 +141,28 @@ def test_prdc_with_one_far_outlier():
     assert precision_recall(real, generated) == pytest.approx(before, abs=0.02)
 
 
+@pytest.mark.parametrize(("far", "tolerance"), [(1e7, 1e-9), (1e9, 1e-9), (1e12, 0.03)])
+def test_prdc_with_a_real_outlier_against_plain_distances(far, tolerance):
+    """The outlier must not move the others so far from 0 that their distances are rounded away.
+
+    At 1e12 the edge of its own ball, which holds 7 of 50 generated samples, is not known any more.
+    """
+    real, generated = draw(60, 3).double(), draw(50, 3, seed=1).double()
+    real[0] = far
+    plain = "donot_use_mm_for_euclid_dist"
+    within, across = (torch.cdist(real, part, compute_mode=plain) for part in (real, generated))
+    own = torch.cdist(generated, generated, compute_mode=plain)
+    real_radius, radius = (part.kthvalue(6, dim=1).values for part in (within, own))
+    in_real, in_generated = across < real_radius[:, None], across < radius
+    expected = {
+        "precision": in_real.any(dim=0).double().mean().item(),
+        "recall": in_generated.any(dim=1).double().mean().item(),
+        "density": in_real.sum().item() / (5 * 50),
+        "coverage": in_real.any(dim=1).double().mean().item(),
+    }
+    assert precision_recall(real, generated) == pytest.approx(expected, abs=tolerance)
+
+
 @pytest.mark.parametrize("function", [squared_mmd, precision_recall])
 def test_values_whose_powers_overflow_are_refused(function):
     x = draw(30, 3)

@@ -294,7 +294,9 @@ def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dic
         ``(N,)``, 1 for a real sample whose ball holds a generated one.
     """
     real, generated = checked_pair(real, generated, num_neighbors + 1)
-    centre = real.mean(dim=0)  # squared norms of features far from 0 would swamp the distances
+    # Squared norms of features far from 0 would swamp the distances; one outlier moves a mean, but
+    # no median.
+    centre = real.median(dim=0).values
     real, generated = real - centre, generated - centre
     real_radius = _radius(real, num_neighbors)
     generated_radius = _radius(generated, num_neighbors)
