@@ -185,6 +185,21 @@ def test_kept_scenes_depend_on_names_alone(name):
     assert kept[0] != set(range(9))
 
 
+@pytest.mark.parametrize("name", ["inf", "kid"])
+def test_drawn_subsets_depend_on_names_alone(name):
+    """Both are means over random subsets of the scenes; rounding alone may follow the order."""
+    values, names = draw(40, 4), [f"drive/{i:03d}" for i in range(40)]
+    results = []
+    for order in (torch.arange(40), torch.randperm(40, generator=torch.Generator())):
+        metric = metric_of(name)
+        for side in (True, False):
+            shifted = values[order] + 0.5 * side
+            metric.update(shifted, real=side, names=[names[i] for i in order])
+        results.append(metric.results(Resampling())[0])
+    assert results[0].value == pytest.approx(results[1].value, rel=1e-9)
+    assert results[0].interval == pytest.approx(results[1].interval, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("cloud", "message"),
     [

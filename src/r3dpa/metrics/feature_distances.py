@@ -77,8 +77,12 @@ class FeatureMetric(SceneMetric):
         return Moments.unpack(getattr(self, f"{side}_moments"))
 
     def rows(self, side: str) -> Tensor:
-        """Features ``(n, F)`` of the kept scenes."""
-        return self.kept(side)[1].double()
+        """Features ``(n, F)`` of the kept scenes, by the hashes of their names.
+
+        What draws some of the rows depends on the names then, not on the order of the scenes.
+        """
+        values = self.kept(side)[1]
+        return values[self._joined(f"{side}_order")[:, 0].argsort(stable=True)].double()
 
     def _both(self) -> tuple[Tensor, Tensor, tuple[int, int]]:
         """Features of the kept real and generated scenes, and their numbers, generated first."""
