@@ -10,7 +10,6 @@ from scipy.stats import wasserstein_distance
 
 from r3dpa.geometry import LidarSensor, points_of
 from r3dpa.metrics import functional
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
     BaselineDistances,
     BEVHistogramDistance,
@@ -34,6 +33,7 @@ from r3dpa.metrics.functional_bev import (
     minimum_matching,
     point_histogram,
 )
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.scene import DEFAULT
 
 PROTOCOL = replace(DEFAULT, sensor=LidarSensor(beams=8, columns=32), voxel_m=1.0)
@@ -160,6 +160,18 @@ def test_results_have_intervals_around_the_value(name):
         assert (row.num_samples, row.num_references) == tuple(
             len(data(name, real)) for real in (False, True)
         )
+
+
+def test_rows_tell_what_else_their_interval_is_of():
+    """Means over real scans do not know how other generated scenes would differ."""
+    rows = [
+        row
+        for name in NAMES
+        for row in updated(metric_of(name), name).results(Resampling())
+        if row.note == "interval over draws of the real scans, generated scenes fixed"
+    ]
+    names = {"MMD", "CD 3D", "MMD 0.5 m", "X recall", "X coverage"}
+    assert {row.name for row in rows} == names
 
 
 @pytest.mark.parametrize("name", ["mmd", "kid"])

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import EvaluationTable
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures

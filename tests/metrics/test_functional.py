@@ -18,6 +18,7 @@ from r3dpa.metrics.functional import (
     polynomial_mmd,
     shared_balls,
     squared_mmd,
+    squared_mmd_error,
 )
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
@@ -53,7 +54,7 @@ def test_frechet_against_the_root_of_the_product():
 def test_frechet_of_draws_is_that_of_their_moments(count, width):
     rows, real = draw(count, width), Moments.of(draw(60, width, seed=1))
     covariance = real.covariance("real")
-    drawn = torch.randint(count, (count,), generator=torch.Generator().manual_seed(0))
+    drawn = torch.arange(count)[::2]
     own = Moments.of(rows[drawn])
     expected = frechet_distance(real.mean, covariance, own.mean, own.covariance("drawn")).item()
     found = frechet_of_draws(real.mean, covariance, rows)(drawn)
@@ -94,6 +95,15 @@ def test_polynomial_mmd_over_subsets():
     assert mean == pytest.approx(squared_mmd(x, y).item(), abs=4 * std / math.sqrt(200))
     with pytest.raises(ValueError, match=r"40 real and 30 generated .* 2 to 30 samples"):
         polynomial_mmd(x, y, generator, subset_size=31)
+
+
+def test_error_of_squared_mmd_is_that_of_leaving_out_each_sample(monkeypatch):
+    monkeypatch.setattr("r3dpa.metrics.functional._BLOCK", 7)
+    real, made = draw(20, 3), draw(16, 3, seed=1) + 0.5
+    kept = [torch.arange(16) != left_out for left_out in range(16)]
+    values = torch.stack([squared_mmd(real, made[rows]) for rows in kept])
+    expected = ((values - values.mean()).square().sum() * 15 / 16).sqrt().item()
+    assert squared_mmd_error(real, made) == pytest.approx(expected, rel=1e-9)
 
 
 # Precision, recall, density, coverage

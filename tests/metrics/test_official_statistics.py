@@ -9,11 +9,11 @@ import torch
 
 from r3dpa.cli import main
 from r3dpa.data.scans import write_bin
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.evaluation import evaluate
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching
 from r3dpa.metrics.official_statistics import OfficialStatistics
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import Evaluation
 from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures

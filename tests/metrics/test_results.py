@@ -1,5 +1,6 @@
 import csv
 import json
+import math
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from r3dpa.metrics.bootstrap import Resampling
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import (
     Evaluation,
     EvaluationTable,
@@ -38,27 +39,62 @@ def marks(values, **fields):
 # Intervals
 
 
-def test_interval_of_a_mean():
-    """The mean of 400 numbers of deviation s is known to 1.96 s / 20."""
-    values = torch.randn(400, generator=torch.Generator().manual_seed(0)).double() + 3
-    mean, half = values.mean().item(), 1.96 * values.std().item() / 20
-    low, high = Resampling(num_resamples=2000).of_mean(values)
-    assert high - mean == pytest.approx(half, rel=0.1)
-    assert mean - low == pytest.approx(half, rel=0.1)
-    assert Resampling(num_resamples=2000).of_mean(values) == (low, high)
-    assert Resampling(1, 2000).of_mean(values) != (low, high)
+def test_interval_of_a_mean_is_students():
+    values = torch.tensor([2.0, 4.0, 4.0, 6.0])  # deviation sqrt(8 / 3), t of 3 degrees 3.1824
+    half = 3.1824 * math.sqrt(8 / 3) / 2
+    ends = pytest.approx((4 - half, 4 + half), abs=1e-4)
+    assert Resampling().of_mean(values) == ends
+    assert Resampling().interval(lambda kept: values[kept].mean().item(), 4) == ends
 
 
-def test_interval_surrounds_a_value_that_resampling_shifts():
-    """Of 100 indices a resample holds 63.4 on average, with a standard deviation of 3.1."""
-    low, high = Resampling(num_resamples=1000).interval(lambda i: len(i.unique()), 100)
-    assert 100 - low == pytest.approx(1.96 * 3.1, abs=1)
-    assert high - 100 == pytest.approx(1.96 * 3.1, abs=1)
+def test_interval_leaves_out_groups_of_equal_size():
+    """Of 35 values, 3 are over: the sums of 16 pairs tell how much the mean varies."""
+    values = torch.randn(35, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    left_out = []
+
+    def mean(kept):
+        left_out.append(sorted(set(range(35)) - set(kept.tolist())))
+        return values[kept].mean().item()
+
+    low, high = Resampling().interval(mean, 35)
+    assert left_out == [*([i, i + 16] for i in range(16)), []]
+    pairs = values[:16] + values[16:32]
+    mean_of_all = values.mean().item()
+    half = 2.1314 * math.sqrt(pairs.var().item() / (2 * 35))  # t of 15 degrees
+    assert (low, high) == pytest.approx((mean_of_all - half, mean_of_all + half), rel=1e-4)
+
+
+@pytest.mark.parametrize(("num_hits", "ends"), [(0, (0, 0.1611)), (20, (0.8389, 1))])
+def test_interval_of_a_share_is_wilsons(num_hits, ends):
+    """Without any hit a share ends at z^2 / (n + z^2), where all resamples would be 0."""
+    hits = torch.arange(20) < num_hits
+    assert Resampling().of_share(hits.double()) == pytest.approx(ends, abs=1e-4)
+
+
+def test_interval_of_few_scenes_is_not_much_wider_than_they_spread():
+    """Samples that are drawn twice would make distances of 16 scenes spread three times as far."""
+    generator = torch.Generator().manual_seed(0)
+    values, halves = [], []
+    for _ in range(60):
+        scenes = (torch.rand(16, 300, generator=generator) < 0.2).double()
+
+        def distance(kept, scenes=scenes):
+            counts = scenes[kept].sum(dim=0)
+            return (counts / counts.sum() - 1 / 300).abs().sum().item() / 2
+
+        low, high = Resampling().interval(distance, 16)
+        values.append(distance(torch.arange(16)))
+        halves.append((high - low) / 2)
+    ratio = torch.tensor(halves).mean() / (1.96 * torch.tensor(values).std())
+    assert 0.9 < ratio < 2
 
 
 def test_intervals_need_samples_and_resamples():
     assert Resampling().of_mean(torch.ones(1)) is None
-    assert Resampling(num_resamples=0).of_mean(torch.ones(9)) is None
+    assert Resampling().interval(len, 2) is None
+    for interval in (Resampling(num_resamples=0).of_mean, Resampling(num_resamples=0).of_share):
+        assert interval(torch.ones(9)) is None
+    assert Resampling(num_resamples=0).interval(len, 9) is None
 
 
 # One result
@@ -200,7 +236,8 @@ def test_text(table):
         "| real vs. real (floor) | 1.00 to 1.50 | - |",
         "",
         "- **best**, _second_, = tie: no further apart than the floor or the intervals",
-        "- [low, high]: 95 % interval of the value at this number of scenes",
+        "- [low, high]: 95 % interval over draws of as many generated scenes against the same real "
+        "scans (MMD: real scans drawn, generated scenes fixed)",
         "- published: against KITTI-360 val, 1000 scans, not ranked",
         "- c, FLD: no net",
     ]

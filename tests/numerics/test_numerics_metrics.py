@@ -13,7 +13,6 @@ from scipy.spatial.distance import jensenshannon
 from tiny import drawn
 
 from r3dpa.metrics import BEVHistogramDistance, FrechetDistance, RangeHistogramDistance
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.functional import (
     Moments,
     fd_infinity,
@@ -25,6 +24,7 @@ from r3dpa.metrics.functional import (
     squared_mmd,
 )
 from r3dpa.metrics.functional_bev import BEVGrid, chamfer_squared, histogram_distance
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import MetricResult
 
 FEW = settings(derandomize=True, max_examples=15, deadline=None, database=None)

@@ -1,6 +1,6 @@
 """Distances of two sets of scenes that need no network, as torchmetrics metrics.
 
-Letters: B scenes, H x W range image, G groups of a bootstrap, n scenes that are kept.
+Letters: B scenes, H x W range image, G groups that intervals leave out, n scenes that are kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from r3dpa.geometry import points_of
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.functional import wasserstein_1
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
@@ -27,12 +26,15 @@ from r3dpa.metrics.functional_bev import (
     minimum_matching,
     point_histogram,
 )
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene import Protocol
 
 #: Width of the bins of ranges, metres.
 RANGE_BIN_M = 0.1
 SIDES = ("real", "generated")
+#: Note of a mean over real scans, whose interval tells nothing of other generated scenes.
+OVER_REAL_SCANS = "interval over draws of the real scans, generated scenes fixed"
 
 #: Powers of ten that the published table prints its columns in.
 _SCALES = {"FLD": -1, "JSD": -2, "MMD": -5}
@@ -183,7 +185,7 @@ class SceneMetric(Metric):
 
 
 class _Histograms(SceneMetric):
-    """Sums of histograms of scenes; the generated ones in groups, which a bootstrap resamples."""
+    """Sums of histograms of scenes; the generated ones in groups, which intervals leave out."""
 
     real_bins: Tensor
     generated_bins: Tensor
@@ -223,7 +225,7 @@ class _Histograms(SceneMetric):
 class BEVHistogramDistance(_Histograms):
     """JSD and TV of how many clouds occupy each cell of ``grid`` seen from above.
 
-    The bootstrap resamples ``num_groups`` groups of generated scenes.
+    Intervals leave out each of ``num_groups`` groups of generated scenes in turn.
     """
 
     def __init__(self, grid: BEVGrid, num_groups: int = 1) -> None:
@@ -256,7 +258,7 @@ class BEVHistogramDistance(_Histograms):
 class RangeHistogramDistance(_Histograms):
     """Earth mover's distance (W1) of the ranges of all returns, metres, in bins of 0.1 m.
 
-    The bootstrap resamples ``num_groups`` groups of generated scenes.
+    Intervals leave out each of ``num_groups`` groups of generated scenes in turn.
     """
 
     def __init__(self, range_max_m: float, num_groups: int = 1) -> None:
@@ -329,7 +331,9 @@ class MinimumMatchingDistance(SceneMetric):
         kept, rows = len(self.kept("generated")[0]), []
         for name, (values, unit) in distances.items():
             mean, ends = values.mean().item(), resampling.of_mean(values)
-            rows.append(self._row(name, mean, (kept, len(values)), interval=ends, unit=unit))
+            counts = (kept, len(values))
+            row = self._row(name, mean, counts, interval=ends, unit=unit, note=OVER_REAL_SCANS)
+            rows.append(row)
         return rows
 
     def _chamfer(self, matching: Matching) -> Tensor:
@@ -391,7 +395,8 @@ class BaselineDistances(MinimumMatchingDistance):
         real_cells, cells = ([coarse.cells(cloud) for cloud in clouds] for clouds in (real, made))
         matched = minimum_matching(real_cells, cells, coarse).squared_normalised
         ends = resampling.of_mean(matched)
-        return [*rows, self._row("MMD 0.5 m", matched.mean().item(), counts, interval=ends)]
+        mean, note = matched.mean().item(), OVER_REAL_SCANS
+        return [*rows, self._row("MMD 0.5 m", mean, counts, interval=ends, note=note)]
 
 
 def _rank(name: str) -> int:

@@ -12,19 +12,19 @@ from typing import Any, NamedTuple
 import torch
 
 from r3dpa.io import source_commit
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
 from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
+from r3dpa.metrics.resampling import Resampling
 from r3dpa.metrics.results import Evaluation, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures, feature_spaces, scene_features
 
 AnyReference = ReferenceStatistics | OfficialStatistics
 
-_GROUPS = 16  # of the bootstrap of histograms
+_GROUPS = 16  # of histograms, which their intervals leave out in turn
 _UNBIASED = (" inf", " KID")  # distances whose mean does not depend on how many scenes there are
 _SHOWN_MATCHES = 3
 _SHARES = ("precision", "recall")
@@ -128,7 +128,7 @@ def evaluate(
         extra["verdict"] = _verdict(rows, floors)
     else:
         extra["left_out"] = reference.left_out
-    extra["bootstrap"] = dict(vars(resampling))
+    extra["resampling"] = dict(vars(resampling))
     if warning := _other_sensor(match):
         extra["warning"] = warning
     if bad:

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torchmetrics import MetricCollection
 
-from r3dpa.metrics.bootstrap import Resampling
 from r3dpa.metrics.distances import (
+    OVER_REAL_SCANS,
     SIDES,
     BaselineDistances,
     BEVHistogramDistance,
@@ -21,6 +21,7 @@ from r3dpa.metrics.distances import (
     SceneMetric,
 )
 from r3dpa.metrics.functional import (
+    NUM_SIZES,
     Moments,
     fd_infinity,
     frechet_distance,
@@ -28,13 +29,14 @@ from r3dpa.metrics.functional import (
     merge_packed,
     polynomial_mmd,
     shared_balls,
+    squared_mmd_error,
 )
+from r3dpa.metrics.resampling import Resampling, quantile_of_t
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene import EvaluationScene, Protocol
 from r3dpa.metrics.scene_features import SceneFeatures
 
 _KID_SUBSETS, _KID_SUBSET_SIZE = 100, 1000
-_NORMAL_95 = 1.96  # deviations of a normal distribution that hold 95 % of it, to each side
 _NEIGHBORS = 5  # of the balls of precision and recall
 _BATCH = 8
 
@@ -120,11 +122,9 @@ class FrechetDistance(FeatureMetric):
         return super().compute()
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The distance, with a bootstrap interval over the generated scenes that are kept."""
+        """The distance, with an interval over the generated scenes that are kept."""
         rows, width = self.rows("generated"), self.num_features
-        ends = None
-        if resampling.num_resamples and len(rows) > 1:
-            ends = resampling.interval(frechet_of_draws(*self._real, rows), len(rows))
+        ends = resampling.interval(frechet_of_draws(*self._real, rows), len(rows))
         fewest = min(self.count(side) or math.inf for side in SIDES)
         few = f"{fewest} scenes for {width} features: dominated by their small number"
         generated = self.moments("generated")
@@ -143,14 +143,19 @@ class FrechetInfinity(FeatureMetric):
     """Fréchet distance extrapolated to infinitely many samples, see :func:`fd_infinity`."""
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The extrapolated distance with the error of the line."""
+        """The extrapolated distance; the interval has the errors of the scenes and of the line."""
         real, generated, counts = self._both()
         name, needed = f"{self.label} inf", 4 * (self.num_features + 1)
         if min(counts) < needed:
             return [self._row(name, None, counts, note=f"needs {needed} scenes of both kinds")]
-        value, standard_error = fd_infinity(real, generated, resampling.generator())
-        error = _NORMAL_95 * standard_error
-        return [self._row(name, value, counts, interval=(value - error, value + error))]
+        value, of_line = fd_infinity(real, generated, resampling.generator())
+        moments = Moments.of(real)
+        distance = frechet_of_draws(moments.mean, moments.covariance(), generated)
+        ends = resampling.interval(distance, len(generated))
+        if ends is not None:
+            half = math.hypot((ends[1] - ends[0]) / 2, quantile_of_t(NUM_SIZES - 2) * of_line)
+            ends = value - half, value + half
+        return [self._row(name, value, counts, interval=ends)]
 
 
 class PolynomialMMD(FeatureMetric):
@@ -160,32 +165,37 @@ class PolynomialMMD(FeatureMetric):
     """
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The mean with the spread of the subsets, wider than a 95 % interval."""
+        """The mean; the interval has the errors of the scenes and of the subsets drawn."""
         real, generated, counts = self._both()
         name = f"{self.label} KID"
         if min(counts) < 4:
             return [self._row(name, None, counts, note="needs 4 scenes of both kinds")]
         size = min(_KID_SUBSET_SIZE, min(counts) // 2)  # subsets as large as a set would all be one
         mean, std = polynomial_mmd(real, generated, resampling.generator(), _KID_SUBSETS, size)
-        ends = (mean - _NORMAL_95 * std, mean + _NORMAL_95 * std)
-        return [self._row(name, mean, counts, interval=ends)]
+        if not resampling.num_resamples:
+            return [self._row(name, mean, counts)]
+        of_scenes = squared_mmd_error(real, generated)
+        half = quantile_of_t(len(generated) - 1) * math.hypot(of_scenes, std / _KID_SUBSETS**0.5)
+        return [self._row(name, mean, counts, interval=(mean - half, mean + half))]
 
 
 class PrecisionRecall(FeatureMetric):
     """Precision, recall, density and coverage, see :func:`shared_balls`."""
 
     def results(self, resampling: Resampling) -> list[MetricResult]:
-        """The four shares; intervals resample the scenes of each mean, but not the balls."""
+        """The four shares; intervals are over the scenes of each mean, with the others fixed."""
         real, generated, counts = self._both()
         fields: dict[str, dict[str, Any]]
         if min(counts) <= _NEIGHBORS:
             unknown = {"value": None, "note": f"needs {_NEIGHBORS + 1} scenes of both kinds"}
             fields = dict.fromkeys(("precision", "recall", "density", "coverage"), unknown)
         else:
-            fields = {
-                name: {"value": shares.mean().item(), "interval": resampling.of_mean(shares)}
-                for name, shares in shared_balls(real, generated, _NEIGHBORS).items()
-            }
+            fields = {}
+            for name, shares in shared_balls(real, generated, _NEIGHBORS).items():
+                interval = resampling.of_mean if name == "density" else resampling.of_share
+                note = OVER_REAL_SCANS if name in ("recall", "coverage") else ""
+                fields[name] = {"value": shares.mean().item(), "interval": interval(shares)}
+                fields[name]["note"] = note
         return [
             self._row(f"{self.label} {name}", counts=counts, direction="higher", **row)
             for name, row in fields.items()

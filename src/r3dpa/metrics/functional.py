@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from scipy.stats import linregress
 from torch import Tensor
 
-_SMALLEST_SHARE, _NUM_SIZES = 4, 8  # fd_infinity starts from a quarter of the samples
+#: Sizes of subsets that the line of :func:`fd_infinity` is fitted to.
+NUM_SIZES = 8
+_SMALLEST_SHARE = 4  # it starts from a quarter of the samples
 _LARGEST = 1e50  # the sixth power of it, in squared_mmd, is finite
 _BLOCK = 1024  # rows of a distance matrix held at once
 
@@ -139,13 +141,10 @@ def frechet_of_draws(mean: Tensor, covariance: Tensor, rows: Tensor) -> Callable
     rotated, own = rows @ _root(covariance.double()), covariance.double().trace()
 
     def distance(drawn: Tensor) -> float:
-        seen, times = drawn.unique(return_counts=True)  # each row once: about 63 % of them
-        share = times[:, None].double() / len(drawn)
-        weight = (times[:, None].double() / (len(drawn) - 1)).sqrt()
-        x, y = rows[seen], rotated[seen]
-        centre = (share * x).sum(dim=0)
-        common = torch.linalg.svdvals(weight * (y - (share * y).sum(dim=0))).sum()
-        spread = (weight * (x - centre)).square().sum()
+        x, y = rows[drawn], rotated[drawn]
+        centre, degrees = x.mean(dim=0), len(drawn) - 1
+        common = torch.linalg.svdvals(y - y.mean(dim=0)).sum() / math.sqrt(degrees)
+        spread = (x - centre).square().sum() / degrees
         found = (mean - centre).square().sum() + own + spread - 2 * common
         return max(found.item(), 0.0)
 
@@ -187,7 +186,7 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
             f"fd_infinity: {largest} samples of {width} features; at least "
             f"{_SMALLEST_SHARE * (width + 1)} are needed; polynomial_mmd has no bias with fewer"
         )
-    inverse = torch.linspace(1 / smallest, 1 / largest, _NUM_SIZES, dtype=torch.float64)
+    inverse = torch.linspace(1 / smallest, 1 / largest, NUM_SIZES, dtype=torch.float64)
     sizes = [round(1 / value) for value in inverse.tolist()]
     distances = [
         frechet_distance_of(
@@ -209,14 +208,33 @@ def squared_mmd(real: Tensor, generated: Tensor) -> Tensor:
     """
     x, y = checked_pair(real, generated, at_least=2)
 
-    def kernel(a: Tensor, b: Tensor) -> Tensor:
-        return (a @ b.T / a.shape[1] + 1) ** 3
-
     def within(a: Tensor) -> Tensor:
-        values = kernel(a, a)
+        values = _cubic_kernel(a, a)
         return (values.sum() - values.trace()) / (len(a) * (len(a) - 1))
 
-    return within(x) + within(y) - 2 * kernel(x, y).mean()
+    return within(x) + within(y) - 2 * _cubic_kernel(x, y).mean()
+
+
+def squared_mmd_error(real: Tensor, generated: Tensor) -> float:
+    """Standard error of :func:`squared_mmd` over draws of the generated samples, three or more.
+
+    Jackknife: the discrepancy without sample j needs only the sums of the kernel from j to all
+    others, which are computed once. The real samples are fixed.
+    """
+    x, y = checked_pair(real, generated, at_least=3)
+    pairs, across = [], []
+    for rows in y.split(_BLOCK):
+        itself = (rows.square().sum(dim=1) / y.shape[1] + 1) ** 3
+        pairs.append(_cubic_kernel(rows, y).sum(dim=1) - itself)
+        across.append(_cubic_kernel(rows, x).mean(dim=1))
+    of_pairs, of_real, num = torch.cat(pairs), torch.cat(across), len(y)
+    within = (of_pairs.sum() - 2 * of_pairs) / ((num - 1) * (num - 2))
+    without = within - 2 * (of_real.sum() - of_real) / (num - 1)
+    return without.std().item() * (num - 1) / math.sqrt(num)
+
+
+def _cubic_kernel(x: Tensor, y: Tensor) -> Tensor:
+    return (x @ y.T / x.shape[1] + 1) ** 3
 
 
 def polynomial_mmd(

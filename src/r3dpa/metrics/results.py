@@ -1,4 +1,4 @@
-"""Results of evaluations: numbers with bootstrap intervals and floors, and their tables.
+"""Results of evaluations: numbers with intervals and floors, and their tables.
 
 Values are stored as computed; a power of ten applies to the printed column only: JSD = 0.0567 is
 stored, and 5.67 is printed below 10^-2.
@@ -20,7 +20,7 @@ from typing import Any, Literal, Self
 from tabulate import LATEX_ESCAPE_RULES
 
 from r3dpa.io import text_table, write_text
-from r3dpa.metrics.bootstrap import Ends
+from r3dpa.metrics.resampling import Ends
 
 Direction = Literal["lower", "higher"]
 Split = Literal["train-val", "val-only"]
@@ -30,6 +30,7 @@ _PUBLISHED: Any = json.loads(files(__package__).joinpath("published.json").read_
 #: Power of ten of the printed column of each metric of the paper.
 PUBLISHED_SCALES: dict[str, int] = _PUBLISHED["scales"]
 _SHOWN_BAD = 20  # samples left out that are printed
+_INTERVAL = "95 % interval over draws of as many generated scenes against the same real scans"
 _FLOOR = "real vs. real (floor)"
 _DISTANCES = (*PUBLISHED_SCALES, "FWID", "FGEO")
 #: Provenance of an evaluation, by default unknown.
@@ -61,8 +62,9 @@ _LATEX: dict[Mark, str] = {
 class MetricResult:
     """One number of an evaluation.
 
-    The 95 % interval is the spread of the value over sets of this many scenes, not corrected for
-    the bias of few scenes, except for extrapolated values.
+    The 95 % interval is the spread of the value over draws of this many generated scenes, compared
+    with the same real scans, unless the note names another. It is not corrected for the bias of few
+    scenes, except for extrapolated values, and too wide where the value is mostly such a bias.
     """
 
     name: str  #: of the metric, as in the head of a column
@@ -175,6 +177,8 @@ class Evaluation:
             lines.append(f"samples that cannot be used and are left out: {len(bad)}")
         if len(bad) > _SHOWN_BAD:
             bad = [*bad[:_SHOWN_BAD], f"and {len(bad) - _SHOWN_BAD} more"]
+        if any(row.interval for row in self.rows):
+            lines.insert(0, f"interval: {_INTERVAL}, unless noted; too wide near the floor")
         return "\n".join([self.label, *head, "", table, "", *lines, *bad])
 
     def save(self, path: str | Path) -> None:
@@ -248,7 +252,7 @@ class EvaluationTable:
             heads.append(f"{result.name} ({kind})")
         table = text_table(self._lines(cell), ["", *heads], "l" + "r" * len(heads), "pipe")
         marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
-        interval = "[low, high]: 95 % interval of the value at this number of scenes"
+        interval = f"[low, high]: {_INTERVAL} (MMD: real scans drawn, generated scenes fixed)"
         below = [f"- {text}" for text in (marks, interval, *self.notes)]
         return "\n".join([table, "", *below]) + "\n"
 

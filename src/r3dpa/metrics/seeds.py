@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from statistics import fmean, stdev
 
-from scipy.stats import t as student
-
-from r3dpa.metrics.bootstrap import Ends
+from r3dpa.metrics.resampling import Ends, quantile_of_t
 from r3dpa.metrics.results import Evaluation
 
 
@@ -60,4 +58,4 @@ def relative_change(
 def _students(values: Sequence[float]) -> float:
     """Half the width of Student's 95 % interval of a mean."""
     num = len(values)
-    return float(student.ppf(0.975, num - 1)) * stdev(values) / math.sqrt(num)
+    return quantile_of_t(num - 1) * stdev(values) / math.sqrt(num)
