@@ -168,7 +168,7 @@ def test_rows_tell_what_else_their_interval_is_of():
         row
         for name in NAMES
         for row in updated(metric_of(name), name).results(Resampling())
-        if row.note == "interval over draws of the real scans, generated scenes fixed"
+        if row.note.startswith("interval over draws of the real scans, generated scenes fixed")
     ]
     names = {"MMD", "CD 3D", "MMD 0.5 m", "X recall", "X coverage"}
     assert {row.name for row in rows} == names

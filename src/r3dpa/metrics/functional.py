@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import linregress
 from torch import Tensor
 
-#: Sizes of subsets that the line of :func:`fd_infinity` is fitted to.
-NUM_SIZES = 8
-_SMALLEST_SHARE = 4  # it starts from a quarter of the samples
+_SMALLEST_SHARE, _NUM_SIZES = 4, 8  # fd_infinity starts from a quarter of the samples
 _LARGEST = 1e50  # the sixth power of it, in squared_mmd, is finite
 _BLOCK = 1024  # rows of a distance matrix held at once
 
@@ -186,7 +184,7 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
             f"fd_infinity: {largest} samples of {width} features; at least "
             f"{_SMALLEST_SHARE * (width + 1)} are needed; polynomial_mmd has no bias with fewer"
         )
-    inverse = torch.linspace(1 / smallest, 1 / largest, NUM_SIZES, dtype=torch.float64)
+    inverse = torch.linspace(1 / smallest, 1 / largest, _NUM_SIZES, dtype=torch.float64)
     sizes = [round(1 / value) for value in inverse.tolist()]
     distances = [
         frechet_distance_of(
