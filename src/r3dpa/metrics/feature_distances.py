@@ -193,7 +193,7 @@ class PrecisionRecall(FeatureMetric):
                 fields[name] = {"value": shares.mean().item(), "interval": interval(shares)}
             fields["recall"]["note"] = OVER_REAL_SCANS
             # Real scans share their neighbours, so that the ones that are missed come in groups.
-            fields["coverage"]["note"] = f"{OVER_REAL_SCANS}; up to a third too narrow"
+            fields["coverage"]["note"] = f"{OVER_REAL_SCANS}; up to a fifth too narrow"
         return [
             self._row(f"{self.label} {name}", counts=counts, direction="higher", **row)
             for name, row in fields.items()

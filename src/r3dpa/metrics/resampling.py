@@ -44,7 +44,7 @@ class Resampling:
 
         The bias of few samples is about the same in all resamples, so the interval shows the
         spread at this number of samples, not the bias. Near zero, where a distance is mostly such
-        a bias, it is up to 1.5 times too wide (Efron and Stein 1981). An end may lie below zero.
+        a bias, it is up to 1.6 times too wide (Efron and Stein 1981). An end may lie below zero.
 
         Source: delete-a-group jackknife (Shao and Tu 1995, section 2.3; Kott 2001).
         """
