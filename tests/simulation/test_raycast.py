@@ -267,3 +267,65 @@ NAN = float("nan")
 def test_impossible_scenes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def fan(num_beams=5, num_shots=720):
+    """Beams from 10 degrees below to 10 degrees above the horizon, shots every half degree."""
+    azimuth = 2 * np.pi / num_shots * np.arange(num_shots)
+    inclination = np.radians(np.linspace(10, -10, num_beams))[:, None]
+    direction = np.stack(
+        [
+            np.cos(inclination) * np.cos(azimuth),
+            np.cos(inclination) * np.sin(azimuth),
+            np.sin(inclination) * np.ones(num_shots),
+        ]
+    )
+    return Rays(np.zeros((3, num_beams, num_shots), np.float32), direction.astype(np.float32))
+
+
+def test_rays_pass_between_the_slats_of_a_fence():
+    """Slats of 0.5 m every 2 m, 10 m ahead: the first begins at the left end, y = 4 m."""
+    fence = replace(solid(Shape.BOX, (10, 0, 2), (4, 0.01, 3), -np.pi / 2), slats=(2.0, 0.25))
+    hits = Hits(Scene((fence,), Pose(z_m=2.0), ground_m=-50), fan())
+    shots = np.arange(-43, 44)
+    met = hits.surface[2, shots] == 0
+    across_m = 4 - 9.99 * np.tan(np.radians(shots / 2))
+    inside_slat = across_m % 2
+    sure = np.abs(inside_slat - 0.5) > 1e-3
+    assert met[sure].tolist() == (inside_slat < 0.5)[sure].tolist()
+    assert 0.15 < met.mean() < 0.35
+
+
+def test_a_wall_with_windows_is_open_between_sill_and_lintel_alone():
+    """At 10 m the beams of -10, -5, 0, 5 and 10 degrees pass at 0.24, 1.13, 2, 2.87 and 3.76 m."""
+    wall = solid(Shape.BOX, (10, 0, 2), (4, 0.01, 2), -np.pi / 2)
+    windows = replace(wall, slats=(2.0, 0.25), open_m=(1.0, 2.5))
+    scene = Scene((windows,), Pose(z_m=2.0), ground_m=-50)
+    shots = np.arange(-40, 41)
+    share = (Hits(scene, fan()).surface[:, shots] == 0).mean(axis=1)
+    np.testing.assert_allclose(share[[0, 1, 4]], 1)
+    assert (share[2:4] < 0.4).all()
+
+
+@pytest.mark.parametrize("constant", ["_SMALL_WINDOW", "_MOSTLY_OPEN"])
+def test_solids_cast_together_are_hit_as_one_by_one(constant, monkeypatch):
+    draw = np.random.default_rng(3)
+    primitives = []
+    for number in range(60):
+        place = (*draw.uniform(-20, 20, 2), draw.uniform(0, 3))
+        one = solid(Shape(number % 3), place, tuple(draw.uniform(0.05, 2, 3)), draw.uniform(0, 6))
+        medium = {"extinction_per_m": 2.0} if number % 4 == 0 else {"slats": (0.3, 0.4)}
+        velocity = (1.0, -2.0) if number % 5 == 0 else (0.0, 0.0)
+        primitives.append(replace(one, velocity_m_s=velocity, **medium))
+    scene, rays = Scene(tuple(primitives), Pose(z_m=2.0)), fan(16)
+    motion = {
+        "actor_time_s": draw.uniform(-0.05, 0.05, (16, 720)).astype(np.float32),
+        "optical_depth": draw.exponential(size=(16, 720)).astype(np.float32),
+    }
+    results = []
+    for value in (0, 10**9):
+        monkeypatch.setattr(raycast, constant, value)
+        results.append(Hits(scene, rays, **motion))
+    np.testing.assert_array_equal(results[0].surface, results[1].surface)
+    np.testing.assert_allclose(results[0].range_m, results[1].range_m, rtol=1e-6)
+    assert len(np.unique(results[0].surface)) > 30

@@ -7,9 +7,9 @@ import pytest
 from sweeps import inside
 
 from r3dpa.simulation import Material, Semantic, Shape, Street, Weather
-from r3dpa.simulation import street as street_module
-from r3dpa.simulation.course import BLOCK_M, course_of
 from r3dpa.simulation.scene import draw_weather
+from r3dpa.simulation.street import streets as street_module
+from r3dpa.simulation.street.course import BLOCK_M, course_of
 
 GROUND = (Semantic.ROAD, Semantic.SIDEWALK, Semantic.TERRAIN)
 DRY = Weather()
@@ -176,17 +176,22 @@ def test_actors_move_as_their_velocity_says():
     for drive in (0, 3):
         street = Street(0, drive, DRY)
         for scan in range(20, 100, 16):
-            parts = {}
+            # Equal parts, such as two wheels, are in the same order in both scans, unless a detail
+            # has come or gone.
+            parts = defaultdict(lambda: ([], []))
             for after in (0, 1):
                 for p in street.scene(scan + after).primitives:
                     key = (p.instance, p.semantic, p.half_size, p.centre[2] > 1, p.yaw_rad)
-                    parts.setdefault(key, {})[after] = p
-            for pair in parts.values():
-                if len(pair) == 2 and any(pair[0].velocity_m_s):
-                    moved = np.subtract(pair[1].centre[:2], pair[0].centre[:2])
-                    expected = 0.1 * np.array(pair[0].velocity_m_s)
-                    np.testing.assert_allclose(moved, expected, atol=0.03)
-                    compared += 1
+                    parts[key][after].append(p)
+            for before, later in parts.values():
+                if len(before) != len(later):
+                    continue
+                for p, moved_part in zip(before, later, strict=True):
+                    if any(p.velocity_m_s):
+                        moved = np.subtract(moved_part.centre[:2], p.centre[:2])
+                        expected = 0.1 * np.array(p.velocity_m_s)
+                        np.testing.assert_allclose(moved, expected, atol=0.03)
+                        compared += 1
     assert compared > 100
 
 
@@ -200,9 +205,11 @@ def test_an_object_has_one_instance_number():
         assert len(by_instance) > 50
         for parts in by_instance.values():
             centres = np.array([p.centre[:2] for p in parts])
-            assert np.ptp(centres, axis=0).max() < 20
+            assert np.ptp(centres, axis=0).max() < BLOCK_M
             classes = {p.semantic for p in parts}
-            assert len(classes) == 1 or classes == {Semantic.RIDER, Semantic.BICYCLE}
+            ridden = {Semantic.RIDER, Semantic.BICYCLE}
+            pushed = {Semantic.PERSON, Semantic.UNKNOWN_OBJECT}
+            assert len(classes) == 1 or classes in (ridden, pushed)
 
 
 def test_every_class_and_material_occurs():

@@ -6,13 +6,14 @@ rays.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from r3dpa.simulation.scene import Shape
-from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, pieces, windows_of
+from r3dpa.simulation.solids import GROUND, NO_SURFACE, Floats, Solids, Windows, pieces, windows_of
 
 # A secondary ray starts on a surface; nearer hits are that surface.
 _START_M = 1e-3
@@ -21,6 +22,11 @@ _SLACK_RAD = 1e-3
 _SLACK_M = 1e-2
 # Secondary rays in one cone: more would widen it, fewer cost a cone each.
 _BLOCK_RAYS = 256
+# Solids that at most this many rays can meet are cast together: the loop costs them more.
+_SMALL_WINDOW = 800
+_BLOCK_PAIRS = 16384
+# Of a larger window all rays are cast if more than this share of them is not yet blocked.
+_MOSTLY_OPEN = 0.5
 # Offsets of the foliage draws from solid to solid; any odd numbers do.
 _BEAM_STRIDE, _SHOT_STRIDE = 17, 641
 
@@ -64,26 +70,156 @@ def cast(
         to_ground = (np.float32(solids.ground_m) - origin[2]) / direction[2]
         _keep_nearer(to_ground, GROUND, nearest, surface)
         windows = windows_of(solids, origin, direction, max_range_m, actor_time_s)
-        for index in windows.order:
-            sloped = bool(solids.grade[index].any())
-            solid = _Solid(solids.matrix[index], solids.offset[index], sloped)
+        turn = _Turn(origin, direction, actor_time_s, optical_depth)
+        is_small = windows.num_rays()[windows.order] <= _SMALL_WINDOW
+        for index in windows.order[~is_small]:
             for window in pieces(index, windows, origin.shape[2]):
-                near = nearest[window]
-                if near.max() <= windows.near_m[index]:
-                    continue
-                rays = (slice(None), *window)
-                start = origin[rays].reshape(3, -1)
-                if actor_time_s is not None and solids.velocity[index].any():
-                    start = _relative(start, solids.velocity[index], actor_time_s[window].ravel())
-                towards = direction[rays].reshape(3, -1)
-                distance, leave = _crossing(solids.shape[index], solid, start, towards)
-                if optical_depth is not None and solids.extinction[index] > 0:
-                    drawn = _draws_of(index, window, optical_depth)
-                    deep = distance + drawn.ravel() / solids.extinction[index]
-                    distance = np.where(distance > 0, deep, np.float32(np.nan))
-                distance = np.where(distance <= leave, distance, np.float32(np.nan))
-                _keep_nearer(distance.reshape(near.shape), index, near, surface[window])
+                open_ray = nearest[window] > windows.near_m[index]
+                share = np.count_nonzero(open_ray) / open_ray.size
+                if share > _MOSTLY_OPEN:
+                    _cast_window(solids, index, window, turn, nearest, surface)
+                elif share > 0:
+                    beam, shot = np.nonzero(open_ray)
+                    beam, shot = beam + window[0].start, shot + window[1].start
+                    alike = np.full(len(beam), index)
+                    _cast_pairs(solids, alike, beam, shot, turn, nearest, surface)
+        for block in _small_blocks(solids, windows.order[is_small], windows):
+            solid_of, beam, shot = _pairs_of(block, windows, origin.shape[2])
+            open_ray = nearest[beam, shot] > windows.near_m[solid_of]
+            solid_of, beam, shot = solid_of[open_ray], beam[open_ray], shot[open_ray]
+            _cast_pairs(solids, solid_of, beam, shot, turn, nearest, surface)
     return np.where(surface == NO_SURFACE, np.float32(np.inf), nearest), surface
+
+
+class _Turn(NamedTuple):
+    """The rays of a turn, see ``cast``."""
+
+    origin: Floats
+    direction: Floats
+    actor_time_s: Floats | None
+    optical_depth: Floats | None
+
+
+def _cast_window(
+    solids: Solids,
+    index: int,
+    window: tuple[slice, slice],
+    turn: _Turn,
+    nearest: Floats,
+    surface: NDArray[np.int32],
+) -> None:
+    """Keep the hits of one solid in a rectangle of beams and shots."""
+    rays = (slice(None), *window)
+    start = turn.origin[rays].reshape(3, -1)
+    towards = turn.direction[rays].reshape(3, -1)
+    if turn.actor_time_s is not None and solids.velocity[index].any():
+        start = _relative(start, solids.velocity[index], turn.actor_time_s[window].ravel())
+    sloped = bool(solids.grade[index].any())
+    solid = _Solid(solids.matrix[index], solids.offset[index], sloped)
+    distance, leave = _crossing(solids.shape[index], solid, start, towards)
+    if solids.slats[index, 0] > 0:
+        at = start + distance * towards
+        distance = np.where(_meets_slat(solids, index, solid, at), distance, np.float32(np.nan))
+    if turn.optical_depth is not None and solids.extinction[index] > 0:
+        drawn = _draws_of(index, window, turn.optical_depth).ravel()
+        distance = _inside_medium(distance, drawn, solids.extinction[index])
+    distance = np.where(distance <= leave, distance, np.float32(np.nan))
+    shape = nearest[window].shape
+    _keep_nearer(distance.reshape(shape), index, nearest[window], surface[window])
+
+
+def _small_blocks(
+    solids: Solids, small: NDArray[np.int64], windows: Windows
+) -> Iterator[NDArray[np.int64]]:
+    """Solids of one shape, few enough for the temporaries of their rays to stay in the cache."""
+    num_rays = windows.num_rays()
+    for shape in Shape:
+        alike = small[solids.shape[small] == shape]
+        block_of = np.cumsum(num_rays[alike]) // _BLOCK_PAIRS
+        yield from np.split(alike, np.flatnonzero(np.diff(block_of)) + 1)
+
+
+def _cast_pairs(
+    solids: Solids,
+    solid_of: NDArray[np.int64],
+    beam: NDArray[np.int64],
+    shot: NDArray[np.int64],
+    turn: _Turn,
+    nearest: Floats,
+    surface: NDArray[np.int32],
+) -> None:
+    """Keep the hits of pairs (each (K,)) of a solid, all of one shape, and a ray."""
+    if not len(solid_of):
+        return
+    nearest, surface = nearest.reshape(-1), surface.reshape(-1)
+    ray = beam * turn.origin.shape[2] + shot
+    distance = _pair_distance(solids, solid_of, beam, shot, ray, turn)
+    hit = np.flatnonzero((distance > 0) & (distance < nearest[ray]))
+    np.minimum.at(nearest, ray[hit], distance[hit])
+    hit = hit[distance[hit] == nearest[ray[hit]]]
+    surface[ray[hit]] = solid_of[hit]
+
+
+def _pairs_of(
+    block: NDArray[np.int64], windows: Windows, num_shots: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Solid, beam and shot (each (K,)) of all rays in the windows of a block of solids."""
+    num_rays = windows.num_rays()[block]
+    place = np.arange(num_rays.sum()) - np.repeat(np.cumsum(num_rays) - num_rays, num_rays)
+    first_beam, first_shot = windows.beams[block, 0], windows.shots[block, 0]
+    wide = windows.shots[block, 1] - first_shot
+    beam, shot = np.divmod(place, np.repeat(wide, num_rays))
+    beam += np.repeat(first_beam, num_rays)
+    shot += np.repeat(first_shot % num_shots, num_rays)
+    shot[shot >= num_shots] -= num_shots
+    return np.repeat(block, num_rays), beam, shot
+
+
+def _pair_distance(
+    solids: Solids,
+    solid_of: NDArray[np.int64],
+    beam: NDArray[np.int64],
+    shot: NDArray[np.int64],
+    ray: NDArray[np.int64],
+    turn: _Turn,
+) -> Floats:
+    """Distance (K,) at which each ray meets its own solid; infinite or NaN for none."""
+    start = turn.origin.reshape(3, -1).take(ray, axis=1)
+    towards = turn.direction.reshape(3, -1).take(ray, axis=1)
+    if turn.actor_time_s is not None and solids.velocity[solid_of].any():
+        velocity = solids.velocity.T.take(solid_of, axis=1)
+        start = _relative(start, velocity, turn.actor_time_s.reshape(-1)[ray])
+    solid = _gather(solids, solid_of)
+    distance, leave = _crossing(solids.shape[solid_of[0]], solid, start, towards)
+    if solids.slats[solid_of, 0].any():
+        meets = _meets_slat(solids, solid_of, solid, start + distance * towards)
+        distance = np.where(meets, distance, np.float32(np.nan))
+    extinction = solids.extinction[solid_of]
+    if turn.optical_depth is not None and extinction.any():
+        num_beams, num_shots = turn.optical_depth.shape
+        beam = (beam + _BEAM_STRIDE * solid_of) % num_beams
+        shot = (shot + _SHOT_STRIDE * solid_of) % num_shots
+        drawn = turn.optical_depth[beam, shot]
+        distance = np.where(extinction > 0, _inside_medium(distance, drawn, extinction), distance)
+    return np.where(distance <= leave, distance, np.float32(np.nan))
+
+
+def _inside_medium(distance: Floats, drawn: Floats, extinction: Floats) -> Floats:
+    """Distance of the hit inside a medium that the ray enters at ``distance``; NaN from within."""
+    return np.where(distance > 0, distance + drawn / extinction, np.float32(np.nan))
+
+
+def _meets_slat(
+    solids: Solids, index: NDArray[np.integer] | int, solid: _Solid, at: Floats
+) -> NDArray[np.bool_]:
+    """Whether points ``(3, M)`` on solids lie on one of their slats; those without have one."""
+    across, _, up = _unit_frame(solid, at, True)
+    pitch_m, share, lowest_m, highest_m = np.moveaxis(solids.slats[index], -1, 0)
+    half_size = solids.half_size[index]
+    place = (across + 1) * half_size[..., 0] / np.where(pitch_m > 0, pitch_m, np.float32(1))
+    height_m = (up + 1) * half_size[..., 2]
+    filled = (pitch_m == 0) | (place % 1 < share)
+    return filled | (height_m < lowest_m) | (height_m > highest_m)
 
 
 def cast_single(

@@ -37,16 +37,18 @@ def check_fields(values: object, rule: Rule, *names: str) -> None:
 
 
 class Semantic(IntEnum):
-    """Class ids of the labels, those of KITTI-360 and Cityscapes."""
+    """Class ids of the labels, those of KITTI-360."""
 
     UNLABELED = 0
     EGO_VEHICLE = 1
     ROAD = 7
     SIDEWALK = 8
+    PARKING = 9
     BUILDING = 11
     WALL = 12
     FENCE = 13
     POLE = 17
+    TRAFFIC_LIGHT = 19
     SIGN = 20
     VEGETATION = 21
     TERRAIN = 22
@@ -55,7 +57,19 @@ class Semantic(IntEnum):
     CAR = 26
     TRUCK = 27
     BUS = 28
+    CARAVAN = 29
+    TRAILER = 30
+    MOTORCYCLE = 32
     BICYCLE = 33
+    GARAGE = 34
+    GATE = 35
+    STOP = 36
+    SMALL_POLE = 37
+    LAMP = 38
+    TRASH_BIN = 39
+    BOX = 41
+    UNKNOWN_CONSTRUCTION = 42
+    UNKNOWN_OBJECT = 44
 
 
 class Material(IntEnum):
@@ -111,6 +125,12 @@ class Primitive:
     # Chance of a hit per metre inside leaves, grass and wire mesh, which are media rather than
     # surfaces; 0 for a closed surface.
     extinction_per_m: float = 0.0
+    # Upright slats across the turned x axis, of pickets, railings and scaffolds: their pitch in
+    # metres and the share of it that they fill. A ray that enters between two slats passes.
+    slats: tuple[float, float] = (0.0, 1.0)
+    # Heights above the lowest point of the solid between which it is open between the slats: a wall
+    # with windows has a sill and a lintel.
+    open_m: tuple[float, float] = (0.0, math.inf)
 
     def __post_init__(self) -> None:
         numbers = (*self.centre, *self.half_size, self.yaw_rad, *self.velocity_m_s, *self.grade)
@@ -125,6 +145,11 @@ class Primitive:
                 f"instance must lie in 0..{MAX_INSTANCE} (16 bits of a label), got {self.instance}"
             )
         check_fields(self, "be 0 or greater", "extinction_per_m")
+        pitch_m, share = self.slats
+        if not (0 <= pitch_m < math.inf and 0 < share <= 1):
+            raise ValueError(
+                f"slats must be a pitch of 0 or more and a share in (0, 1], got {self.slats}"
+            )
         if max(map(abs, self.grade)) > 0.2:
             raise ValueError(f"grade must stay within 0.2, got {self.grade}")
 

@@ -35,6 +35,7 @@ class Solids(NamedTuple):
     offset: Floats  # (N, 3): matrix @ point - offset are the unit coordinates of ``Primitive``
     velocity: Floats  # (N, 2), metres per second
     extinction: Floats  # (N,)
+    slats: Floats  # (N, 4) pitch, filled share, lowest and highest opening, see ``Primitive``
     ground_m: float  # height of the ground
 
 
@@ -67,6 +68,7 @@ def solids_of(primitives: tuple[Primitive, ...], pose: Pose, ground_m: float) ->
         offset=np.einsum("nij,nj->ni", matrix, centre).astype(np.float32),
         velocity=velocity.astype(np.float32),
         extinction=np.array([p.extinction_per_m for p in primitives], dtype=np.float32),
+        slats=np.array([p.slats + p.open_m for p in primitives], dtype=np.float32).reshape(-1, 4),
         ground_m=ground_m - pose.z_m,
     )
 
@@ -95,6 +97,10 @@ class Windows(NamedTuple):
     shots: NDArray[np.int64]  # (N, 2) may be negative or pass W: the turn wraps
     near_m: NDArray[np.float64]  # (N,)
     order: NDArray[np.int64]  # solids within reach, near to far
+
+    def num_rays(self) -> NDArray[np.int64]:
+        """Rays ``(N,)`` in each window."""
+        return np.diff(self.beams)[:, 0] * np.diff(self.shots)[:, 0]
 
 
 def windows_of(

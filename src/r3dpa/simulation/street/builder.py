@@ -6,9 +6,9 @@ import math
 
 from numpy.random import Generator
 
-from r3dpa.simulation.course import BLOCK_M, Course, Section
 from r3dpa.simulation.scene import Interval, Material, Primitive, Puddle, Semantic, Shape
-from r3dpa.simulation.vehicles import Body
+from r3dpa.simulation.street.course import BLOCK_M, Course, Section
+from r3dpa.simulation.street.vehicles import Body
 
 #: Walls and crowns reach into the ground, which falls away below them where the street is steep.
 FOOTING_M = 0.6
@@ -55,12 +55,15 @@ class Builder:
         inclined: bool = False,
         extinction_per_m: float = 0.0,
         detail: bool = False,
+        slats: tuple[float, float] = (0.0, 1.0),
+        open_m: tuple[float, float] = (0.0, math.inf),
     ) -> None:
         """Add a solid that stands on the ground.
 
         ``at``: centre (s, lateral). ``size``: along, across and up. ``bottom_m``: lowest point
         above the ground. ``yaw_rad``: against the street. ``inclined``: follows the slope of the
         street instead of standing level. ``detail``: only scans from nearby have it.
+        ``extinction_per_m``, ``slats`` and ``open_m``: see ``Primitive``.
         """
         x, y, z = self.section.at(*at)
         z += self.course.surface_m(at[1]) + bottom_m + size[2] / 2
@@ -71,7 +74,7 @@ class Builder:
         (self.details if detail else self.primitives).append(
             Primitive(
                 shape, (x, y, z), half_size, semantic, reflectivity, heading, instance, material,
-                still, grade, extinction_per_m,
+                still, grade, extinction_per_m, slats, open_m,
             )
         )  # fmt: skip
 
@@ -93,7 +96,7 @@ class Builder:
             half_size = (part.size[0] / 2, part.size[1] / 2, part.size[2] / 2)
             primitive = Primitive(
                 part.shape, centre, half_size, part.semantic, part.reflectivity, heading, instance,
-                part.material, velocity, grade,
+                part.material, velocity, grade, part.extinction_per_m, part.slats,
             )  # fmt: skip
             (self.details if part.detail else self.primitives).append(primitive)
 

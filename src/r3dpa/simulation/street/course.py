@@ -17,8 +17,12 @@ START_M = 10 * BLOCK_M
 SCAN_PERIOD_S = 0.1
 
 _CAMBER = 0.02
-_GUTTER_M = (0.5, 1.3)
+# Lanes and pavements of German residential streets.
+_LANE_M, _PAVEMENT_M = (2.75, 3.25), (1.5, 2.8)
+_GUTTER_M = (0.3, 0.8)
 _PARKING_M = 2.1
+# Bins are emptied on one working day of five.
+_COLLECTION_DAYS = 0.2
 _RISE = (-0.01, 0.08)
 # A cross slope that bends on a hill have left dies away by this factor from block to block.
 _LEVELLING = 0.93
@@ -31,44 +35,61 @@ Wave = tuple[float, float, float]
 class Character(NamedTuple):
     """Surroundings of a drive; pairs are intervals to draw from.
 
-    ``lanes``: possible numbers of lanes ahead and towards us. ``districts``: weights of town,
-    houses, green and yard. ``parked``: share of taken places. ``parking``, ``pavement``: chance.
+    ``lanes``: possible numbers of lanes ahead and towards us. ``districts``: weights of town, row
+    houses, houses, blocks of flats, green, yards and fields. ``parked``: share of taken places.
+    ``parking``, ``pavement``: chance. ``clutter``: mean number of small things on 24 m of
+    pavement. ``people``: chance of people who stand there. ``lights``: whether crossings have
+    traffic lights. ``island``: chance of a traffic island at a crossing.
     """
 
     lanes: tuple[tuple[int, int], ...]
-    districts: tuple[float, float, float, float]
+    districts: tuple[float, float, float, float, float, float, float]
     parked: tuple[float, float]
     parking: float
     pavement: float
+    clutter: float
+    people: float
+    lights: bool
+    island: float
     car_gap_m: tuple[float, float]
     people_gap_m: tuple[float, float]
     crossing_every: tuple[int, int]
     slope: float
 
 
-#: Dense town, suburb, park and edge of town, arterial road.
-CHARACTERS = (
-    Character(
-        lanes=((1, 1), (1, 1), (1, 0)), districts=(0.75, 0.1, 0.1, 0.05), parked=(0.35, 0.75),
-        parking=0.8, pavement=1.0, car_gap_m=(40, 90), people_gap_m=(50, 110),
-        crossing_every=(3, 6), slope=0.02,
-    ),
-    Character(
-        lanes=((1, 1), (1, 0)), districts=(0.1, 0.75, 0.1, 0.05), parked=(0.35, 0.75),
-        parking=0.75, pavement=0.95, car_gap_m=(60, 140), people_gap_m=(60, 160),
-        crossing_every=(4, 8), slope=0.05,
-    ),
-    Character(
-        lanes=((1, 1),), districts=(0.05, 0.2, 0.65, 0.1), parked=(0.3, 0.7),
-        parking=0.4, pavement=0.6, car_gap_m=(60, 140), people_gap_m=(80, 200),
-        crossing_every=(6, 10), slope=0.06,
-    ),
-    Character(
-        lanes=((2, 2), (2, 1), (2, 2)), districts=(0.25, 0.15, 0.4, 0.2), parked=(0.3, 0.7),
-        parking=0.5, pavement=0.8, car_gap_m=(40, 70), people_gap_m=(60, 160),
-        crossing_every=(5, 9), slope=0.03,
-    ),
+_TOWN = Character(
+    lanes=((1, 1), (1, 1), (1, 0)), districts=(0.6, 0.15, 0.0, 0.1, 0.1, 0.05, 0.0),
+    parked=(0.25, 0.6), parking=0.8, pavement=1.0, clutter=1.1, people=0.35, lights=True,
+    island=0.3, car_gap_m=(40, 90), people_gap_m=(40, 90), crossing_every=(3, 6), slope=0.02,
 )  # fmt: skip
+_ROW_HOUSES = Character(
+    lanes=((1, 1), (1, 0)), districts=(0.1, 0.55, 0.2, 0.1, 0.05, 0.0, 0.0),
+    parked=(0.2, 0.6), parking=0.8, pavement=0.95, clutter=1.6, people=0.15, lights=False,
+    island=0.1, car_gap_m=(60, 140), people_gap_m=(50, 140), crossing_every=(4, 8), slope=0.04,
+)  # fmt: skip
+_SUBURB = Character(
+    lanes=((1, 1), (1, 0)), districts=(0.05, 0.15, 0.65, 0.05, 0.1, 0.0, 0.0),
+    parked=(0.15, 0.55), parking=0.75, pavement=0.95, clutter=1.4, people=0.15, lights=False,
+    island=0.1, car_gap_m=(60, 140), people_gap_m=(60, 160), crossing_every=(4, 8), slope=0.05,
+)  # fmt: skip
+_GREEN = Character(
+    lanes=((1, 1),), districts=(0.05, 0.05, 0.15, 0.1, 0.55, 0.1, 0.0),
+    parked=(0.1, 0.4), parking=0.4, pavement=0.6, clutter=0.4, people=0.05, lights=False,
+    island=0.2, car_gap_m=(60, 140), people_gap_m=(80, 200), crossing_every=(6, 10), slope=0.06,
+)  # fmt: skip
+_ARTERIAL = Character(
+    lanes=((2, 2), (2, 1), (2, 2)), districts=(0.1, 0.05, 0.15, 0.2, 0.4, 0.1, 0.0),
+    parked=(0.3, 0.7), parking=0.5, pavement=0.8, clutter=3.0, people=0.1, lights=True,
+    island=0.5, car_gap_m=(40, 70), people_gap_m=(60, 160), crossing_every=(5, 9), slope=0.03,
+)  # fmt: skip
+_COUNTRY = Character(
+    lanes=((1, 1),), districts=(0.0, 0.0, 0.2, 0.0, 0.3, 0.05, 0.45),
+    parked=(0.05, 0.3), parking=0.15, pavement=0.3, clutter=0.2, people=0.03, lights=False,
+    island=0.2, car_gap_m=(60, 160), people_gap_m=(120, 300), crossing_every=(8, 12), slope=0.06,
+)  # fmt: skip
+
+#: Surroundings by the number of the drive, in turn: KITTI-360 leads mostly through suburbs.
+CHARACTERS = (_TOWN, _SUBURB, _GREEN, _ARTERIAL, _ROW_HOUSES, _SUBURB, _COUNTRY)
 
 
 class Kerb(NamedTuple):
@@ -132,6 +153,7 @@ class Course(NamedTuple):
     kerbs: tuple[Kerb, Kerb]  # right, left
     kerb_m: float
     crossing_every: int
+    collection_day: bool  # bins stand at the kerb
     road_reflectivity: float
     mount_pitch_rad: float
     mount_roll_rad: float
@@ -224,13 +246,13 @@ def course_of(seed: int, drive: int) -> Course:
     """The course of a drive; neighbouring drives lead through places of different character."""
     draw = generator_for(seed, "course", drive)
     character = CHARACTERS[(drive + seed) % len(CHARACTERS)]
-    lane_m = draw.uniform(3.0, 3.5)
+    lane_m = draw.uniform(*_LANE_M)
     lanes = character.lanes[int(draw.integers(len(character.lanes)))]
     kerbs = []
     for count in lanes:
         parking = bool(draw.random() < character.parking)
         lanes_m = count * lane_m + draw.uniform(*_GUTTER_M)
-        pavement_m = draw.uniform(1.5, 4.0) if draw.random() < character.pavement else 0.0
+        pavement_m = draw.uniform(*_PAVEMENT_M) if draw.random() < character.pavement else 0.0
         edge_m, rise = lanes_m + parking * _PARKING_M, draw.uniform(*_RISE)
         kerbs.append(Kerb(lanes_m, edge_m, pavement_m, parking, rise))
     period = draw.uniform(40.0, 90.0)
@@ -249,6 +271,7 @@ def course_of(seed: int, drive: int) -> Course:
         kerbs=(kerbs[0], kerbs[1]),
         kerb_m=draw.uniform(0.08, 0.15),
         crossing_every=int(draw.integers(*character.crossing_every, endpoint=True)),
+        collection_day=bool(draw.random() < _COLLECTION_DAYS),
         road_reflectivity=draw.uniform(0.13, 0.19),
         mount_pitch_rad=draw.normal(0.009, 0.003),
         mount_roll_rad=draw.normal(0.0, 0.004),

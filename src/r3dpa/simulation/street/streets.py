@@ -10,10 +10,7 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from r3dpa.simulation.builder import Builder, build_ground
-from r3dpa.simulation.course import BLOCK_M, SCAN_PERIOD_S, Course, course_of
 from r3dpa.simulation.draws import generator_for
-from r3dpa.simulation.roadside import build_plots, build_side_street
 from r3dpa.simulation.scene import (
     EgoMotion,
     Pose,
@@ -24,7 +21,12 @@ from r3dpa.simulation.scene import (
     check_fields,
     draw_weather,
 )
-from r3dpa.simulation.vehicles import Body, cyclist, person, recording_car, vehicle
+from r3dpa.simulation.street.builder import Builder, build_ground
+from r3dpa.simulation.street.course import BLOCK_M, SCAN_PERIOD_S, Course, course_of
+from r3dpa.simulation.street.kerbside import build_corner, build_island, build_kerbside
+from r3dpa.simulation.street.people import cyclist, person
+from r3dpa.simulation.street.plots import build_plots, build_side_street
+from r3dpa.simulation.street.vehicles import Body, recording_car, vehicle
 
 # Blocks behind and ahead of the car's own that are built: beyond lies less than 1 % of the
 # returns of real scans.
@@ -35,10 +37,10 @@ _DETAIL_M = 25.0
 _BLOCKS_PER_DISTRICT = 6
 # Weather lasts this many scans.
 _SCANS_PER_WEATHER = 100
-# Instance numbers: those of blocks repeat after 800 blocks = 19 km, those of actors of one kind
+# Instance numbers: those of blocks repeat after 200 blocks = 4.8 km, those of actors of one kind
 # in one lane after 1000.
-_MAX_OBJECTS_PER_BLOCK = 64
-_STATIC_BLOCKS = 800
+_MAX_OBJECTS_PER_BLOCK = 256
+_STATIC_BLOCKS = 200
 _ACTORS_PER_STREAM = 1000
 _FIRST_ACTOR = 1 + _STATIC_BLOCKS * _MAX_OBJECTS_PER_BLOCK
 # The level ground lies this far below the lowest road of a scene.
@@ -50,10 +52,11 @@ class Street:
     """An endless street along which one drive is recorded.
 
     The axis bends gently and rises and falls; ``s`` runs along it, the lateral coordinate points
-    to the left. Road, pavements, buildings, parked cars, lamps, signs, trees, hedges and fences
-    stand still in blocks of 24 m. Vehicles, cyclists and people move in lanes. The recording car
-    advances 1.0 to 1.4 m a scan or stands for a while. By its number a drive leads through a dense
-    town, a suburb, a green edge of town, or along an arterial road.
+    to the left. Road, plots with houses and gardens, and the kerbside with parked cars, trees and
+    street furniture stand still in blocks of 24 m. Vehicles, cyclists and people move in lanes. The
+    recording car advances 1.0 to 1.4 m per scan or stands for a while. By its number a drive leads
+    through a dense town, a suburb, a green edge of town, along an arterial road, past row houses,
+    or through fields, see ``course.CHARACTERS``.
 
     Args:
         seed: Seed of the data set, 0 or greater.
@@ -132,8 +135,12 @@ def _block(seed: int, drive: int, block: int) -> Builder:
         build_ground(builder, draw, side, opening)
         if opening:
             build_side_street(builder, draw, side)
+            build_corner(builder, draw, side)
         else:
             build_plots(builder, draw, side, district)
+            build_kerbside(builder, draw, side, district)
+    if crosses:
+        build_island(builder, draw)
     assert builder.num_objects < _MAX_OBJECTS_PER_BLOCK, f"block {block} has too many objects"
     return builder
 
