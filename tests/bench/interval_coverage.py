@@ -1,8 +1,9 @@
 """How often the 95 % intervals of the metrics hold the mean of the value over repeated draws.
 
-``python tests/bench/interval_coverage.py notebooks/results/interval_coverage.json 1000`` writes the
-study: rows of metric, case, what is drawn anew, share of intervals that hold the mean, and their
-width over that of the central 95 % of a normal distribution with the spread of the values.
+``python tests/bench/interval_coverage.py after.json 1000`` writes the study, which
+``notebooks/results/interval_coverage.json`` holds for two commits. Each row has the metric, the
+case, what is drawn anew, the share of intervals that hold the mean, and their width over that of
+the central 95 % of a normal distribution with the spread of the values.
 """
 
 import json
