@@ -122,8 +122,8 @@ def share_of_rays_that_pass(name, seed):
 
 def test_fences_let_rays_pass_and_hedges_hardly_any():
     fences = np.array([share_of_rays_that_pass("fence", seed) for seed in range(20)])
-    # All but fences of boards.
-    assert ((fences > 0.2) & (fences < 0.97)).sum() >= 12
+    # Not fences of boards, a third of all, and few rays of those that are seen at a slant.
+    assert ((fences > 0.2) & (fences < 0.97)).sum() >= 8
     hedges = [share_of_rays_that_pass("hedge", seed) for seed in range(20)]
     assert np.median(hedges) < 0.1
 

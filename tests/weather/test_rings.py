@@ -22,7 +22,7 @@ def test_rings_by_the_order_of_the_file_in_any_direction(model, beams):
     points, ring = simulated(model, 520)
     forward, backward = (rings_of(RecordedScan(p)) for p in (points, points[::-1].copy()))
     assert (forward.ring == ring).all()
-    assert (backward.ring[::-1] == ring).mean() > 0.999
+    assert (backward.ring[::-1] == ring).mean() > 0.998
     for found in (forward, backward):
         assert (found.how, found.num_rings, found.num_shots) == ("order", beams, 520)
         assert found.sure > 0.98

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 @pytest.fixture(scope="module")
 def scan():
     sensor = load_sensor("hdl64e", shots=520)
-    scene = Street(5, 1, SimulatedWeather()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 0, SimulatedWeather()).scene(3, sensor.mount_height_m)
     found = simulate_scan(scene, sensor, ("recorded",))
     return RecordedScan(found.points[:, :3].copy(), found.points[:, 3].copy(), labels=found.labels)
 

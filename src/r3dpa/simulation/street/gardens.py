@@ -21,7 +21,7 @@ _CLIPPED_PER_M, _FREE_PER_M = (9.0, 16.0), (2.0, 5.0)
 _PATH_M, _DRIVE_M = (0.9, 1.3), (2.7, 3.4)
 # A front garden has a plant per this many square metres, and at most so many.
 _PLANT_M2, _MOST_PLANTS = 4.0, 20
-_TUFT_M2, _MOST_TUFTS = 4.0, 14
+_TUFT_M2, _MOST_TUFTS = 8.0, 10
 _WALL_M, _PILLAR_M = 0.22, 0.4
 # Longer borders belong to two neighbours.
 _PROPERTY_M = 18.0
@@ -35,7 +35,7 @@ def border(builder: Builder, draw: Generator, lateral: float, first: float, last
         border(builder, draw, lateral, middle, last)
         return
     kind = draw.random()
-    build = hedge if kind < 0.4 else fence if kind < 0.75 else garden_wall
+    build = hedge if kind < 0.5 else fence if kind < 0.75 else garden_wall
     wide_m = draw.uniform(*(_PATH_M if draw.random() < 0.7 else _DRIVE_M))
     if last - first < wide_m + 3.0 or draw.random() < 0.25:
         build(builder, draw, lateral, first, last)
@@ -97,7 +97,7 @@ def _leafy_box(
 def fence(builder: Builder, draw: Generator, lateral: float, first: float, last: float) -> None:
     """A fence of pickets, railings, wire mesh, boards or rails, now and then overgrown."""
     kinds = (_pickets, _railings, _mesh, _boards, _rails)
-    kind = kinds[int(draw.choice(len(kinds), p=(0.25, 0.25, 0.25, 0.15, 0.1)))]
+    kind = kinds[int(draw.choice(len(kinds), p=(0.15, 0.15, 0.2, 0.35, 0.15)))]
     kind(builder, draw, lateral, first, last)
     if draw.random() < 0.25:
         for _ in range(int(draw.integers(1, 4))):
@@ -176,7 +176,7 @@ def _mesh(builder: Builder, draw: Generator, lateral: float, first: float, last:
     """Wire mesh, of which a beam meets a wire now and then, between thin posts."""
     look = (Semantic.FENCE, Material.PAINT, 0.14)
     instance, tall_m, along = builder.new_instance(), draw.uniform(0.9, 1.8), (first, last)
-    wires_per_m = draw.uniform(3.0, 8.0)
+    wires_per_m = draw.uniform(1.0, 3.0)
     heights = (0.03, tall_m)
     _strip(builder, look, lateral, along, heights, 0.05, instance, extinction_per_m=wires_per_m)
     _posts(builder, look, lateral, along, tall_m, instance, post_m=0.06, apart_m=2.5)
@@ -370,7 +370,7 @@ def front_garden(
         # Along the house and along the border rather than on the lawn between.
         share = draw.beta(0.6, 0.6)
         if abs(s - path_s) > half_m + 0.8:
-            at = side * (near_m + 0.7 + share * max(room_m - 1.4, 0.0))
+            at = side * (near_m + 1.1 + share * max(room_m - 1.8, 0.0))
             _plant(builder, draw, s, at, room_m)
 
 

@@ -209,9 +209,9 @@ def _several_stems(builder: Builder, draw: Generator, at: Place) -> None:
 
 
 def street_tree(builder: Builder, draw: Generator, s: float, lateral: float) -> None:
-    """A tree by the kerb: mostly of a high crown, some low, young, cut back or narrow."""
+    """A tree by the kerb: of a high or a low crown, young, cut back or narrow."""
     at, habit = (s, lateral), draw.random()
-    if habit < 0.45:
+    if habit < 0.25:
         _broadleaf(builder, draw, at, _STREET_STEM_M, (3.5, 7.5))
     elif habit < 0.62:
         _broadleaf(builder, draw, at, _LOW_STEM_M, (2.5, 5.0))
