@@ -127,13 +127,23 @@ def windows_of(
     around = np.hypot(*(origin[:2] - middle[:, None])).max(axis=0)
     if spread_m.max(initial=0.0) < 2 * around.min():
         return wide
-    for index in wide.order:
-        first, last = wide.shots[index]
-        if last - first < fan.num_shots:
-            inside = np.arange(first, last) % fan.num_shots
-            here[index] = middle[:, inside[len(inside) // 2]]
-            away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
-            spread_m[index] = away.max() + reach[index]
+    first = wide.shots[wide.order, 0] % fan.num_shots
+    wide_shots = np.diff(wide.shots)[wide.order, 0]
+    last = first + wide_shots
+    # The sensor moves on: within a window it is farthest from its middle at one of the ends.
+    at_once = (last <= fan.num_shots) & (wide_shots < fan.num_shots)
+    index = wide.order[at_once]
+    here[index] = middle[:, (first + wide_shots // 2)[at_once]].T
+    ends = np.stack([middle[:, first[at_once]], middle[:, last[at_once] - 1]])
+    away = np.hypot(*np.moveaxis(ends - here[index].T, 1, 0)).max(axis=0)
+    spread_m[index] = away + around.max() + reach[index]
+    # Where the turn ends and begins, the sensor jumps.
+    for place in np.flatnonzero(~at_once & (wide_shots < fan.num_shots)):
+        index = wide.order[place]
+        inside = np.arange(first[place], last[place]) % fan.num_shots
+        here[index] = middle[:, inside[len(inside) // 2]]
+        away = np.hypot(*(middle[:, inside] - here[index][:, None])) + around[inside]
+        spread_m[index] = away.max() + reach[index]
     return _windows_from(solids, fan, max_range_m, here, spread_m)
 
 

@@ -101,10 +101,6 @@ class FoliageOcclusion(Effect):
         count = sum(p.extinction_per_m > 0 for p in scene.primitives)
         return f"{count} solids of leaves, grass or mesh" if count else None
 
-    def rays(self, sweep: Sweep) -> RayIndex:
-        """Rays whose window meets foliage at the time of the shot."""
-        return sweep.all_near(subset(sweep.solids, sweep.solids.extinction > 0), sweep.actor_time_s)
-
     def apply(self, sweep: Sweep, rays: RayIndex, draws: Draws) -> None:
         shift = int(sweep.num_rays * draws.uniform(slice(0, 1))[0])
         clumps = np.roll(_clumps(sweep.shape), shift)

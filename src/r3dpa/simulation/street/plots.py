@@ -137,7 +137,7 @@ def _side_garden(
     wide_m = last - first
     if wide_m < 1.5:
         return
-    for away_m in draw.uniform(1, 16, 6):
+    for away_m in draw.uniform(1, 16, 7):
         shrub(builder, draw, draw.uniform(first, last), side * (front_m + away_m))
     for away_m in (draw.uniform(1, 4), draw.uniform(5, 14)):
         if draw.random() < 0.6:
