@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from r3dpa.geometry import (
+    NUM_CLASSES,
+    UNKNOWN_CLASS,
     LidarSensor,
     RangeCodec,
     RingProjection,
@@ -97,6 +99,44 @@ def test_inverse_range_and_reflectance():
         codec.to_image(range_m)
     with pytest.raises(ValueError, match="exclude each other"):
         RangeCodec(return_channel=True, reflectance=True)
+
+
+def test_intensity_and_class_survive_the_round_trip():
+    codec = RangeCodec("log2", return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
+    sensor = LidarSensor(beams=1, columns=4)
+    range_m = torch.tensor([[2.0, -1.0, 30.0, 5.5]])
+    intensity = torch.tensor([[0.0, 0.7, 1.0, 0.25]])
+    classes = torch.tensor([[0, 3, NUM_CLASSES - 1, UNKNOWN_CLASS]])
+    image = codec.to_image(range_m, intensity, classes)
+    assert image.shape == (codec.channels, 1, 4) == (4, 1, 4)
+    assert torch.equal(image[:2], RangeCodec("log2", return_channel=True).to_image(range_m))
+    assert image[2].tolist() == [[-1.0, -1.0, 1.0, -0.5]]
+    assert image[3].tolist() == [[0.0, -1.0, NUM_CLASSES - 1, -1.0]]
+    found = codec.pixels_of(image, sensor)
+    torch.testing.assert_close(found.range_m, range_m)
+    assert found.intensity.tolist() == [[0.0, 0.0, 1.0, 0.25]]
+    assert found.classes.tolist() == [[0, UNKNOWN_CLASS, NUM_CLASSES - 1, UNKNOWN_CLASS]]
+    assert torch.equal(codec.returns_of(image), range_m[None] > 0)
+    # Of an empty pixel neither range nor intensity matter; numbers of classes have no distance.
+    assert codec.informative(image)[:, 0, 1].tolist() == [False, True, False, False]
+    assert codec.informative(image)[:, 0, 0].tolist() == [True, True, True, False]
+    assert (codec.to_image(range_m, intensity)[3] == UNKNOWN_CLASS).all()  # without labels
+
+
+def test_intensity_and_class_need_a_return_channel_and_their_values():
+    with pytest.raises(ValueError, match=r"need codec\.return_channel"):
+        RangeCodec(intensity_channel=True)
+    with pytest.raises(ValueError, match=f"must be {NUM_CLASSES}, or 0 for none, got 3"):
+        RangeCodec(return_channel=True, num_classes=3)
+    with pytest.raises(ValueError, match="needs scans with an intensity"):
+        RangeCodec(return_channel=True, intensity_channel=True).to_image(torch.ones(1, 4))
+
+
+def test_a_recorded_geometry_without_the_newer_options_is_read():
+    geometry = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(return_channel=True), (2, 8))
+    values = geometry.to_dict()
+    del values["codec"]["intensity_channel"], values["codec"]["num_classes"]
+    assert ScanGeometry.from_dict(values) == geometry
 
 
 @pytest.mark.parametrize(

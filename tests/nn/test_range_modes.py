@@ -139,3 +139,71 @@ def test_a_return_channel_survives_the_round_trip():
     informative = codec.informative(image)
     assert not informative[0].any()
     assert informative[1].all()
+
+
+LABELLED = STEM | {"intensity": True, "num_classes": 3}
+
+
+def labelled_image():
+    torch.manual_seed(1)
+    image = torch.randn(2, 4, 16, 64)
+    image[:, 3] = torch.randint(-1, 3, (2, 16, 64))
+    return image
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_intensity_and_likeliest_class_follow_range_and_return(modes):
+    torch.manual_seed(0)
+    vae, image = VAE(**LABELLED | {"modes": modes}), labelled_image()
+    prediction = vae.predict(vae.encode(image).mean)
+    assert prediction.shape[1] == {1: 1, 2: 5}[modes] + 1 + 1 + 3
+    outputs, found = vae.outputs_of(prediction), vae.image_of(prediction)
+    assert found.shape == image.shape == (2, vae.image_channels, 16, 64)
+    assert torch.equal(found[:, 1:2], outputs.returns)
+    assert torch.equal(found[:, 2:3], outputs.intensity)
+    assert torch.equal(found[:, 3], prediction[:, -3:].argmax(dim=1).float())
+    assert set(found[:, 3].unique().tolist()) == {0, 1, 2}
+    without = VAE(**STEM | {"modes": modes})
+    assert torch.equal(found[:, :2], without.image_of(prediction[:, :-4]))
+    assert torch.equal(vae.scan_of(prediction), without.scan_of(prediction[:, :-4]))
+
+
+def test_the_encoder_starts_as_one_without_intensity_and_class_and_can_learn_them():
+    vae, without, image = VAE(**LABELLED), VAE(**STEM), labelled_image()
+    unknown = vae.load_state_dict(without.state_dict(), strict=False)
+    assert {name.rpartition(".")[0] for name in unknown.missing_keys} == {
+        "encoder.further_in",
+        "decoder.further_out",
+    }
+    latents = vae.encode(image).mean
+    assert torch.equal(latents, without.encode(image[:, :2]).mean)
+    latents.sum().backward()
+    inputs = vae.encoder.further_in.weight.grad.view(32, 4, 32)  # intensity, three classes
+    assert (inputs.abs().amax(dim=(0, 2)) > 0).all()
+
+
+def test_a_class_is_seen_as_a_name_not_as_a_number():
+    vae, image = VAE(**LABELLED), labelled_image()
+    image[:, 2] = 0.0
+    with torch.no_grad():  # only the channel of class 1
+        vae.encoder.further_in.weight.view(32, 4, 32)[:, 2].fill_(0.1)
+    latents = []
+    for number in (-1, 0, 1, 2):
+        image[:, 3] = number
+        latents.append(vae.encode(image).mean)
+    assert torch.equal(latents[0], latents[1])
+    assert torch.equal(latents[0], latents[3])
+    assert not torch.equal(latents[0], latents[2])
+
+
+def test_in_half_precision_outputs_stay_wide():
+    vae = VAE(**LABELLED).eval().halve_decoder_()
+    prediction = vae.predict(torch.zeros(1, 4, 2, 4))
+    assert prediction.dtype == torch.float32
+    assert vae.decoder.further_out.weight.dtype == torch.float32
+    assert vae.decoder.mid.block_1.conv1.weight.dtype == torch.bfloat16
+
+
+def test_classes_need_range_and_return():
+    with pytest.raises(ValueError, match="intensity and num_classes need in_channels 2"):
+        VAE(in_channels=1, num_classes=3)

@@ -9,22 +9,37 @@ from r3dpa.geometry.projection import (
     pool_cells,
     range_image,
     unproject,
+    values_at_returns,
 )
-from r3dpa.geometry.scan_geometry import RangeCodec, ScanGeometry, projection_to_dict
+from r3dpa.geometry.scan_geometry import Pixels, RangeCodec, ScanGeometry, projection_to_dict
+from r3dpa.geometry.semantics import (
+    NUM_CLASSES,
+    SEMANTIC_CLASSES,
+    UNKNOWN_CLASS,
+    classes_of,
+    labels_of,
+)
 from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 __all__ = [
     "EMPTY_RANGE_M",
+    "NUM_CLASSES",
+    "SEMANTIC_CLASSES",
+    "UNKNOWN_CLASS",
     "LidarSensor",
+    "Pixels",
     "Projection",
     "RangeCodec",
     "RingProjection",
     "ScanGeometry",
     "SphericalProjection",
+    "classes_of",
     "in_range",
+    "labels_of",
     "points_of",
     "pool_cells",
     "projection_to_dict",
     "range_image",
     "unproject",
+    "values_at_returns",
 ]

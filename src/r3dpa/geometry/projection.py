@@ -189,13 +189,24 @@ def points_of(
     from 0, so that a written file can be read with the same projection. Otherwise as
     :func:`unproject`.
     """
-    if range_m.ndim != 2:
-        raise ValueError(f"images must be (H, W), one by one, got {tuple(range_m.shape)}")
-    columns = projection.column_order().to(range_m.device)
     points = unproject(range_m, projection, corner)
     if intensity is not None:
         points = torch.cat([points, intensity[..., None].to(points)], dim=-1)
-    return points[:, columns][range_m[:, columns] > 0]
+    return values_at_returns(points, range_m, projection)
+
+
+def values_at_returns(values: Tensor, range_m: Tensor, projection: Projection) -> Tensor:
+    """Values ``(P, ...)`` of the pixels with a return, in the order of :func:`points_of`.
+
+    Args:
+        values: ``(H, W, ...)`` anything known per pixel.
+        range_m: ``(H, W)`` metres, not positive without a return.
+        projection: Gives the order of the columns.
+    """
+    if range_m.ndim != 2:
+        raise ValueError(f"images must be (H, W), one by one, got {tuple(range_m.shape)}")
+    columns = projection.column_order().to(range_m.device)
+    return values[:, columns][range_m[:, columns] > 0]
 
 
 def pool_cells(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from r3dpa.geometry.projection import Projection, RingProjection, SphericalProjection
+from r3dpa.geometry.semantics import NUM_CLASSES, UNKNOWN_CLASS
 from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
@@ -19,6 +20,19 @@ _DEFAULT_SCALES = {"linear": 56.0, "log2": 5.84, "inverse": 1.45}
 _LOG_OFFSET_M = 1e-4
 _LEAST_VALID_M = 1 / 255  # one grey level of a metre in the official 8-bit pictures
 _THRESHOLD_MARGIN = 1e-6
+
+
+class Pixels(NamedTuple):
+    """What is known of the pixels of scans, each ``(..., H, W)``; None where it is not.
+
+    ``range_m`` metres, -1 without a return; ``intensity`` in [0, 1], 0 without a return;
+    ``classes`` int64 numbers of :data:`r3dpa.geometry.SEMANTIC_CLASSES`, -1 without a return or a
+    label.
+    """
+
+    range_m: Tensor
+    intensity: Tensor | None = None
+    classes: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,11 @@ class RangeCodec:
     does not blur the border between the two into ghost points. With ``reflectance`` the second
     channel is that of the returns instead, from [0, 1] to [-1, 1], and -1 without a return.
 
+    After range and return there may be two further channels: with ``intensity_channel`` the
+    intensity, from [0, 1] to [-1, 1]; with ``num_classes`` the number of the class of a return, see
+    :data:`r3dpa.geometry.SEMANTIC_CLASSES`, which is not scaled. Both are -1 without a return, and
+    the class also where the return has none.
+
     Source: the two data configurations of valeoai/R3DPA. Its inverse of the logarithm leaves
     the 1e-4 m out; ``legacy_inverse`` does so too, for published numbers. R2DM and R2Flow: ``log2``
     with scale ``log2(81)`` and offset 0, or ``inverse``, both with ``reflectance``.
@@ -47,6 +66,9 @@ class RangeCodec:
         return_channel: Images have a second channel, whose sign says where returns are.
         reflectance: Images have a second channel of reflectance.
         offset_m: Offset of ``log2``, metres.
+        intensity_channel: Images have a channel of intensity; needs ``return_channel``.
+        num_classes: Number of semantic classes, of which images have a channel; 0 for none. Needs
+            ``return_channel``.
     """
 
     encoding: Literal["linear", "log2", "inverse"] = "linear"
@@ -55,6 +77,8 @@ class RangeCodec:
     return_channel: bool = False
     reflectance: bool = False
     offset_m: float = _LOG_OFFSET_M
+    intensity_channel: bool = False
+    num_classes: int = 0
 
     def __post_init__(self) -> None:
         if self.encoding not in _DEFAULT_SCALES:
@@ -62,6 +86,12 @@ class RangeCodec:
             raise ValueError(f"range encoding must be one of {known}, got {self.encoding!r}")
         if self.return_channel and self.reflectance:
             raise ValueError("codec.return_channel and codec.reflectance exclude each other")
+        if (self.intensity_channel or self.num_classes) and not self.return_channel:
+            raise ValueError("codec.intensity_channel and num_classes need codec.return_channel")
+        if self.num_classes not in (0, NUM_CLASSES):
+            raise ValueError(
+                f"codec.num_classes must be {NUM_CLASSES}, or 0 for none, got {self.num_classes}"
+            )
         # So that a codec equals the same one written out. Not the number in place of None: the
         # scale of a default codec would stay when a YAML file names another encoding alone.
         if self.scale == _DEFAULT_SCALES[self.encoding]:
@@ -130,28 +160,52 @@ class RangeCodec:
     @property
     def channels(self) -> int:
         """Channels C of an image."""
-        return 2 if self.return_channel or self.reflectance else 1
+        further = self.intensity_channel + (self.num_classes > 0)
+        return 1 + (self.return_channel or self.reflectance) + further
 
-    def to_image(self, range_m: Tensor, reflectance: Tensor | None = None) -> Tensor:
+    def to_image(
+        self, range_m: Tensor, intensity: Tensor | None = None, classes: Tensor | None = None
+    ) -> Tensor:
         """Image ``(..., C, H, W)`` in [-1, 1] of ranges ``(..., H, W)`` in metres.
 
-        Reflectances ``(..., H, W)`` in [0, 1] are needed where they are the second channel.
+        Args:
+            range_m: Any value of 0 or less means no return.
+            intensity: ``(..., H, W)`` in [0, 1]; needed where a channel is of intensity or
+                reflectance.
+            classes: ``(..., H, W)`` numbers of semantic classes; unknown where None.
         """
-        encoded = self.encode(range_m)
-        if self.reflectance:
-            if reflectance is None:
-                raise ValueError("codec.reflectance needs scans with a reflectance; set it false")
-            second = torch.where(range_m > 0, 2 * reflectance - 1, -1.0)
-            return torch.stack([encoded, second.clamp(-1, 1).to(encoded)], dim=-3)
-        if not self.return_channel:
-            return encoded.unsqueeze(-3)
-        returns = torch.where(range_m > 0, 1.0, -1.0)
-        return torch.stack([encoded, returns.to(encoded)], dim=-3)
+        encoded, returns = self.encode(range_m), range_m > 0
+        channels = [encoded]
+        if self.return_channel:
+            channels.append(torch.where(returns, 1.0, -1.0).to(encoded))
+        if self.reflectance or self.intensity_channel:
+            if intensity is None:
+                option, what = "intensity_channel", "an intensity"
+                if self.reflectance:
+                    option, what = "reflectance", "a reflectance"
+                raise ValueError(f"codec.{option} needs scans with {what}; set it false")
+            scaled = torch.where(returns, 2 * intensity - 1, -1.0)
+            channels.append(scaled.clamp(-1, 1).to(encoded))
+        if self.num_classes:
+            unknown = torch.full_like(encoded, UNKNOWN_CLASS)
+            channels.append(unknown if classes is None else torch.where(returns, classes, unknown))
+        return torch.stack(channels, dim=-3)
+
+    def pixels_of(self, image: Tensor, sensor: LidarSensor) -> Pixels:
+        """Inverse of :meth:`to_image`, as :meth:`decode` for the ranges."""
+        range_m = self.ranges_of(image, sensor)
+        intensity, classes = None, None
+        if self.intensity_channel:
+            intensity = (image[..., 2, :, :].float() + 1) / 2
+            intensity = torch.where(range_m > 0, intensity.clamp(0, 1), 0.0)
+        if self.num_classes:
+            classes = torch.where(range_m > 0, image[..., -1, :, :].long(), UNKNOWN_CLASS)
+        return Pixels(range_m, intensity, classes)
 
     def returns_of(self, image: Tensor) -> Tensor:
         """Pixels ``(..., 1, H, W)``, bool, with a return in images ``(..., C, H, W)``."""
         if self.return_channel:
-            return image[..., 1:, :, :] > 0
+            return image[..., 1:2, :, :] > 0
         return self.valid_mask(image[..., :1, :, :] if self.reflectance else image)
 
     def drop_returns(self, image: Tensor, uniform: Tensor) -> Tensor:
@@ -162,7 +216,7 @@ class RangeCodec:
         borders of large holes.
 
         Args:
-            image: ``(..., 2, H, W)``, whose second channel is the logit of a return.
+            image: ``(..., C, H, W)``, whose second channel is the logit of a return.
             uniform: ``(..., H, W)`` in [0, 1).
         """
         returns = image[..., 1, :, :].sigmoid()
@@ -170,10 +224,17 @@ class RangeCodec:
         return image.masked_fill(dropped.unsqueeze(-3), -1.0)
 
     def informative(self, image: Tensor) -> Tensor:
-        """Values, bool ``(..., C, H, W)``, that a decoder has to match: no range without return."""
+        """Values, bool ``(..., C, H, W)``, that a decoder has to match by their difference.
+
+        No range or intensity without a return, and no number of a class.
+        """
         informative = torch.ones_like(image, dtype=torch.bool)
         if self.return_channel:
             informative[..., :1, :, :] = self.returns_of(image)
+        if self.intensity_channel:
+            informative[..., 2:3, :, :] = self.returns_of(image)
+        if self.num_classes:
+            informative[..., -1:, :, :] = False
         return informative
 
     def ranges_of(self, image: Tensor, sensor: LidarSensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self, cast
 
 import torch
 import torch.nn.functional as F
@@ -24,6 +24,7 @@ from r3dpa.nn.layers import (
     WideCircularConv2d,
     at_least_float32,
     downsample,
+    zeroed,
 )
 
 Size = tuple[int, int]
@@ -74,6 +75,19 @@ class Posterior:
         """
         terms = self.mean.square() + self.logvar.exp() - 1.0 - self.logvar
         return 0.5 * terms.flatten(1).sum(dim=1)
+
+
+class PixelOutputs(NamedTuple):
+    """Parts of the outputs of a decoder, each ``(B, ..., H, W)``; None where it has no such part.
+
+    ``ranges`` are encoded ranges, or the parameters of a :class:`RangeMixture`; ``returns`` the
+    logit of a return; ``intensity`` encoded; ``classes`` the logits of the classes.
+    """
+
+    ranges: Tensor
+    returns: Tensor | None
+    intensity: Tensor | None
+    classes: Tensor | None
 
 
 class RangeMixture:
@@ -215,11 +229,16 @@ class VAE(Autoencoder):
     mixture of two Laplacians for the range, which keeps edges sharp where one value would lie
     between near and far (Tosi et al., "SMD-Nets", CVPR 2021).
 
+    ``intensity`` and ``num_classes`` add channels to such images: the encoder takes the class as
+    one channel for each, the decoder predicts their logits. They enter and leave through layers of
+    their own, whose kernels are 1 x 1 to save time. That of the encoder starts at 0: with the other
+    weights of a VAE without these channels, this one has its latents.
+
     Source: Ran et al., "Towards realistic scene generation with LiDAR diffusion models" (CVPR
     2024); R3DPA (ICRA 2026) uses h2p4d8. State-dict keys are those of the official checkpoints.
 
     Args:
-        in_channels: Channels of the range image.
+        in_channels: Channels of the range image, without those of intensity and class.
         latent_channels: Channels C of the latents.
         channels: Base width, a multiple of 32.
         channel_multipliers: Width of each level in units of the base width.
@@ -232,6 +251,9 @@ class VAE(Autoencoder):
         modes: 1 or, for images of two channels, 2.
         least_scale: Of two modes, see :class:`RangeMixture`; the default is 0.5 % of the range in
             a ``log2`` image.
+        intensity: Images have a channel of intensity after range and return.
+        num_classes: Classes of the returns, whose number is the last channel of the images; 0 where
+            they have none.
     """
 
     def __init__(
@@ -247,11 +269,18 @@ class VAE(Autoencoder):
         stem: Size = (1, 1),
         modes: Literal[1, 2] = 1,
         least_scale: float = math.exp(-6),
+        intensity: bool = False,
+        num_classes: int = 0,
     ) -> None:
         if least_scale <= 0:
             raise ValueError(f"least_scale must be above 0, got {least_scale}")
         if modes == 2 and in_channels != 2:
             raise ValueError(f"two modes need in_channels 2 (range and return), got {in_channels}")
+        if (intensity or num_classes) and in_channels != 2:
+            raise ValueError(
+                "intensity and num_classes need in_channels 2 (range and return), got "
+                f"{in_channels}"
+            )
         num_levels = len(channel_multipliers)
         if len(strides) != num_levels - 1:
             raise ValueError(
@@ -270,51 +299,80 @@ class VAE(Autoencoder):
         up = list(zip(deeper, widths, attention, [None, *steps], strict=True))
         outputs = in_channels if modes == 1 else RangeMixture.num_outputs + 1
         strides = (stem, *strides)
+        further = intensity + num_classes
+        encoder = _Encoder(
+            in_channels, 2 * latent_channels, down, num_res_blocks, stem, intensity, num_classes
+        )
+        decoder = _Decoder(
+            latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem, further
+        )
         super().__init__(
-            _Encoder(in_channels, 2 * latent_channels, down, num_res_blocks, stem),
-            _Decoder(latent_channels, outputs, up, num_res_blocks + 1, legacy_upsample, stem),
+            encoder,
+            decoder,
             in_channels,
             latent_channels,
             (math.prod(rows for rows, _ in strides), math.prod(columns for _, columns in strides)),
         )
         self.modes, self.least_scale = modes, least_scale
+        self.intensity, self.num_classes = intensity, num_classes
+
+    @property
+    def image_channels(self) -> int:
+        """Channels of the images that it encodes and decodes."""
+        return self.in_channels + self.intensity + (self.num_classes > 0)
+
+    def outputs_of(self, prediction: Tensor) -> PixelOutputs:
+        """Parts of outputs ``(B, ..., H, W)`` of the decoder."""
+        sizes = [
+            1 if self.modes == 1 else RangeMixture.num_outputs,
+            self.in_channels - 1,
+            int(self.intensity),
+            self.num_classes,
+        ]
+        ranges, *further = prediction.split(sizes, dim=1)
+        return PixelOutputs(ranges, *(part if part.shape[1] else None for part in further))
 
     def mixture_of(self, prediction: Tensor) -> RangeMixture:
-        """Distribution of the encoded ranges, of outputs ``(B, 6, H, W)`` for two modes."""
+        """Distribution of the encoded ranges, of outputs ``(B, 6 or more, H, W)`` for two modes."""
         return RangeMixture(prediction, self.least_scale)
 
     def image_of(self, prediction: Tensor) -> Tensor:
-        """Images ``(B, in_channels, H, W)``; of two modes, the one of the higher density.
+        """Images ``(B, image_channels, H, W)``, with the likeliest class.
 
-        A choice for each pixel alone still leaves some that fly, which are moved to a surface.
+        Of two modes, the one of the higher density. A choice for each pixel alone still leaves some
+        that fly, which are moved to a surface; intensity and class stay.
         """
-        if self.modes == 1:
-            return prediction
-        image = torch.cat([self.mixture_of(prediction).mode(), prediction[:, -1:]], dim=1)
-        return without_flying_pixels(image)
+        outputs, image = self.outputs_of(prediction), prediction[:, : self.in_channels]
+        if self.modes == 2:
+            mode, returns = self.mixture_of(prediction).mode(), cast(Tensor, outputs.returns)
+            image = without_flying_pixels(torch.cat([mode, returns], dim=1))
+        further = [] if outputs.intensity is None else [outputs.intensity]
+        if outputs.classes is not None:
+            further.append(outputs.classes.argmax(dim=1, keepdim=True).to(prediction.dtype))
+        return torch.cat([image, *further], dim=1) if further else image
 
     def scan_of(self, prediction: Tensor) -> Tensor:
         """Images ``(B, in_channels, H, W)`` of outputs, as a discriminator sees those of scans.
 
-        Where the second channel is the logit of a return, it becomes 1 or -1, and the range -1
-        without one: the logit would give every reconstruction away. The threshold has the gradient
-        of a sigmoid (straight-through, Bengio et al. 2013).
+        They are without intensity and class. Where the second channel is the logit of a return, it
+        becomes 1 or -1, and the range -1 without one: the logit would give every reconstruction
+        away. The threshold has the gradient of a sigmoid (straight-through, Bengio et al. 2013).
         """
         image = self.image_of(prediction)
         if self.in_channels == 1:
             return image
-        logit = at_least_float32(image[:, 1:])
+        logit = at_least_float32(image[:, 1:2])
         soft = torch.sigmoid(logit)
         seen = (logit > 0).to(soft) + soft - soft.detach()
         return torch.cat([seen * (image[:, :1] + 1) - 1, 2 * seen - 1], dim=1)
 
     def halve_decoder_(self) -> Self:
-        """Casts the convolutions of the decoder, but for the last, to bfloat16 for sampling.
+        """Casts the convolutions of the decoder, but for the outputs, to bfloat16 for sampling.
 
         Statistics of the norms and the result of :meth:`decode` stay float32.
         """
         for layer in self.decoder.modules():
-            if isinstance(layer, nn.Conv2d) and layer is not self.decoder.conv_out:
+            if isinstance(layer, nn.Conv2d) and not isinstance(layer, WideCircularConv2d):
                 layer.bfloat16()
         return self
 
@@ -341,10 +399,13 @@ class _Encoder(nn.Module):
         levels: Sequence[LevelSizes],
         num_blocks: int,
         stem: Size,
+        intensity: bool,
+        num_classes: int,
     ) -> None:
         super().__init__()
         first, last = levels[0][1], levels[-1][1]
         self.stem = (stem[0], stem[1])
+        self.in_channels, self.num_classes = in_channels, num_classes
         self.conv_in = CircularConv2d(in_channels * math.prod(stem), first, (3, 3))
         self.down = nn.ModuleList(
             _Level(level, num_blocks, (3, 3), "downsample", downsample) for level in levels
@@ -352,14 +413,29 @@ class _Encoder(nn.Module):
         self.mid = _Middle(last)
         self.norm_out = GroupNorm(last)
         self.conv_out = CircularConv2d(last, out_channels, (3, 3))
+        self.further_in: nn.Module | None = None
+        if further := intensity + num_classes:
+            self.further_in = zeroed(CircularConv2d(further * math.prod(stem), first, (1, 1)))
 
     def forward(self, image: Tensor) -> Tensor:
-        rows, columns = self.stem
-        hidden = rearrange(image, "B C (h p) (w q) -> B (C p q) h w", p=rows, q=columns)
-        hidden = self.conv_in(hidden)
+        hidden = self.conv_in(self._blocks(image[:, : self.in_channels]))
+        if self.further_in is not None:
+            hidden = hidden + self.further_in(self._blocks(self._further(image)))
         for level in self.down:
             hidden = level(hidden)
         return self.conv_out(F.silu(self.norm_out(self.mid(hidden))))
+
+    def _blocks(self, image: Tensor) -> Tensor:
+        rows, columns = self.stem
+        return rearrange(image, "B C (h p) (w q) -> B (C p q) h w", p=rows, q=columns)
+
+    def _further(self, image: Tensor) -> Tensor:
+        """Intensity where images have it, and a channel for each class: 1 where it is, else 0."""
+        further = image[:, self.in_channels :]
+        if not self.num_classes:
+            return further
+        numbers = torch.arange(self.num_classes, device=image.device).view(-1, 1, 1)
+        return torch.cat([further[:, :-1], (further[:, -1:] == numbers).to(image)], dim=1)
 
 
 class _Decoder(nn.Module):
@@ -371,6 +447,7 @@ class _Decoder(nn.Module):
         num_blocks: int,
         legacy: bool,
         stem: Size,
+        further: int,
     ) -> None:
         super().__init__()
         first, last = levels[0][1], levels[-1][1]  # level 0 has the resolution of the stem
@@ -388,14 +465,23 @@ class _Decoder(nn.Module):
         self.norm_out = GroupNorm(first)
         kernel = (1, 4) if by_pixel else (3, 3)
         self.conv_out = WideCircularConv2d(first, out_channels * math.prod(stem), kernel)
+        self.further_out: nn.Module | None = None
+        if further:
+            self.further_out = WideCircularConv2d(first, further * math.prod(stem), (1, 1))
 
     def forward(self, latents: Tensor) -> Tensor:
         hidden = self.mid(self.conv_in(latents.to(self.conv_in.weight.dtype)))
         for level in reversed(self.up):
             hidden = level(hidden)
-        hidden = self.conv_out(F.silu(self.norm_out(hidden)))
+        hidden = F.silu(self.norm_out(hidden))
+        outputs = self._pixels(self.conv_out(hidden))
+        if self.further_out is None:
+            return outputs
+        return torch.cat([outputs, self._pixels(self.further_out(hidden))], dim=1)
+
+    def _pixels(self, blocks: Tensor) -> Tensor:
         rows, columns = self.stem
-        return rearrange(hidden, "B (C p q) h w -> B C (h p) (w q)", p=rows, q=columns)
+        return rearrange(blocks, "B (C p q) h w -> B C (h p) (w q)", p=rows, q=columns)
 
 
 class _Level(nn.Module):
