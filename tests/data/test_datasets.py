@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from r3dpa.data import Augmentation, FeatureGrids, LidarDataset, find_scans
+from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset, find_scans
 from r3dpa.data.augmentation import View
 from r3dpa.data.datasets import DrawnPoints
 from r3dpa.data.feature_grids import write_feature_grids
 from r3dpa.data.scans import ScanError
 from r3dpa.data.store import CachedTensors, tensor_cache
-from r3dpa.geometry import LidarSensor, RangeCodec, RingProjection
+from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES, LidarSensor, RangeCodec, RingProjection
 from r3dpa.weather import WeatherPrior
 
 
@@ -90,6 +90,32 @@ def test_weather_that_leaves_no_point_is_blamed_and_not_the_file(tmp_path, proje
     for sample in (lambda: points[epoch, 0], lambda: images.sample(0, in_fog)):
         with pytest.raises(ScanError, match=r"no point within the sensor's range 1\.\.56 m$"):
             sample()
+
+
+def test_labels_of_semantic_kitti_are_a_channel_that_turns_with_the_scan(tmp_path, projection):
+    points = [[14, 0, 0, 0.25], [28, 0, 0, 0.5], [0, 20, 0, 0.75]]  # the second is hidden
+    scans = write(tmp_path / "velodyne", points)
+    codec = RangeCodec(return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
+    dataset = LidarDataset(scans, projection, codec)
+    with pytest.raises(ScanError, match=r"000000\.bin has no labels"):
+        dataset[0]
+    (tmp_path / "labels").mkdir()
+    labels = np.array([252, 40, 0], "<u4")  # a car that moves, road, nothing
+    (tmp_path / "labels" / "000000.label").write_bytes(labels.tobytes())
+    sample = dataset[0]
+    car = [semantic.name for semantic in SEMANTIC_CLASSES].index("car")
+    assert sample["range_image"][2:, 0, 16].tolist() == [-0.5, car]
+    assert sample["range_image"][2:, 0, 8].tolist() == [0.5, -1.0]
+    assert sample["range_image"][:, 0, 0].tolist() == [-1.0] * 4
+    assert sample["valid_mask"].sum() == 2
+    turned = View(columns=1, mirrored=False, grid_columns=8).sample(sample)["range_image"]
+    assert turned[3, 0, 20] == car
+
+
+def test_labels_do_not_follow_the_points_of_a_weather(tmp_path):
+    codec = RangeCodec(return_channel=True, num_classes=NUM_CLASSES)
+    with pytest.raises(ValueError, match=r"weather: the labels of codec\.num_classes"):
+        LidarDataModule(str(tmp_path), codec=codec, weather=WeatherPrior())
 
 
 def test_posteriors_turn_with_the_scan(tmp_path, make_scans, projection):

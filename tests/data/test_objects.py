@@ -6,7 +6,8 @@ import torch
 from safetensors.torch import save_file
 
 from r3dpa.data import Scan, ScanError, write_bin
-from r3dpa.data.objects import CLASS_NAMES, ObjectClass, ObjectLibrary, object_library, read_labels
+from r3dpa.data.labels import CLASS_NAMES, read_labels
+from r3dpa.data.objects import ObjectClass, ObjectLibrary, object_library
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
 from r3dpa.simulation import Semantic
 

@@ -3,12 +3,20 @@ from __future__ import annotations
 import pytest
 import torch
 
-from r3dpa.data import SimulatedImageDataModule
-from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection, range_image
+from r3dpa.data import SimulatedDataModule, SimulatedImageDataModule
+from r3dpa.geometry import (
+    NUM_CLASSES,
+    LidarSensor,
+    RangeCodec,
+    SphericalProjection,
+    classes_of,
+    range_image,
+)
 from r3dpa.simulation import Simulator
 
 SMALL = LidarSensor(beams=16, columns=64)
 CODEC = RangeCodec("log2", return_channel=True)
+LABELLED = RangeCodec("log2", return_channel=True, intensity_channel=True, num_classes=NUM_CLASSES)
 
 
 def module(root, **settings):
@@ -58,3 +66,39 @@ def test_images_of_another_request_are_not_mixed_up(root):
 def test_rings_need_points(tmp_path):
     with pytest.raises(ValueError, match="projection must be spherical"):
         module(tmp_path, projection="rings")
+
+
+def test_intensity_and_class_are_those_of_the_nearest_points(tmp_path):
+    data = module(tmp_path, codec=LABELLED, num_scans=2)
+    data.prepare_data()
+    data.setup("fit")
+    (item,) = data.train_set.scans
+    scan = Simulator(0, int(item.drive)).scan(item.number)
+    points, labels = torch.from_numpy(scan.points), torch.from_numpy(scan.labels.astype("int64"))
+    values = torch.stack([points[:, 3], 1.0 + classes_of(labels & 0xFFFF)], dim=1)
+    range_m, values = range_image(points[:, :3], SphericalProjection(SMALL), values)
+    found = LABELLED.pixels_of(data.train_set[0]["range_image"], SMALL)
+    torch.testing.assert_close(found.range_m, range_m, rtol=2**-11, atol=1e-3)
+    torch.testing.assert_close(found.intensity, values[0], rtol=0, atol=1e-6)
+    assert torch.equal(found.classes, values[1].long() - 1)
+    assert len(found.classes.unique()) > 4
+    (row,) = tmp_path.glob("labelled_image_*/shard_00000.rows")
+    assert row.stat().st_size == 2 * 3 * 16 * 64  # two scans, three bytes a pixel
+
+
+def test_cached_images_and_files_of_the_same_scans_agree(tmp_path):
+    settings = {"sensor": SMALL, "codec": LABELLED, "grid_size": (4, 8), "num_scans": 2}
+    files = SimulatedDataModule(str(tmp_path / "files"), **settings)
+    images = module(tmp_path / "images", codec=LABELLED, num_scans=2, every=1)
+    samples = []
+    for data in (files, images):
+        data.prepare_data()
+        data.setup("fit")
+        samples.append(data.train_set[0])
+    assert [s["name"] for s in samples] == [
+        "2013_05_28_drive_0003_sync/0000000000",
+        "0003/0000000000",
+    ]
+    read, cached = (sample["range_image"] for sample in samples)
+    torch.testing.assert_close(cached, read, rtol=0, atol=2e-4)
+    assert torch.equal(cached[3], read[3])

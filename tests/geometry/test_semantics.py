@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from r3dpa.data.objects import CLASS_NAMES
+from r3dpa.data.labels import CLASS_NAMES
 from r3dpa.geometry.semantics import (
     NUM_CLASSES,
     SEMANTIC_CLASSES,
@@ -16,7 +16,7 @@ WITHOUT_CLASS = {0, 1, 2, 3, 23}  # unlabelled, ego vehicle, border, out of roi,
 
 
 def test_each_label_of_kitti_360_is_of_one_class_at_most():
-    labels = [label for c in SEMANTIC_CLASSES for label in (c.label, *c.also)]
+    labels = [label for c in SEMANTIC_CLASSES for label in c.labels]
     assert sorted(labels) == sorted(set(range(45)) - WITHOUT_CLASS)
     classes = classes_of(torch.arange(45))
     assert {int(label) for label in torch.nonzero(classes == UNKNOWN_CLASS)} == WITHOUT_CLASS

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
-from r3dpa.data.datasets import DrawnPoints, LidarDataset
+from r3dpa.data.datasets import CachedImages, DrawnPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
 from r3dpa.data.loaders import LoaderModule, at_least
 from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
@@ -53,7 +53,8 @@ class LidarDataModule(LoaderModule):
         sensor: Image size, field of view and range limits.
         projection: ``"spherical"``: rows of equal pitch; ``"rings"``: one row per laser, for scans
             stored ring after ring, at inclinations measured in the first training scans.
-        codec: Metres to [-1, 1].
+        codec: Metres to [-1, 1]. With ``num_classes`` every scan needs labels, see
+            :func:`r3dpa.data.labels.read_labels`.
         grid_size: Rows and columns (h, w) of the feature grid.
         extractor: Frozen network, see :class:`r3dpa.data.Extractor`; makes the grids that are
             missing before training. Without it, ``features_dir`` must hold all of them.
@@ -117,6 +118,11 @@ class LidarDataModule(LoaderModule):
                 "weather adds points at the end of a scan, which then has no order of rings: use "
                 "projection: spherical"
             )
+        if weather is not None and codec.num_classes:
+            raise ValueError(
+                "weather: the labels of codec.num_classes are those of the clear scans. Switch one "
+                "of them off"
+            )
         with_grids = self.features_dir is not None and not augmentation.approximate_grids
         if weather is not None and with_grids:
             raise ValueError(
@@ -139,8 +145,8 @@ class LidarDataModule(LoaderModule):
         return str(any_settings(self.features_dir).extractor["name"])
 
     @property
-    def images(self) -> CachedTensors[Any] | None:
-        """Cached range images ``(H, W)`` in metres; None where scans are read from their files."""
+    def images(self) -> CachedImages | None:
+        """Cached images of the scans; None where these are read from their files."""
         return None
 
     @property

@@ -5,16 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple, NotRequired, Protocol, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from r3dpa.data.labels import read_labels
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
 from r3dpa.data.store import CachedTensors, ItemKey
-from r3dpa.geometry import LidarSensor, Projection, RangeCodec, in_range, range_image
+from r3dpa.geometry import (
+    UNKNOWN_CLASS,
+    LidarSensor,
+    Pixels,
+    Projection,
+    RangeCodec,
+    classes_of,
+    in_range,
+    range_image,
+)
 from r3dpa.weather import WeatherPrior
 
 #: Function of the points ``(P, 4)`` of a scan.
@@ -24,12 +34,13 @@ Change = Callable[[np.ndarray], np.ndarray]
 class LidarBatch(TypedDict):
     """Batch of the training modules.
 
-    ``range_image`` ``(B, C, H, W)`` float32 in [-1, 1] and ``valid_mask`` ``(B, 1, H, W)`` bool,
-    True where a pixel has a return; where they are cached, instead ``posterior_moments``
-    ``(B, 2C, h, w)`` float32, means, then log-variances of the raw latents, see
-    :class:`r3dpa.nn.Posterior`. ``feature_grid`` ``(B, N, D)`` float32, empty cells zero, absent
-    where no grids are used; ``noise`` ``(B, C, H, W)`` that a generated image was made of, absent
-    for scans; ``index`` ``(B,)`` int64 position in the data set; ``name`` B strings.
+    ``range_image`` ``(B, C, H, W)`` float32, the channels of :class:`r3dpa.geometry.RangeCodec`,
+    and ``valid_mask`` ``(B, 1, H, W)`` bool, True where a pixel has a return; where they are
+    cached, instead ``posterior_moments`` ``(B, 2C, h, w)`` float32, means, then log-variances of
+    the raw latents, see :class:`r3dpa.nn.Posterior`. ``feature_grid`` ``(B, N, D)`` float32, empty
+    cells zero, absent where no grids are used; ``noise`` ``(B, C, H, W)`` that a generated image
+    was made of, absent for scans; ``index`` ``(B,)`` int64 position in the data set; ``name`` B
+    strings.
     """
 
     range_image: NotRequired[Tensor]
@@ -41,6 +52,13 @@ class LidarBatch(TypedDict):
     name: list[str]
 
 
+class CachedImages(Protocol):
+    """Images that scans are read from, safe to hand to loader processes."""
+
+    def read(self, scan: Any, /) -> Pixels:
+        """Pixels ``(H, W)`` of a scan."""
+
+
 @dataclass(eq=False, repr=False)
 class LidarDataset(Dataset[dict[str, Any]]):
     """Range image and mask, or cached posterior, and feature grid of each scan; nothing random."""
@@ -50,7 +68,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
     codec: RangeCodec
     grids: CachedTensors[Scan] | None = None
     posteriors: CachedTensors[Scan] | None = None  #: ``(2C, h, w)``, in place of image and mask
-    images: CachedTensors[Any] | None = None  #: ``(H, W)`` metres, which the scans are read from
+    images: CachedImages | None = None  #: which the scans are read from, in place of their files
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -74,7 +92,7 @@ class LidarDataset(Dataset[dict[str, Any]]):
 
     def range_m(self, index: int) -> Tensor:
         """Range image ``(H, W)`` of a scan in metres, -1 without a return."""
-        return self._project(self.scans[index])[0]
+        return self._project(self.scans[index]).range_m
 
     def ranges_m(self, batch_size: int) -> Iterator[Tensor]:
         """Range images ``(B, H, W)`` of all scans in order."""
@@ -82,23 +100,44 @@ class LidarDataset(Dataset[dict[str, Any]]):
             last = min(first + batch_size, len(self))
             yield torch.stack([self.range_m(index) for index in range(first, last)])
 
-    def _project(self, scan: Scan, change: Change | None = None) -> tuple[Tensor, Tensor | None]:
-        """Ranges and, where the codec takes it, reflectance."""
+    def _project(self, scan: Scan, change: Change | None = None) -> Pixels:
+        """Ranges and, where the codec takes them, intensities and classes."""
         if self.images is not None:
-            return self.images.read(scan), None
-        read = read_scan(scan.path)
+            return self.images.read(scan)
+        read, codec = read_scan(scan.path), self.codec
         points = torch.from_numpy(read if change is None else change(read))
+        # Labels are of the points as they were read: a data module refuses both together.
+        labels = torch.from_numpy(read_labels(scan.path, len(read))) if codec.num_classes else None
         try:
-            values = points[:, 3:4] if self.codec.reflectance else None
-            range_m, values = range_image(points[:, :3], self.projection, values)
+            if codec.reflectance or codec.intensity_channel or codec.num_classes:
+                pixels = project_pixels(points, self.projection, labels)
+            else:
+                pixels = Pixels(range_image(points[:, :3], self.projection)[0])
         except ValueError as error:
             raise ScanError(f"{scan.path}: cannot be projected: {error}") from error
-        if not (range_m > 0).any():
+        if not (pixels.range_m > 0).any():
             if change is None:
                 raise out_of_range(scan.path, self.projection.sensor)
             self._project(scan)  # without the change, to blame a file that shows nothing by itself
             raise _lost_in_weather(scan.path, self.projection.sensor)
-        return range_m, None if values is None else values[0]
+        return pixels
+
+
+def project_pixels(points: Tensor, projection: Projection, labels: Tensor | None = None) -> Pixels:
+    """Range, intensity and, with labels, class of the nearest return in each pixel.
+
+    Args:
+        points: ``(P, 4)`` x, y, z in metres, and the intensity.
+        projection: Which pixel a point belongs to.
+        labels: ``(P,)`` integers, KITTI-360 class in the lower 16 bits.
+    """
+    values = points[:, 3:4]
+    if labels is not None:
+        known = classes_of(labels & 0xFFFF) - UNKNOWN_CLASS  # 0 without a return
+        values = torch.cat([values, known[:, None].to(values)], dim=1)
+    range_m, image = range_image(points[:, :3], projection, values)
+    assert image is not None
+    return Pixels(range_m, image[0], None if labels is None else image[1].long() + UNKNOWN_CLASS)
 
 
 class PointSample(NamedTuple):

@@ -11,22 +11,25 @@ from pathlib import Path
 from typing import Any, cast
 from zlib import crc32
 
+import numpy as np
 import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import SimulatedDataModule
-from r3dpa.data.datasets import PointSample
+from r3dpa.data.datasets import PointSample, project_pixels
 from r3dpa.data.feature_grids import GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least
+from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
 from r3dpa.data.store import CachedTensors, ItemKey, Store, tensor_cache
 from r3dpa.geometry import (
+    SEMANTIC_CLASSES,
+    Pixels,
     Projection,
     SphericalProjection,
     points_of,
     projection_to_dict,
-    range_image,
 )
 from r3dpa.io import only_writer
 from r3dpa.simulation import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
@@ -56,11 +59,26 @@ class SimulatedImage:
         return self.name, self.request, 0
 
 
+@dataclass(frozen=True)
+class CachedPixels:
+    """Images of a cache: of ranges alone in float16, else in the codes of ``pixel_codes``."""
+
+    rows: CachedTensors[SimulatedImage]
+    range_max_m: float
+
+    def read(self, image: SimulatedImage, /) -> Pixels:
+        """Pixels ``(H, W)`` of an image."""
+        row = self.rows.read(image)
+        coded = self.rows.store.dtype == "uint8"
+        return decode_pixels(row, self.range_max_m) if coded else Pixels(row)
+
+
 class SimulatedImageDataModule(SimulatedDataModule):
     """Simulated streets whose range images are cached in float16, 131 kB each; points are dropped.
 
     Images are made before the first use, and so are feature grids if there is an extractor: those
-    that are missing only. Ranges are rounded to 11 bits, 1 cm at 20 m.
+    that are missing only. Ranges are rounded to 11 bits, 1 cm at 20 m. Where the codec has channels
+    of intensity or class, both are cached beside the range: 197 kB each.
 
     Args:
         root: Folder of the caches.
@@ -105,14 +123,20 @@ class SimulatedImageDataModule(SimulatedDataModule):
                 self._simulate(sorted(lacking), projection, stores)
 
     @cached_property
-    def images(self) -> CachedTensors[Any]:
-        """Cached range images ``(H, W)`` in metres."""
+    def images(self) -> CachedPixels:
+        """Cached images of all scans."""
         train, val, _ = self._scans_and_projection()
-        return CachedTensors(self._store, sorted(train + val))
+        rows = CachedTensors(self._store, sorted(train + val))
+        return CachedPixels(rows, self.sensor.range_max_m)
 
     def points(self, scan: Any) -> torch.Tensor:
         """Points ``(P, 3)`` at the centres of the pixels."""
-        return points_of(self.images.read(scan), SphericalProjection(self.sensor))
+        return points_of(self.images.read(scan).range_m, SphericalProjection(self.sensor))
+
+    @property
+    def _with_values(self) -> bool:
+        """Whether intensity and class are cached beside the range."""
+        return self.codec.intensity_channel or self.codec.num_classes > 0
 
     @property
     def _store(self) -> Store:
@@ -125,8 +149,11 @@ class SimulatedImageDataModule(SimulatedDataModule):
             "projection": projection_to_dict(SphericalProjection(self.sensor)),
         }
         shape = (self.sensor.beams, self.sensor.columns)
-        request = json.loads(json.dumps(request))
-        return tensor_cache(Path(self.root), "range_image", request, shape, "float16")
+        root, request = Path(self.root), json.loads(json.dumps(request))
+        if not self._with_values:
+            return tensor_cache(root, "range_image", request, shape, "float16")
+        request["classes"] = [list(semantic.labels) for semantic in SEMANTIC_CLASSES]
+        return tensor_cache(root, "labelled_image", request, (3, *shape), "uint8")
 
     def _simulate(
         self, items: Sequence[SimulatedImage], projection: Projection, stores: Sequence[Store]
@@ -145,7 +172,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
         }
         prepare = None if extractor is None else extractor.prepare
         loader = DataLoader(
-            _Simulated(items, simulators, projection, prepare),
+            _Simulated(items, simulators, projection, prepare, self._with_values),
             batch_size=8,
             collate_fn=list,
             num_workers=self.num_workers,
@@ -155,7 +182,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
             images, *grids = [stack.enter_context(store.writer()) for store in stores]
             for samples in tqdm(loader, desc="simulate", unit_scale=8, unit="scan", disable=None):
                 keys = [sample.key for sample, _ in samples]
-                images.add(keys, torch.stack([range_m for _, range_m in samples]))
+                images.add(keys, torch.stack([row for _, row in samples]))
                 for writer in grids:
                     found = [sample for sample, _ in samples]
                     made = pooled_grids(extractor, found, projection, [self.grid_size])
@@ -163,7 +190,7 @@ class SimulatedImageDataModule(SimulatedDataModule):
 
 
 class _Simulated(Dataset[Any]):
-    """Points, prepared for an extractor if there is one, and range image of each scan."""
+    """Points, prepared for an extractor if there is one, and row of the cache of each scan."""
 
     def __init__(
         self,
@@ -171,16 +198,22 @@ class _Simulated(Dataset[Any]):
         simulators: dict[str, Simulator],
         projection: Projection,
         prepare: Any,
+        with_values: bool,
     ) -> None:
         self.items, self.simulators = items, simulators
         self.projection, self.prepare = projection, prepare
+        self.with_values = with_values
 
     def __len__(self) -> int:
         return len(self.items)
 
     def __getitem__(self, index: int) -> tuple[PointSample, torch.Tensor]:
         item = self.items[index]
-        points = torch.from_numpy(self.simulators[item.drive].scan(item.number).points)
-        range_m, _ = range_image(points[:, :3], self.projection)
+        scan = self.simulators[item.drive].scan(item.number)
+        points, labels = torch.from_numpy(scan.points), torch.from_numpy(np.int64(scan.labels))
+        pixels = project_pixels(points, self.projection, labels)
+        row = pixels.range_m
+        if self.with_values:
+            row = encode_pixels(pixels, self.projection.sensor.range_max_m)
         prepared = None if self.prepare is None else self.prepare(points)
-        return PointSample(cast(Any, item), item.cache_key, points, prepared), range_m
+        return PointSample(cast(Any, item), item.cache_key, points, prepared), row

@@ -34,7 +34,11 @@ from r3dpa.io import no_follow, refuse_name, write_text
 ItemKey = tuple[str, int, int]
 """Name, size in bytes and time of change (ns) of the file that a row is made from."""
 _VERSION = 1  # to be raised when the same settings give other numbers
-_DTYPES: dict[str, np.dtype[Any]] = {"float16": np.dtype("<f2"), "float32": np.dtype("<f4")}
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "float16": np.dtype("<f2"),
+    "float32": np.dtype("<f4"),
+    "uint8": np.dtype("u1"),
+}
 
 
 class DataError(ValueError):
@@ -77,7 +81,7 @@ class Store:
     folder: Path
     settings: str  #: all that the tensors depend on beside the item, as JSON text
     shape: tuple[int, ...]
-    dtype: Literal["float32", "float16"] = "float32"  #: float16 clamps larger values
+    dtype: Literal["float32", "float16", "uint8"] = "float32"  #: float16 clamps larger values
     what: str = "cached tensors"  #: name of the rows, and how they are made again, for messages
     remedy: str = "by starting the run again"
 
@@ -155,7 +159,7 @@ def tensor_cache(
     name: str,
     settings: Mapping[str, Any],
     shape: tuple[int, ...],
-    dtype: Literal["float32", "float16"] = "float32",
+    dtype: Literal["float32", "float16", "uint8"] = "float32",
 ) -> Store:
     """Store of tensors whose folder ``root/<name>_<hash>`` follows from its settings.
 
@@ -205,8 +209,11 @@ class StoreWriter:
             for row, (name, size, time) in enumerate(new, start=self._num_rows)
         ]
         dtype = _DTYPES[self._store.dtype]
-        largest = np.finfo(dtype).max
-        values = kept.float().cpu().numpy().clip(-largest, largest).astype(dtype)
+        values = kept.cpu().numpy()
+        if dtype.kind == "f":
+            largest = np.finfo(dtype).max
+            values = kept.float().cpu().numpy().clip(-largest, largest)
+        values = values.astype(dtype, copy=False)
         with writing(self._store.what, self._store.folder):
             try:
                 rows, journal = self._open()
@@ -258,7 +265,7 @@ class CachedTensors(Generic[Item]):
             raise self._missing([names[name] for name in sorted(missing)])
 
     def read(self, item: Item) -> Tensor:
-        """Float32 copy ``shape`` of the row of one item.
+        """Copy ``shape`` of the row of one item, float32, or uint8 where these are stored.
 
         ``StoreError`` if its file was replaced since the row was made, or the store was damaged.
         """
@@ -280,8 +287,9 @@ class CachedTensors(Generic[Item]):
             path = store.rows(shard)
             what = f"{path} is gone or was cut short since its journal was read"
             raise store.damaged(path.with_suffix(".jsonl"), what)
+        tensor = torch.from_numpy(values)
         # Torch converts half precision eight times as fast as NumPy.
-        return torch.from_numpy(values).float()
+        return tensor.float() if tensor.is_floating_point() else tensor
 
     def _missing(self, items: Sequence[Cacheable]) -> StoreError:
         more = f" and {len(items) - 1} more" if len(items) > 1 else ""

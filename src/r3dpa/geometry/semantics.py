@@ -18,6 +18,11 @@ class SemanticClass(NamedTuple):
     label: int
     also: tuple[int, ...] = ()
 
+    @property
+    def labels(self) -> tuple[int, ...]:
+        """All its KITTI-360 ids."""
+        return self.label, *self.also
+
 
 #: Position in this list is the number of a class. Ids that are missing count as unlabelled:
 #: unlabeled 0, ego vehicle 1, rectification border 2, out of roi 3, sky 23.
@@ -46,7 +51,7 @@ _NUM_LABELS = 1 << 16  # of a label file, whose upper bits are the object
 def _classes_by_label() -> Tensor:
     table = torch.full((_NUM_LABELS,), UNKNOWN_CLASS)
     for number, semantic in enumerate(SEMANTIC_CLASSES):
-        table[[semantic.label, *semantic.also]] = number
+        table[list(semantic.labels)] = number
     return table
 
 

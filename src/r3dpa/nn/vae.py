@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple, Self, cast
+from typing import Any, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F
@@ -26,9 +26,9 @@ from r3dpa.nn.layers import (
     downsample,
     zeroed,
 )
+from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, without_flying_pixels
 
 Size = tuple[int, int]
-_FLYING_GAP = 0.01  # from both neighbours, encoded: 2 % of the range in log2, 0.28 m in linear
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
@@ -75,80 +75,6 @@ class Posterior:
         """
         terms = self.mean.square() + self.logvar.exp() - 1.0 - self.logvar
         return 0.5 * terms.flatten(1).sum(dim=1)
-
-
-class PixelOutputs(NamedTuple):
-    """Parts of the outputs of a decoder, each ``(B, ..., H, W)``; None where it has no such part.
-
-    ``ranges`` are encoded ranges, or the parameters of a :class:`RangeMixture`; ``returns`` the
-    logit of a return; ``intensity`` encoded; ``classes`` the logits of the classes.
-    """
-
-    ranges: Tensor
-    returns: Tensor | None
-    intensity: Tensor | None
-    classes: Tensor | None
-
-
-class RangeMixture:
-    """Two Laplacians for the encoded range of each pixel, near and far at an edge.
-
-    Without a least scale the likelihood of a flat wall would have no limit. Errors smaller than it
-    count linearly instead of by their logarithm, so that large errors count more beside them.
-
-    Source: Tosi et al., "SMD-Nets: stereo mixture density networks" (CVPR 2021).
-
-    Args:
-        outputs: ``(B, 5 or more, H, W)`` of a decoder: two centres, two logarithms of scales, and
-            the logit of the first centre.
-        least_scale: Positive, in units of the encoded range.
-    """
-
-    num_outputs = 5
-
-    def __init__(self, outputs: Tensor, least_scale: float) -> None:
-        outputs = at_least_float32(outputs)
-        least = math.log(least_scale)
-        self.centres = outputs[:, :2]
-        self.log_scales = F.softplus(outputs[:, 2:4] - least) + least
-        logit = outputs[:, 4:5]
-        self.log_weights = torch.cat([F.logsigmoid(logit), F.logsigmoid(-logit)], dim=1)
-
-    def mode(self) -> Tensor:
-        """Centre ``(B, 1, H, W)`` where the density is higher."""
-        first = (self.log_weights - self.log_scales).diff(dim=1) <= 0
-        return torch.where(first, self.centres[:, :1], self.centres[:, 1:])
-
-    def nll(self, image: Tensor) -> Tensor:
-        """Negative log-likelihood ``(B, 1, H, W)`` in nats of encoded ranges ``(B, 1, H, W)``."""
-        distance = (image - self.centres).abs() * torch.exp(-self.log_scales)
-        density = self.log_weights - self.log_scales - math.log(2.0) - distance
-        return -density.logsumexp(dim=1, keepdim=True)
-
-
-def without_flying_pixels(image: Tensor) -> Tensor:
-    """Images with the flying pixels on the nearer of the surfaces that they lie between.
-
-    A pixel flies if its left and right neighbours have a return, are on two surfaces, and are both
-    farther from it than the flatter surface is inclined there. A second pass moves what is left
-    of wider ramps. Thin poles stay, since there is one surface behind them, and so do walls at a
-    grazing angle but for their last pixels.
-
-    Args:
-        image: ``(B, 2, H, W)`` encoded ranges, and logits of a return, above 0 with one. Columns
-            wrap around.
-    """
-    ranges, logit = image[:, :1], image[:, 1:]
-    between = (logit.roll(1, -1) > 0) & (logit.roll(-1, -1) > 0)
-    for _ in range(2):
-        left, right = ranges.roll(1, -1), ranges.roll(-1, -1)
-        to_left = (ranges - left).abs()
-        to_right = to_left.roll(-1, -1)
-        inclination = torch.minimum(to_left.roll(1, -1), to_right.roll(-1, -1))
-        flying = torch.minimum(to_left, to_right) > _FLYING_GAP + inclination
-        flying &= between & ((left - right).abs() > 2 * _FLYING_GAP)
-        ranges = torch.where(flying, torch.where(to_left < to_right, left, right), ranges)
-    return torch.cat([ranges, logit], dim=1)
 
 
 class Autoencoder(nn.Module):
