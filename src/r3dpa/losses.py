@@ -15,6 +15,7 @@ __all__ = [
     "alignment_loss",
     "balanced_gradient",
     "centred_features",
+    "class_errors",
     "discriminator_loss",
     "flow_matching_loss",
     "generator_loss",
@@ -67,6 +68,16 @@ def return_loss(logits: Tensor, returns: Tensor) -> Tensor:
     """Cross-entropy ``(B,)`` of the logits of a return, both ``(B, 1, H, W)``, in nats a pixel."""
     each = F.binary_cross_entropy_with_logits(logits.float(), returns.float(), reduction="none")
     return each.flatten(1).mean(dim=1)
+
+
+def class_errors(logits: Tensor, classes: Tensor) -> Tensor:
+    """Cross-entropy ``(B, 1, H, W)`` in nats of logits ``(B, K, H, W)`` of K classes.
+
+    ``classes`` ``(B, 1, H, W)`` are numbers of classes; where they are negative, the error is 0.
+    """
+    numbers = classes[:, 0].long()
+    each = F.cross_entropy(logits.float(), numbers.clamp(min=-1), ignore_index=-1, reduction="none")
+    return each.unsqueeze(1)
 
 
 def generator_loss(fake_logits: Tensor) -> Tensor:

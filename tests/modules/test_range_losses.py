@@ -1,17 +1,21 @@
-"""Stages on images of range and return; end of the alignment; learning rate by step."""
+"""Losses of images of range, return, intensity and class; noise on latents; learning rate."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from tiny_stages import QUIET, SENSOR, STAGES, TinyData, stage_module, tiny_sit, train
 
-from r3dpa.geometry import RangeCodec, ScanGeometry, SphericalProjection
-from r3dpa.losses import centred_features, masked_mean, return_loss
-from r3dpa.modules import LossWeights, OptimizerConfig
-from r3dpa.nn import VAE, PatchDiscriminator
+from r3dpa.checkpoints import read_checkpoint
+from r3dpa.geometry import NUM_CLASSES, RangeCodec, ScanGeometry, SphericalProjection
+from r3dpa.losses import centred_features, class_errors, masked_mean, return_loss
+from r3dpa.modules import LossWeights, OptimizerConfig, VAEAlignment
+from r3dpa.modules.checks import check_image
+from r3dpa.modules.steps import PathDraws
+from r3dpa.nn import VAE, PatchDiscriminator, SiT
 
 pytestmark = QUIET
 
@@ -27,15 +31,34 @@ class RangeData(TinyData):
         for batch in self.batches:
             range_m = 50 * torch.rand(2, 8, 16, generator=torch.Generator().manual_seed(1)) - 5
             range_m[1] = -1
-            batch["range_image"] = self.codec.to_image(range_m)
+            batch["range_image"] = RangeData.codec.to_image(range_m)
 
 
-def range_module(modes, discriminator=None, train_encoder=True, **kwargs):
+class LabelledData(RangeData):
+    """The same with intensity and class; a third of the returns has no label."""
+
+    codec = replace(RangeData.codec, intensity_channel=True, num_classes=NUM_CLASSES)
+    geometry = ScanGeometry(SphericalProjection(SENSOR), codec, (2, 4))
+
+    def __init__(self, steps):
+        super().__init__(steps)
+        generator = torch.Generator().manual_seed(2)
+        intensity = torch.rand(2, 8, 16, generator=generator)
+        classes = torch.randint(3, (2, 8, 16), generator=generator) - 1
+        for batch in self.batches:
+            range_m = self.codec.ranges_of(batch["range_image"], SENSOR)
+            batch["range_image"] = self.codec.to_image(range_m, intensity, classes)
+
+
+def range_module(modes, discriminator=None, train_encoder=True, labelled=False, **kwargs):
     torch.manual_seed(0)
-    vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes)
+    further = {"intensity": True, "num_classes": NUM_CLASSES} if labelled else {}
+    vae = VAE(2, 4, 32, (1,), (), 1, stem=(2, 2), modes=modes, **further)
+    latent_noise = kwargs.pop("latent_noise", 0.0)
     weights = LossWeights(vae_alignment=0.0, **kwargs)
     settings = {"weights": weights, "optimizer": OptimizerConfig(lr=3e-3)}
     settings |= {"discriminator": discriminator, "train_encoder": train_encoder}
+    settings |= {"latent_noise": latent_noise}
     return STAGES["vae_alignment"](vae=vae, sit=tiny_sit(), **settings)
 
 
@@ -45,6 +68,90 @@ def test_ranges_and_returns_are_learned_without_discriminator(modes):
     assert set(module.parts[0]) == {"reconstruction", "returns", "kl"}
     for name in ("reconstruction", "returns"):
         assert module.parts[-1][name] < module.parts[0][name] - 0.01, name
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_intensity_and_class_are_learned_beside_them(modes):
+    module = train(range_module(modes, labelled=True), LabelledData(30))
+    names = {"reconstruction", "returns", "intensity", "classes"}
+    assert set(module.parts[0]) == names | {"kl"}
+    for name in names:
+        assert module.parts[-1][name] < module.parts[0][name] - 0.01, name
+
+
+def test_intensity_and_class_count_where_there_is_a_return_and_a_label():
+    module, image = range_module(1, labelled=True), LabelledData(1).batches[0]["range_image"]
+    prediction = torch.zeros(2, 3 + NUM_CLASSES, 8, 16, requires_grad=True)
+    parts = module._range_losses(image, prediction)
+    returns, labelled = image[:, 1] > 0, image[:, 3] >= 0
+    assert 0 < labelled.sum() < returns.sum()
+    assert parts["classes"].tolist() == pytest.approx([math.log(NUM_CLASSES), 0.0])
+    error = image[:, 2].abs()[returns].mean()
+    torch.testing.assert_close(parts["intensity"], torch.stack([error, torch.tensor(0.0)]))
+    (parts["intensity"] + parts["classes"]).sum().backward()
+    assert torch.equal(prediction.grad[:, 2] != 0, returns)
+    assert torch.equal(prediction.grad[:, 3] != 0, labelled)
+    assert not prediction.grad[:, :2].any()
+
+
+def test_a_discriminator_sees_neither_intensity_nor_class():
+    discriminator = PatchDiscriminator(2, channels=4, num_layers=1)
+    module = range_module(2, discriminator, labelled=True, adversarial=1.0)
+    assert "discriminator" in train(module, LabelledData(1)).parts[0]
+
+
+def test_noise_replaces_a_share_of_the_latents_by_their_own_spread():
+    module = range_module(2, latent_noise=0.5)
+    latents, noise = torch.randn(2, 4, 4, 8), torch.randn(2, 4, 4, 8)
+    draws = PathDraws(noise, torch.zeros(2), noise, torch.tensor([0.0, 0.4]))
+    module.latent_norm.running_mean.fill_(2.0)
+    module.latent_norm.running_var.fill_(9.0)
+    found = module.decoder_latents(latents, draws)
+    assert torch.equal(found[0], latents[0])
+    expected = 0.8 * latents[1] + 0.2 * (2.0 + 3.0 * noise[1])
+    torch.testing.assert_close(found[1], expected, rtol=1e-4, atol=1e-4)
+    module.latent_noise = 0.0
+    assert module.decoder_latents(latents, draws) is latents
+    with pytest.raises(ValueError, match=r"latent_noise must lie in \[0, 1\], got 1.5"):
+        range_module(2, latent_noise=1.5)
+
+
+def test_only_the_decoder_sees_noisy_latents():
+    modules = [train(range_module(2, latent_noise=noise), RangeData(1)) for noise in (0.0, 0.9)]
+    clean, noisy = (module.parts[0] for module in modules)
+    assert clean["kl"] == noisy["kl"]
+    assert clean["reconstruction"] != noisy["reconstruction"]
+    means = [module.latent_norm.running_mean for module in modules]
+    assert torch.equal(*means)
+
+
+def test_the_shipped_weights_start_a_vae_with_intensity_and_class():
+    shipped = read_checkpoint("r3dpa-s")
+    plain = shipped.network("vae").build()
+    further = {"intensity": True, "num_classes": NUM_CLASSES}
+    sit = SiT(**{**shipped.network("ema").arguments, "average_blocks": 0, "depth": 6})
+    module = VAEAlignment(
+        VAE(**{**shipped.network("vae").arguments, **further}),
+        sit,
+        init_from="r3dpa-s",
+        init_networks=["vae", "latent_norm"],
+    )
+    module.load_previous_stage()
+    recorded = ScanGeometry.from_dict(module._previous_geometry)
+    assert recorded.codec == LabelledData.codec
+    assert module.latent_norm.fitted
+    image = torch.rand(1, 4, 16, 64)
+    with torch.no_grad():
+        latents = plain.encode(image[:, :2]).mean
+        assert torch.equal(module.vae.encode(image).mean, latents)
+        assert torch.equal(module.vae.predict(latents)[:, :6], plain.predict(latents))
+
+
+def test_images_of_another_codec_are_refused():
+    vae = range_module(2, labelled=True).vae
+    check_image(vae, LabelledData.codec)
+    with pytest.raises(ValueError, match=r"num_classes 15, but data\.codec gives channels 2"):
+        check_image(vae, RangeData.codec)
 
 
 def test_a_decoder_is_trained_on_for_the_latents_of_a_fixed_encoder():
@@ -91,6 +198,13 @@ def test_means_and_cross_entropy_by_hand():
     certain = torch.tensor([[50.0, -50.0]])
     assert return_loss(certain, torch.tensor([[True, False]])).item() == pytest.approx(0.0)
     assert return_loss(certain, torch.tensor([[False, False]])).item() == pytest.approx(25.0)
+
+
+def test_cross_entropy_of_classes_by_hand():
+    logits = torch.tensor([1.0, 2.0, 0.5]).log().view(1, 3, 1, 1).expand(1, 3, 1, 4)
+    classes = torch.tensor([0, 1, 2, -1]).view(1, 1, 1, 4)
+    expected = [math.log(3.5), math.log(3.5 / 2), math.log(7), 0.0]
+    assert class_errors(logits, classes).flatten().tolist() == pytest.approx(expected)
 
 
 def test_centred_features_have_no_mean_and_keep_empty_cells():

@@ -51,9 +51,11 @@ class BadBatch:
                 if about.pop("format", None) != _FORMAT:
                     raise ValueError("it was not written by a training of r3dpa")
                 found = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            draws = PathDraws(*(found.pop(f"draws.{key}") for key in PathDraws._fields))
-            tensors = {key.removeprefix("batch."): value for key, value in found.items()}
-            return cls(tensors, draws, LossWeights(**about.pop("weights")), about)
+            draws, tensors = (
+                {k.removeprefix(part): v for k, v in found.items() if k.startswith(part)}
+                for part in ("draws.", "batch.")
+            )
+            return cls(tensors, PathDraws(**draws), LossWeights(**about.pop("weights")), about)
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is no saved batch of r3dpa, or damaged: {error}") from error
 

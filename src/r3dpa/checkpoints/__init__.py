@@ -3,7 +3,12 @@
 from r3dpa.checkpoints.files import convert, read_checkpoint, save_checkpoint
 from r3dpa.checkpoints.networks import Checkpoint, NetworkState, load_into, weights_sha256
 from r3dpa.checkpoints.official import from_official, to_official
-from r3dpa.checkpoints.transfer import read_snapshot, transfer_rgb, vae_fingerprint
+from r3dpa.checkpoints.transfer import (
+    read_snapshot,
+    transfer_rgb,
+    vae_fingerprint,
+    with_further_channels,
+)
 
 __all__ = [
     "Checkpoint",
@@ -18,4 +23,5 @@ __all__ = [
     "transfer_rgb",
     "vae_fingerprint",
     "weights_sha256",
+    "with_further_channels",
 ]

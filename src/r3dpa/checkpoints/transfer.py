@@ -1,4 +1,4 @@
-"""Takes over weights of another model: RGB weights to start from, a weak model to guide by."""
+"""Takes over weights of another model: to start from, of RGB or fewer channels, or to guide by."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
 from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of, weights_sha256
-from r3dpa.nn import LatentNorm, SiT, VelocityNetwork
+from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
 Weights = Mapping[str, Tensor]
 Result = Literal["kept", "fresh", "resized", "truncated"]
@@ -83,6 +83,28 @@ def transfer_rgb(
     fitting = replace(checkpoint, networks=networks)
     load_into({"sit": sit, "latent_norm": latent_norm}, fitting, stage="RGB transfer")
     return rows
+
+
+def with_further_channels(checkpoint: Checkpoint, vae: VAE) -> Checkpoint:
+    """Checkpoint of a VAE of range and return as one that has the intensity and class of ``vae``.
+
+    The layers of these channels have the values that they have in ``vae``, all others stay: the
+    encoder gives the same latents, and the decoder the same ranges and returns. Unchanged where
+    ``vae`` has no such layers, or the checkpoint has some.
+    """
+    state = checkpoint.network("vae")
+    layers = {k: v for k, v in vae.state_dict().items() if ".further_" in k}
+    if not layers or any(".further_" in key for key in state.state_dict):
+        return checkpoint
+    own = {"intensity": vae.intensity, "num_classes": vae.num_classes}
+    wider = replace(
+        state, init_args={**state.init_args, **own}, state_dict={**state.state_dict, **layers}
+    )
+    networks, geometry = {**checkpoint.networks, "vae": wider}, checkpoint.geometry
+    if geometry is not None:
+        channels = {"intensity_channel": vae.intensity, "num_classes": vae.num_classes}
+        geometry = {**geometry, "codec": {**geometry["codec"], **channels}}
+    return replace(checkpoint, networks=networks, geometry=geometry)
 
 
 def _transfer_result(

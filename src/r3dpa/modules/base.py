@@ -22,6 +22,7 @@ from r3dpa.modules import steps
 from r3dpa.modules.checks import (
     check_features,
     check_geometry,
+    check_image,
     check_latents,
 )
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, PathName, TimeSampling
@@ -59,6 +60,8 @@ class GenerativeModule(ScanStage):
         rgb_weights: RGB-pretrained SiT, official ``.pt`` or ours, for a SiT only; None starts from
             random values.
         keep_projector: Keep the RGB model's projection head where its shape fits.
+        latent_noise: Largest share of noise in the latents that the decoder learns from, see
+            :meth:`decoder_latents`, in the stages that train it; 0 for none.
         seed: Key of the training draws.
         channels_last: Keep images and kernels of VAE and discriminator with their channels next to
             each other. The same numbers to rounding; files keep the usual order.
@@ -87,10 +90,13 @@ class GenerativeModule(ScanStage):
         init_networks: list[str] | None = None,
         rgb_weights: str | None = None,
         keep_projector: bool = False,
+        latent_noise: float = 0.0,
         seed: int = 0,
         channels_last: bool = False,
         compile: bool = False,
     ) -> None:
+        if not 0 <= latent_noise <= 1:
+            raise ValueError(f"model.latent_noise must lie in [0, 1], got {latent_noise}")
         super().__init__(optimizer, seed, time_sampling)
         with steps.networks_as_settings():
             self.save_hyperparameters()
@@ -105,6 +111,7 @@ class GenerativeModule(ScanStage):
         self.init_networks = self.default_init if init_networks is None else tuple(init_networks)
         self.rgb_weights, self.keep_projector = rgb_weights, keep_projector
         self.channels_last, self.compiles = channels_last, compile
+        self.latent_noise = latent_noise
         self.ema: EMA | None = None
         if self.trains_velocity:
             self.ema = EMA(sit, self.latent_norm, ema_decay, ema_buffers)
@@ -134,6 +141,7 @@ class GenerativeModule(ScanStage):
         """
         datamodule, geometry = self.attach()
         sensor = geometry.projection.sensor
+        check_image(self.vae, geometry.codec)
         if geometry.codec.reflectance:
             raise ValueError(
                 f"stage {self.stage} has no use for the reflectance of data.codec, which the "
@@ -226,16 +234,28 @@ class GenerativeModule(ScanStage):
         return {name: getattr(weights, name) * values.mean() for name, values in each.items()}
 
     def _range_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
-        """Losses ``(B,)`` of images of range and return: of ranges at returns, and of returns."""
-        ranges, returns = image[:, :1], image[:, 1:] > 0
+        """Losses ``(B,)`` of images of range and return, of their intensity and class too.
+
+        All but that of returns are means over the pixels with a return, of classes with a label.
+        """
+        outputs = self.vae.outputs_of(prediction)
+        ranges, returns = image[:, :1], image[:, 1:2] > 0
         if self.vae.modes == 2:
             error = self.vae.mixture_of(prediction).nll(ranges)
         else:
-            error = losses.pixel_error(prediction[:, :1], ranges, self.weights.reconstruction_norm)
-        return {
+            error = losses.pixel_error(outputs.ranges, ranges, self.weights.reconstruction_norm)
+        parts = {
             "reconstruction": losses.masked_mean(error, returns),
-            "returns": losses.return_loss(prediction[:, -1:], returns),
+            "returns": losses.return_loss(cast(Tensor, outputs.returns), returns),
         }
+        if outputs.intensity is not None:
+            error = losses.pixel_error(outputs.intensity, image[:, 2:3])
+            parts["intensity"] = losses.masked_mean(error, returns)
+        if outputs.classes is not None:
+            classes = image[:, -1:]
+            error = losses.class_errors(outputs.classes, classes)
+            parts["classes"] = losses.masked_mean(error, returns & (classes >= 0))
+        return parts
 
     def discriminator_losses(self, image: Tensor, prediction: Tensor) -> dict[str, Tensor]:
         """Hinge loss on scans and detached reconstructions; a plain 0 before its start."""
@@ -244,10 +264,27 @@ class GenerativeModule(ScanStage):
         weights = self.weights
         if weights.discriminator == 0 or self.global_step < weights.adversarial_start:
             return {"discriminator": steps.zero_loss(self.discriminator)}
-        real = self.discriminator(image)
+        real = self.discriminator(image[:, : self.vae.in_channels])
         fake = self.discriminator(self.vae.scan_of(prediction).detach())
         loss = losses.discriminator_loss(real, fake)
         return {"discriminator": weights.discriminator * loss}
+
+    def decoder_latents(self, latents: Tensor, draws: PathDraws) -> Tensor:
+        """Raw latents ``(B, C, h, w)`` that the decoder learns to decode.
+
+        With ``latent_noise`` they are, with a share s of noise drawn for each sample::
+
+            (1 - s) * latents + s * noise        s = latent_noise * uniform
+
+        The noise has the mean and spread of the latents. Those that a flow draws are never without
+        an error, which a decoder of clean ones enlarges.
+
+        Source: l-DeTok (Yang et al., "Latent denoising makes good tokenizers", ICLR 2026).
+        """
+        if self.latent_noise == 0:
+            return latents
+        share = self.latent_noise * draws.uniform[:, None, None, None]
+        return (1 - share) * latents + share * self.latent_norm.denormalise(draws.noise)
 
     def vae_alignment_losses(
         self, latents: Tensor, features: Tensor | None, draws: PathDraws
@@ -274,13 +311,14 @@ class GenerativeModule(ScanStage):
     # Evaluation
 
     def reconstruct(self, image: Tensor) -> Tensor:
-        """Encoded range images ``(B, 1, H, W)`` through the VAE's posterior mean and back."""
+        """Encoded range images ``(B, C, H, W)`` through the VAE's posterior mean and back."""
         return self.vae.decode(self.vae.encode(image).mean)
 
     def validation_step(self, batch: LidarBatch, batch_idx: int) -> None:
         """Adds held-out scans to the means: the losses, and the reconstruction error in metres.
 
-        The error is the mean over all pixels with a return, the losses are means over the scans.
+        The error is the mean over all pixels with a return, the class accuracy over those with a
+        label; the losses are means over the scans.
         The SiT is the averaged one where the stage has an average.
         """
         image, mask = batch["range_image"], batch["valid_mask"]
@@ -293,7 +331,8 @@ class GenerativeModule(ScanStage):
         networks, features = self.ema or self, batch.get("feature_grid")
         latents = networks.latent_norm.normalise(posterior.sample(draws.posterior_noise))
         aligns = self.needs_features()
-        values = steps.flow_errors(
+        values: dict[str, Tensor | tuple[Tensor, Tensor]] = {}
+        values |= steps.flow_errors(
             self, networks.sit, latents, features, draws, self.trains_velocity, aligns
         )
         if image.shape[1] == 1:
@@ -301,6 +340,9 @@ class GenerativeModule(ScanStage):
             values["reconstruction"] = each
         else:
             values |= self._range_losses(image, prediction)
+        if self.vae.num_classes:
+            right = (reconstruction[:, -1:] == image[:, -1:]).flatten(1).sum(dim=1)
+            values["class_accuracy"] = right, (image[:, -1:] >= 0).flatten(1).sum(dim=1)
         self.held_out.update(
             batch["index"],
             range_error_m=((error_m * mask).flatten(1).sum(dim=1), mask.flatten(1).sum(dim=1)),

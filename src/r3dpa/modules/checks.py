@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning.pytorch.callbacks import StochasticWeightAveraging
 
-from r3dpa.geometry import ScanGeometry
+from r3dpa.geometry import RangeCodec, ScanGeometry
 from r3dpa.nn import VAE, ImageVAE, VelocityNetwork
 
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
@@ -41,6 +41,21 @@ def geometry_of(datamodule: object, module: object) -> ScanGeometry:
             f"as r3dpa.data.LidarDataModule, got {type(datamodule).__name__}"
         )
     return geometry
+
+
+def check_image(vae: VAE, codec: RangeCodec) -> None:
+    """Refuses a VAE of other images than those of a codec."""
+    own = vae.image_channels, vae.intensity, vae.num_classes
+    theirs = codec.channels, codec.intensity_channel, codec.num_classes
+    if own != theirs:
+        names = ("channels", "intensity", "num_classes")
+        given = (
+            ", ".join(f"{n} {v}" for n, v in zip(names, vs, strict=True)) for vs in (own, theirs)
+        )
+        raise ValueError(
+            "model.vae is one of images with {}, but data.codec gives {}: set in_channels, "
+            "intensity and num_classes of the former to the latter".format(*given)
+        )
 
 
 def check_latents(vae: VAE | ImageVAE, sit: VelocityNetwork, image_size: tuple[int, int]) -> None:

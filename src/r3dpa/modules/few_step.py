@@ -94,7 +94,10 @@ class FewStep(FlowMatching):
             raise ValueError(f"model.trajectories must be at least 1, got {trajectories}")
         super().__init__(vae, sit, **kwargs)
         if thin_decoder is not None:
-            for name in ("in_channels", "latent_channels", "stride", "modes", "least_scale"):
+            for name in (
+                *("in_channels", "latent_channels", "stride", "modes", "least_scale"),
+                *("intensity", "num_classes"),
+            ):
                 theirs, own = getattr(vae, name), getattr(thin_decoder, name)
                 if theirs != own:
                     raise ValueError(

@@ -46,12 +46,12 @@ class JointAlignment(GenerativeModule):
         }
 
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
-        """One step on range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+        """One step on range images ``(B, C, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
         draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
-        prediction = self.vae.predict(latents)
+        prediction = self.vae.predict(self.decoder_latents(latents, draws))
 
         losses = self.vae_losses(image, posterior, prediction)
         with frozen(self.sit):

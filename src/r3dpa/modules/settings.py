@@ -21,6 +21,8 @@ class LossWeights:
             return channel, of those with a return (of two modes, the negative log-likelihood).
         reconstruction_norm: ``l1`` (official code) or ``l2`` (paper); of one mode only.
         returns: Weight of the cross-entropy of the return channel, where images have one.
+        intensity: Weight of the absolute error of the encoded intensity at returns, likewise.
+        classes: Weight of the cross-entropy of the class of labelled returns, likewise.
         kl: Weight of the Kullback-Leibler term, summed per sample.
         adversarial: Weight of the generator's adversarial loss (official 0.3 x 0.001).
         adversarial_ratio: Length of the adversarial gradient at the image, relative to that of an
@@ -40,6 +42,8 @@ class LossWeights:
     reconstruction: float = 1.0
     reconstruction_norm: Literal["l1", "l2"] = "l1"
     returns: float = 0.2
+    intensity: float = 1.0
+    classes: float = 0.2
     kl: float = 1e-6
     adversarial: float = 3e-4
     adversarial_ratio: float | None = None

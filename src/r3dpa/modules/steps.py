@@ -23,12 +23,15 @@ from r3dpa.nn import VelocityNetwork
 class PathDraws(NamedTuple):
     """Random numbers of one training step.
 
-    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``.
+    ``posterior_noise`` and ``noise`` are ``(B, C, h, w)`` standard normal, ``time`` is ``(B,)``,
+    and ``uniform`` ``(B,)`` in [0, 1) selects the noise on the latents of a decoder; empty in draws
+    for steps without.
     """
 
     posterior_noise: Tensor
     time: Tensor
     noise: Tensor
+    uniform: Tensor = torch.empty(0)
 
 
 def draw_path(module: Any, num_samples: int, number: int | None = None) -> PathDraws:
@@ -62,6 +65,7 @@ def _draw(module: Any, key: list[int], total: int) -> PathDraws:
         torch.randn(shape, generator=generator, device=module.device),
         sample_time(total, module.time_sampling, generator=generator),
         torch.randn(shape, generator=generator, device=module.device),
+        torch.rand(total, generator=generator, device=module.device),
     )
 
 

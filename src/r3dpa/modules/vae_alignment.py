@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from r3dpa.checkpoints import Checkpoint, with_further_channels
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.modules.base import GenerativeModule
 from r3dpa.nn import VAE, PatchDiscriminator, VelocityNetwork
@@ -19,6 +20,8 @@ class VAEAlignment(GenerativeModule):
     the plain VAE of the ablations and the SiT takes no part. The latent statistics follow the VAE,
     so that the frozen blocks see unit variance and the joint stage starts from fitted statistics
     (the official code leaves them at mean 0, variance 1).
+
+    A VAE with channels of intensity or class may start from one without.
 
     Source: R3DPA (ICRA 2026), section "VAE Alignment for RGB Image Priors".
 
@@ -66,13 +69,19 @@ class VAEAlignment(GenerativeModule):
             networks["discriminator"] = self.discriminator
         return networks | ({"sit": self.sit} if self.needs_features() else {})
 
+    def previous_networks(self, before: Checkpoint) -> Checkpoint:
+        """Checkpoint of the stage before, its VAE with the channels of this one."""
+        before = super().previous_networks(before)
+        has_vae = "vae" in before.networks and "vae" in self.init_networks
+        return with_further_channels(before, self.vae) if has_vae else before
+
     def training_step(self, batch: LidarBatch, batch_idx: int) -> Tensor:
-        """One step on range images ``(B, 1, H, W)`` and feature grids ``(B, N, D)``."""
+        """One step on range images ``(B, C, H, W)`` and feature grids ``(B, N, D)``."""
         image, features = batch["range_image"], batch.get("feature_grid")
         draws = self.draw_path(len(image))
         posterior = self.vae.encode(image)
         latents = posterior.sample(draws.posterior_noise)
-        prediction = self.vae.predict(latents)
+        prediction = self.vae.predict(self.decoder_latents(latents, draws))
 
         losses = self.vae_losses(image, posterior, prediction)
         losses |= self.vae_alignment_losses(latents, features, draws)
