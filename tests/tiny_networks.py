@@ -15,10 +15,10 @@ SIT_ARGS = {"input_size": [4, 16], "in_channels": 4, "hidden_size": 32, "depth":
 SIT_ARGS |= {"alignment_depth": 1, "feature_dim": 8, "projector_dim": 8}
 
 
-def tiny_networks(spread=0.1, **sit_args):
+def tiny_networks(spread=0.1, vae_args=VAE_ARGS, **sit_args):
     """``vae, sit, norm``: weights spread at random, so that scenes differ and have holes."""
     torch.manual_seed(0)
-    vae, sit, norm = VAE(**VAE_ARGS), SiT(**SIT_ARGS | sit_args), LatentNorm(4)
+    vae, sit, norm = VAE(**vae_args), SiT(**SIT_ARGS | sit_args), LatentNorm(4)
     with torch.no_grad():
         for parameter in sit.parameters():
             parameter.add_(spread * torch.randn_like(parameter))
@@ -27,13 +27,15 @@ def tiny_networks(spread=0.1, **sit_args):
     return vae, sit, norm
 
 
-def tiny_checkpoint(path, geometry, spread=0.1, sit_args=None, stage="joint", **fields):
+def tiny_checkpoint(
+    path, geometry, spread=0.1, sit_args=None, stage="joint", vae_args=VAE_ARGS, **fields
+):
     """Checkpoint of a stage for inference, of :func:`tiny_networks`."""
     if stage == "few_step":
         sit_args = {"average_blocks": 1, **(sit_args or {})}
-    vae, sit, norm = tiny_networks(spread, **sit_args or {})
+    vae, sit, norm = tiny_networks(spread, vae_args, **sit_args or {})
     networks = {
-        "vae": NetworkState.of(vae, VAE_ARGS),
+        "vae": NetworkState.of(vae, vae_args),
         "ema": NetworkState.of(sit, SIT_ARGS | (sit_args or {})),
         "ema_latent_norm": NetworkState.of(norm, {"channels": 4}),
     }

@@ -19,7 +19,14 @@ from r3dpa.flow.interpolant import Interpolant
 from r3dpa.flow.noise import scene_noise, scene_uniform
 from r3dpa.flow.sampler import Quality, SamplerConfig
 from r3dpa.flow.solvers import Velocity
-from r3dpa.geometry import Projection, ScanGeometry, points_of
+from r3dpa.geometry import (
+    Pixels,
+    Projection,
+    ScanGeometry,
+    labels_of,
+    points_of,
+    values_at_returns,
+)
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
@@ -37,6 +44,7 @@ class SceneBatch:
         nfe: Network evaluations per scene.
         projection: Maps pixels to points.
         intensity: ``(B, H, W)`` in [0, 1], of networks that generate it.
+        labels: ``(B, H, W)`` int64 class ids of KITTI-360, 0 without a return, likewise.
     """
 
     range_m: Tensor
@@ -44,6 +52,13 @@ class SceneBatch:
     nfe: int
     projection: Projection
     intensity: Tensor | None = None
+    labels: Tensor | None = None
+
+    @classmethod
+    def of(cls, pixels: Pixels, latents: Tensor, nfe: int, projection: Projection) -> Self:
+        """Scenes of decoded pixels ``(B, H, W)``."""
+        labels = None if pixels.classes is None else labels_of(pixels.classes)
+        return cls(pixels.range_m, latents, nfe, projection, pixels.intensity, labels)
 
     def __len__(self) -> int:
         """Number of scenes B."""
@@ -52,6 +67,21 @@ class SceneBatch:
     def points(self, index: int) -> Tensor:
         """Points ``(P, 3)`` of one scene in metres, x forward, y left, z up, on the CPU."""
         return points_of(self.range_m[index].cpu(), self.projection)
+
+    def point_intensity(self, index: int) -> Tensor:
+        """Intensity ``(P,)`` of each of the points of one scene, on the CPU."""
+        return self._of_points("intensity", self.intensity, index)
+
+    def point_labels(self, index: int) -> Tensor:
+        """Class id of KITTI-360 ``(P,)`` of each of the points of one scene, on the CPU."""
+        return self._of_points("labels", self.labels, index)
+
+    def _of_points(self, name: str, values: Tensor | None, index: int) -> Tensor:
+        if values is None:
+            raise ValueError(
+                f"these scenes have no {name}: their checkpoint was trained on range images without"
+            )
+        return values_at_returns(values[index].cpu(), self.range_m[index].cpu(), self.projection)
 
 
 @dataclass(frozen=True)
@@ -287,13 +317,23 @@ class SceneGenerator:
         draws = (filled(x, size).to(self.device) for x in noise)
         latents = self._solve(next(draws), draws)[: len(indices)]
         nfe, projection = sum(one.evaluations for one in self._networks), self.geometry.projection
-        return SceneBatch(self.decode(latents, indices, seed), latents, nfe, projection)
+        return SceneBatch.of(self.decode_pixels(latents, indices, seed), latents, nfe, projection)
 
     @torch.no_grad()
     def decode(
         self, latents: Tensor, indices: Sequence[int] | None = None, seed: int = 0
     ) -> Tensor:
         """Range images ``(B, H, W)``, metres, as in :class:`SceneBatch`, of normalised latents.
+
+        See :meth:`decode_pixels`.
+        """
+        return self.decode_pixels(latents, indices, seed).range_m
+
+    @torch.no_grad()
+    def decode_pixels(
+        self, latents: Tensor, indices: Sequence[int] | None = None, seed: int = 0
+    ) -> Pixels:
+        """Ranges of normalised latents, and intensities and classes where the VAE has them.
 
         Where images have a return channel, scenes with numbers ``indices`` of the collection
         ``seed`` lose single returns at random, see :meth:`r3dpa.geometry.RangeCodec.drop_returns`.
@@ -307,9 +347,11 @@ class SceneGenerator:
             if indices is not None and codec.return_channel:
                 uniform = scene_uniform(image.shape[2:], indices[first : first + size], seed)
                 image = codec.drop_returns(image, uniform.to(image.device))
-            range_m = codec.ranges_of(image, sensor)
-            parts.append(torch.where(finite[:, None, None], range_m, torch.nan))
-        return torch.cat(parts)
+            pixels = codec.pixels_of(image, sensor)
+            range_m = torch.where(finite[:, None, None], pixels.range_m, torch.nan)
+            parts.append(pixels._replace(range_m=range_m))
+        joined = (None if own[0] is None else torch.cat(own) for own in zip(*parts, strict=True))
+        return Pixels(*joined)
 
     def velocity(self, latents: Tensor, time: Tensor) -> Tensor:
         """Unguided velocity ``(B, C, h, w)`` at times ``(B,)``, in the dtype of the latents."""

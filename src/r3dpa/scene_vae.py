@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.generation import SceneBatch, geometry_of, opened
-from r3dpa.geometry import ScanGeometry, range_image
+from r3dpa.geometry import ScanGeometry, project_pixels
 from r3dpa.io import usable_device
 from r3dpa.nn import VAE
 
@@ -50,17 +50,27 @@ class SceneVAE:
     from_pretrained = from_checkpoint  # names of `r3dpa models`
 
     @torch.no_grad()
-    def encode(self, points: Tensor | np.ndarray) -> Tensor:
-        """Posterior means ``(1, C, h, w)`` of one scan ``(P, 3)`` or ``(P, 4)`` in metres."""
-        xyz = torch.as_tensor(points)[:, :3].float()
-        range_m = range_image(xyz, self.geometry.projection)[0]
-        image = self.geometry.codec.to_image(range_m.to(next(self.vae.parameters()).device))
+    def encode(
+        self, points: Tensor | np.ndarray, labels: Tensor | np.ndarray | None = None
+    ) -> Tensor:
+        """Posterior means ``(1, C, h, w)`` of one scan.
+
+        Args:
+            points: ``(P, 3)`` in metres, or ``(P, 4)`` with the intensity, which some VAEs need.
+            labels: ``(P,)`` KITTI-360 class in the lower 16 bits, for a VAE of classes; without,
+                it sees returns of no class, which it has hardly been trained on.
+        """
+        given = torch.as_tensor(points).float()
+        known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
+        pixels = project_pixels(given, self.geometry.projection, known)
+        device = next(self.vae.parameters()).device
+        image = self.geometry.codec.to_image(*(x if x is None else x.to(device) for x in pixels))
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> SceneBatch:
-        """Scenes of raw latents ``(B, C, h, w)``."""
+        """Scenes of raw latents ``(B, C, h, w)``, with what the VAE has of intensity and labels."""
         projection = self.geometry.projection
         image = self.vae.decode(latents).float()
-        range_m = self.geometry.codec.ranges_of(image, projection.sensor)
-        return SceneBatch(range_m, latents, 0, projection)
+        pixels = self.geometry.codec.pixels_of(image, projection.sensor)
+        return SceneBatch.of(pixels, latents, 0, projection)

@@ -29,8 +29,9 @@ def sample(
 ) -> str:
     """Generate scenes from a checkpoint: points, range images, pictures and a page to turn.
 
-    The same command completes an interrupted run. An option that the solver does not read is an
-    error. ``metadata.json`` holds everything needed to repeat the run.
+    Where the checkpoint generates them, points have an intensity, and ``labels`` holds their
+    classes of KITTI-360. The same command completes an interrupted run. An option that the solver
+    does not read is an error. ``metadata.json`` holds everything needed to repeat the run.
 
     Args:
         num: Number of scenes.

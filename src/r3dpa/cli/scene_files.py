@@ -112,7 +112,7 @@ def generate_all(
         for first in range(first_index, writer.num, batch_size):
             indices = range(first, min(first + batch_size, writer.num))
             batch = generator.generate(indices, seed)
-            writer.put(batch.range_m, batch.nfe, batch.intensity)
+            writer.put(batch.range_m, batch.nfe, batch.intensity, batch.labels)
             progress.update(len(indices))
     writer.close()
     elapsed, drawn = time.perf_counter() - start, writer.num - first_index
@@ -144,7 +144,11 @@ def draw_all(out: Path, range_path: Path, pictures: int, geometry: ScanGeometry)
         draw_scene(out, index, range_m, geometry)
     viz.save(viz.scenes_sheet(drawn[:_ON_SHEET], geometry.projection), out / "scenes.png")
     scans = [
-        viz.PageScan(f"scene {index:06d}", points_of(image, geometry.projection).numpy())
+        viz.PageScan(
+            f"scene {index:06d}",
+            points_of(image, geometry.projection).numpy(),
+            _written_labels(out, index),
+        )
         for index, image in enumerate(drawn[:_ON_PAGE])
         if (image > 0).any()  # neither empty nor NaN
     ]
@@ -152,6 +156,12 @@ def draw_all(out: Path, range_path: Path, pictures: int, geometry: ScanGeometry)
         return f"open {out / 'scenes.png'}"
     page = write_page(out / "scenes.html", scans, f"{out.resolve().name} - r3dpa sample")
     return f"open {out / 'scenes.png'} and {page}"
+
+
+def _written_labels(out: Path, index: int) -> NDArray | None:
+    """Labels of the points of a scene that a writer has written, if scenes have them."""
+    path = out / "labels" / f"{index:06d}.label"
+    return np.fromfile(path, dtype="<u4") if path.exists() else None
 
 
 def page_scans(source: Path) -> list[Callable[[], viz.PageScan]]:

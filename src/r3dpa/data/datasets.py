@@ -16,13 +16,12 @@ from r3dpa.data.labels import read_labels
 from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
 from r3dpa.data.store import CachedTensors, ItemKey
 from r3dpa.geometry import (
-    UNKNOWN_CLASS,
     LidarSensor,
     Pixels,
     Projection,
     RangeCodec,
-    classes_of,
     in_range,
+    project_pixels,
     range_image,
 )
 from r3dpa.weather import WeatherPrior
@@ -121,23 +120,6 @@ class LidarDataset(Dataset[dict[str, Any]]):
             self._project(scan)  # without the change, to blame a file that shows nothing by itself
             raise _lost_in_weather(scan.path, self.projection.sensor)
         return pixels
-
-
-def project_pixels(points: Tensor, projection: Projection, labels: Tensor | None = None) -> Pixels:
-    """Range, intensity and, with labels, class of the nearest return in each pixel.
-
-    Args:
-        points: ``(P, 4)`` x, y, z in metres, and the intensity.
-        projection: Which pixel a point belongs to.
-        labels: ``(P,)`` integers, KITTI-360 class in the lower 16 bits.
-    """
-    values = points[:, 3:4]
-    if labels is not None:
-        known = classes_of(labels & 0xFFFF) - UNKNOWN_CLASS  # 0 without a return
-        values = torch.cat([values, known[:, None].to(values)], dim=1)
-    range_m, image = range_image(points[:, :3], projection, values)
-    assert image is not None
-    return Pixels(range_m, image[0], None if labels is None else image[1].long() + UNKNOWN_CLASS)
 
 
 class PointSample(NamedTuple):

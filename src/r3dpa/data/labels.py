@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from r3dpa.data.scans import ScanError, read_beside, read_bytes
+from r3dpa.io import atomic_path
 
 _NAMES = {
     6: "ground,road,sidewalk,parking,rail track,building,wall,fence,guard rail,bridge,tunnel",
@@ -61,6 +63,12 @@ def read_labels(scan: str | Path, num_points: int) -> NDArray[np.int64]:
         "velodyne_points/data as KITTI-360 and `r3dpa data simulate` have it, or velodyne as "
         "SemanticKITTI"
     )
+
+
+def write_labels(path: str | Path, labels: Tensor) -> None:
+    """Write the KITTI-360 classes ``(P,)`` of points as the uint32 of a ``.label`` file; atomic."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(labels.numpy().astype("<u4").tobytes())
 
 
 def _semantic_kitti(path: Path, num_points: int) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from r3dpa.data.datamodules import SimulatedDataModule
-from r3dpa.data.datasets import PointSample, project_pixels
+from r3dpa.data.datasets import PointSample
 from r3dpa.data.feature_grids import GridSettings, pooled_grids
 from r3dpa.data.loaders import at_least
 from r3dpa.data.pixel_codes import decode_pixels, encode_pixels
@@ -29,6 +29,7 @@ from r3dpa.geometry import (
     Projection,
     SphericalProjection,
     points_of,
+    project_pixels,
     projection_to_dict,
 )
 from r3dpa.io import only_writer

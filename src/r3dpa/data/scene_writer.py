@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r3dpa.data.labels import write_labels
 from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.data.store import append
-from r3dpa.geometry import points_of
+from r3dpa.geometry import points_of, values_at_returns
 from r3dpa.geometry.projection import Projection
 from r3dpa.io import delete_unfinished, no_follow, only_writer, write_text
 
@@ -26,19 +27,20 @@ _CLOUD_WRITERS: dict[str, Callable[[Path, Tensor], None]] = {"bin": write_bin, "
 #: Files that ``r3dpa sample`` and the edits write beside their metadata.
 _WRITTEN = (
     *(*_CLOUD_WRITERS, "range_m.npy", "scenes.npz", "range", "birds_eye", "scene_3d"),
-    *("before.npy", "mask.png", "edit.png", "edit.html"),
+    *("before.npy", "mask.png", "edit.png", "edit.html", "labels"),
 )
 
 
 class SceneWriter:
     """Writes scenes in order, in a thread, and completes an interrupted run.
 
-    ===================== =====================================================================
-    ``range_m.npy``       ``(num, H, W)`` float32 metres, -1 without a return
-    ``bin/000000.bin``    points of each scene, if asked for; ``ply/000000.ply`` likewise
-    ``scenes.npz``        all scenes in one file, without intensity; only if asked for
-    ``metadata.json``     written last: a folder without it is unfinished
-    ===================== =====================================================================
+    ======================= ===================================================================
+    ``range_m.npy``         ``(num, H, W)`` float32 metres, -1 without a return
+    ``bin/000000.bin``      points of each scene, if asked for; ``ply/000000.ply`` likewise
+    ``labels/000000.label`` uint32 KITTI-360 class of each of these points, if scenes have them
+    ``scenes.npz``          all scenes in one file, without intensity; only if asked for
+    ``metadata.json``       written last: a folder without it is unfinished
+    ======================= ===================================================================
 
     Until the end there are two hidden files, ``.unfinished.npy`` and ``.unfinished.json`` with the
     request and the number of scenes written. At most two batches are in memory. An error of the
@@ -107,17 +109,24 @@ class SceneWriter:
         """Range images of all scenes, complete after :meth:`close`."""
         return self.out / "range_m.npy"
 
-    def put(self, range_m: Tensor, nfe: int = 0, intensity: Tensor | None = None) -> None:
+    def put(
+        self,
+        range_m: Tensor,
+        nfe: int = 0,
+        intensity: Tensor | None = None,
+        labels: Tensor | None = None,
+    ) -> None:
         """Write the next scenes beside the caller; waits for those before them.
 
         Args:
             range_m: ``(B, H, W)`` metres on any device; must not be changed afterwards.
             nfe: Network evaluations of each of them.
             intensity: ``(B, H, W)`` of the points; 0 in ``.bin`` files without.
+            labels: ``(B, H, W)`` KITTI-360 class of the points.
         """
         self._wait()
-        values = None if intensity is None else intensity.cpu()
-        self._batch = self._thread.submit(self._write, range_m.cpu(), nfe, values)
+        intensity, labels = (x if x is None else x.cpu() for x in (intensity, labels))
+        self._batch = self._thread.submit(self._write, range_m.cpu(), nfe, intensity, labels)
 
     def close(self) -> None:
         """Wait until all scenes are written, and give ``range_m.npy`` its name."""
@@ -201,18 +210,24 @@ class SceneWriter:
         file.seek(end)
         return file
 
-    def _write(self, range_m: Tensor, nfe: int, intensity: Tensor | None) -> None:
-        values = [None] * len(range_m) if intensity is None else intensity
-        for index, (scene, value) in enumerate(zip(range_m, values, strict=True), self.num_done):
+    def _write(
+        self, range_m: Tensor, nfe: int, intensity: Tensor | None, labels: Tensor | None
+    ) -> None:
+        for place, scene in enumerate(range_m):
+            index = self.num_done + place
             if scene.isnan().any():
                 raise ValueError(
                     f"scene {index:06d} of {self.out} holds NaN: the networks diverged; check the "
                     "checkpoint, or sample in fp32"
                 )
+            value = None if intensity is None else intensity[place]
             points = points_of(scene, self._projection, intensity=value)
             for name in self._formats:
                 if name in _CLOUD_WRITERS:
                     _CLOUD_WRITERS[name](self.out / name / f"{index:06d}.{name}", points)
+            if labels is not None:
+                own = values_at_returns(labels[place], scene, self._projection)
+                write_labels(self.out / "labels" / f"{index:06d}.label", own)
         try:
             append(self._file, range_m.numpy().astype("<f4", copy=False).tobytes())
         except OSError as error:

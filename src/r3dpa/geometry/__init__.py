@@ -11,7 +11,13 @@ from r3dpa.geometry.projection import (
     unproject,
     values_at_returns,
 )
-from r3dpa.geometry.scan_geometry import Pixels, RangeCodec, ScanGeometry, projection_to_dict
+from r3dpa.geometry.scan_geometry import (
+    Pixels,
+    RangeCodec,
+    ScanGeometry,
+    project_pixels,
+    projection_to_dict,
+)
 from r3dpa.geometry.semantics import (
     NUM_CLASSES,
     SEMANTIC_CLASSES,
@@ -38,6 +44,7 @@ __all__ = [
     "labels_of",
     "points_of",
     "pool_cells",
+    "project_pixels",
     "projection_to_dict",
     "range_image",
     "unproject",

@@ -9,8 +9,13 @@ from typing import Any, Literal, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from r3dpa.geometry.projection import Projection, RingProjection, SphericalProjection
-from r3dpa.geometry.semantics import NUM_CLASSES, UNKNOWN_CLASS
+from r3dpa.geometry.projection import (
+    Projection,
+    RingProjection,
+    SphericalProjection,
+    range_image,
+)
+from r3dpa.geometry.semantics import NUM_CLASSES, UNKNOWN_CLASS, classes_of
 from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
 
 _PROJECTIONS = {"spherical": SphericalProjection, "rings": RingProjection}
@@ -33,6 +38,25 @@ class Pixels(NamedTuple):
     range_m: Tensor
     intensity: Tensor | None = None
     classes: Tensor | None = None
+
+
+def project_pixels(points: Tensor, projection: Projection, labels: Tensor | None = None) -> Pixels:
+    """Range and, where they are given, intensity and class of the nearest return in each pixel.
+
+    Args:
+        points: ``(P, 3)`` x, y, z in metres, or ``(P, 4)`` with the intensity.
+        projection: Which pixel a point belongs to.
+        labels: ``(P,)`` integers, KITTI-360 class in the lower 16 bits.
+    """
+    values = points[:, 3:4]
+    with_intensity = values.shape[1] == 1
+    if labels is not None:
+        known = classes_of(labels & 0xFFFF) - UNKNOWN_CLASS  # 0 without a return
+        values = torch.cat([values, known[:, None].to(values)], dim=1)
+    range_m, image = range_image(points[:, :3], projection, values)
+    assert image is not None
+    intensity = image[0] if with_intensity else None
+    return Pixels(range_m, intensity, None if labels is None else image[-1].long() + UNKNOWN_CLASS)
 
 
 @dataclass(frozen=True)
