@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import torch
@@ -350,7 +350,9 @@ class SceneGenerator:
             pixels = codec.pixels_of(image, sensor)
             range_m = torch.where(finite[:, None, None], pixels.range_m, torch.nan)
             parts.append(pixels._replace(range_m=range_m))
-        joined = (None if own[0] is None else torch.cat(own) for own in zip(*parts, strict=True))
+        joined: list[Any] = [
+            None if own[0] is None else torch.cat(own) for own in zip(*parts, strict=True)
+        ]
         return Pixels(*joined)
 
     def velocity(self, latents: Tensor, time: Tensor) -> Tensor:

@@ -63,8 +63,7 @@ class SceneVAE:
         given = torch.as_tensor(points).float()
         known = None if labels is None else torch.from_numpy(np.asarray(labels, dtype=np.int64))
         pixels = project_pixels(given, self.geometry.projection, known)
-        device = next(self.vae.parameters()).device
-        image = self.geometry.codec.to_image(*(x if x is None else x.to(device) for x in pixels))
+        image = self.geometry.codec.to_image(*pixels).to(next(self.vae.parameters()).device)
         return self.vae.encode(image[None]).mean
 
     @torch.no_grad()

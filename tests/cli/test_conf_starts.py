@@ -172,7 +172,7 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         settings["data.init_args.scans"] = smoke_root
     else:
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
-    if name not in ("box", "box_labels"):
+    if name != "box":
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "box_flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)

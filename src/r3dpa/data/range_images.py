@@ -64,7 +64,7 @@ class SimulatedImage:
 class CachedPixels:
     """Images of a cache: of ranges alone in float16, else in the codes of ``pixel_codes``."""
 
-    rows: CachedTensors[SimulatedImage]
+    rows: CachedTensors[Any]
     range_max_m: float
 
     def read(self, image: SimulatedImage, /) -> Pixels:
