@@ -29,6 +29,9 @@ from r3dpa.nn.layers import (
 from r3dpa.nn.pixel_outputs import PixelOutputs, RangeMixture, without_flying_pixels
 
 Size = tuple[int, int]
+# AdamW moves a weight by at most its rate a step: without, logits need hundreds of steps to say
+# even how frequent the classes are.
+_LOGIT_GAIN = 8.0
 LevelSizes = tuple[int, int, bool, Size | None]  # input, output, attention, stride
 
 
@@ -255,8 +258,13 @@ class VAE(Autoencoder):
             int(self.intensity),
             self.num_classes,
         ]
-        ranges, *further = prediction.split(sizes, dim=1)
-        return PixelOutputs(ranges, *(part if part.shape[1] else None for part in further))
+        ranges, returns, intensity, classes = prediction.split(sizes, dim=1)
+        return PixelOutputs(
+            ranges,
+            returns if self.in_channels > 1 else None,
+            intensity if self.intensity else None,
+            _LOGIT_GAIN * classes if self.num_classes else None,
+        )
 
     def mixture_of(self, prediction: Tensor) -> RangeMixture:
         """Distribution of the encoded ranges, of outputs ``(B, 6 or more, H, W)`` for two modes."""
