@@ -141,12 +141,12 @@ class GenerativeModule(ScanStage):
         """
         datamodule, geometry = self.attach()
         sensor = geometry.projection.sensor
-        check_image(self.vae, geometry.codec)
         if geometry.codec.reflectance:
             raise ValueError(
                 f"stage {self.stage} has no use for the reflectance of data.codec, which the "
                 "baselines generate: set codec.reflectance to false"
             )
+        check_image(self.vae, geometry.codec)
         check_latents(self.vae, self.sit, (sensor.beams, sensor.columns))
         if stage != "predict":
             self.feature_source = getattr(datamodule, "feature_source", None)

@@ -25,7 +25,9 @@ _TWIGS_PER_M = (0.2, 0.5)
 _SCREEN_PER_M = (1.5, 3.0)
 _NEEDLES_PER_M = (2.5, 6.0)
 # Clear stems: 2.5 m above pavements where it is pruned, less where it is not.
-_STREET_STEM_M, _LOW_STEM_M = (2.1, 3.0), (1.4, 2.0)
+_STREET_STEM_M, _LOW_STEM_M = (2.1, 3.0), (1.6, 2.1)
+# A low crown is cut back at the kerb, where cars pass.
+_LOW_CROWN_M = (1.8, 3.0)
 # Per 18 m of the edge of a wood; of its trunks those before the leaves.
 _WOOD_SCREENS, _WOOD_TRUNKS, _WOOD_CROWNS, _WOOD_SHRUBS = 2, 8, 12, 12
 _TUFTS_PER_MEADOW = 7
@@ -214,7 +216,7 @@ def street_tree(builder: Builder, draw: Generator, s: float, lateral: float) -> 
     if habit < 0.25:
         _broadleaf(builder, draw, at, _STREET_STEM_M, (3.5, 7.5))
     elif habit < 0.62:
-        _broadleaf(builder, draw, at, _LOW_STEM_M, (2.5, 5.0))
+        _broadleaf(builder, draw, at, _LOW_STEM_M, _LOW_CROWN_M)
     elif habit < 0.82:
         _young(builder, draw, at)
     elif habit < 0.92:
