@@ -34,8 +34,6 @@ _WINDOW_PITCH_M, _PIER_SHARE = (1.6, 3.0), (0.4, 0.62)
 _PANES = 0.3
 # German garages: 3 m x 6 m outside, 2.5 m high.
 _GARAGE_M = (3.0, 6.0, 2.5)
-# Pallets and crates before a hall on 24 m, on average.
-_STACKS = 8.0
 
 
 class Look(NamedTuple):
