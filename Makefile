@@ -22,25 +22,25 @@ endif
 FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/trainer_demo.yaml $(SOURCE)
 else
 ifeq ($(DATA),)
-SOURCE := --config conf/box/demo_data.yaml
-REAL := conf/box/demo_data.yaml
+SOURCE := --config conf/r3dpa_s/demo_data.yaml
+REAL := conf/r3dpa_s/demo_data.yaml
 else
-SOURCE := --config conf/box/demo_folder.yaml --data.init_args.scans $(DATA)
+SOURCE := --config conf/r3dpa_s/demo_folder.yaml --data.init_args.scans $(DATA)
 REAL := $(DATA)
 endif
-FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/box/trainer.yaml $(SOURCE)
+FIT := $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml $(SOURCE)
 endif
 # The long training of r3dpa-s; the same command continues an interrupted run.
-BOX_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/box/trainer.yaml \
-	--config conf/box/data.yaml --ckpt_path last
+R3DPA_S_FIT := nice -n 19 $(BIN)/r3dpa fit --config conf/trainer.yaml --config conf/r3dpa_s/trainer.yaml \
+	--config conf/r3dpa_s/data.yaml --ckpt_path last
 
 .DEFAULT_GOAL := help
 .PHONY: help install format lint types test test-all test-numerics \
-	test-faults test-nodes fuzz notebooks demo gallery box box-scores clean bench bench-training \
+	test-faults test-nodes fuzz notebooks demo gallery r3dpa-s r3dpa-s-scores clean bench bench-training \
 	bench-sampling bench-gpu ablations
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "%-16s %s\n", $$1, $$2}'
 
 install: $(READY) ## set .venv up; does nothing when it is up to date
 
@@ -101,14 +101,14 @@ demo: $(READY) ## the weights of the package, then trained on: make demo [DATA=f
 else
 demo: $(READY)
 	rm -rf $(OUT)/vae $(OUT)/flow $(OUT)/reference.safetensors
-	$(BIN)/r3dpa sample --num 16 --out $(OUT)/box --overwrite true
-	$(BIN)/r3dpa edit inpaint --scan $(OUT)/box/bin/000000.bin --box -30 30 -25 3 --num 2 \
+	$(BIN)/r3dpa sample --num 16 --out $(OUT)/r3dpa-s --overwrite true
+	$(BIN)/r3dpa edit inpaint --scan $(OUT)/r3dpa-s/bin/000000.bin --box -30 30 -25 3 --num 2 \
 		--steps 16 --out $(OUT)/edit --overwrite true
 	$(BIN)/r3dpa data reference --data $(REAL) --limit 32 --out $(OUT)/reference.safetensors
-	$(BIN)/r3dpa evaluate --samples $(OUT)/box --reference $(OUT)/reference.safetensors \
+	$(BIN)/r3dpa evaluate --samples $(OUT)/r3dpa-s --reference $(OUT)/reference.safetensors \
 		--allow_few --label before --out $(OUT)/before
-	$(FIT) --config conf/box/vae_alignment.yaml --config conf/box/demo_vae.yaml --run_dir $(OUT)/vae
-	$(FIT) --config conf/box/flow_matching.yaml --config conf/box/demo_flow.yaml \
+	$(FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/demo_vae.yaml --run_dir $(OUT)/vae
+	$(FIT) --config conf/r3dpa_s/flow_matching.yaml --config conf/r3dpa_s/demo_flow.yaml \
 		--run_dir $(OUT)/flow --model.init_args.init_from $(OUT)/vae/checkpoints/last.ckpt
 	$(BIN)/r3dpa sample --ckpt $(OUT)/flow/checkpoints/last.ckpt --num 16 --out $(OUT)/scenes \
 		--overwrite true
@@ -117,27 +117,27 @@ demo: $(READY)
 endif
 
 gallery: $(READY) ## one page of 64 scenes in order, their nearest training scans, edits, weather
-	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/box/data),--data conf/box/data.yaml)
+	$(BIN)/r3dpa gallery --out runs/gallery.html $(if $(wildcard runs/r3dpa_s/data),--data conf/r3dpa_s/data.yaml)
 
-box: $(READY) ## train the weights of the package: an hour of a GPU, days of two cores; stop and repeat at any time
-	$(BOX_FIT) --config conf/box/vae_alignment.yaml --run_dir runs/box/vae
-	$(BOX_FIT) --config conf/box/vae_alignment.yaml --config conf/box/vae_more.yaml \
-		--run_dir runs/box/vae_more \
-		--model.init_args.init_from runs/box/vae/checkpoints/last.ckpt
-	$(BOX_FIT) --config conf/box/vae_alignment.yaml --config conf/box/vae_decoder.yaml \
-		--run_dir runs/box/vae_decoder \
-		--model.init_args.init_from runs/box/vae_more/checkpoints/last.ckpt
-	$(BOX_FIT) --config conf/box/flow_matching.yaml --run_dir runs/box/flow \
-		--model.init_args.init_from runs/box/vae_decoder/checkpoints/last.ckpt
-	$(BOX_FIT) --config conf/box/few_step.yaml --run_dir runs/box/few_step \
-		--model.init_args.init_from runs/box/flow/checkpoints/last.ckpt \
-		--model.init_args.latents_dir runs/box/flow/latents
-	$(BIN)/r3dpa convert runs/box/few_step/checkpoints/last.ckpt runs/box/r3dpa-s.safetensors \
+r3dpa-s: $(READY) ## train the weights of the package: an hour of a GPU, days of two cores; stop and repeat at any time
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --run_dir runs/r3dpa_s/vae
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_more.yaml \
+		--run_dir runs/r3dpa_s/vae_more \
+		--model.init_args.init_from runs/r3dpa_s/vae/checkpoints/last.ckpt
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/vae_alignment.yaml --config conf/r3dpa_s/vae_decoder.yaml \
+		--run_dir runs/r3dpa_s/vae_decoder \
+		--model.init_args.init_from runs/r3dpa_s/vae_more/checkpoints/last.ckpt
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/flow_matching.yaml --run_dir runs/r3dpa_s/flow \
+		--model.init_args.init_from runs/r3dpa_s/vae_decoder/checkpoints/last.ckpt
+	$(R3DPA_S_FIT) --config conf/r3dpa_s/few_step.yaml --run_dir runs/r3dpa_s/few_step \
+		--model.init_args.init_from runs/r3dpa_s/flow/checkpoints/last.ckpt \
+		--model.init_args.latents_dir runs/r3dpa_s/flow/latents
+	$(BIN)/r3dpa convert runs/r3dpa_s/few_step/checkpoints/last.ckpt runs/r3dpa_s/r3dpa-s.safetensors \
 		--networks vae ema ema_latent_norm --half --overwrite
 
-box-scores: $(READY) ## measure the weights of the package on 2,000 scenes: hours; notebooks/results/box
-	BOX_SCENES=2000 nice -n 19 $(BIN)/pytest --nbmake --nbmake-timeout=86400 --overwrite \
-		notebooks/07_model_in_the_box.ipynb
+r3dpa-s-scores: $(READY) ## measure the weights of the package on 2,000 scenes: hours; notebooks/results/r3dpa_s
+	R3DPA_S_SCENES=2000 nice -n 19 $(BIN)/pytest --nbmake --nbmake-timeout=86400 --overwrite \
+		notebooks/08_r3dpa_s.ipynb
 
 bench: $(READY) ## micro-benchmarks of simulation, data, features, metrics, VAE, sampling, guidance
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/bench -m bench

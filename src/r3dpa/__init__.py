@@ -4,19 +4,30 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lidarsim import RecordedScan, Simulator
+    from lidarsim.weather import Weather
     from r3dpa.editing import SceneEditor
     from r3dpa.generation import SceneGenerator
     from r3dpa.scene_vae import SceneVAE
-    from r3dpa.simulation import Simulator
 
 __version__ = "0.1.0"
-__all__ = ["SceneEditor", "SceneGenerator", "SceneVAE", "Simulator", "__version__"]
+__all__ = [
+    "RecordedScan",
+    "SceneEditor",
+    "SceneGenerator",
+    "SceneVAE",
+    "Simulator",
+    "Weather",
+    "__version__",
+]
 
 _MODULES = {
+    "RecordedScan": "lidarsim.recorded",
     "SceneEditor": "r3dpa.editing",
     "SceneGenerator": "r3dpa.generation",
     "SceneVAE": "r3dpa.scene_vae",
-    "Simulator": "r3dpa.simulation",
+    "Simulator": "lidarsim",
+    "Weather": "lidarsim.weather",
 }
 
 

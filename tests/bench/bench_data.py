@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from r3dpa.data import FeatureGrids, LidarDataModule, kitti360_scans, read_scan, write_feature_grids
+from r3dpa.features import GeometricFeatures
 from r3dpa.geometry import LidarSensor, SphericalProjection, pool_cells, range_image
-from r3dpa.nn.backbones import GeometricFeatures
 
 pytestmark = [pytest.mark.bench, pytest.mark.filterwarnings("ignore")]
 

@@ -7,12 +7,12 @@ import torch
 from torch.nn import functional as F
 
 from r3dpa.metrics.functional_bev import BEVGrid, histogram_distance, minimum_matching
+from r3dpa.metrics.networks.liploc import LIPLoc
+from r3dpa.metrics.networks.minkowski import SPVCNN, MinkowskiNet
+from r3dpa.metrics.networks.rangevit import RangeViT
+from r3dpa.metrics.networks.sparse import SparseConv, Voxels, voxelize
 from r3dpa.metrics.scene import PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import lip_loc_space, range_vit_space, voxel_space
-from r3dpa.nn.backbones.liploc import LIPLoc
-from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
-from r3dpa.nn.backbones.rangevit import RangeViT
-from r3dpa.nn.backbones.sparse import SparseConv, Voxels, voxelize
 
 pytestmark = pytest.mark.bench
 

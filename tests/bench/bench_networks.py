@@ -8,11 +8,11 @@ import torch
 import yaml
 
 from r3dpa.bench.measure import flop_of
+from r3dpa.features import feature_source
 from r3dpa.flow.guidance import FeatureGuidance, FeatureTarget
 from r3dpa.generation import SamplerConfig, SceneGenerator
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn import LatentNorm, SiT
-from r3dpa.nn.backbones import feature_source
 
 pytestmark = [pytest.mark.bench, pytest.mark.benchmark(min_rounds=3, warmup=True)]
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from r3dpa.simulation import Street, Weather, hdl64e, simulate_scan
+from lidarsim import Street, hdl64e, simulate_scan
+from lidarsim.scene import Weather
 
 pytestmark = [pytest.mark.bench, pytest.mark.benchmark(group="simulate one scan", min_rounds=9)]
 

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from r3dpa.simulation import Street, Weather, hdl64e, simulate, simulate_scan
+from lidarsim import Street, hdl64e, simulate, simulate_scan
+from lidarsim.scene import Weather
 
 
 @pytest.fixture(scope="session")

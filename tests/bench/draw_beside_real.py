@@ -16,7 +16,8 @@ import torch
 from matplotlib.figure import Figure
 from street_fullness import height_above_ground, shorten
 
-from r3dpa.data.scans import evenly, find_scans, read_scan
+from lidarsim.scan_files import read_scan
+from r3dpa.data.scans import evenly, find_scans
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
 from r3dpa.viz import birds_eye_picture, range_image_picture, save
 

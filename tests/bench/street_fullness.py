@@ -29,11 +29,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r3dpa.data.objects import CLASS_NAMES
-from r3dpa.data.scans import RAW, Scan, evenly, find_scans, read_beside, read_scan
+from lidarsim.scan_files import read_beside, read_scan
+from lidarsim.scan_structure import Ground, fit_ground, sweep_of
+from r3dpa.data.scans import RAW, Scan, evenly, find_scans
+from r3dpa.editing.objects import CLASS_NAMES
 from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
 from r3dpa.io import text_table
-from r3dpa.metrics.scan_structure import Ground, fit_ground, sweep_of
 
 PROJECTION = SphericalProjection(LidarSensor(range_min_m=1.0, range_max_m=80.0))
 EDGE_M = 0.5

@@ -29,7 +29,8 @@ from matplotlib.figure import Figure
 from street_fullness import height_above_ground, recordings, shorten
 from torch import Tensor
 
-from r3dpa.data.scans import evenly, kitti360_scans, read_scan
+from lidarsim.scan_files import read_scan
+from r3dpa.data.scans import evenly, kitti360_scans
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection, range_image
 from r3dpa.io import text_table
 from r3dpa.metrics.classifier import _network

@@ -10,11 +10,11 @@ import pytest
 import torch
 import yaml
 
+from lidarsim import simulate
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.cli import main
 from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection
 from r3dpa.nn import VAE, LatentNorm, SiT, UNet
-from r3dpa.simulation import simulate
 
 THIN_DECODER = {"latent_channels": 4, "channels": 32, "num_res_blocks": 0}
 THIN_DECODER |= {"channel_multipliers": [1, 1, 1], "strides": [[2, 2], [2, 2]]}
@@ -40,8 +40,8 @@ STARTS = {  # each after the YAML of its stage, which test_stages starts alone
     "few_step_demo": "simulated",
     "joint": "folder",
 }
-BOX = {  # in the order given
-    "box": ("data", "vae_alignment"),
+R3DPA_S = {  # in the order given
+    "trained": ("data", "vae_alignment"),
     "box_more": ("data", "vae_alignment", "vae_more"),
     "box_labels": ("data", "data_labels", "vae_alignment", "vae_alignment_labels"),
     "box_decoder": ("data", "vae_alignment", "vae_decoder"),
@@ -60,7 +60,7 @@ QUIET = {
     "data.init_args.num_workers": 0,
     "data.init_args.batch_size": 1,
 }
-GEOMETRIC = "r3dpa.nn.backbones.GeometricFeatures"
+GEOMETRIC = "r3dpa.features.GeometricFeatures"
 SIMULATED = {"data.init_args.num_scans": 12}  # as in smoke.yaml: the same folder
 WIDE = f"{{class_path: {GEOMETRIC}, init_args: {{dim: 768}}}}"
 pytestmark = pytest.mark.filterwarnings("ignore:.*fast_dev_run.*")
@@ -73,8 +73,8 @@ def test_no_file_is_left_out():
     started |= {f"data/{name}" for name in STARTS.values()}
     started |= {f"net/{name}" for name in VELOCITIES}
     started |= {
-        f"box/{name}"
-        for names in BOX.values()
+        f"r3dpa_s/{name}"
+        for names in R3DPA_S.values()
         for name in (*names, "vae", "vae_labels", "sit", "trainer")
     }
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
@@ -153,13 +153,13 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
 
 @pytest.mark.parametrize(
     "name",
-    [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in BOX],
+    [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in R3DPA_S],
 )
 def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
-    given = BOX[name]
+    given = R3DPA_S[name]
     vae, sit = (
-        yaml.safe_load((CONF / f"box/{part}.yaml").read_text())["init_args"]
+        yaml.safe_load((CONF / f"r3dpa_s/{part}.yaml").read_text())["init_args"]
         for part in ("vae", "sit")
     )
     sit["input_size"] = [2, 4]
@@ -172,11 +172,11 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         settings["data.init_args.scans"] = smoke_root
     else:
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
-    if name != "box":
+    if name != "trained":
         codec = RangeCodec("log2", return_channel=True)
         exported = None if name == "box_flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
-    configs = ["trainer", *(f"box/{part}" for part in ("trainer", *given))]
+    configs = ["trainer", *(f"r3dpa_s/{part}" for part in ("trainer", *given))]
     start(configs, settings)
 
 

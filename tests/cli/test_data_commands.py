@@ -10,13 +10,13 @@ import pytest
 from PIL import Image
 from tiny_networks import SIT_ARGS
 
+from lidarsim import Origin, Semantic, simulate
+from lidarsim.scan_files import ScanError, read_scan, write_bin, write_npz, write_ply
 from r3dpa.cli import main
 from r3dpa.cli.data import objects, view
 from r3dpa.cli.evaluate import realism
-from r3dpa.data.objects import ObjectLibrary
-from r3dpa.data.scans import ScanError, read_scan, write_bin, write_npz, write_ply
-from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.simulation import Origin, Semantic, simulate
+from r3dpa.editing.objects import ObjectLibrary
+from r3dpa.features import GeometricFeatures
 
 CALIBRATION = "lasers: [{vert_correction: 0.02}, {vert_correction: -0.1}]"
 

@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 from tiny_networks import tiny_checkpoint
 
+from lidarsim import simulate
 from r3dpa import viz
 from r3dpa.cli import main
 from r3dpa.data import read_scan, write_bin, write_npz, write_ply
@@ -20,7 +21,6 @@ from r3dpa.geometry import (
     points_of,
     range_image,
 )
-from r3dpa.simulation import simulate
 
 SENSOR = LidarSensor(beams=16, columns=64)
 PROJECTION = SphericalProjection(SENSOR)

@@ -6,12 +6,12 @@ import torch
 import yaml
 
 import r3dpa.cli.evaluate as command
+from lidarsim.scan_files import write_bin
 from r3dpa.cli import main
-from r3dpa.data.scans import write_bin
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
+from r3dpa.metrics.networks.minkowski import MinkowskiNet, official_name
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.results import Evaluation
-from r3dpa.nn.backbones.minkowski import MinkowskiNet, official_name
 from r3dpa.viz import evaluation as figures
 
 pytestmark = pytest.mark.usefixtures("coarse_protocols")

@@ -15,14 +15,14 @@ import yaml
 from r3dpa.cli import main
 from r3dpa.data import FeatureGrids, find_scans
 from r3dpa.data.feature_grids import any_settings
+from r3dpa.features import WaffleIron
+from r3dpa.features.scalr import official_name
 from r3dpa.geometry import LidarSensor, SphericalProjection
-from r3dpa.nn.backbones import WaffleIron
-from r3dpa.nn.backbones.point_features import official_name
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 NUM = 30
 PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
-GEOMETRIC = {"class_path": "r3dpa.nn.backbones.GeometricFeatures", "init_args": {"dim": 16}}
+GEOMETRIC = {"class_path": "r3dpa.features.GeometricFeatures", "init_args": {"dim": 16}}
 QUIET = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
 ROW = 2 * 8 * 16 * 2  # bytes of a 2 x 8 grid, 16 float16 a cell
 
@@ -125,7 +125,7 @@ class TestForms:
         network = WaffleIron(width=4, depth=1, head_dim=5)
         weights = {f"module.{official_name(k)}": v for k, v in network.state_dict().items()}
         torch.save({"model_points": weights}, tmp_path / "ckpt_last.pth")
-        words = ["--data.init_args.extractor", "r3dpa.nn.backbones.ScaLR.from_checkpoint"]
+        words = ["--data.init_args.extractor", "r3dpa.features.ScaLR.from_checkpoint"]
         words += ["--data.init_args.extractor.init_args.path", tmp_path / "ckpt_last.pth"]
         words += ["--data.init_args.limit", 1, "--out", tmp_path / "grids"]
         words += ["--grid_sizes", "[[2, 8], [4, 16]]"]

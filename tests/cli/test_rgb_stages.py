@@ -10,9 +10,9 @@ from PIL import Image
 
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.cli import main
+from r3dpa.features import DINOv2
 from r3dpa.modules import LossWeights, RGBPretraining
 from r3dpa.nn import ImageVAE, SiT
-from r3dpa.nn.backbones import DINOv2
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SIT = yaml.safe_load((CONF / "smoke.yaml").read_text())["model"]["init_args"]["sit"]["init_args"]

@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 from tiny_networks import tiny_checkpoint
 
+from lidarsim.scan_files import read_npz, read_ply, read_scan
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
 from r3dpa.cli.sample import sample as sample_command
-from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.flow.solvers import ODE_SOLVERS
 from r3dpa.generation import SamplerConfig
 from r3dpa.geometry import (

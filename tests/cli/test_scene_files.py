@@ -1,5 +1,5 @@
+from lidarsim import Semantic
 from r3dpa.cli.scene_files import _COLOURS
-from r3dpa.simulation import Semantic
 
 
 def test_every_class_has_a_colour_of_its_own():

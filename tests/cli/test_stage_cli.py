@@ -12,7 +12,7 @@ from lightning.pytorch.demos.boring_classes import BoringModel
 
 from r3dpa.cli import main
 from r3dpa.cli.stages import ignore_harmless_warnings
-from r3dpa.nn.backbones import feature_source
+from r3dpa.features import feature_source
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 BORING = "lightning.pytorch.demos.boring_classes"

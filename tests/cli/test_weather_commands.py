@@ -11,9 +11,9 @@ import time
 import numpy as np
 import pytest
 
+from lidarsim import Simulator, load_sensor
+from lidarsim.scan_files import ScanError
 from r3dpa.cli import main
-from r3dpa.data.scans import ScanError
-from r3dpa.simulation import Simulator, load_sensor
 
 FOG = ["--weather.visibility_m", "40"]
 

@@ -6,12 +6,12 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import default_collate
 
+from lidarsim import simulate
+from lidarsim.weather import WeatherPrior
 from r3dpa.data import Augmentation, LidarDataModule, PointDataModule, find_scans, read_scan
 from r3dpa.data.augmentation import View
+from r3dpa.features import GeometricFeatures
 from r3dpa.geometry import LidarSensor, SphericalProjection, pool_cells, range_image
-from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.simulation import simulate
-from r3dpa.weather import WeatherPrior
 
 GRID = (8, 64)
 PROJECTION = SphericalProjection(LidarSensor())

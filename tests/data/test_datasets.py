@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from lidarsim.scan_files import ScanError
+from lidarsim.weather import WeatherPrior
 from r3dpa.data import Augmentation, FeatureGrids, LidarDataModule, LidarDataset, find_scans
 from r3dpa.data.augmentation import View
 from r3dpa.data.datasets import DrawnPoints
 from r3dpa.data.feature_grids import write_feature_grids
-from r3dpa.data.scans import ScanError
 from r3dpa.data.store import CachedTensors, tensor_cache
 from r3dpa.geometry import NUM_CLASSES, SEMANTIC_CLASSES, LidarSensor, RangeCodec, RingProjection
-from r3dpa.weather import WeatherPrior
 
 
 def write(folder, points):

@@ -8,6 +8,7 @@ from threading import Event
 import pytest
 import torch
 
+from lidarsim.scan_files import ScanError
 from r3dpa.data import (
     FeatureGrids,
     StoreError,
@@ -18,7 +19,6 @@ from r3dpa.data import (
 )
 from r3dpa.data.datasets import PointDataset
 from r3dpa.data.feature_grids import any_settings, plan
-from r3dpa.data.scans import ScanError
 from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection, pool_cells
 
 GRID = (2, 4)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from lidarsim import Simulator
 from r3dpa.data import SimulatedDataModule, SimulatedImageDataModule
 from r3dpa.geometry import (
     NUM_CLASSES,
@@ -12,7 +13,6 @@ from r3dpa.geometry import (
     classes_of,
     range_image,
 )
-from r3dpa.simulation import Simulator
 
 SMALL = LidarSensor(beams=16, columns=64)
 CODEC = RangeCodec("log2", return_channel=True)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from lidarsim.scan_files import ScanError, write_bin, write_npz, write_ply
 from r3dpa.data.samples import read_samples
-from r3dpa.data.scans import ScanError, write_bin, write_npz, write_ply
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, range_image, unproject
 
 SENSOR = LidarSensor(beams=4, columns=8)

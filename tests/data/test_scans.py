@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from r3dpa.data.scans import (
-    KITTI360_DRIVES,
+from lidarsim.clouds import read_file
+from lidarsim.scan_files import (
     ScanError,
-    check,
-    find_scans,
-    kitti360_scans,
     read_npz,
     read_ply,
     read_scan,
@@ -19,9 +16,9 @@ from r3dpa.data.scans import (
     write_npz,
     write_ply,
 )
+from r3dpa.data.scans import KITTI360_DRIVES, check, find_scans, kitti360_scans
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import atomic_path, refuse_name
-from r3dpa.weather.files import read_file
 
 POINTS = np.array([[10, 0, -1, 0.5], [0, 20, 0.25, 0.0], [-30, 1, 2, 1.0]], np.float32)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from lidarsim.scan_files import read_npz, read_ply, read_scan
 from r3dpa.data import scene_writer
-from r3dpa.data.scans import read_npz, read_ply, read_scan
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
 

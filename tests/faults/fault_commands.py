@@ -27,8 +27,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
+from lidarsim.scan_files import read_npz, read_ply, read_scan
 from r3dpa.data.feature_grids import GridSettings
-from r3dpa.data.scans import read_npz, read_ply, read_scan
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(

@@ -11,10 +11,11 @@ from fault_commands import cut, fit_words
 from safetensors.torch import save_file
 from torch import nn
 
+from lidarsim.scan_files import ScanError
 from r3dpa.cli import main
 from r3dpa.data.datasets import LidarDataset
 from r3dpa.data.feature_grids import FeatureGrids, write_feature_grids
-from r3dpa.data.scans import ScanError, find_scans
+from r3dpa.data.scans import find_scans
 from r3dpa.data.store import StoreError
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection
 from r3dpa.io import atomic_path, only_writer

@@ -21,6 +21,7 @@ import torch
 import yaml
 from PIL import Image
 
+from lidarsim import expected_scans
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.data import (
     FeatureGrids,
@@ -36,13 +37,12 @@ from r3dpa.data import (
 )
 from r3dpa.data.feature_grids import GridSettings
 from r3dpa.data.images import read_mask
-from r3dpa.data.objects import ObjectClass, ObjectLibrary
+from r3dpa.editing.objects import ObjectClass, ObjectLibrary
 from r3dpa.geometry import LidarSensor, SphericalProjection, projection_to_dict
 from r3dpa.metrics.official_statistics import OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import PROTOCOLS
 from r3dpa.nn.latent_norm import LatentNorm
-from r3dpa.simulation import expected_scans
 
 SECONDS = 10.0  # a file of a few kilobytes takes milliseconds; the machine may be busy
 MEMORY = 2**30  # more than the process has when it starts

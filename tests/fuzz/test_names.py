@@ -13,14 +13,14 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from lidarsim import expected_scans
+from lidarsim.scan_files import read_npz
 from r3dpa.data import read_samples
-from r3dpa.data.scans import read_npz
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
 from r3dpa.metrics.official_statistics import OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
 from r3dpa.metrics.scene import PROTOCOLS
-from r3dpa.simulation import expected_scans
 
 BAD = ["../../x", "/etc/x", "a/../../x", "a/./x", "a//x", "..", ".", "", "C:x", "c:\\x", "a\\..\\x"]
 BAD += ["a\0b", "a\nb", "x" * 2000]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import torch
 
+from lidarsim import Semantic
 from r3dpa.data.labels import CLASS_NAMES
 from r3dpa.geometry.semantics import (
     NUM_CLASSES,
@@ -10,7 +11,6 @@ from r3dpa.geometry.semantics import (
     classes_of,
     labels_of,
 )
-from r3dpa.simulation import Semantic
 
 WITHOUT_CLASS = {0, 1, 2, 3, 23}  # unlabelled, ego vehicle, border, out of roi, sky
 

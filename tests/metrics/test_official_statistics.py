@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from lidarsim.scan_files import write_bin
 from r3dpa.cli import main
-from r3dpa.data.scans import write_bin
 from r3dpa.metrics.evaluation import evaluate
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance, minimum_matching

@@ -4,7 +4,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from r3dpa.features import GeometricFeatures, WaffleIronS
 from r3dpa.geometry import LidarSensor, unproject
+from r3dpa.metrics.networks.liploc import LIPLoc
+from r3dpa.metrics.networks.minkowski import SPVCNN, MinkowskiNet, official_name
+from r3dpa.metrics.networks.pointnet import PointNet
+from r3dpa.metrics.networks.rangenet import RangeNet, picked
+from r3dpa.metrics.networks.rangevit import _NAMES, RangeViT, range_channels
+from r3dpa.metrics.networks.sparse import pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, PUBLISHED, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import (
     SceneFeatures,
@@ -13,13 +20,6 @@ from r3dpa.metrics.scene_features import (
     scene_features,
     voxel_space,
 )
-from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
-from r3dpa.nn.backbones.liploc import LIPLoc
-from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet, official_name
-from r3dpa.nn.backbones.pointnet import PointNet
-from r3dpa.nn.backbones.rangenet import RangeNet, picked
-from r3dpa.nn.backbones.rangevit import _NAMES, RangeViT, range_channels
-from r3dpa.nn.backbones.sparse import pool_voxels, voxelize
 
 SENSOR = LidarSensor(beams=16, columns=64)
 CENTRE, CORNER = (replace(protocol, sensor=SENSOR) for protocol in (DEFAULT, PUBLISHED))

@@ -11,9 +11,9 @@ from lightning import Trainer
 from tiny_stages import SILENT
 
 from r3dpa.data import FeatureGrids, StoreError, find_scans, write_feature_grids
+from r3dpa.features import GeometricFeatures
 from r3dpa.geometry import LidarSensor, SphericalProjection
 from r3dpa.modules import FeatureExtraction
-from r3dpa.nn.backbones import GeometricFeatures
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread"),

@@ -10,8 +10,8 @@ from tiny_stages import SILENT
 from r3dpa.data import LidarDataModule, write_bin
 from r3dpa.data.datamodules import PointDataModule
 from r3dpa.data.datasets import DrawnPoints
+from r3dpa.features import Masking, ScanGrid, WaffleIron, WaffleIronS, collate_scans
 from r3dpa.modules import PointPretraining
-from r3dpa.nn.backbones import Masking, ScanGrid, WaffleIron, WaffleIronS, collate_scans
 
 GRID = ScanGrid((-8.0, -8.0, -2.0), (8.0, 8.0, 4.0), cell_m=0.5, voxel_m=0.3, num_neighbors=4)
 

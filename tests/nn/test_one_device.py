@@ -11,9 +11,10 @@ import pytest
 import torch
 from one_device import OneDevice
 
+from r3dpa.features import DINOv2, PointCloudBatch, WaffleIron
 from r3dpa.geometry import LidarSensor
+from r3dpa.metrics.networks import RangeViT
 from r3dpa.nn import EMA, VAE, ImageVAE, LatentNorm, PatchDiscriminator, SiT, UNet
-from r3dpa.nn.backbones import DINOv2, PointCloudBatch, RangeViT, WaffleIron
 
 LATENTS = (2, 4, 4, 16)
 HEAD = {"input_size": (4, 16), "in_channels": 4, "feature_dim": 12, "projector_dim": 24}

@@ -29,9 +29,9 @@ from r3dpa.metrics.functional_bev import (
     minimum_matching,
     point_histogram,
 )
-from r3dpa.nn.backbones.pointnet import PointNet
-from r3dpa.nn.backbones.rangenet import RangeNet, banded, our_name, picked, picked_places
-from r3dpa.nn.backbones.rangevit import range_channels
+from r3dpa.metrics.networks.pointnet import PointNet
+from r3dpa.metrics.networks.rangenet import RangeNet, banded, our_name, picked, picked_places
+from r3dpa.metrics.networks.rangevit import range_channels
 
 NETWORKS = ("rangenet21", "pointnet")
 METRICS = ("r2flow_metrics", "lidm_metrics")

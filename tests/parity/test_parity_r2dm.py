@@ -18,6 +18,7 @@ from r3dpa.baselines.diffusion import (
     target_of,
     weighted_mean,
 )
+from r3dpa.baselines.diffusion_paths import DiffusionPath, forward_step, repaint
 from r3dpa.baselines.efficient_unet import (
     EfficientUNet,
     Resample,
@@ -29,7 +30,6 @@ from r3dpa.baselines.efficient_unet import (
 from r3dpa.baselines.r2dm import R2DM, ema_decay_at
 from r3dpa.checkpoints import read_checkpoint
 from r3dpa.checkpoints.baselines import unet_weights
-from r3dpa.flow.diffusion import DiffusionPath, forward_step, repaint
 from r3dpa.flow.sde import ancestral, ancestral_step
 from r3dpa.geometry import (
     LidarSensor,

@@ -9,11 +9,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from r3dpa.features.official import load_strictly, renamed
 from r3dpa.geometry import LidarSensor
-from r3dpa.nn.backbones import liploc, rangevit
-from r3dpa.nn.backbones.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
-from r3dpa.nn.backbones.official import load_strictly, renamed
-from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
+from r3dpa.metrics.networks import liploc, rangevit
+from r3dpa.metrics.networks.liploc import LIPLoc, wrapped_grey_levels, wrapped_picture
+from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
 
 STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # no parameters
 PREFIX = "encoder_lidar.model."  # of LIP-Loc's lidar encoder in the released file

@@ -6,6 +6,7 @@ import pytest
 import torch
 from recorded_networks import build_sit
 
+from r3dpa.editing.latents import invert, pnp_flow_feature
 from r3dpa.flow import (
     FeatureGuidance,
     FeatureTarget,
@@ -13,9 +14,7 @@ from r3dpa.flow import (
     euler,
     euler_maruyama,
     heun,
-    invert,
     ode_times,
-    pnp_flow_feature,
     sde_times,
 )
 

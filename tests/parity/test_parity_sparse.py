@@ -8,7 +8,8 @@ import pytest
 import torch
 from recorded_networks import with_outputs
 
-from r3dpa.nn.backbones.minkowski import (
+from r3dpa.features.official import load_strictly
+from r3dpa.metrics.networks.minkowski import (
     SPVCNN,
     MinkowskiNet,
     Points,
@@ -18,8 +19,7 @@ from r3dpa.nn.backbones.minkowski import (
     to_points,
     to_voxels,
 )
-from r3dpa.nn.backbones.official import load_strictly
-from r3dpa.nn.backbones.sparse import SparseConv, Voxels, pool_voxels, voxelize
+from r3dpa.metrics.networks.sparse import SparseConv, Voxels, pool_voxels, voxelize
 
 NETWORKS = {"minkowskinet": MinkowskiNet, "spvcnn": SPVCNN}
 STAGES = [f"stage{i}" for i in range(1, 5)] + [f"up{i}" for i in range(1, 5)]

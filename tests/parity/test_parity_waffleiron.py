@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from r3dpa.nn.backbones import (
+from r3dpa.features import (
     PointCloudBatch,
     ScaLR,
     ScanGrid,
@@ -19,8 +19,8 @@ from r3dpa.nn.backbones import (
     collate_scans,
     prepare_scan,
 )
-from r3dpa.nn.backbones.official import load_strictly
-from r3dpa.nn.backbones.point_features import official_name
+from r3dpa.features.official import load_strictly
+from r3dpa.features.scalr import official_name
 
 # parity/README.md: tokens reach 69, float32 and float64 runs differ by 3.4e-5.
 TOKENS = {"atol": 1e-4, "rtol": 0.0}

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from r3dpa.baselines.diffusion_paths import repaint
 from r3dpa.baselines.efficient_unet import corner_angles
 from r3dpa.baselines.generator import BaselineGenerator
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow.diffusion import repaint
 from r3dpa.flow.interpolant import LINEAR, Interpolant
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import Velocity

@@ -116,8 +116,9 @@ class BaselineGenerator:
         """Completes an encoded range image ``(C, H, W)``, once per index.
 
         Pixels that are True in ``known`` ``(H, W)`` are kept. ``resamplings`` is that of
-        :func:`r3dpa.flow.diffusion.repaint`, the steps are those of the sampler. Latents are
-        completed without resampling, see :func:`r3dpa.flow.diffusion.inpaint`.
+        :func:`~r3dpa.baselines.diffusion_paths.repaint`, the steps are those of the sampler.
+        Latents are completed without resampling, see
+        :func:`~r3dpa.baselines.diffusion_paths.inpaint`.
         """
         self.calls, baseline, indices = 0, self.baseline, scene_indices(indices)
         noises = scene_noise(baseline.latent_shape, indices, seed)

@@ -15,11 +15,11 @@ from torch import Tensor, nn
 
 from r3dpa.baselines.base import Baseline
 from r3dpa.baselines.diffusion import Norm, sample_errors
+from r3dpa.baselines.diffusion_paths import StepPath, inpaint
 from r3dpa.baselines.lidm_networks import LiDMUNet, VQAutoencoder
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.datasets import LidarBatch
 from r3dpa.flow import Interpolant
-from r3dpa.flow.diffusion import StepPath, inpaint
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.sde import ancestral
 from r3dpa.flow.solvers import Velocity

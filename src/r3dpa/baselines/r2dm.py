@@ -17,9 +17,9 @@ from r3dpa.baselines.diffusion import (
     target_of,
     weighted_mean,
 )
+from r3dpa.baselines.diffusion_paths import DiffusionPath, Schedule
 from r3dpa.baselines.efficient_unet import EfficientUNet
 from r3dpa.data.datasets import LidarBatch
-from r3dpa.flow.diffusion import DiffusionPath, Schedule
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps

@@ -23,9 +23,11 @@ from lightning.pytorch.cli import LightningArgumentParser
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
+from lidarsim import simulate
 from r3dpa.bench.measure import peak_bytes, synchronise
 from r3dpa.checkpoints import Checkpoint, NetworkState, save_checkpoint
 from r3dpa.data.datamodules import LidarDataModule
+from r3dpa.features import GeometricFeatures
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import (
     command,
@@ -38,8 +40,6 @@ from r3dpa.io import (
 )
 from r3dpa.modules import GenerativeModule
 from r3dpa.nn import LatentNorm
-from r3dpa.nn.backbones import GeometricFeatures
-from r3dpa.simulation import simulate
 
 STAGES = ("vae_alignment", "joint", "flow_matching")
 

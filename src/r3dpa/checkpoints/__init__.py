@@ -1,7 +1,7 @@
 """Checkpoints: our files, Lightning's and the official ones, with strict loading."""
 
 from r3dpa.checkpoints.files import convert, read_checkpoint, save_checkpoint
-from r3dpa.checkpoints.networks import Checkpoint, NetworkState, load_into, weights_sha256
+from r3dpa.checkpoints.networks import Checkpoint, NetworkState, load_into
 from r3dpa.checkpoints.official import from_official, to_official
 from r3dpa.checkpoints.transfer import (
     read_snapshot,
@@ -9,6 +9,7 @@ from r3dpa.checkpoints.transfer import (
     vae_fingerprint,
     with_further_channels,
 )
+from r3dpa.io import weights_sha256
 
 __all__ = [
     "Checkpoint",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 import itertools
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.utils.hooks import RemovableHandle
 
+from r3dpa.class_paths import current_path
 from r3dpa.io import UNPICKLING_ERRORS
 
 #: Fields of a :class:`Checkpoint` that files of ours, Lightning's and official ones share.
@@ -25,7 +25,7 @@ FACTS = (
     *("version", "commit"),
 )
 
-_ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.baselines.")
+_ALLOWED_PACKAGES = ("r3dpa.nn.", "r3dpa.features.", "r3dpa.baselines.")
 _NUM_LISTED = 10
 _AVERAGES = {"sit": "ema", "latent_norm": "ema_latent_norm"}
 # Arguments that change what the weights compute but not the shape of any weight, and the attribute
@@ -68,6 +68,9 @@ class NetworkState:
     init_args: Mapping[str, Any]
     state_dict: Mapping[str, Tensor]
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "class_path", current_path(str(self.class_path)))
+
     @classmethod
     def of(cls, network: nn.Module, init_args: Mapping[str, Any]) -> NetworkState:
         """State of a network built by hand; a ``ValueError`` if the arguments do not rebuild it."""
@@ -81,7 +84,7 @@ class NetworkState:
     @property
     def kind(self) -> type[nn.Module]:
         """The class; raises a ``ValueError`` if it is no network of this package."""
-        module_path, _, name = str(self.class_path).rpartition(".")
+        module_path, _, name = self.class_path.rpartition(".")
         if f"{module_path}.".startswith(_ALLOWED_PACKAGES):
             try:
                 found = getattr(importlib.import_module(module_path), name)
@@ -92,8 +95,8 @@ class NetworkState:
                 return found
         raise ValueError(
             f"class {self.class_path!r} is not allowed: a checkpoint may only name networks "
-            "defined in r3dpa.nn or r3dpa.baselines. Edit the class_path if the class was moved; "
-            "otherwise do not trust the file"
+            "defined in r3dpa.nn, r3dpa.features or r3dpa.baselines. Edit the class_path if the "
+            "class was moved; otherwise do not trust the file"
         )
 
     @property
@@ -215,17 +218,6 @@ def load_into(networks: Mapping[str, nn.Module], checkpoint: Checkpoint, stage: 
         )
     for name, network in networks.items():
         network.load_state_dict(checkpoint.network(sources[name]).state_dict, strict=True)
-
-
-def weights_sha256(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 of the names and bytes of weights, whatever device, memory format or file."""
-    digest = hashlib.sha256()
-    for name in sorted(state):
-        digest.update(name.encode())
-        # As bytes: numpy knows no bfloat16.
-        values = state[name].detach().cpu().contiguous().flatten().view(torch.uint8)
-        digest.update(values.numpy().data)
-    return digest.hexdigest()
 
 
 def _different_settings(state: NetworkState, network: nn.Module) -> list[str]:

@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple
 from torch import Tensor
 
 from r3dpa.checkpoints.files import read_checkpoint
-from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of, weights_sha256
+from r3dpa.checkpoints.networks import Checkpoint, load_into, shapes_of
+from r3dpa.io import weights_sha256
 from r3dpa.nn import VAE, LatentNorm, SiT, VelocityNetwork
 
 Weights = Mapping[str, Tensor]

@@ -27,7 +27,7 @@ COMMANDS = {
     "validate": Command("stages:run", "evaluate on the validation split"),
     "test": Command("stages:run", "sample scenes and compare them with real scans"),
     "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
-    "data simulate": Command("r3dpa.simulation:simulate", "write simulated scans", True),
+    "data simulate": Command("lidarsim:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
     "data features": Command("features:features", "write feature grids of scans", resumable=True),

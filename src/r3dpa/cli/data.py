@@ -22,10 +22,11 @@ def check(path: Path) -> None:
         path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans; or of other scans that
             ``r3dpa data weather`` reads.
     """
-    from r3dpa.data.scans import ScanError, evenly, scan_files
+    from lidarsim.clouds import find_files, read_file
+    from lidarsim.rings import rings_of
+    from lidarsim.scan_files import ScanError
     from r3dpa.data.scans import check as check_scans
-    from r3dpa.weather import rings_of
-    from r3dpa.weather.files import find_files, read_file
+    from r3dpa.data.scans import evenly, scan_files
 
     files = [file for file in sorted(scan_files(path)) if file.suffix == ".bin"]
     others: list[Path] = []
@@ -105,11 +106,11 @@ def objects(
     from r3dpa.checkpoints import read_checkpoint
     from r3dpa.cli.scene_files import feature_source_of
     from r3dpa.data import find_scans
-    from r3dpa.data.objects import object_library
     from r3dpa.data.scans import evenly
+    from r3dpa.editing.objects import object_library
+    from r3dpa.features import feature_source
     from r3dpa.generation import SceneGenerator
     from r3dpa.io import text_table, usable_device
-    from r3dpa.nn.backbones import feature_source
 
     check_file(out)
     if out.suffix != ".safetensors":

@@ -49,8 +49,8 @@ def inpaint(
     arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
     from r3dpa.cli.scene_files import feature_source_of
-    from r3dpa.data.objects import ObjectLibrary
-    from r3dpa.geometry import regions
+    from r3dpa.editing import regions
+    from r3dpa.editing.objects import ObjectLibrary
 
     if sum(region is not None for region in (box, box3d, mask)) != 1:
         raise ValueError("give one of --box, --box3d and --mask: the part that is to change")
@@ -109,7 +109,7 @@ def mix(
     """
     arguments = dict(locals())
     from r3dpa.cli.edit_session import EditSession
-    from r3dpa.geometry.regions import mask_of_tokens, sector_weights
+    from r3dpa.editing.regions import mask_of_tokens, sector_weights
 
     session = EditSession(EditOptions(**options), num, strength, window)
     paths = enumerate((left, right))
@@ -160,7 +160,8 @@ def complete(
     import torch
 
     from r3dpa.cli.edit_session import EditSession, held_out_errors
-    from r3dpa.geometry import SphericalProjection, regions
+    from r3dpa.editing import regions
+    from r3dpa.geometry import SphericalProjection
 
     session = EditSession(EditOptions(**options), num)
     stage = session.checkpoint.stage

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lidarsim.scan_files import out_of_range
 from r3dpa import viz
 from r3dpa.baselines import BASELINES, scene_generator
 from r3dpa.checkpoints import read_checkpoint
@@ -23,18 +24,17 @@ from r3dpa.cli.parser import EditOptions
 from r3dpa.cli.scene_files import draw_scene, feature_source_of, provenance, read_clouds
 from r3dpa.data import PointSample, Scan, ScanError, pooled_grids
 from r3dpa.data.images import read_mask
-from r3dpa.data.scans import out_of_range
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.editing import EditResult, EditSettings, SceneEditor
+from r3dpa.editing.gaps import check_view, filled, range_error_m
+from r3dpa.editing.regions import check_mask
+from r3dpa.features import feature_source
 from r3dpa.flow.sampler import SamplerConfig
 from r3dpa.flow.solvers import evaluations
 from r3dpa.generation import SceneBatch
 from r3dpa.geometry import in_range, range_image
-from r3dpa.geometry.gaps import check_view, filled, range_error_m
-from r3dpa.geometry.regions import check_mask
 from r3dpa.io import atomic_path, usable_device, write_text
 from r3dpa.nn import VelocityNetwork
-from r3dpa.nn.backbones import feature_source
 
 _SHOWN = 8  # results on the sheet and the page
 

@@ -229,9 +229,11 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     """
     from tqdm import tqdm
 
-    from r3dpa.data.scans import ScanError, find_scans, read_scan
+    from lidarsim.realism import realism_table
+    from lidarsim.scan_files import ScanError, read_scan
+    from lidarsim.scan_statistics import ScanStatistics, scan_statistics
+    from r3dpa.data.scans import find_scans
     from r3dpa.io import write_text
-    from r3dpa.metrics import ScanStatistics, realism_table, scan_statistics
 
     check_file(out)
     statistics: list[dict[str, ScanStatistics]] = []

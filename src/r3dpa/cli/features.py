@@ -15,10 +15,10 @@ from r3dpa.cli.stages import StageParser, ignore_harmless_warnings
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.feature_grids import features_lock, plan
 from r3dpa.data.scans import Scan
+from r3dpa.features.scalr import SOURCES, feature_source
 from r3dpa.geometry import Projection
 from r3dpa.modules.checks import check_trainer
 from r3dpa.modules.feature_extraction import FeatureExtraction
-from r3dpa.nn.backbones.point_features import SOURCES, feature_source
 
 
 def features(args: list[str]) -> None:

@@ -43,14 +43,15 @@ def gallery(
     import torch
     from tqdm import tqdm
 
+    from lidarsim.recorded import RecordedScan
+    from lidarsim.weather import Weather
     from r3dpa import viz
     from r3dpa.cli.features import read_data
-    from r3dpa.editing import SceneEditor
+    from r3dpa.editing import SceneEditor, regions
     from r3dpa.generation import SceneGenerator
-    from r3dpa.geometry import points_of, range_image, regions
+    from r3dpa.geometry import points_of, range_image
     from r3dpa.io import usable_device, write_text
     from r3dpa.metrics.nearest import nearest_images
-    from r3dpa.weather import RecordedScan, Weather
 
     check_file(out)
     generator = SceneGenerator.from_checkpoint(ckpt, quality, device=usable_device(device))

@@ -14,19 +14,35 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, NoReturn, Union, cast, get_args, get_origin
 
-from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
+import yaml
+from jsonargparse import (
+    ArgumentParser,
+    Namespace,
+    get_loader,
+    set_loader,
+    set_parsing_settings,
+)
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
+from r3dpa.class_paths import current_path, with_current_paths
 from r3dpa.pretrained import DEFAULT_WEIGHTS
 
 # Packages whose classes a configuration may name. An argument of any type gets plain values alone:
 # the classes of other packages, and those that nothing restricts to a base, can start a shell.
-_ALLOWED = ("r3dpa", "lightning", "torch.nn", "torch.optim")
+_ALLOWED = ("r3dpa", "lidarsim", "lightning", "torch.nn", "torch.optim")
 set_parsing_settings(
     instantiate_subclass_spec_in_any=False,
     import_path_denylist=["*"],
     import_path_allowlist=list(_ALLOWED),
 )
+_load_yaml = get_loader("yaml")
+
+
+def _load_yaml_of_any_version(text: str) -> Any:
+    return with_current_paths(_load_yaml(text))
+
+
+set_loader("yaml", _load_yaml_of_any_version, (yaml.YAMLError,))
 _DENIED = re.compile(r"Importing '([\w.]+)' is not allowed, .* set_parsing_settings to allow it")
 
 
@@ -38,6 +54,14 @@ class Parser(ArgumentParser):
         if kwargs.get("type") is bool:
             kwargs |= {"nargs": "?", "const": True}
         return super().add_argument(*args, **kwargs)
+
+    def parse_args(self, args: Any = None, *others: Any, **settings: Any) -> Any:
+        """Parses words, in which classes may have the import paths of earlier versions."""
+        words = []
+        for word in sys.argv[1:] if args is None else args:
+            name, equals, value = word.rpartition("=")  # --option=class or class
+            words.append(f"{name}{equals}{current_path(value)}")
+        return super().parse_args(words, *others, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Prints the message and exits with status 2; parsers of nested classes raise it."""
@@ -117,9 +141,9 @@ def allow_imports(words: Sequence[str]) -> list[str]:
 
 
 def load(target: str) -> Callable[..., Any]:
-    """The function of ``file:name`` below ``r3dpa.cli``, or of ``r3dpa.area:name``."""
+    """The function of ``file:name`` below ``r3dpa.cli``, or of ``package.module:name``."""
     file, _, name = target.partition(":")
-    module = import_module(file if file.startswith("r3dpa.") else f"r3dpa.cli.{file}")
+    module = import_module(file if file.startswith(("r3dpa.", "lidarsim")) else f"r3dpa.cli.{file}")
     return cast(Callable[..., Any], getattr(module, name))
 
 

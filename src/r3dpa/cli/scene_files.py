@@ -18,16 +18,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 import r3dpa
+from lidarsim import Origin, Semantic
+from lidarsim.scan_files import ScanError, read_beside, read_npz, read_ply, read_scan
 from r3dpa import viz
 from r3dpa.baselines import BaselineGenerator
 from r3dpa.checkpoints import Checkpoint
 from r3dpa.cli.parser import SceneOptions
-from r3dpa.data.scans import ScanError, find_scans, read_beside, read_npz, read_ply, read_scan
+from r3dpa.data.scans import find_scans
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.generation import SceneGenerator
 from r3dpa.geometry import ScanGeometry, points_of
 from r3dpa.io import source_commit, write_text
-from r3dpa.simulation import Origin, Semantic
 
 # Colours that people expect (plants are green), and quiet ones for what is everywhere; a category
 # that is not named here takes one of the palette.

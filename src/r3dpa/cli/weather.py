@@ -14,12 +14,13 @@ import numpy as np
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
+from lidarsim.drive_files import to_json, weather_to_dict, write
+from lidarsim.drives import differences
+from lidarsim.faults import Fault, Kind
+from lidarsim.recorded import Instrument, RecordedScan
+from lidarsim.weather import Weather, WeatheredScan
 from r3dpa.cli.parser import check_folder
 from r3dpa.io import delete_unfinished, in_processes, no_follow, only_writer
-from r3dpa.simulation.drive_files import to_json, weather_to_dict, write
-from r3dpa.simulation.drives import differences
-from r3dpa.weather import Instrument, RecordedScan, Weather, WeatheredScan
-from r3dpa.weather.faults import Fault, Kind
 
 _REQUEST, _LINES, _REPORT, _PAGE = "request.json", ".unfinished.jsonl", "report.jsonl", "scans.html"
 _LOST, _MOVED = 254, 255  # colours of the page, beside those of Origin
@@ -109,8 +110,8 @@ class _Job:
         return path.relative_to(self.root).as_posix()
 
     def read(self, path: Path) -> tuple[Any, WeatheredScan]:
-        from r3dpa.data.scans import ScanError
-        from r3dpa.weather.files import read_file
+        from lidarsim.clouds import read_file
+        from lidarsim.scan_files import ScanError
 
         file = read_file(path, self.options.columns, self.options.drop_nan)
         key, scan = (self.options.seed, self.name(path)), file.scan
@@ -130,8 +131,8 @@ class _Job:
         return file, result
 
     def __call__(self, path: Path) -> dict[str, Any]:
-        from r3dpa.data.scans import ScanError
-        from r3dpa.weather.files import inputs_of, write_file
+        from lidarsim.clouds import inputs_of, write_file
+        from lidarsim.scan_files import ScanError
 
         inputs = inputs_of(path, self.root)  # before they are read
         try:
@@ -146,8 +147,9 @@ class _Job:
 
 
 def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
-    from r3dpa.data.scans import ScanError, evenly
-    from r3dpa.weather.files import find_files, inputs_of
+    from lidarsim.clouds import find_files, inputs_of
+    from lidarsim.scan_files import ScanError
+    from r3dpa.data.scans import evenly
 
     root, files = find_files(source)
     out, job = options.out, _Job(root, change, options)
@@ -196,7 +198,7 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
 
 def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]) -> None:
     """Refuse a folder of other files or results, before anything is written."""
-    from r3dpa.weather.files import refuse_shared_labels
+    from lidarsim.clouds import refuse_shared_labels
 
     check_folder(out)
     place, above = out.resolve(), root.resolve()
@@ -240,7 +242,7 @@ def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> b
 
 def _delete_results(line: dict[str, Any], out: Path) -> None:
     """Delete the files of an earlier run, since new ones may have no labels in their place."""
-    from r3dpa.weather.files import refuse_outside
+    from lidarsim.clouds import refuse_outside
 
     for name in line.get("results", ()):
         refuse_outside(out / name, out)

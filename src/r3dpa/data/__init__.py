@@ -6,17 +6,8 @@ The data modules need Lightning, which takes seconds to import: they are loaded 
 from importlib import import_module
 from typing import Any
 
-from r3dpa.data.augmentation import Augmentation
-from r3dpa.data.datasets import LidarBatch, LidarDataset, PointSample
-from r3dpa.data.feature_grids import Extractor, FeatureGrids, pooled_grids, write_feature_grids
-from r3dpa.data.images import DeadLeaves, ImageFolder
-from r3dpa.data.samples import read_samples
-from r3dpa.data.scans import (
-    Scan,
+from lidarsim.scan_files import (
     ScanError,
-    check,
-    find_scans,
-    kitti360_scans,
     read_beside,
     read_npz,
     read_ply,
@@ -25,6 +16,12 @@ from r3dpa.data.scans import (
     write_npz,
     write_ply,
 )
+from r3dpa.data.augmentation import Augmentation
+from r3dpa.data.datasets import LidarBatch, LidarDataset, PointSample
+from r3dpa.data.feature_grids import Extractor, FeatureGrids, pooled_grids, write_feature_grids
+from r3dpa.data.images import DeadLeaves, ImageFolder
+from r3dpa.data.samples import read_samples
+from r3dpa.data.scans import Scan, check, find_scans, kitti360_scans
 from r3dpa.data.store import StoreError
 
 _ON_FIRST_USE = {

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lidarsim.weather import WeatherPrior
 from r3dpa.data.datasets import LidarDataset
-from r3dpa.weather import WeatherPrior
 
 # Separate these draws from those of the order, which have the same seed.
 _STREAM, _WEATHER_STREAM = 1, 2

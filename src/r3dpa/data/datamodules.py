@@ -13,11 +13,15 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from lidarsim import simulate
+from lidarsim.scan_files import read_scan
+from lidarsim.scene import Weather
+from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import CachedImages, DrawnPoints, LidarDataset
 from r3dpa.data.feature_grids import Extractor, FeatureGrids, any_settings, write_feature_grids
 from r3dpa.data.loaders import LoaderModule, at_least
-from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans, read_scan
+from r3dpa.data.scans import Scan, evenly, find_scans, kitti360_scans
 from r3dpa.data.store import CachedTensors
 from r3dpa.geometry import (
     LidarSensor,
@@ -27,8 +31,6 @@ from r3dpa.geometry import (
     ScanGeometry,
     SphericalProjection,
 )
-from r3dpa.simulation import Weather, simulate
-from r3dpa.weather import WeatherPrior
 
 _SENSOR = LidarSensor()
 _CODEC = RangeCodec()
@@ -331,7 +333,7 @@ class PointDataModule(LoaderModule):
     Args:
         source: Scans and their split, simulated where it does that. Give it ``extractor: null``.
         prepare: Function of the points ``(P, 4)`` and a generator, such as
-            ``r3dpa.nn.backbones.Masking``.
+            ``r3dpa.features.Masking``.
         batch_size: Scans per batch and process.
         num_workers: Loader processes per training process.
         seed: Seed of order and draws.

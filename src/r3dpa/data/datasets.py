@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lidarsim.scan_files import ScanError, out_of_range, read_scan
+from lidarsim.weather import WeatherPrior
 from r3dpa.data.labels import read_labels
-from r3dpa.data.scans import Scan, ScanError, out_of_range, read_scan
+from r3dpa.data.scans import Scan
 from r3dpa.data.store import CachedTensors, ItemKey
 from r3dpa.geometry import (
     LidarSensor,
@@ -24,7 +26,6 @@ from r3dpa.geometry import (
     project_pixels,
     range_image,
 )
-from r3dpa.weather import WeatherPrior
 
 #: Function of the points ``(P, 4)`` of a scan.
 Change = Callable[[np.ndarray], np.ndarray]

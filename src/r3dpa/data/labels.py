@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from r3dpa.data.scans import ScanError, read_beside, read_bytes
+from lidarsim.scan_files import ScanError, read_beside, read_bytes
 from r3dpa.io import atomic_path
 
 _NAMES = {

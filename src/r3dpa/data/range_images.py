@@ -17,6 +17,7 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
+from lidarsim import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 from r3dpa.data.datamodules import SimulatedDataModule
 from r3dpa.data.datasets import PointSample
 from r3dpa.data.feature_grids import GridSettings, pooled_grids
@@ -33,7 +34,6 @@ from r3dpa.geometry import (
     projection_to_dict,
 )
 from r3dpa.io import only_writer
-from r3dpa.simulation import SIMULATOR_VERSION, TRAIN_DRIVES, VAL_DRIVES, Simulator, split_scans
 
 
 @dataclass(frozen=True, order=True)

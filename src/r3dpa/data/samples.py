@@ -35,15 +35,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r3dpa.data.scans import (
+from lidarsim.scan_files import (
     ScanError,
     files_below,
-    find_scans,
     npz_arrays,
     out_of_range,
     read_ply,
     read_scan,
 )
+from r3dpa.data.scans import find_scans
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 

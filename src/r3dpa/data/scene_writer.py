@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsim.scan_files import write_bin, write_npz, write_ply
 from r3dpa.data.labels import write_labels
-from r3dpa.data.scans import write_bin, write_npz, write_ply
 from r3dpa.data.store import append
 from r3dpa.geometry import points_of, values_at_returns
 from r3dpa.geometry.projection import Projection

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarsim.scan_files import DataError
 from r3dpa.io import no_follow, refuse_name, write_text
 
 ItemKey = tuple[str, int, int]
@@ -39,16 +40,6 @@ _DTYPES: dict[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "uint8": np.dtype("u1"),
 }
-
-
-class DataError(ValueError):
-    """A file that cannot be used; a one-line message, also from a loader process."""
-
-    def __init__(self, message: object) -> None:
-        text = str(message)
-        if "Original Traceback" in text:  # which torch adds to errors of loader processes
-            text = text.strip().rpartition("\n")[2].partition("Error: ")[2]
-        super().__init__(text)
 
 
 class StoreError(DataError):

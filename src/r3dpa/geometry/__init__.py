@@ -1,5 +1,13 @@
 """Sensor, projections and range images: the one place that maps points to pixels."""
 
+from lidarsim.sensors.view import LidarSensor
+from r3dpa.geometry.codec import (
+    Pixels,
+    RangeCodec,
+    ScanGeometry,
+    project_pixels,
+    projection_to_dict,
+)
 from r3dpa.geometry.projection import (
     Projection,
     RingProjection,
@@ -11,13 +19,6 @@ from r3dpa.geometry.projection import (
     unproject,
     values_at_returns,
 )
-from r3dpa.geometry.scan_geometry import (
-    Pixels,
-    RangeCodec,
-    ScanGeometry,
-    project_pixels,
-    projection_to_dict,
-)
 from r3dpa.geometry.semantics import (
     NUM_CLASSES,
     SEMANTIC_CLASSES,
@@ -25,7 +26,7 @@ from r3dpa.geometry.semantics import (
     classes_of,
     labels_of,
 )
-from r3dpa.geometry.sensor import EMPTY_RANGE_M, LidarSensor
+from r3dpa.geometry.sensor import EMPTY_RANGE_M
 
 __all__ = [
     "EMPTY_RANGE_M",

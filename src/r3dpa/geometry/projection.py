@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from lidarsim.sensors.view import LidarSensor
 from r3dpa.geometry.rings import RingProjection
 from r3dpa.geometry.sensor import (
     EMPTY_RANGE_M,
-    LidarSensor,
     angles_of,
     check_points,
     column_azimuths,

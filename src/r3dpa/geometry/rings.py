@@ -13,8 +13,10 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from lidarsim import ring_order
+from lidarsim.ring_order import not_in_ring_order
+from lidarsim.sensors.view import LidarSensor
 from r3dpa.geometry.sensor import (
-    LidarSensor,
     angles_of,
     check_points,
     column_azimuths,
@@ -22,9 +24,7 @@ from r3dpa.geometry.sensor import (
     range_of,
 )
 
-_BACKWARD_RAD = 1.0  # a smaller step back is jitter, a larger one starts the next ring
 _OUT_OF_PLACE_SHARE = 1 / 8  # of the field of view; 1/2 where the lowest ring comes first
-_STRAY_SHARE = 0.01  # a ring with fewer returns than this share of the median ring is no ring
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class RingProjection:
             )
         medians = torch.stack([torch.cat(values).median() for values in measured])
         if (medians.diff() >= 0).any():
-            raise _not_in_ring_order("the inclination does not fall from ring to ring", sensor)
+            raise not_in_ring_order("the inclination does not fall from ring to ring", sensor)
         return cls(sensor, tuple(medians.rad2deg().tolist()))
 
     def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,7 +144,7 @@ class RingProjection:
         out_of_place = (measured - known[beam]).abs().median()
         if out_of_place > _OUT_OF_PLACE_SHARE * self.sensor.field_of_view_rad:
             found = f"rings lie {out_of_place.rad2deg():.1f} degrees from the beam of their place"
-            raise _not_in_ring_order(found, self.sensor)
+            raise not_in_ring_order(found, self.sensor)
         return beam.to(ring.device)[ring]
 
     def _inclinations(self) -> Tensor:
@@ -152,33 +152,10 @@ class RingProjection:
 
 
 def rings_in_order(inclination: Tensor, azimuth: Tensor, sensor: LidarSensor) -> tuple[Tensor, int]:
-    """Ring ``(P,)`` of each return from the wraps of the azimuth, and the number of rings.
-
-    ``inclination`` and ``azimuth`` are ``(P,)`` radians in the order of the file.
-    """
-    if len(azimuth) == 0:
-        return torch.zeros_like(azimuth, dtype=torch.int64), 0
-    step = (azimuth % (2 * math.pi)).diff(prepend=azimuth[:1] % (2 * math.pi))
-    # Jitter may step back over the seam, which looks like a step ahead of almost a turn.
-    turn = (step < -_BACKWARD_RAD).long() - (step > 2 * math.pi - _BACKWARD_RAD).long()
-    if turn.sum() < 0:
-        raise _not_in_ring_order("the azimuth falls", sensor)
-    if (num_wraps := int((turn > 0).sum())) > 2 * sensor.beams:
-        raise _not_in_ring_order(f"the azimuth wraps {num_wraps} times", sensor)
-    ring = turn.cumsum(0)
-    ring = ring - ring.min()
-    counts = torch.bincount(ring)
-    stray = counts < _STRAY_SHARE * counts.median()
-    ring = ((~stray).cumsum(0) - 1).clamp(min=0)[ring]  # strays join the ring before them
-    num_rings = int(ring.max()) + 1
-
-    mean = mean_per_ring(inclination, ring, num_rings)
-    spread = mean_per_ring((inclination - mean[ring]).square(), ring, num_rings).sqrt().median()
-    # Inclinations spread evenly over the field of view have a deviation of 0.29 times it.
-    if spread > sensor.field_of_view_rad / 6:
-        found = f"inclinations within one turn have a deviation of {spread.rad2deg():.1f} degrees"
-        raise _not_in_ring_order(found, sensor)
-    return ring, num_rings
+    """Ring ``(P,)`` of each return and the number of rings, see :mod:`lidarsim.ring_order`."""
+    angles = inclination.cpu().numpy(), azimuth.cpu().numpy()
+    ring, num_rings = ring_order.rings_in_order(*angles, sensor)
+    return torch.from_numpy(ring).to(inclination.device), num_rings
 
 
 def unfolded_rows(points: Tensor, beams: int) -> Tensor:
@@ -225,11 +202,3 @@ def _is_return(points: Tensor, sensor: LidarSensor) -> Tensor:
     check_points(points)
     distance = range_of(points)
     return distance.isfinite() & (distance > sensor.range_min_m)
-
-
-def _not_in_ring_order(found: str, sensor: LidarSensor) -> ValueError:
-    return ValueError(
-        f"the scan is not stored ring after ring (highest first, each by growing azimuth from 0): "
-        f"{found}, for a sensor of {sensor.beams} beams; keep the order of the original file, or "
-        "use SphericalProjection, which needs no order"
-    )

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
+from lidarsim.divergences import wasserstein_1
 from r3dpa.geometry import points_of
-from r3dpa.metrics.functional import wasserstein_1
 from r3dpa.metrics.functional_bev import (
     BEVGrid,
     Matching,

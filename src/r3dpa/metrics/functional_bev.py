@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from r3dpa.metrics.functional import jensen_shannon
+from lidarsim.divergences import jensen_shannon
 
 Cells = NDArray[np.int64]
 

@@ -29,18 +29,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r3dpa.features import GeometricFeatures, WaffleIronS
+from r3dpa.features.geometric import CENTRES
+from r3dpa.features.scalr import sha256
 from r3dpa.geometry import unproject
 from r3dpa.io import usable_device
+from r3dpa.metrics.networks.liploc import GREY_LEVELS_PER_M, LIPLoc
+from r3dpa.metrics.networks.minkowski import SPVCNN, MinkowskiNet
+from r3dpa.metrics.networks.pointnet import POINTS_SCALE_M, PointNet
+from r3dpa.metrics.networks.rangenet import NUM_BANDS, NUM_PICKED, RangeNet, banded, picked
+from r3dpa.metrics.networks.rangevit import RangeViT, range_channels
+from r3dpa.metrics.networks.sparse import NUM_BINS, pool_voxels, voxelize
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
-from r3dpa.nn.backbones import GeometricFeatures, WaffleIronS
-from r3dpa.nn.backbones.geometric import CENTRES
-from r3dpa.nn.backbones.liploc import GREY_LEVELS_PER_M, LIPLoc
-from r3dpa.nn.backbones.minkowski import SPVCNN, MinkowskiNet
-from r3dpa.nn.backbones.point_features import sha256
-from r3dpa.nn.backbones.pointnet import POINTS_SCALE_M, PointNet
-from r3dpa.nn.backbones.rangenet import NUM_BANDS, NUM_PICKED, RangeNet, banded, picked
-from r3dpa.nn.backbones.rangevit import RangeViT, range_channels
-from r3dpa.nn.backbones.sparse import NUM_BINS, pool_voxels, voxelize
 
 #: Names that :func:`scene_features` knows.
 SPACES = (

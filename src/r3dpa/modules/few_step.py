@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from r3dpa import losses
 from r3dpa.checkpoints import Checkpoint, weights_sha256
 from r3dpa.data.datasets import LidarBatch
+from r3dpa.data.posterior_cache import filled
 from r3dpa.data.store import CachedTensors, ItemKey, tensor_cache
 from r3dpa.flow import ab3, average_times, average_velocity_steps, ode_times
 from r3dpa.flow.average_velocity import AVERAGE_STEPS, TIME_SHIFT
 from r3dpa.flow.times import per_sample
 from r3dpa.modules import steps
-from r3dpa.modules.encoding import filled
 from r3dpa.modules.flow_matching import FlowMatching
 from r3dpa.modules.settings import TimeSampling
 from r3dpa.modules.steps import PathDraws, batch_number

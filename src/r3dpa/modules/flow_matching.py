@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from r3dpa.data.datamodules import LidarDataModule
 from r3dpa.data.datasets import LidarBatch
+from r3dpa.data.posterior_cache import encoded_once
 from r3dpa.modules.base import GenerativeModule
-from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights
 from r3dpa.modules.steps import PathDraws
 from r3dpa.nn import VAE, Posterior, VelocityNetwork

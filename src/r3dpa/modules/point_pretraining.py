@@ -13,11 +13,11 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from r3dpa.data.scans import evenly
+from r3dpa.features import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
+from r3dpa.features.scalr import save_weights
+from r3dpa.features.voxels import NUM_TARGETS, MaskedScan, Masking
 from r3dpa.modules import steps
 from r3dpa.modules.settings import OptimizerConfig
-from r3dpa.nn.backbones import PointCloudBatch, ScanGrid, WaffleIron, collate_scans
-from r3dpa.nn.backbones.point_features import save_weights
-from r3dpa.nn.backbones.voxels import NUM_TARGETS, MaskedScan, Masking
 
 _SCANS_TO_QUANTISE = 16
 _NUM_BINS = 8  # quantiles of each descriptor
@@ -28,7 +28,7 @@ class PointPretraining(LightningModule):
 
     Blocks of rays are hidden; the hidden points are known by their cells alone. From the token of
     every point, hidden or not, a linear layer predicts in which of 8 quantiles each
-    descriptor of the point lies, see :meth:`r3dpa.nn.backbones.Masking.describe`; the loss is the
+    descriptor of the point lies, see :meth:`r3dpa.features.Masking.describe`; the loss is the
     mean cross-entropy.
 
     Source: masked prediction of quantised hand-made features, as in HuBERT (Hsu et al., 2021) and
@@ -68,7 +68,7 @@ class PointPretraining(LightningModule):
         if not isinstance(masking, Masking):
             raise ValueError(
                 "PointPretraining needs r3dpa.data.PointDataModule with prepare "
-                f"r3dpa.nn.backbones.Masking, got {masking!r}."
+                f"r3dpa.features.Masking, got {masking!r}."
             )
         if masking.grid.cells != self.network.cells:
             raise ValueError(

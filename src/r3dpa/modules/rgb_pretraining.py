@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from r3dpa.checkpoints import load_into, read_checkpoint
 from r3dpa.data.image_datamodule import ImageBatch, ImageDataset, latent_statistics
 from r3dpa.data.images import ImageEntry
+from r3dpa.data.posterior_cache import encoded_once
 from r3dpa.data.store import CachedTensors
+from r3dpa.features import DINOv2
 from r3dpa.modules import steps
 from r3dpa.modules.checks import check_latents, check_trainer
-from r3dpa.modules.encoding import encoded_once
 from r3dpa.modules.settings import LossWeights, OptimizerConfig, TimeSampling
 from r3dpa.modules.stage import ImageStage
 from r3dpa.nn import EMA, ImageVAE, LatentNorm, Posterior, SiT
-from r3dpa.nn.backbones import DINOv2
 
 
 class RGBPretraining(ImageStage):

@@ -6,17 +6,15 @@ M width of a modulation row.
 
 from __future__ import annotations
 
-import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r3dpa.nn.latent_norm import LatentNorm
 from r3dpa.nn.layers import at_least_float32, no_autocast
 
 TIME_WIDTH = 256
@@ -166,60 +164,6 @@ class VelocityNetwork(nn.Module, ABC):
                 f"{type(self).__name__} takes latents {expected} for {len(time)} times, got "
                 f"{tuple(latents.shape)} and times {tuple(time.shape)}"
             )
-
-
-class EMA(nn.Module):
-    """Averaged float32 copies of a velocity network and of its latent statistics.
-
-    Parameters follow ``average = decay * average + (1 - decay) * weight`` after every optimiser
-    step. Buffers (the latent statistics, which are an average already) are copied by default: at
-    decay 0.9999 an averaged statistic lags about 1e4 steps behind the VAE. The official code
-    averages floating-point buffers too, as does ``buffers="decay"``.
-
-    Args:
-        sit: Network to average; copied, never changed.
-        latent_norm: Its statistics.
-        decay: Weight of the old average, in [0, 1).
-        buffers: ``copy`` or ``decay``.
-    """
-
-    def __init__(
-        self,
-        sit: VelocityNetwork,
-        latent_norm: LatentNorm,
-        decay: float = 0.9999,
-        buffers: Literal["copy", "decay"] = "copy",
-    ) -> None:
-        super().__init__()
-        if not 0.0 <= decay < 1.0:
-            raise ValueError(f"EMA decay must be in [0, 1), got {decay}")
-        self.decay = decay
-        self.decays_buffers = buffers == "decay"
-        self.sit = copy.deepcopy(sit).float().eval().requires_grad_(False)
-        self.latent_norm = copy.deepcopy(latent_norm).float().eval().requires_grad_(False)
-
-    @torch.no_grad()
-    def update(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Moves the averages one step towards the current weights."""
-        for average, network in ((self.sit, sit), (self.latent_norm, latent_norm)):
-            weights = [weight.float() for weight in network.parameters()]
-            if weights:
-                torch._foreach_lerp_([*average.parameters()], weights, 1.0 - self.decay)
-            for target, source in zip(average.buffers(), network.buffers(), strict=True):
-                if self.decays_buffers and source.is_floating_point():
-                    target.lerp_(source.float(), 1.0 - self.decay)
-                else:
-                    target.copy_(source)
-
-    @torch.no_grad()
-    def reset(self, sit: VelocityNetwork, latent_norm: LatentNorm) -> None:
-        """Sets the averages to the current weights, as at the start of a training stage."""
-        self.sit.load_state_dict(sit.state_dict())
-        self.latent_norm.load_state_dict(latent_norm.state_dict())
-
-    def train(self, mode: bool = True) -> EMA:
-        """Stays in evaluation mode."""
-        return super().train(False)
 
 
 def time_frequencies(time: Tensor, width: int = TIME_WIDTH) -> Tensor:

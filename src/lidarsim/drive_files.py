@@ -1,0 +1,181 @@
+"""The files of one simulated drive, in the layout of KITTI-360.
+
+::
+
+    data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/
+        timestamps.txt                  one line a scan, 10 Hz
+        data/%010d.bin                  (P, 4) float32 x, y, z, intensity
+        labels/%010d.label              (P,) uint32 semantic | instance << 16
+        origins/%010d.origin            (P,) uint8 origin of each point, see ``Origin``
+        sim/%010d.json                  summary of the scene and of each effect
+    data_poses/2013_05_28_drive_XXXX_sync/
+        velodyne_to_world.txt           one line a scan: number, then (3, 4) row by row
+
+KITTI-360's own ``poses.txt``, of the same format, holds poses of its inertial unit, which is not
+simulated; hence the other name. Every file depends on the request only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarsim.io import atomic_path, delete_unfinished
+from lidarsim.scan import SimulatedScan
+from lidarsim.scene import Pose, Weather
+
+# In the order of writing: a scan whose points exist is complete.
+_SUFFIXES = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
+_FIRST_SCAN = datetime(2013, 5, 28, 8, 46, 2)
+_SCAN_PERIOD = timedelta(seconds=0.1)
+
+
+@dataclass(frozen=True)
+class DriveFiles:
+    """The files of one drive (a four-digit number) below the root folder of a data set."""
+
+    root: Path
+    drive: str
+
+    @property
+    def points_folder(self) -> Path:
+        """Folder of the scans."""
+        return self.root / "data_3d_raw" / drive_name(self.drive) / "velodyne_points"
+
+    def missing(self, count: int) -> list[int]:
+        """Numbers below ``count`` of the scans that lack a file, or whose points lack a label."""
+        sizes = {
+            kind: {p.stem: p.stat().st_size for p in (self.points_folder / kind).glob("[!.]*")}
+            for kind in _SUFFIXES
+        }
+        complete = {
+            stem
+            for stem, size in sizes["data"].items()
+            if size > 0
+            and sizes["labels"].get(stem) == size // 4
+            and sizes["origins"].get(stem) == size // 16
+            and sizes["sim"].get(stem)
+        }
+        return [number for number in range(count) if _stem(number) not in complete]
+
+    def write_scan(self, number: int, scan: SimulatedScan) -> None:
+        """Write the files of a scan, the points last."""
+        scene = scan.scene
+        summary = {
+            "drive": self.drive,
+            "scan": number,
+            "pose": asdict(scene.pose),
+            "motion": asdict(scene.motion),
+            "weather": weather_to_dict(scene.weather),
+            "primitives": len(scene.primitives),
+            "moving_primitives": sum(any(p.velocity_m_s) for p in scene.primitives),
+            "puddles": len(scene.puddles),
+            "points": len(scan.points),
+            "effects": {
+                effect.name: {"status": effect.status, "reason": effect.reason, "rays": effect.rays}
+                for effect in scan.effects
+            },
+        }
+        contents = {
+            "labels": scan.labels.astype("<u4").tobytes(),
+            "origins": scan.origins.tobytes(),
+            "sim": to_json(summary),
+            "data": scan.points.astype("<f4").tobytes(),
+        }
+        for kind in _SUFFIXES:
+            write(self._path(kind, number), contents[kind])
+
+    def summaries(self, count: int) -> list[dict[str, Any]]:
+        """Contents of ``sim/*.json`` of the first ``count`` scans; errors name a damaged file."""
+        return [self._summary(self._path("sim", number)) for number in range(count)]
+
+    def write_times_and_poses(self, summaries: Sequence[dict[str, Any]]) -> None:
+        """Write ``timestamps.txt`` and ``velodyne_to_world.txt`` of all scans, in order."""
+        stamps = (_FIRST_SCAN + summary["scan"] * _SCAN_PERIOD for summary in summaries)
+        # KITTI-360 stores nanoseconds.
+        times = "".join(f"{stamp:%Y-%m-%d %H:%M:%S.%f}000\n" for stamp in stamps)
+        write(self.points_folder / "timestamps.txt", times.encode())
+        lines = []
+        for summary in summaries:
+            matrix = velodyne_to_world(Pose(**summary["pose"]))
+            numbers = " ".join(f"{value:.12g}" for value in matrix.flat)
+            lines.append(f"{summary['scan']} {numbers}\n")
+        poses = self.root / "data_poses" / drive_name(self.drive) / "velodyne_to_world.txt"
+        write(poses, "".join(lines).encode())
+
+    def delete_unfinished(self) -> None:
+        """Delete the temporary files of killed writers."""
+        for top in ("data_3d_raw", "data_poses"):
+            delete_unfinished(self.root / top / drive_name(self.drive))
+
+    def _path(self, kind: str, number: int) -> Path:
+        return self.points_folder / kind / f"{_stem(number)}{_SUFFIXES[kind]}"
+
+    def _summary(self, path: Path) -> dict[str, Any]:
+        try:
+            summary = json.loads(path.read_text())
+            Pose(**summary["pose"])
+            summary["points"] + sum(effect["rays"] for effect in summary["effects"].values())
+            for effect in summary["effects"].values():
+                effect["status"], effect["reason"]
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(
+                f"{path} is damaged ({error!r}): delete it and simulate again, which completes "
+                f"the data set"
+            ) from error
+        return summary
+
+
+def drive_name(number: str) -> str:
+    """Folder of a drive in the KITTI-360 layout, of its four-digit number."""
+    return f"2013_05_28_drive_{number}_sync"
+
+
+def velodyne_to_world(pose: Pose) -> NDArray[np.float64]:
+    """Matrix ``(3, 4)`` from the sensor frame (middle of the sweep) to the world frame, metres.
+
+    World x east, y north, z up::
+
+        [Rz(heading) Ry(pitch) Rx(roll) | (x, y, z)]
+    """
+    (cos_h, sin_h), (cos_p, sin_p), (cos_r, sin_r) = (
+        (math.cos(angle), math.sin(angle))
+        for angle in (pose.heading_rad, pose.pitch_rad, pose.roll_rad)
+    )
+    heading = np.array([[cos_h, -sin_h, 0], [sin_h, cos_h, 0], [0, 0, 1]])
+    pitch = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
+    roll = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
+    return np.column_stack([heading @ pitch @ roll, (pose.x_m, pose.y_m, pose.z_m)])
+
+
+def weather_to_dict(weather: Weather) -> dict[str, Any]:
+    """The weather as JSON holds it: a visibility of None, not infinity, without fog."""
+    values = asdict(weather)
+    if math.isinf(weather.visibility_m):
+        values["visibility_m"] = None
+    return values
+
+
+def to_json(values: Any) -> bytes:
+    """Plain values and NumPy scalars as the bytes of a JSON file."""
+    return f"{json.dumps(values, indent=1, allow_nan=False, default=np.generic.item)}\n".encode()
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file atomically, unless it already holds these bytes."""
+    if path.is_file() and path.read_bytes() == content:
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _stem(number: int) -> str:
+    return f"{number:010d}"

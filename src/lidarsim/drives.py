@@ -1,0 +1,305 @@
+"""Simulated data sets: split into scans, worker processes, and the manifest.
+
+::
+
+    simulation.json                     the request
+    data_3d_raw/, data_poses/           the scans and their poses, see ``drive_files``
+    report.json                         what each effect did
+
+Equal requests give the same bytes, for any number of workers and after any number of
+interruptions.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
+from lidarsim.io import in_processes, only_writer, text_table
+from lidarsim.scan import Simulator, check_switches
+from lidarsim.scene import Weather
+from lidarsim.sensors.spinning import SpinningLidar, load_sensor
+
+TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
+VAL_DRIVES = ("0000", "0002")
+VAL_SHARE = 0.2
+
+_MANIFEST = "simulation.json"
+# Raised whenever the same request gives other scans than before.
+SIMULATOR_VERSION = 3
+# Neighbouring scans share their blocks of street, so a worker takes a few in a row.
+_SCANS_PER_TASK = 8
+_Task = tuple[DriveFiles, Simulator, list[int]]  # numbers of the scans of one drive
+
+
+class EffectTotal(NamedTuple):
+    """An effect in all scans of a data set: counts by status, reason, and rays."""
+
+    ran: int
+    not_called: int
+    off: int
+    why: str  # reason in the first scan in which it ran, or in the first scan of all
+    rays_per_scan: float  # selected rays, mean over all scans
+
+
+@dataclass(frozen=True)
+class SimulationReport:
+    """Contents of a data set, and the scans added by a call of ``simulate``."""
+
+    scans_per_drive: dict[str, int]  # by four-digit number
+    num_empty: int  # without a single point
+    effects: dict[str, EffectTotal]  # in the order in which they are applied
+    num_written: int  # by this call; the others existed before
+
+    def to_dict(self) -> dict[str, Any]:
+        """Content that depends on the request alone, as plain values."""
+        effects = {name: total._asdict() for name, total in self.effects.items()}
+        about = {"scans_per_drive": self.scans_per_drive, "num_empty": self.num_empty}
+        return about | {"effects": effects}
+
+    def __str__(self) -> str:
+        heads = ["effect", "ran", "not called", "off", "rays/scan"]
+        rows = []
+        for name, total in self.effects.items():
+            counts = [str(count) for count in (total.ran, total.not_called, total.off)]
+            rows.append([name, *counts, f"{total.rays_per_scan:.0f}", total.why])
+        table = text_table(rows, [*heads, "why, in the first scan"], "lrrrrl", "plain")
+        per_drive = ", ".join(f"{drive} {num}" for drive, num in self.scans_per_drive.items())
+        num_scans = sum(self.scans_per_drive.values())
+        lines = [f"{num_scans} scans ({per_drive}), {self.num_written} of them simulated now"]
+        if self.num_empty:
+            lines.append(
+                f"{self.num_empty} of them hold no points: in this weather the sensor sees nothing"
+            )
+        return "\n".join([table, "", *lines])
+
+
+def simulate(
+    out: Path,
+    scans: int = 100,
+    seed: int = 0,
+    workers: int = 1,
+    drives: Sequence[str] | None = None,
+    sensor: str | SpinningLidar = "hdl64e",
+    return_mode: Literal["strongest", "dual"] | None = None,
+    effects: Mapping[str, str | bool] | None = None,
+    weather: Weather | None = None,
+) -> SimulationReport:
+    """Write a simulated data set in the layout of KITTI-360, complete one, or add scans to one.
+
+    Each scan depends only on the request and its number: the files are the same bytes for any
+    number of workers. Files are written atomically, so an interrupted call is completed by the
+    same call, which also deletes the temporary files of killed runs. A call for more scans adds
+    them and keeps the existing ones. A second call for the same folder waits for the first.
+
+    Args:
+        out: Root folder of the data set; made if missing.
+        scans: Scans of all drives together, 1 or more.
+        seed: Seed of streets and instrument, 0 or greater.
+        workers: Processes; more than one needs an importable main module, as ``spawn`` does.
+        drives: Four-digit drives, such as ``0000 0003``; default: all of training and validation.
+            With drives of both splits, a fifth of the scans (at least one, if there are two or
+            more) is for validation.
+        sensor: ``hdl64e``, ``hdl32e``, ``vls128``, or a calibration YAML as ``velodyne_pointcloud``
+            reads, for an HDL-64E; in Python any instrument.
+        return_mode: Strongest return of each shot, or the two strongest; default: as the sensor.
+        effects: ``off`` or ``auto`` by effect, such as ``--effects.fog off``; default: ``auto``.
+        weather: Of all scans, such as ``--weather.rain_mm_h 10``; default: drawn for each stretch
+            of street.
+
+    Returns:
+        Contents of the data set by effect, also written to ``report.json``.
+
+    Raises:
+        ValueError: If a value is out of range, an effect or a drive is unknown, a drive is named
+            twice, or ``out`` holds other data, more scans, or the data set of another request.
+        ChildProcessError: If a worker was killed.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be 1 or greater, got {workers}")
+    if isinstance(sensor, str):
+        sensor = load_sensor(sensor)
+    if return_mode is not None:
+        sensor = replace(sensor, return_mode=return_mode)
+    names = (*TRAIN_DRIVES, *VAL_DRIVES) if drives is None else tuple(drives)
+    counts = split_scans(scans, names)
+    simulators = {drive: Simulator(seed, int(drive), weather, sensor, effects) for drive in counts}
+    request = {
+        "simulator_version": SIMULATOR_VERSION,
+        "seed": seed,
+        "scans": scans,
+        "drives": list(names),
+        "sensor": json.loads(json.dumps(asdict(sensor))),  # lists instead of tuples
+        "effects": check_switches(effects or {}),
+        "weather": None if weather is None else weather_to_dict(weather),
+    }
+    _check_folder(out, request)
+    files = {DriveFiles(out, drive): count for drive, count in counts.items()}
+    read_only = out.is_dir() and not os.access(out, os.W_OK)
+    if read_only and not any(drive.missing(count) for drive, count in files.items()):
+        return make_report([one for drive in files for one in drive.summaries(files[drive])], 0)
+    out.mkdir(parents=True, exist_ok=True)
+    from tqdm import tqdm  # simulated scans that are not written do not need it
+
+    with only_writer(out / ".lock", f"simulates into {out}", wait=True):
+        _check_folder(out, request)  # again: another process may have written meanwhile
+        write(out / _MANIFEST, to_json(request))
+        tasks = []
+        for drive, count in files.items():
+            missing, simulator = drive.missing(count), simulators[drive.drive]
+            for start in range(0, len(missing), _SCANS_PER_TASK):
+                tasks.append((drive, simulator, missing[start : start + _SCANS_PER_TASK]))
+        num_missing = sum(len(numbers) for *_, numbers in tasks)
+        complete = scans - num_missing
+        # disable=None: no bar without a terminal.
+        with tqdm(total=scans, initial=complete, unit="scan", desc="simulate", disable=None) as bar:
+            for num_written in in_processes(_run, tasks, workers):
+                bar.update(num_written)
+        return _finish(out, files, num_missing)
+
+
+def split_scans(scans: int, drives: Sequence[str]) -> dict[str, int]:
+    """Scans of each drive: a fifth of them for validation, evenly within each split.
+
+    More scans never give a drive fewer of them, so that a data set can grow.
+
+    Raises:
+        ValueError: If there is no scan, no drive, an unknown drive, or one is named twice.
+    """
+    if scans < 1:
+        raise ValueError(f"scans must be 1 or greater, got {scans}")
+    unknown = sorted(set(drives) - {*TRAIN_DRIVES, *VAL_DRIVES})
+    if unknown or not drives or len(set(drives)) < len(drives):
+        raise ValueError(
+            f"drives must be different ones of {', '.join((*TRAIN_DRIVES, *VAL_DRIVES))}, "
+            f"got {', '.join(drives) or 'none'}"
+        )
+    train = [drive for drive in TRAIN_DRIVES if drive in drives]
+    val = [drive for drive in VAL_DRIVES if drive in drives]
+    num_val = max(1, round(VAL_SHARE * scans)) if scans > 1 else 0
+    num_val = num_val if train and val else scans * (not train)
+    return _share(scans - num_val, train) | _share(num_val, val)
+
+
+def expected_scans(root: Path) -> dict[str, int] | None:
+    """Scans by drive folder of a complete simulated data set; None if ``root`` holds none."""
+    manifest = root / _MANIFEST
+    if not manifest.is_file():
+        return None
+    request = _read_json(manifest)
+    try:
+        counts = split_scans(request["scans"], request["drives"])
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{manifest} does not say which scans were simulated ({error!r}); simulate the data "
+            f"set again into an empty folder"
+        ) from error
+    return {drive_name(drive): count for drive, count in sorted(counts.items())}
+
+
+def _share(scans: int, drives: list[str]) -> dict[str, int]:
+    counts = (len(range(place, scans, len(drives))) for place in range(len(drives)))
+    return {drive: count for drive, count in zip(drives, counts, strict=True) if count}
+
+
+def _check_folder(out: Path, request: dict[str, Any]) -> None:
+    """Refuse a folder that holds anything but this data set."""
+    manifest = out / _MANIFEST
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; give the folder of the data set")
+    if not manifest.exists():
+        if (out / "data_3d_raw").exists():
+            raise ValueError(
+                f"{out} holds a data set that was not simulated ({_MANIFEST} is missing); "
+                f"give another folder"
+            )
+        return
+    stored = _read_json(manifest)
+    if isinstance(stored.get("scans"), int) and stored["scans"] < request["scans"]:
+        stored["scans"] = request["scans"]  # scans are added
+    if different := list(differences(stored, request)):
+        raise ValueError(
+            f"{out} holds a data set of another request ({'; '.join(different)}); give another "
+            f"folder, or delete it"
+        )
+
+
+def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
+    """Each value of a stored request that differs from the wanted one, as text."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        for key in stored | wanted:
+            place = f"{name}.{key}" if name else key
+            yield from differences(stored.get(key), wanted.get(key), place)
+    elif stored != wanted:
+        yield f"{name} {_short(stored)} there, {_short(wanted)} now"
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list) and len(value) > 9 else repr(value)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text())
+        if not isinstance(values, dict):
+            raise ValueError(f"it holds {type(values).__name__}, not an object")
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{path} is damaged ({error}); simulate the data set again into an empty folder"
+        ) from error
+    return values
+
+
+def _run(task: _Task) -> int:
+    files, simulator, numbers = task
+    for number in numbers:
+        files.write_scan(number, simulator.scan(number))
+    return len(numbers)
+
+
+def _finish(out: Path, files: Mapping[DriveFiles, int], num_written: int) -> SimulationReport:
+    summaries = []
+    for drive, count in files.items():
+        of_drive = drive.summaries(count)
+        drive.write_times_and_poses(of_drive)
+        summaries += of_drive
+        # At the end: the workers of a killed run may outlive it by a moment.
+        drive.delete_unfinished()
+    for path in out.glob(".*.partial.json"):
+        path.unlink(missing_ok=True)
+    report = make_report(summaries, num_written)
+    write(out / "report.json", to_json(report.to_dict()))
+    return report
+
+
+def make_report(summaries: Sequence[Mapping[str, Any]], num_written: int) -> SimulationReport:
+    """Report from ``sim/*.json`` of all scans."""
+    effects = {
+        name: _effect_total([summary["effects"][name] for summary in summaries])
+        for name in summaries[0]["effects"]
+    }
+    return SimulationReport(
+        scans_per_drive=dict(Counter(summary["drive"] for summary in summaries)),
+        num_empty=sum(summary["points"] == 0 for summary in summaries),
+        effects=effects,
+        num_written=num_written,
+    )
+
+
+def _effect_total(records: Sequence[Mapping[str, Any]]) -> EffectTotal:
+    counts = Counter(record["status"] for record in records)
+    ran = (record["reason"] for record in records if record["status"] == "ran")
+    return EffectTotal(
+        ran=counts["ran"],
+        not_called=counts["not_called"],
+        off=counts["off"],
+        why=next(ran, records[0]["reason"]),
+        rays_per_scan=statistics.fmean(record["rays"] for record in records),
+    )

@@ -1,0 +1,332 @@
+"""Realism of scans: 36 distances to real scans, each beside the distance between real drives.
+
+The floor is the median distance between two drives of the reference, and the distance of the scans
+the median over pairs of one drive of the scans and one of the reference, as pooled sets are closer
+to each other. A ratio of 1 means that the scans are no farther from a real drive than another real
+drive is. Drives of few scans have noisier histograms and come out farther away, never nearer.
+
+Source: JSD and W1 of histograms as in LiDARGen (ECCV 2022) and LiDM (CVPR 2024), but the divergence
+itself in nats, not its root.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations, product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.divergences import curve_rmse, jensen_shannon, wasserstein_1
+from lidarsim.io import text_table
+from lidarsim.scan_statistics import (
+    BEAMS,
+    BEV_EXTENT_M,
+    BINS,
+    INTENSITY_LEVELS,
+    SENSOR,
+    ScanStatistics,
+)
+from lidarsim.scan_structure import Floats
+
+_MAX_RATIO = 3.0
+_COLUMNS = ("measure", "unit", "A", "B", "distance", "floor", "(max)", "ratio", "<= 3", "pooled")
+_MIN_COUNT = 200  # a bin of a curve with fewer returns is left out
+_LAST_RING_SHARE = 0.1  # of the azimuth
+_NEAR_RINGS_M = 25.0  # farther rings are apart by metres and follow the slope of the road
+_HIT_ROW_SHARE = 0.02
+_NORMAL_MEDIAN = 0.6745  # median of |x| of a normal variable of deviation 1
+_NEEDS = {
+    "points": ("num_scans", "no scan"),
+    "rings": ("num_ring_scans", "no scan is stored ring after ring"),
+    "beams": ("num_beam_scans", f"no scan shows {BEAMS} rings in order"),
+    "ground": ("num_ground_scans", "no scan shows a ground plane"),
+    "intensity": ("num_intensity_scans", "the intensity is zero everywhere"),
+}
+
+
+class Measure(NamedTuple):
+    """One quantity of a set of scans."""
+
+    name: str
+    unit: str  # of the distance and of the summary
+    lacks: str  # why the set cannot give the measure; empty where it can
+    distance: Callable[[Any, Any], float]  # of the values of two sets; NaN where unknown
+    values: Any  # number, curve or histogram that is compared
+    summary: float = math.nan  # one number for the set; NaN where there is none
+
+
+def measures(s: ScanStatistics) -> dict[str, Measure]:
+    """The 36 measures of a set of scans by name."""
+    missing = {need: why for need, (count, why) in _NEEDS.items() if not getattr(s, count)}
+    found = {}
+    for measure in _measures(s):  # whose ``lacks`` are still names of ``_NEEDS``
+        lacks = next((missing[need] for need in measure.lacks.split() if need in missing), "")
+        found[measure.name] = measure._replace(lacks=lacks)
+    return found
+
+
+def _measures(s: ScanStatistics) -> Iterator[Measure]:
+    row_shares = _ratio(s.row_returns, s.num_scans * SENSOR.columns)
+    mean_returns = _ratio(s.num_returns, s.num_scans)
+    hit_rows = (row_shares > _HIT_ROW_SHARE).sum()
+    yield _w1("returns per scan", "points", "points", s, "points_per_scan", mean_returns)
+    yield _w1("valid share of the image", "1", "points", s, "valid_share", row_shares.mean())
+    yield Measure("valid share by image row", "1", "points", curve_rmse, row_shares)
+    yield _number("image rows > 2 % valid", "rows", "points", hit_rows)
+
+    upper, lower = s.range_counts
+    for block, ranges in (("", upper + lower), (", upper block", upper), (", lower block", lower)):
+        yield _w1(f"range W1{block}", "m", "points", s, "range_counts", histogram=ranges)
+        yield _jsd(f"range JSD{block}", "points", ranges)
+
+    dropout = (1 - _ratio(s.beam_returns, s.shots)).clip(0)  # no return between 1 and 80 m
+    yield Measure("dropout by beam", "1", "beams", curve_rmse, dropout, dropout.mean())
+    yield _w1("dropout run length", "shots", "rings", s, "drop_runs")
+    yield _keep_rate("range, any surface", "rings", s.keep_by_range)
+    yield _keep_rate("range, ground", "rings ground", s.surface_keep_by_range[0])
+    yield _keep_rate("range, upright", "rings", s.surface_keep_by_range[1])
+    yield _keep_rate("incidence, ground", "rings ground", s.keep_by_incidence[0])
+    yield _keep_rate("incidence, upright", "rings", s.keep_by_incidence[1])
+
+    # Around the neighbours in the ring. From the median of the absolute residuals, as for a normal
+    # variable, so that the few returns of grass and foliage that pass for smooth do not count more.
+    noise_mm = _quantile(s.residual_counts, 0.5) * BINS["residual_counts"].width * 1000
+    noise_mm /= _NORMAL_MEDIAN
+    median_mm = _known(np.median, noise_mm)
+    yield Measure("range residual sd by beam", "mm", "beams", curve_rmse, noise_mm, median_mm)
+    # Median range of a beam minus that of both neighbouring beams.
+    middle = BINS["step_counts"].number / 2
+    bias_mm = (_quantile(s.step_counts, 0.5) - middle) * BINS["step_counts"].width * 1000
+    yield Measure("range bias by beam", "mm", "beams", curve_rmse, bias_mm)
+    yield _number("spread of the beams' bias", "mm", "beams", _known(np.std, bias_mm))
+
+    intensities = s.intensity_by_range.sum(axis=0)
+    saturated = intensities[-2:].sum()  # 0.99 is the largest intensity in KITTI files
+    yield _jsd("intensity JSD", "intensity", intensities)
+    yield _intensity("range", "intensity", s.intensity_by_range)
+    yield _intensity("incidence, ground", "intensity ground", s.intensity_by_incidence[0])
+    yield _intensity("incidence, upright", "intensity rings", s.intensity_by_incidence[1])
+    yield _number("saturated share", "1", "intensity", _ratio(saturated, intensities.sum()))
+
+    yield _number("share below z = -1.4 m", "1", "points", _ratio(s.low_points, s.num_returns))
+    heights = BINS["ground_residual_counts"]
+    shares = _ratio(s.ground_residual_counts, s.ground_residual_counts.sum())
+    centres_mm = (np.arange(heights.number) + 0.5) * heights.width * 1000
+    spread_mm = np.sqrt((shares * (centres_mm - (shares * centres_mm).sum()) ** 2).sum())
+    yield _w1(
+        "ground plane residual", "mm", "ground", s, "ground_residual_counts", spread_mm, scale=1000
+    )
+    # Horizontal distance at or beyond which 10 % of the azimuth still sees ground.
+    last = _quantile(s.ground_reach_counts, 1 - _LAST_RING_SHARE, 1)
+    yield _number("last ground ring", "m", "ground", last * BINS["ground_reach_counts"].width)
+    yield _w1("ground reach by sector", "m", "ground", s, "ground_reach_counts")
+    ring_m = _ratio(s.ground_distance_m, s.ground_returns, _MIN_COUNT)
+    spacing_m = np.where(ring_m[:-1] < _NEAR_RINGS_M, -np.diff(ring_m), np.nan)
+    median_m = _known(np.median, spacing_m)
+    yield Measure("ground ring spacing", "m", "beams ground", curve_rmse, spacing_m, median_m)
+
+    pairs, mixed, jumps = s.neighbours
+    cells = len(s.bev_counts) // 2
+    coarse = s.bev_counts.reshape(cells, 2, cells, 2).sum(axis=(1, 3))
+    # Of the 1-m cells within 50 m, those that hold a return.
+    in_sector = np.pi * BEV_EXTENT_M**2 / len(s.sector_cells)
+    occupied = _ratio(s.sector_cells, s.num_scans * in_sector)
+    yield _number("mixed pixels", "1", "rings", _ratio(mixed, pairs))
+    yield _number("jumps > 0.5 m to the next", "1", "rings", _ratio(jumps, pairs))
+    yield _jsd("BEV JSD, 0.5 m cells", "points", s.bev_counts)
+    yield _jsd("BEV JSD, 1 m cells", "points", coarse)
+    yield _w1("height map W1", "m", "points", s, "height_counts")
+    yield Measure("occupied cells by sector", "1", "points", curve_rmse, occupied, occupied.mean())
+
+
+def _number(name: str, unit: str, needs: str, value: Any) -> Measure:
+    return Measure(name, unit, needs, lambda a, b: abs(a - b), value, value)
+
+
+def _jsd(name: str, needs: str, histogram: Floats) -> Measure:
+    return Measure(name, "nats", needs, jensen_shannon, histogram)
+
+
+def _w1(
+    name: str,
+    unit: str,
+    needs: str,
+    s: ScanStatistics,
+    table: str,
+    summary: float | None = None,
+    *,
+    histogram: Floats | None = None,
+    scale: float = 1.0,
+) -> Measure:
+    """Earth mover's distance of a histogram; its mean unless there is another summary."""
+    bins = BINS[table]
+    values = getattr(s, table) if histogram is None else histogram
+    if summary is None:
+        centres = bins.start + (np.arange(bins.number) + 0.5) * bins.width
+        summary = _ratio(values @ centres, values.sum())
+    distance = partial(wasserstein_1, bin_width=bins.width * scale)
+    return Measure(name, unit, needs, distance, values, summary)
+
+
+def _keep_rate(by: str, needs: str, outcomes: Floats) -> Measure:
+    """Share of the shots that came back, among those between two returns of one surface."""
+    curve = _ratio(outcomes[:, 1], outcomes.sum(axis=-1), _MIN_COUNT)
+    mean = _ratio(outcomes[:, 1].sum(), outcomes.sum())
+    return Measure(f"keep rate by {by}", "1", needs, curve_rmse, curve, mean)
+
+
+def _intensity(by: str, needs: str, histograms: Floats) -> Measure:
+    """Median intensity; each step of 0.01 is an interval."""
+
+    def median(levels: Floats) -> Any:
+        return (_quantile(levels, 0.5) - 0.5) / (INTENSITY_LEVELS - 1)
+
+    curve, summary = median(histograms), median(histograms.sum(axis=0))
+    return Measure(f"median intensity by {by}", "1", needs, curve_rmse, curve, summary)
+
+
+def _ratio(numerator: Any, denominator: Any, at_least: float = 0.0) -> Any:
+    """Quotient, NaN where the denominator is 0 or below ``at_least``."""
+    known = (denominator > 0) & (denominator >= at_least)
+    return np.where(known, numerator / np.where(known, denominator, 1.0), np.nan)
+
+
+def _quantile(histograms: Floats, quantile: float, at_least: float = _MIN_COUNT) -> Floats:
+    """Quantile along the last axis in bins from 0, linear within a bin; NaN for too few counts."""
+    cdf = histograms.cumsum(axis=-1)
+    total = cdf[..., -1:]
+    wanted = quantile * total
+    index = (cdf < wanted).sum(axis=-1, keepdims=True).clip(max=histograms.shape[-1] - 1)
+    inside = np.take_along_axis(histograms, index, axis=-1)
+    below = np.take_along_axis(cdf, index, axis=-1) - inside
+    return np.where(total >= at_least, index + _ratio(wanted - below, inside), np.nan)[..., 0]
+
+
+def _known(statistic: Callable[[Floats], Any], curve: Floats) -> float:
+    finite = curve[np.isfinite(curve)]
+    return float(statistic(finite)) if len(finite) else math.nan
+
+
+class RealismRow(NamedTuple):
+    """One measure; NaN where a number is unknown."""
+
+    name: str
+    unit: str  # of all numbers but the ratio
+    value_a: float  # summary of the scans, where the measure has one
+    value_b: float  # the same of the reference
+    distance: float  # median from a drive of the scans to a drive of the reference
+    floor: float  # median between two drives of the reference
+    floor_max: float  # largest of these
+    pooled: float  # between all scans and the whole reference
+    ratio: float  # distance / floor; infinite where only the floor is 0
+    reason: str  # why there is no ratio; empty where there is one
+
+    @property
+    def within(self) -> bool | None:
+        """Whether the distance is at most 3 times the floor; None without a ratio."""
+        return None if math.isnan(self.ratio) else self.ratio <= _MAX_RATIO
+
+
+@dataclass(frozen=True)
+class RealismTable:
+    """Realism of scans (A) against a reference (B); ``str`` gives the table."""
+
+    rows: tuple[RealismRow, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def misses(self) -> tuple[RealismRow, ...]:
+        """Measures farther off than 3 times the floor, the worst first."""
+        missed = [row for row in self.rows if row.within is False]
+        return tuple(sorted(missed, key=lambda row: -row.ratio))
+
+    def __str__(self) -> str:
+        table = text_table(map(_cells, self.rows), _COLUMNS, align="ll" + "r" * 8)
+        missed = ", ".join(f"{row.name} ({row.ratio:.1f}x)" for row in self.misses)
+        num_judged = sum(row.within is not None for row in self.rows)
+        verdict = f"{num_judged - len(self.misses)} of {num_judged} measures within 3 x the floor"
+        unknown = [f"n/a: {row.name}: {row.reason}" for row in self.rows if row.reason]
+        missing = [f"beyond 3 x the floor: {missed}"] if missed else []
+        return "\n".join([table, "", verdict, *missing, *unknown, *self.notes])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Rows and notes for JSON, null where a number is unknown."""
+        rows = [row._asdict() | {"within_3x": row.within} for row in self.rows]
+        for row in rows:
+            unknown = [k for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)]
+            row |= dict.fromkeys(unknown)
+        return {"rows": rows, "notes": list(self.notes)}
+
+
+def realism_table(
+    scans: Mapping[str, ScanStatistics],
+    reference: Mapping[str, ScanStatistics],
+    notes: Iterable[str] = (),
+) -> RealismTable:
+    """Compare drives of scans with drives of a reference, at least one of each."""
+    if not scans or not reference:
+        raise ValueError("realism needs at least one drive of scans and one of the reference")
+    a = sum(scans.values(), ScanStatistics())
+    b = sum(reference.values(), ScanStatistics())
+    of_scans, of_reference = ([*map(measures, drives.values())] for drives in (scans, reference))
+    pairs, real_pairs = [*product(of_scans, of_reference)], [*combinations(of_reference, 2)]
+    whole_b = measures(b)
+    rows = []
+    for name, own in measures(a).items():
+        distances, floors = (
+            np.array([float(own.distance(x[name].values, y[name].values)) for x, y in both])
+            for both in (pairs, real_pairs)
+        )
+        distance, floor = _known(np.median, distances), _known(np.median, floors)
+        real, ratio = whole_b[name], math.nan
+        lacks = {"A": own.lacks, "B": real.lacks}
+        reason = "; ".join(f"{side}: {why}" for side, why in lacks.items() if why)
+        if math.isnan(distance):
+            reason = reason or "no bin holds enough returns in a drive of A and in one of B"
+        elif math.isnan(floor):
+            reason = reason or "no two drives of B can be compared, so there is no floor"
+        if not reason and floor:
+            ratio = distance / floor
+        elif not reason:
+            ratio = math.inf if distance else 0.0
+        values = float(own.summary), float(real.summary)
+        pooled = float(own.distance(own.values, real.values))
+        largest = _known(np.max, floors)
+        rows.append(
+            RealismRow(name, own.unit, *values, distance, floor, largest, pooled, ratio, reason)
+        )
+    described = (_counted("A", scans, a), _counted("B", reference, b))
+    return RealismTable(tuple(rows), (*described, *notes))
+
+
+def _cells(row: RealismRow) -> tuple[str, ...]:
+    given = (row.value_a, row.value_b)
+    values = ["-" if math.isnan(value) and not row.reason else _text(value) for value in given]
+    distances = [_text(value) for value in (row.distance, row.floor, row.floor_max)]
+    ratio = "n/a" if math.isnan(row.ratio) else f"{row.ratio:.1f}"
+    within = {None: "n/a", True: "yes", False: "NO"}[row.within]
+    return (row.name, row.unit, *values, *distances, ratio, within, _text(row.pooled))
+
+
+def _text(value: float) -> str:
+    if math.isnan(value):
+        return "n/a"
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics) -> str:
+    sizes = [statistics.num_scans for statistics in drives.values()]
+    total = f"{name}: {pooled.num_scans} scans of {len(drives)} drive{'s' * (len(drives) > 1)}, "
+    total += f"{min(sizes)} to {max(sizes)} each"
+    parts = {
+        "not in ring order": pooled.num_scans - pooled.num_ring_scans,
+        "with another number of rings": pooled.num_ring_scans - pooled.num_beam_scans,
+        "without a ground plane": pooled.num_scans - pooled.num_ground_scans,
+        "without intensity": pooled.num_scans - pooled.num_intensity_scans,
+    }
+    left_out = [f"{count} {what}" for what, count in parts.items() if count]
+    return f"{total}; left out where needed: {', '.join(left_out)}" if left_out else total

@@ -1,0 +1,98 @@
+"""What a range image shows of a spinning LiDAR, and ranges and angles of points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class LidarSensor:
+    """Size of the range image, vertical field of view and range limits of a spinning LiDAR.
+
+    The defaults are the ones R3DPA uses for the HDL-64E of KITTI-360.
+
+    Args:
+        beams: Rows H of the range image.
+        columns: Columns W of the range image, one turn of the sensor.
+        inclination_max_deg: Upper border of the first row, degrees above the horizon.
+        inclination_min_deg: Lower border of the last row, degrees above the horizon.
+        range_min_m: Points at this distance or nearer are dropped, metres.
+        range_max_m: Points at this distance or farther are dropped, metres.
+    """
+
+    beams: int = 64
+    columns: int = 1024
+    inclination_max_deg: float = 3.0
+    inclination_min_deg: float = -25.0
+    range_min_m: float = 1.0
+    range_max_m: float = 56.0
+
+    def __post_init__(self) -> None:
+        if self.beams < 1 or self.columns < 1:
+            raise ValueError(
+                "a sensor needs at least one beam and one column, "
+                f"got beams={self.beams}, columns={self.columns}"
+            )
+        if not -90.0 <= self.inclination_min_deg < self.inclination_max_deg <= 90.0:
+            raise ValueError(
+                "the vertical field of view must satisfy -90 <= min < max <= 90 degrees, got "
+                f"inclination_min_deg={self.inclination_min_deg}, "
+                f"inclination_max_deg={self.inclination_max_deg}"
+            )
+        if not 0.0 <= self.range_min_m < self.range_max_m < math.inf:
+            raise ValueError(
+                "the range limits must satisfy 0 <= min < max < infinity metres, got "
+                f"range_min_m={self.range_min_m}, range_max_m={self.range_max_m}"
+            )
+
+    def cell_size(self, grid_size: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of pixels in one cell of a grid ``(rows, columns)``."""
+        rows, columns = grid_size
+        if rows < 1 or columns < 1 or self.beams % rows or self.columns % columns:
+            raise ValueError(
+                f"a grid of {rows} x {columns} cells does not divide the "
+                f"{self.beams} x {self.columns} range image"
+            )
+        return self.beams // rows, self.columns // columns
+
+    @property
+    def inclination_max_rad(self) -> float:
+        """Upper border of the first row, radians."""
+        return math.radians(self.inclination_max_deg)
+
+    @property
+    def field_of_view_rad(self) -> float:
+        """Height of the vertical field of view, radians."""
+        return self.inclination_max_rad - math.radians(self.inclination_min_deg)
+
+
+def range_of(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Distance from the sensor of points ``(..., 3)``, correctly rounded."""
+    return np.sqrt(np.square(points.astype(np.float64)).sum(axis=-1)).astype(np.float32)
+
+
+def in_range(points: NDArray[np.floating], sensor: LidarSensor) -> NDArray[np.bool_]:
+    """Whether each point of ``(..., 3)`` is finite and strictly inside the range limits."""
+    range_m = range_of(points)
+    return (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+
+
+def angles_of(points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Inclination and azimuth of finite points ``(..., 3)``, radians."""
+    x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
+    return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
+
+
+def hit_pixels(points: NDArray[np.floating], sensor: LidarSensor) -> NDArray[np.bool_]:
+    """Pixels ``(H, W)`` of the spherical projection with a return of ``(P, 3)`` within range."""
+    inclination, azimuth = angles_of(points[in_range(points, sensor)])
+    pitch_rad = sensor.field_of_view_rad / sensor.beams
+    row = np.floor((sensor.inclination_max_rad - inclination) / pitch_rad).astype(np.int64)
+    column = np.floor((math.pi - azimuth) / (2 * math.pi) * sensor.columns).astype(np.int64)
+    hit = np.zeros((sensor.beams, sensor.columns), dtype=bool)
+    hit[row.clip(0, sensor.beams - 1), column % sensor.columns] = True
+    return hit

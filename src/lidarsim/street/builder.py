@@ -1,0 +1,171 @@
+"""Solids and ground of one block, placed in street coordinates."""
+
+from __future__ import annotations
+
+import math
+
+from numpy.random import Generator
+
+from lidarsim.scene import Interval, Material, Primitive, Puddle, Semantic, Shape
+from lidarsim.street.course import BLOCK_M, Course, Section
+from lidarsim.street.vehicles import Body
+
+#: Walls and crowns reach into the ground, which falls away below them where the street is steep.
+FOOTING_M = 0.6
+
+#: Street coordinates (s, lateral).
+Place = tuple[float, float]
+
+_TERRAIN_M = 48.0
+_SLAB_M = 1.0
+
+
+class Builder:
+    """Collects the solids of one block, given in street coordinates.
+
+    ``details`` are solids that exist in scans from nearby only, ``puddles`` places of standing
+    water on a wet road; instances are numbered from ``first_instance`` on.
+    """
+
+    def __init__(self, course: Course, section: Section, first_instance: int) -> None:
+        self.course = course
+        self.section = section
+        self.primitives: list[Primitive] = []
+        self.details: list[Primitive] = []
+        self.puddles: list[Puddle] = []
+        self.num_objects = 0
+        self._first_instance = first_instance
+
+    def new_instance(self) -> int:
+        """Unique instance number within the block."""
+        self.num_objects += 1
+        return self._first_instance + self.num_objects - 1
+
+    def solid(
+        self,
+        shape: Shape,
+        at: Place,
+        size: tuple[float, float, float],
+        semantic: Semantic,
+        material: Material,
+        reflectivity: float,
+        instance: int = 0,
+        bottom_m: float = 0.0,
+        yaw_rad: float = 0.0,
+        inclined: bool = False,
+        extinction_per_m: float = 0.0,
+        detail: bool = False,
+        slats: tuple[float, float] = (0.0, 1.0),
+        open_m: tuple[float, float] = (0.0, math.inf),
+    ) -> None:
+        """Add a solid that stands on the ground.
+
+        ``at``: centre (s, lateral). ``size``: along, across and up. ``bottom_m``: lowest point
+        above the ground. ``yaw_rad``: against the street. ``inclined``: follows the slope of the
+        street instead of standing level. ``detail``: only scans from nearby have it.
+        ``extinction_per_m``, ``slats`` and ``open_m``: see ``Primitive``.
+        """
+        x, y, z = self.section.at(*at)
+        z += self.course.surface_m(at[1]) + bottom_m + size[2] / 2
+        half_size = (size[0] / 2, size[1] / 2, size[2] / 2)
+        heading, still = self.section.heading_rad + yaw_rad, (0.0, 0.0)
+        slopes = (self.section.slope, self.section.cross)
+        grade = _turned(slopes, yaw_rad) if inclined else (0.0, 0.0)
+        (self.details if detail else self.primitives).append(
+            Primitive(
+                shape, (x, y, z), half_size, semantic, reflectivity, heading, instance, material,
+                still, grade, extinction_per_m, slats, open_m,
+            )
+        )  # fmt: skip
+
+    def body(
+        self, body: Body, at: Place, yaw_rad: float, instance: int, speed_m_s: float = 0.0
+    ) -> None:
+        """Add a vehicle or a person at (s, lateral), which moves along its heading."""
+        x, y, z = self.section.at(*at)
+        z += self.course.surface_m(at[1])
+        heading = self.section.heading_rad + yaw_rad
+        cosine, sine = math.cos(heading), math.sin(heading)
+        cross = self.section.cross + self.course.surface_cross(at[1])
+        grade = _turned((self.section.slope, cross), yaw_rad)
+        velocity = (speed_m_s * cosine, speed_m_s * sine) if speed_m_s else (0.0, 0.0)
+        for part in body:
+            ahead, left, up = part.centre
+            up += grade[0] * ahead + grade[1] * left
+            centre = (x + ahead * cosine - left * sine, y + ahead * sine + left * cosine, z + up)
+            half_size = (part.size[0] / 2, part.size[1] / 2, part.size[2] / 2)
+            primitive = Primitive(
+                part.shape, centre, half_size, part.semantic, part.reflectivity, heading, instance,
+                part.material, velocity, grade, part.extinction_per_m, part.slats,
+            )  # fmt: skip
+            (self.details if part.detail else self.primitives).append(primitive)
+
+    def slab(
+        self,
+        along: Interval,
+        across: Interval,
+        semantic: Semantic,
+        material: Material,
+        reflectivity: float,
+        sunk_m: float = 0.0,
+    ) -> None:
+        """Add a piece of ground between two distances along the chord and two lateral ones.
+
+        Its middle lies ``sunk_m`` below the surface of the street. At the ends of the block it
+        reaches over the wedge that the bend of the street opens.
+        """
+        first, last = along
+        widest = max(map(abs, across))
+        if first == 0:
+            first -= widest * abs(self.section.corner_before)
+        if last == BLOCK_M:
+            last += widest * abs(self.section.corner_after)
+        lateral = sum(across) / 2
+        x, y, z = self.section.on_chord((first + last) / 2, lateral)
+        z += self.course.surface_m(lateral) - sunk_m
+        half_size = ((last - first) / 2, abs(across[1] - across[0]) / 2, _SLAB_M / 2)
+        grade = (self.section.slope, self.section.cross + self.course.surface_cross(lateral))
+        self.primitives.append(
+            Primitive(
+                Shape.BOX, (x, y, z - _SLAB_M / 2), half_size, semantic, reflectivity,
+                self.section.heading_rad, material=material, grade=grade,
+            )
+        )  # fmt: skip
+
+    def puddle(self, draw: Generator, s: float, lateral: float) -> None:
+        """Add a place of standing water on a wet road."""
+        x, y, _ = self.section.at(s, lateral)
+        self.puddles.append(Puddle(x, y, draw.uniform(0.3, 1.6)))
+
+
+def _turned(slopes: tuple[float, float], yaw_rad: float) -> tuple[float, float]:
+    """Slopes along and across the street, along the axes of a turned solid."""
+    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+    along, across = slopes
+    return cosine * along + sine * across, cosine * across - sine * along
+
+
+def build_ground(builder: Builder, draw: Generator, side: float, opening: bool) -> None:
+    """Roadway, pavement or verge, and terrain; with the opening of a side street."""
+    course, whole = builder.course, (0.0, BLOCK_M)
+    edge_m, pavement_m = course.kerb(side).edge_m, course.kerb(side).pavement_m
+    asphalt = (Semantic.ROAD, Material.ASPHALT, course.road_reflectivity)
+    builder.slab(whole, (0.0, side * edge_m), *asphalt)
+    paving = (Semantic.SIDEWALK, Material.PAVING, draw.uniform(0.13, 0.19))
+    for _ in range(int(draw.poisson(0.7))):
+        at = draw.uniform(0.5, edge_m) * side
+        builder.puddle(draw, (builder.section.block + draw.random()) * BLOCK_M, at)
+    pavement = (side * edge_m, side * (edge_m + pavement_m))
+    beyond = (pavement[1], side * (edge_m + _TERRAIN_M))
+    strips = (pavement, beyond) if pavement_m else (beyond,)
+    if opening:
+        half_m = draw.uniform(2.8, 4.2)
+        near, far = (0.0, BLOCK_M / 2 - half_m), (BLOCK_M / 2 + half_m, BLOCK_M)
+        for strip in strips:
+            builder.slab((near[1], far[0]), strip, *asphalt, course.kerb_m)
+            builder.slab(near, strip, *paving)
+            builder.slab(far, strip, *paving)
+        return
+    if pavement_m:
+        builder.slab(whole, pavement, *paving)
+    builder.slab(whole, beyond, Semantic.TERRAIN, Material.SOIL, draw.uniform(0.15, 0.22))

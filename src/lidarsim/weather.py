@@ -1,0 +1,346 @@
+"""Weather on recorded scans, by the effects of the simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarsim import scene
+from lidarsim.draws import Draws
+from lidarsim.effects import EFFECTS
+from lidarsim.effects.instrument import Blooming
+from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, num_saturated
+from lidarsim.scan import (
+    SECOND_RETURN_M,
+    EffectRecord,
+    check_switches,
+    effect_name,
+    run_effect,
+)
+from lidarsim.scene import Interval, Pose, Primitive, Scene, Semantic, Shape
+from lidarsim.sweep import Effect, Origin
+
+#: Added points have this class plus their ``Origin``: no data set uses these numbers.
+ADDED_CLASS = 0xFF00
+_HERE = "the scan shows it already"
+#: Why effects cannot act on a recorded scan.
+REFUSED = {
+    "glass": "what stands behind a pane is not in it",
+    "polished_metal": "what a mirror shows is not in it",
+    "foliage_occlusion": "what stands behind leaves is not in it",
+    "moving_actors": "what vehicles hide is not in it",
+    "rolling_shutter": "what the sensor would see from elsewhere is not in it",
+    "mixed_pixels": _HERE,
+    "ego_occlusion": _HERE,
+    "diffuse_reflection": _HERE,
+    "surface_texture": _HERE,
+    "retro_reflection": _HERE,
+    "laser_calibration": _HERE,
+}
+# Instrument effects that every recorded scan has: they run where they are switched on.
+_ON_REQUEST = ("blooming", "range_noise")
+# Whether an echo is detected is asked again where its power has changed.
+_DETECTION = {"soft_raydrop", "detection_limit", "dual_return"}
+# Of labels with an instance: KITTI-360, SemanticKITTI.
+_VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
+# A vehicle of fewer points has no box.
+_LEAST_POINTS = 20
+_INSTRUMENT = Instrument()
+# Of priors: equally likely fields, and the deepest film of a road in rain.
+_FIELDS = ("visibility_m", "rain_mm_h", "snow_mm_h")
+_FULL_FILM_MM = 1.5
+
+
+@dataclass(frozen=True)
+class WeatheredScan:
+    """A scan in weather. Letter Q: points, those that stay in the order of the input.
+
+    Args:
+        points: ``(Q, 3)`` float32, those of the input bit for bit unless ``range_noise`` runs;
+            added points last.
+        intensity: ``(Q,)`` in units and type of the input; None if it has none.
+        labels: ``(Q,)`` uint32, ``ADDED_CLASS`` plus the ``Origin`` of added points; None if the
+            input has none.
+        index: ``(Q,)`` number of each point in the input, -1 for added ones.
+        shot: ``(Q,)`` number of the input's point of the same shot.
+        origins: ``(Q,)`` uint8, the ``Origin`` of each point.
+        effects: Which effects ran, and why.
+        report: What was assumed, and counts of points that were lost, moved and added, by cause.
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray | None
+    labels: NDArray[np.uint32] | None
+    index: NDArray[np.int64]
+    shot: NDArray[np.int64]
+    origins: NDArray[np.uint8]
+    effects: tuple[EffectRecord, ...]
+    report: dict[str, object]
+
+
+@dataclass(frozen=True)
+class Weather(scene.Weather):
+    """State of air, sky and road for recorded scans, see :class:`lidarsim.scene.Weather`.
+
+    ``sun_azimuth_deg`` is counter-clockwise from the scan's x axis. The scan is taken to be one in
+    clear air over a dry road. Nothing is known of shots without a return: they stay empty, also
+    where fog, rain or snow before the sky would give one.
+
+    Args:
+        traffic_m_s: Speed of vehicles that have an instance in the labels, for their spray; they
+            are taken to drive along their length and ahead rather than back.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(5, 40, (1000, 3)).astype(np.float32)
+        >>> weathered = Weather(visibility_m=60).apply(RecordedScan(points))
+        >>> weathered.report["points"], len(weathered.points) > 0
+        (1000, True)
+    """
+
+    traffic_m_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        scene.check_fields(self, "be 0 or greater", "traffic_m_s")
+
+    def apply(
+        self,
+        scan: RecordedScan,
+        seed: int | tuple[int | str, ...] = 0,
+        instrument: Instrument = _INSTRUMENT,
+        boxes: NDArray[np.floating] | None = None,
+        effects: Mapping[str, str | bool] | None = None,
+    ) -> WeatheredScan:
+        """The scan as it would be in this weather.
+
+        Args:
+            scan: The scan.
+            seed: Of the random draws; of each effect they do not depend on the others.
+            instrument: What is assumed of the instrument.
+            boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
+                metres, heading in radians, speed in m/s.
+            effects: ``off`` omits an effect; ``blooming`` and ``range_noise``, which a recorded
+                scan has already, run where they are ``on``.
+
+        Raises:
+            ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
+                intensities cannot be used.
+        """
+        off, wanted, idle = _switched(tuple((effects or {}).items()))
+        vehicles = _vehicles(boxes)
+        if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
+            vehicles += _labelled_vehicles(scan, self.traffic_m_s)
+        blooms = any(isinstance(effect, Blooming) for effect in wanted)
+        bright = num_saturated(scan, instrument) if blooms else 0
+        world = Scene(vehicles, Pose(z_m=0.0), weather=self, ground_m=-1e3, sheet_points=bright)
+        sensor = instrument.sensor_for(scan)
+        called = {effect_name(effect) for effect in wanted if effect.called_by(world, sensor)}
+        if not called - off.keys() - _DETECTION:
+            every = _numbers(1 << len(scan).bit_length())[: len(scan)]
+            return kept_part(scan, every, idle)
+        key = seed if isinstance(seed, tuple) else (seed,)
+        sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
+        records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
+        return _result(scan, sweep, records)
+
+
+@cache
+def _switched(
+    effects: tuple[tuple[str, str | bool], ...],
+) -> tuple[dict[str, str], list[Effect], tuple[EffectRecord, ...]]:
+    """Effects that are off, those that may run, and the records where none is called."""
+    off = check_switches(dict(effects))
+    on = {name for name, switch in effects if switch in ("on", True)}
+    for name in REFUSED.keys() & on:
+        raise ValueError(f"effect {name} cannot act on a recorded scan: {REFUSED[name]}")
+    left_out = {*REFUSED, *_ON_REQUEST} - on
+    wanted = {name: e for e in EFFECTS if (name := effect_name(e)) not in left_out}
+    why = "nothing calls for it"
+    idle = (EffectRecord(n, "off" if n in off else "not_called", why, 0) for n in wanted)
+    return off, list(wanted.values()), tuple(idle)
+
+
+def kept_part(
+    scan: RecordedScan,
+    kept: NDArray[np.int64],
+    records: tuple[EffectRecord, ...],
+    lost: dict[str, int] | None = None,
+    moved: int = 0,
+) -> WeatheredScan:
+    """Result that consists of some points ``(Q,)`` of a scan."""
+    report = {"points": len(scan), "lost": lost or {}, "moved": moved, "dimmed": 0, "added": {}}
+    columns: dict[str, Any] = {n: getattr(scan, n) for n in ("points", "intensity", "labels")}
+    if len(kept) < len(scan):
+        columns = {n: None if column is None else column[kept] for n, column in columns.items()}
+    nothing = np.zeros(len(kept), dtype=np.uint8)
+    return WeatheredScan(
+        index=kept, shot=kept, origins=nothing, effects=records, report=report, **columns
+    )
+
+
+@cache
+def _numbers(num: int) -> NDArray[np.int64]:
+    """0, 1, 2, ...: kept, since it would be most of the cost of clear weather."""
+    numbers = np.arange(num)
+    numbers.flags.writeable = False
+    return numbers
+
+
+def _result(
+    scan: RecordedScan, sweep: RecordedSweep, records: tuple[EffectRecord, ...]
+) -> WeatheredScan:
+    """Points of the echoes that are left: the recorded ones, then those of the air."""
+    echoes = list(sweep.echoes())
+    seen = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
+    for second, is_seen in zip(echoes[1:], seen[1:], strict=True):
+        is_seen &= seen[0]
+        apart_m = second.range_m[is_seen] - echoes[0].range_m[is_seen]
+        is_seen[is_seen] = np.abs(apart_m) > SECOND_RETURN_M
+    points = scan.points.copy()
+    intensity = None if scan.intensity is None else scan.intensity.copy()
+    stays = np.ones(len(scan), dtype=bool)
+    stays[sweep.rays_of] = False
+    added, moved, dimmed = [], 0, 0
+    for echo, is_seen in zip(echoes, seen, strict=True):
+        rays = np.flatnonzero(is_seen & (echo.origin == Origin.SURFACE))
+        stays[sweep.rays_of[rays]] = True
+        away = rays[echo.range_m[rays] != sweep.recorded_m[rays]]
+        points[sweep.rays_of[away]] = sweep.at(away, echo.range_m[away])
+        weaker = rays[echo.power[rays] != sweep.recorded_power[rays]]
+        moved, dimmed = moved + len(away), dimmed + len(weaker)
+        if intensity is not None:
+            faded = sweep.in_units(echo.power[weaker], echo.range_m[weaker])
+            at = sweep.rays_of[weaker]
+            intensity[at] = np.minimum(intensity[at], faded.astype(intensity.dtype))
+        rays = np.flatnonzero(is_seen & (echo.origin != Origin.SURFACE))
+        range_m, origin = echo.range_m[rays], echo.origin[rays]
+        shown = sweep.in_units(echo.power[rays], range_m)
+        added.append((sweep.at(rays, range_m), shown, sweep.rays_of[rays], origin))
+
+    new, shown, shot, made_by = map(np.concatenate, zip(*added, strict=True))
+    kept = np.flatnonzero(stays)
+    labels = scan.labels
+    if labels is not None:
+        labels = np.concatenate([labels[kept], ADDED_CLASS + made_by.astype(np.uint32)])
+    if intensity is not None:
+        intensity = np.concatenate([intensity[kept], shown.astype(intensity.dtype)])
+    outshone = np.where(seen[0], echoes[0].origin, Origin.SURFACE)[~stays[sweep.rays_of]]
+    counts = _by_origin(outshone)
+    lost = {"too weak": counts.pop("surface", 0)} | counts
+    report = {
+        "points": len(scan), "intensity": sweep.scale.text, "lost": lost, "moved": moved,
+        "dimmed": dimmed, "added": _by_origin(made_by),
+    }  # fmt: skip
+    return WeatheredScan(
+        np.concatenate([points[kept], new]),
+        intensity,
+        labels,
+        np.concatenate([kept, np.full(len(new), -1)]),
+        np.concatenate([kept, shot]),
+        np.concatenate([np.zeros(len(kept), dtype=np.uint8), made_by]),
+        records,
+        report,
+    )
+
+
+def _by_origin(origins: NDArray[np.uint8]) -> dict[str, int]:
+    """Number of points of each origin that occurs, by its name."""
+    found, counts = np.unique(origins, return_counts=True)
+    return {Origin(o).name.lower(): int(n) for o, n in zip(found, counts, strict=True)}
+
+
+def _vehicles(boxes: NDArray[np.floating] | None) -> tuple[Primitive, ...]:
+    """Boxes ``(N, 8)`` of :meth:`Weather.apply`."""
+    if boxes is None:
+        return ()
+    boxes = np.asarray(boxes, dtype=float)
+    if boxes.ndim != 2 or boxes.shape[1] != 8 or not np.isfinite(boxes).all():
+        raise ValueError(
+            "boxes must be (N, 8) numbers x, y, z, length, width, height, heading, speed, "
+            f"got the shape {boxes.shape}"
+        )
+    return tuple(
+        Primitive(
+            Shape.BOX, (x, y, z), (length / 2, width / 2, height / 2), Semantic.CAR, 0.5, heading,
+            velocity_m_s=(speed * math.cos(heading), speed * math.sin(heading)),
+        )
+        for x, y, z, length, width, height, heading, speed in boxes.tolist()
+    )  # fmt: skip
+
+
+def _labelled_vehicles(scan: RecordedScan, speed_m_s: float) -> tuple[Primitive, ...]:
+    """Boxes around the points of each vehicle, along the longer axis of these."""
+    assert scan.labels is not None
+    boxes = []
+    is_vehicle = np.isin(scan.labels & 0xFFFF, _VEHICLES) & (scan.labels >> 16 > 0)
+    for code in np.unique(scan.labels[is_vehicle]):
+        points = scan.points[scan.labels == code].astype(float)
+        if len(points) < _LEAST_POINTS:
+            continue
+        _, axes = np.linalg.eigh(np.cov(points[:, :2].T))
+        ahead = axes[:, 1] * (1 if axes[0, 1] >= 0 else -1)
+        turn = np.array([[*ahead, 0], [-ahead[1], ahead[0], 0], [0, 0, 1]])
+        low, high = (points @ turn.T).min(axis=0), (points @ turn.T).max(axis=0)
+        size = (high - low).clip(min=0.1)
+        heading = math.atan2(ahead[1], ahead[0])
+        boxes.append([*(turn.T @ ((low + high) / 2)), *size, heading, speed_m_s])
+    return _vehicles(np.array(boxes)) if boxes else ()
+
+
+@dataclass(frozen=True)
+class WeatherPrior:
+    """Weather drawn anew for each training scan and epoch: fog, rain on a wet road, or snow.
+
+    The three are equally likely; visibility and rates are log-uniform.
+
+    Args:
+        probability: Of bad weather; other scans stay as they are.
+        visibility_m: Least and largest visibility in fog.
+        rain_mm_h: Least and largest rate.
+        snow_mm_h: Least and largest rate, as water.
+        instrument: What is assumed of the instrument.
+    """
+
+    probability: float = 0.5
+    visibility_m: Interval = (30.0, 1000.0)
+    rain_mm_h: Interval = (1.0, 30.0)
+    snow_mm_h: Interval = (0.5, 3.0)
+    instrument: Instrument = _INSTRUMENT
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"probability must lie in [0, 1], got {self.probability}")
+        for name in _FIELDS:
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise ValueError(f"{name} must be a positive interval, got {low}..{high}")
+            for limit in (low, high):
+                Weather(**{name: limit})
+
+    def draw(self, generator: np.random.Generator) -> Weather | None:
+        """Weather of one scan; None where it stays as it is."""
+        chance, kind, share, film = generator.random(4)
+        if chance >= self.probability:
+            return None
+        name = _FIELDS[int(3 * kind)]
+        low, high = np.log(getattr(self, name))
+        values: dict[str, Any] = {name: math.exp(low + share * (high - low))}
+        if name == "rain_mm_h":
+            values["water_film_mm"] = _FULL_FILM_MM * film
+        return Weather(**values)
+
+    def points(self, points: NDArray[np.float32], seed: tuple[int, ...]) -> NDArray[np.float32]:
+        """Points ``(P, 4)`` in the weather of a seed, such as that of training, epoch and scan."""
+        weather = self.draw(np.random.default_rng(seed))
+        if weather is None:
+            return points
+        scan = RecordedScan(points[:, :3], points[:, 3])
+        result = weather.apply(scan, ("training", *seed), self.instrument)
+        assert result.intensity is not None
+        return np.column_stack([result.points, result.intensity])

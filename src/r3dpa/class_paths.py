@@ -1,0 +1,40 @@
+"""Where classes stand now that checkpoints and YAML files of earlier versions name elsewhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: Old module or class, and the new one; the longest one that fits counts.
+MOVED = {
+    "r3dpa.data.objects": "r3dpa.editing.objects",
+    "r3dpa.flow.diffusion": "r3dpa.baselines.diffusion_paths",
+    "r3dpa.geometry.scan_geometry": "r3dpa.geometry.codec",
+    "r3dpa.nn.backbones": "r3dpa.features",
+    "r3dpa.nn.backbones.point_features": "r3dpa.features.scalr",
+    "r3dpa.nn.backbones.vit": "r3dpa.features.dinov2",
+    "r3dpa.nn.velocity_network.EMA": "r3dpa.nn.ema.EMA",
+    "r3dpa.simulation": "lidarsim",
+    "r3dpa.simulation.Weather": "lidarsim.scene.Weather",
+    "r3dpa.simulation.sensor": "lidarsim.sensors.spinning",
+    "r3dpa.weather": "lidarsim",
+    "r3dpa.weather.Weather": "lidarsim.weather.Weather",
+    "r3dpa.weather.weather": "lidarsim.weather",
+}
+
+
+def current_path(path: str) -> str:
+    """Import path of today for an import path of any version; other text stays as it is."""
+    parts = path.split(".")
+    for count in range(len(parts), 1, -1):
+        if new := MOVED.get(".".join(parts[:count])):
+            return ".".join([new, *parts[count:]])
+    return path
+
+
+def with_current_paths(value: Any) -> Any:
+    """A value of a YAML file with the import paths of today."""
+    if isinstance(value, dict):
+        return {key: with_current_paths(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [with_current_paths(item) for item in value]
+    return current_path(value) if isinstance(value, str) else value

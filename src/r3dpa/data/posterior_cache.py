@@ -1,0 +1,89 @@
+"""Caches that the processes of a training fill together: VAE posteriors of the training set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from lightning.pytorch.utilities import rank_zero_info
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from r3dpa.data.store import Cacheable, CachedTensors, Store, tensor_cache
+from r3dpa.io import weights_sha256
+
+Item = TypeVar("Item", bound=Cacheable)
+
+
+@torch.no_grad()
+def encoded_once(
+    module: Any,
+    root: Path,
+    settings: Mapping[str, Any],
+    items: Sequence[Item],
+    dataset_of: Callable[[list[Item]], Dataset[Any]],
+    image: str,
+) -> CachedTensors[Item]:
+    """Posterior moments ``(2C, h, w)`` of items; only those that the cache lacks are encoded.
+
+    They are computed in float32 whatever the precision of the steps.
+
+    Args:
+        module: In training, on its device; has a frozen ``vae`` and ``latent_shape`` (C, h, w).
+        root: Folder of caches.
+        settings: What the moments depend on beside the weights of the VAE, as JSON values.
+        items: Scans or images, the same in all processes, which share the work.
+        dataset_of: Dataset of some items, whose samples hold their ``index`` and an image.
+        image: Name of the image in a sample, ``(C', H, W)``.
+
+    Raises:
+        StoreError: If the cache cannot be written or is damaged, or moments are not finite.
+    """
+    datamodule = module.trainer.datamodule
+    channels, *size = module.latent_shape
+    about = {**settings, "vae": weights_sha256(module.vae.state_dict())}
+    cache = tensor_cache(root, "posterior", about, (2 * channels, *size))
+
+    def moments(own: list[Item]) -> Iterator[Tensor]:
+        loader = DataLoader(
+            dataset_of(own),
+            batch_size=datamodule.batch_size,
+            num_workers=datamodule.num_workers,
+            generator=torch.Generator(),  # the default draws from the global random state
+        )
+        for batch in loader:
+            posterior = module.vae.encode(batch[image].to(module.device))
+            yield torch.cat([posterior.mean, posterior.logvar], dim=1)
+
+    return filled(module.trainer, cache, items, moments)
+
+
+def filled(
+    trainer: Any,
+    cache: Store,
+    items: Sequence[Item],
+    rows_of: Callable[[list[Item]], Iterator[Tensor]],
+) -> CachedTensors[Item]:
+    """The cache with a row for each item; ``rows_of`` yields rows ``(B, ...)`` of some in order.
+
+    All processes of a training call it with the same items, and share the work.
+    """
+    missing = cache.missing(items)
+    trainer.strategy.barrier("cached tensors: all have looked")
+    # Where each node has a disk of its own, its processes make everything.
+    if trainer.datamodule.prepare_data_per_node:
+        own = missing[trainer.local_rank :: trainer.num_devices]
+    else:
+        own = missing[trainer.global_rank :: trainer.world_size]
+    if own:
+        rank_zero_info(f"making {len(missing)} of {len(items)} once, into {cache.folder}")
+        keys = [item.cache_key for item in own]
+        done = 0
+        with cache.writer(trainer.global_rank) as writer:
+            for rows in rows_of(own):
+                writer.add(keys[done : done + len(rows)], rows)
+                done += len(rows)
+    trainer.strategy.barrier("cached tensors: all are written")
+    return CachedTensors(cache, items)

@@ -1,0 +1,28 @@
+"""What the method aligns with: frozen extractors of point features, and their training scans."""
+
+from r3dpa.features.dinov2 import DINOv2
+from r3dpa.features.geometric import GeometricFeatures
+from r3dpa.features.scalr import SOURCES, ScaLR, WaffleIronS, feature_source
+from r3dpa.features.voxels import (
+    Masking,
+    PointCloudBatch,
+    ScanGrid,
+    collate_scans,
+    prepare_scan,
+)
+from r3dpa.features.waffleiron import WaffleIron
+
+__all__ = [
+    "SOURCES",
+    "DINOv2",
+    "GeometricFeatures",
+    "Masking",
+    "PointCloudBatch",
+    "ScaLR",
+    "ScanGrid",
+    "WaffleIron",
+    "WaffleIronS",
+    "collate_scans",
+    "feature_source",
+    "prepare_scan",
+]

@@ -1,0 +1,143 @@
+"""What a scan lacks: refused where it is of another sensor, interpolated where it is a gap."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from r3dpa.data import read_scan
+from r3dpa.editing.gaps import check_view, filled, range_error_m, refined
+from r3dpa.geometry import LidarSensor, SphericalProjection, range_image
+
+PROJECTION = SphericalProjection(LidarSensor(beams=16, columns=64))
+
+
+def rows_missing(every):
+    missing = torch.ones(16, 64, dtype=torch.bool)
+    missing[::every] = False
+    return missing
+
+
+def a_plane():
+    """Ground 1.7 m below the sensor in the rows that look down steeply enough to be in range."""
+    down = -PROJECTION.ray_angles()[0].sin()
+    range_m = torch.where(down > 1.7 / 50, 1.7 / down.clamp(min=1e-3), -1.0)
+    return range_m.float()[:, None].repeat(1, 64)
+
+
+class TestFilled:
+    def test_known_pixels_and_scans_without_gaps_stay(self):
+        range_m, missing = a_plane(), rows_missing(4)
+        for how in ("inverse", "linear", "nearest"):
+            assert filled(range_m, missing, how)[~missing].equal(range_m[~missing])
+            assert filled(range_m, torch.zeros_like(missing), how).equal(range_m)
+
+    def test_inverse_range_is_exact_on_the_ground_but_for_the_curvature_of_angles(self):
+        """Between beams 3.5 degrees apart 1 / range follows a sine, straight to 1e-3."""
+        range_m, missing = a_plane(), rows_missing(2)
+        errors = {}
+        for how in ("inverse", "linear", "nearest"):
+            made = filled(range_m, missing, how)
+            errors[how] = ((made - range_m).abs() / range_m)[4:15].max().item()
+        assert errors["inverse"] < 1e-3 < errors["linear"] < errors["nearest"]
+
+    def test_by_hand(self):
+        range_m = torch.full((16, 64), -1.0)
+        range_m[0], range_m[4], range_m[8] = 10.0, 40.0, -1.0
+        missing = rows_missing(4)
+        linear, nearest = filled(range_m, missing, "linear"), filled(range_m, missing, "nearest")
+        assert linear[:5, 0].tolist() == [10.0, 17.5, 25.0, 32.5, 40.0]
+        assert nearest[:5, 0].tolist() == [10.0, 10.0, 10.0, 40.0, 40.0]
+        assert filled(range_m, missing)[2, 0].item() == pytest.approx(16.0)  # 1 / mean(.1, .025)
+        # Beside a beam without a return nothing is averaged with its -1.
+        assert linear[4:9, 0].tolist() == [40.0, 40.0, 40.0, -1.0, -1.0]
+
+    def test_a_sector_is_filled_across_the_seam(self):
+        range_m = torch.full((16, 64), 10.0)
+        range_m[:, 32:] = 20.0
+        missing = torch.zeros(16, 64, dtype=torch.bool)
+        missing[:, [0, 1, 62, 63]] = True
+        made = filled(range_m, missing, "linear")
+        assert made[0, [62, 63, 0, 1]].tolist() == [18.0, 16.0, 14.0, 12.0]
+
+
+class TestRefined:
+    def test_one_surface_is_interpolated_and_empty_beams_leave_nothing_between(self):
+        range_m = torch.full((16, 64), -1.0)
+        range_m[0:3] = 10.0
+        missing = rows_missing(2)
+        made = refined(torch.full((16, 64), 11.0), range_m, missing)
+        assert (made[1] == 10).all()
+        assert (made[5] == -1).all()
+
+    def test_at_an_edge_the_error_of_known_beams_is_taken_off(self):
+        range_m = torch.full((16, 64), 10.0)
+        range_m[2:] = 30.0
+        missing = rows_missing(2)
+        made = torch.full((16, 64), 12.0)  # 2 m too long above the edge, 18 m too short below
+        assert (refined(made, range_m, missing)[1] == 12 + (-2 + 18) / 2).all()
+
+    def test_far_from_what_is_known_it_stays_as_made(self):
+        range_m = torch.full((16, 64), 10.0)
+        missing = torch.ones(16, 64, dtype=torch.bool)
+        missing[0] = False
+        made = refined(torch.full((16, 64), 12.0), range_m, missing)
+        assert (made[8:] == 12).all()
+
+
+def cloud(lowest_deg, highest_deg, beams=64, azimuths_deg=(-180.0, 180.0)):
+    inclination = torch.linspace(lowest_deg, highest_deg, beams).deg2rad()
+    azimuth = torch.linspace(*azimuths_deg, 256).deg2rad()
+    up, around = torch.meshgrid(inclination, azimuth, indexing="ij")
+    flat = up.cos()
+    return (10 * torch.stack([flat * around.cos(), flat * around.sin(), up.sin()], -1)).view(-1, 3)
+
+
+class TestView:
+    def check(self, points, missing=None):
+        check_view(points, range_image(points, PROJECTION)[0], PROJECTION, missing)
+
+    def test_a_scan_of_the_same_view_passes(self):
+        self.check(cloud(-24.5, 4.0))
+
+    @pytest.mark.parametrize(
+        ("points", "message"),
+        [
+            (cloud(-25, 15), r"28% of the points lie outside .*-24.1 to 2.1 .*from -25.0 to 15.0"),
+            (cloud(-8, 2.5), r"fills 44% of the 16 beams .*-24.1 to 2.1 degrees"),
+            (cloud(-24.5, 2.5, azimuths_deg=(-45, 45)), r"fills 2\d% of the 64 columns"),
+            (cloud(-24.1, 2.1, beams=8), r"only 0% of the returns .*fewer beams"),
+        ],
+        ids=["looks up", "looks ahead only", "part of a turn", "fewer beams"],
+    )
+    def test_others_are_refused_with_the_numbers(self, points, message):
+        with pytest.raises(ValueError, match=message):
+            self.check(points)
+
+    def test_what_is_missing_need_not_be_filled(self):
+        missing = torch.ones(16, 64, dtype=torch.bool)
+        missing[:, 24:40] = False  # 90 degrees ahead
+        self.check(cloud(-24.5, 2.5, azimuths_deg=(-50, 50)), missing)
+
+    @pytest.mark.data
+    def test_real_scans_pass_and_half_their_beams_do_not(self, real_scans_dir):
+        """Of the 64 lasers, stored one after the other, every second one is left out."""
+        projection = SphericalProjection(LidarSensor())
+        for path in sorted(real_scans_dir.rglob("*.bin"))[::3]:
+            points = torch.from_numpy(read_scan(path)[:, :3])
+            check_view(points, range_image(points, projection)[0], projection)
+        azimuth = torch.atan2(points[:, 1], points[:, 0]) % (2 * math.pi)
+        laser = torch.cat([torch.zeros(1), (azimuth.diff() < -math.pi).cumsum(0)])
+        half = points[laser % 2 == 0]
+        with pytest.raises(ValueError, match="fewer beams than the checkpoint"):
+            check_view(half, range_image(half, projection)[0], projection)
+
+
+def test_error_counts_pixels_with_returns_in_both():
+    first = torch.tensor([[10.0, -1.0, 5.0, 7.0]])
+    second = torch.tensor([[12.0, 4.0, -1.0, 6.0]])
+    assert range_error_m(first, second) == 1.5
+    assert range_error_m(first, second, torch.tensor([[True, True, True, False]])) == 2
+    assert math.isnan(range_error_m(first, -torch.ones(1, 4)))

@@ -1,0 +1,197 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lidarsim import Semantic
+from r3dpa.data import Scan, ScanError, write_bin
+from r3dpa.data.labels import CLASS_NAMES, read_labels
+from r3dpa.editing.objects import ObjectClass, ObjectLibrary, object_library
+from r3dpa.geometry import LidarSensor, RingProjection, SphericalProjection
+
+CAR, ROAD = 26, 7
+SENSOR = LidarSensor(beams=4, columns=8, inclination_max_deg=20, inclination_min_deg=-20)
+PROJECTION = SphericalProjection(SENSOR)
+
+
+def write_scan(root, frame, points, labels):
+    folder = root / "velodyne_points"
+    path = folder / "data" / f"{frame}.bin"
+    write_bin(path, np.asarray(points, dtype=np.float32))
+    (folder / "labels").mkdir(exist_ok=True)
+    (folder / "labels" / f"{frame}.label").write_bytes(np.array(labels, "<u4").tobytes())
+    return Scan("drive", frame, path)
+
+
+def test_names_are_those_of_the_simulator():
+    unnamed = (Semantic.UNLABELED, Semantic.EGO_VEHICLE)
+    for semantic in set(Semantic) - set(unnamed):
+        name = semantic.name.lower().replace("_", "")
+        assert CLASS_NAMES[semantic].replace(" ", "") == name
+
+
+def test_semantic_kitti_becomes_kitti_360(tmp_path):
+    scan = tmp_path / "velodyne" / "000001.bin"
+    path = tmp_path / "labels" / "000001.label"
+    path.parent.mkdir()
+    # A car, one that moves, a trunk, a lane marking, an outlier.
+    path.write_bytes(np.array([10 | 5 << 16, 252, 71, 60, 1], dtype="<u4").tobytes())
+    labels = read_labels(scan, 5)
+    assert (labels >> 16).tolist() == [5, 0, 0, 0, 0]
+    names = [CLASS_NAMES.get(label) for label in (labels & 0xFFFF).tolist()]
+    assert names == ["car", "car", "vegetation", "road", None]
+
+    path.write_bytes(np.array([10, 10, 10, 10, 12], dtype="<u4").tobytes())
+    with pytest.raises(ScanError, match=r"000001\.label holds \[12\], which are no classes"):
+        read_labels(scan, 5)
+    path.write_bytes(bytes(12))
+    with pytest.raises(ScanError, match=r"000001\.label holds 3 labels, but its scan 5 points"):
+        read_labels(scan, 5)
+
+
+# Ahead, left, and right of the sensor; one behind that is out of range.
+AHEAD, LEFT, RIGHT, FAR = (10, 1, 0, 0.5), (-1, 10, 0, 0.25), (1, -20, 0, 1.0), (-99, 1, 0, 0.0)
+
+
+@pytest.fixture
+def library(tmp_path, scaled_points):
+    points = [AHEAD, AHEAD, AHEAD, AHEAD, LEFT, FAR, RIGHT]
+    labels = [CAR | 1 << 16, CAR, CAR, ROAD, CAR | 2 << 16, CAR, 0]
+    scans = [write_scan(tmp_path, "0", points, labels)]
+    return object_library(scans, scaled_points(gain=2.0), PROJECTION, (2, 4))
+
+
+def test_a_cell_counts_by_the_share_of_its_points_that_are_of_the_class(library):
+    ahead, left = 2 * torch.tensor(AHEAD), 2 * torch.tensor(LEFT)
+    assert library.names == ("road", "car")
+    # Three of four points ahead are of the car, and the only one to the left.
+    expected = (0.75 * ahead + left) / 1.75
+    torch.testing.assert_close(library.feature("car"), expected)
+    torch.testing.assert_close(library.feature("road"), ahead)
+    cosine = torch.nn.functional.cosine_similarity
+    near = 0.75 * cosine(ahead, expected, dim=0) + cosine(left, expected, dim=0)
+    road, car = library.classes
+    assert (car.num_scans, car.num_cells, car.num_points) == (1, 2, 4)
+    assert car.spread == pytest.approx(1 - near.item() / 1.75, abs=1e-6)
+    assert (road.num_scans, road.num_cells, road.num_points) == (1, 1, 1)
+    assert road.spread == pytest.approx(0, abs=1e-6)
+
+
+def test_scans_add_up(tmp_path, scaled_points):
+    scans = [
+        write_scan(tmp_path, "0", [AHEAD, LEFT], [CAR | 3 << 16, ROAD]),
+        write_scan(tmp_path, "1", [RIGHT, RIGHT], [CAR, CAR]),
+    ]
+    assert read_labels(scans[0].path, 2).tolist() == [CAR | 3 << 16, ROAD]
+    library = object_library(scans, scaled_points(), PROJECTION, (2, 4))
+    expected = (torch.tensor(AHEAD) + torch.tensor(RIGHT)) / 2
+    torch.testing.assert_close(library.feature("car"), expected)
+    assert library.names == ("road", "car")
+    assert (library.classes[1].num_scans, library.classes[1].num_points) == (2, 3)
+
+
+def test_rings_are_found_in_whole_scans(tmp_path, scaled_points):
+    """Of the points of one class alone, the rows could not be told."""
+    rings = RingProjection(SENSOR, (15.0, 5.0, -5.0, -15.0))
+    inclination, azimuth = np.meshgrid(
+        np.deg2rad(rings.ring_inclinations_deg), np.linspace(0.01, 6.27, 40), indexing="ij"
+    )
+    x, y = np.cos(inclination) * np.cos(azimuth), np.cos(inclination) * np.sin(azimuth)
+    points = 10 * np.stack([x, y, np.sin(inclination), 0 * x], axis=-1)
+    labels = np.full((4, 40), ROAD)
+    labels[2, :5] = CAR
+    scan = write_scan(tmp_path, "0", points.reshape(-1, 4), labels.ravel())
+    library = object_library([scan], scaled_points(), rings, (4, 1))
+    # A cell is a ring; of that of the car, an eighth is car.
+    torch.testing.assert_close(
+        library.feature("car"), torch.from_numpy(points[2, :5].mean(axis=0)).float()
+    )
+    assert {entry.name: entry.num_cells for entry in library.classes} == {"car": 1, "road": 4}
+
+
+class Lifted(torch.nn.Module):
+    """Lifts its features to twice their width."""
+
+    name, dim, settings = "lifted", 4, {"pair": (1, 2)}
+
+    def prepare(self, points):
+        return points[:, :2]
+
+    def point_features(self, prepared):
+        return prepared
+
+    def lift(self, values):
+        return torch.cat([values, -values], dim=1)
+
+
+def test_the_linear_step_is_taken(tmp_path):
+    scan = write_scan(tmp_path, "0", [AHEAD], [CAR | 2 << 16])
+    library = object_library([scan], Lifted(), PROJECTION, (2, 4))
+    assert library.feature("car").tolist() == [*AHEAD[:2], *(-value for value in AHEAD[:2])]
+    assert library.source == "lifted"
+    assert library.extractor["settings"] == {"pair": [1, 2]}  # as it comes back from a file
+
+
+def test_features_may_be_targets_of_a_backward_pass(library):
+    weight = torch.ones(4, requires_grad=True)
+    (library.feature("car") * weight).sum().backward()
+    assert weight.grad.equal(library.feature("car"))
+
+
+def test_library_comes_back_from_its_file(tmp_path, library):
+    path = tmp_path / "new" / "objects.safetensors"
+    library.save(path)
+    loaded = ObjectLibrary.load(path)
+    assert loaded.features.equal(library.features)
+    assert replace(loaded, features=library.features) == library
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_other_objects_and_features_of_another_source_are_refused(library):
+    with pytest.raises(ValueError, match="no 'tram' among the objects; there are road, car"):
+        library.feature("tram")
+    library.check_source("scaled", 4)
+    for source, dim in (("scalr", 4), (None, 4), ("scaled", 768)):
+        with pytest.raises(ValueError, match=f"of 'scaled' of width 4, .* of {source!r} of width"):
+            library.check_source(source, dim)
+
+
+def test_what_the_scans_do_not_show_is_refused(tmp_path, scaled_points):
+    scans = [write_scan(tmp_path, "0", [AHEAD, FAR], [CAR, ROAD])]
+
+    def make(extractor=None):
+        object_library(scans, extractor or scaled_points(), PROJECTION, (2, 4))
+
+    with pytest.raises(ValueError, match=r"0\.bin: extractor scaled gave NaN or infinite"):
+        make(scaled_points(gain=float("nan")))
+    scans = [write_scan(tmp_path, "1", [AHEAD], [0])]
+    with pytest.raises(ValueError, match="no labelled point within range"):
+        make()
+    scans[0].path.parents[1].joinpath("labels", "1.label").unlink()
+    with pytest.raises(ScanError, match=r"1\.bin has no labels: looked for labels/1\.label"):
+        make()
+
+
+def test_parts_that_do_not_fit_are_refused(library):
+    car = ObjectClass("car", 1, 1, 1, 0.0)
+    with pytest.raises(ValueError, match="different classes"):
+        replace(library, classes=(car, car))
+    with pytest.raises(ValueError, match="different classes"):
+        replace(library, classes=(car,))
+    with pytest.raises(ValueError, match="NaN"):
+        replace(library, features=library.features * torch.nan)
+
+
+def test_a_file_of_something_else_is_named(tmp_path, library):
+    path = tmp_path / "objects.safetensors"
+    library.save(path)
+    for data in (path.read_bytes()[:40], b"no library"):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"objects\.safetensors holds no objects"):
+            ObjectLibrary.load(path)
+    for metadata in (None, {"r3dpa_objects": "{}"}, {"r3dpa_objects": '{"version": 2}'}):
+        save_file({"features": torch.ones(1, 2)}, path, metadata)
+        with pytest.raises(ValueError, match="holds no objects"):
+            ObjectLibrary.load(path)

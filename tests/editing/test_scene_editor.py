@@ -1,0 +1,242 @@
+"""Edits with tiny random networks: what must stay stays, seeds are independent of their batch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_networks import VAE_ARGS, tiny_checkpoint, tiny_networks
+
+from r3dpa.editing import EditSettings, SceneEditor
+from r3dpa.editing.regions import angle_box, dropped_beams, sector_weights, token_mask
+from r3dpa.generation import SamplerConfig, SceneGenerator
+from r3dpa.geometry import LidarSensor, RangeCodec, ScanGeometry, SphericalProjection, points_of
+from r3dpa.nn import VAE
+
+SENSOR = LidarSensor(beams=16, columns=64, range_min_m=1.0, range_max_m=50.0)
+GEOMETRY = ScanGeometry(SphericalProjection(SENSOR), RangeCodec(), (2, 8))
+MASK = angle_box(GEOMETRY.projection, -60, 20, -20, 0)
+SETTINGS = EditSettings(steps=6)
+
+
+@pytest.fixture(scope="module")
+def generator():
+    networks = tiny_networks(spread=0.05)
+    return SceneGenerator(*networks, GEOMETRY, SamplerConfig("heun", steps=3))
+
+
+@pytest.fixture(scope="module")
+def editor(generator):
+    return SceneEditor(generator, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def scan():
+    random = torch.Generator().manual_seed(1)
+    range_m = 5 + 20 * torch.rand(16, 64, generator=random)
+    return torch.where(torch.rand(16, 64, generator=random) < 0.2, -1.0, range_m)
+
+
+FEATURE = torch.eye(8)[0]
+
+
+class TestInpaint:
+    def test_outside_the_mask_the_scan_stays_bit_by_bit(self, editor, scan):
+        """And the tokens outside keep their latents."""
+        result = editor.inpaint(scan, MASK, range(2), feature=FEATURE)
+        assert result.range_m.shape == (2, 16, 64)
+        for made in result.range_m:
+            assert made[~MASK].equal(scan[~MASK])
+            assert not made[MASK].equal(scan[MASK])
+        latents = editor.encode(scan[None])[0]
+        kept = ~token_mask(MASK, (2, 8)).view(2, 8)
+        kept = kept.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        assert result.latents[0][:, kept].equal(latents[:, kept])
+        assert not result.latents[0][:, ~kept].equal(latents[:, ~kept])
+
+    def test_guidance_raises_the_cosine_and_none_is_none(self, generator, scan):
+        cosines = {}
+        for strength in (0.0, 0.8):
+            own = SceneEditor(generator, EditSettings(steps=6, strength=strength))
+            cosines[strength] = own.inpaint(scan, MASK, range(2), feature=FEATURE)
+        assert (cosines[0.8].cosine > cosines[0.0].cosine).all()
+        plain = SceneEditor(generator, SETTINGS).inpaint(scan, MASK, range(2))
+        assert plain.latents.equal(cosines[0.0].latents)
+        assert plain.cosine is None
+
+    def test_a_later_start_lies_on_the_path_of_the_network(self, scan):
+        """At t = 0.5 of the cosine path, where a network of velocity 0 leaves it."""
+        still = SceneGenerator(*tiny_networks(spread=0.0), GEOMETRY, path="cosine")
+        editor = SceneEditor(still, EditSettings("euler", 4))
+        result = editor.inpaint(scan, MASK, [3], seed=1, start=0.5)
+        latents, noise = editor.encode(scan[None]), still.noise([3], 1)
+        edited = token_mask(MASK, (2, 8)).view(2, 8)
+        edited = edited.repeat_interleave(2, 0).repeat_interleave(2, 1)
+        expected = torch.where(edited, (latents + noise) * 2**-0.5, latents)
+        torch.testing.assert_close(result.latents, expected)
+
+    def test_the_weights_get_no_gradients(self, generator, scan):
+        generator.sit.requires_grad_(True)
+        SceneEditor(generator, EditSettings(steps=2)).inpaint(scan, MASK, [0], feature=FEATURE)
+        weights = [*generator.sit.parameters(), *generator.vae.parameters()]
+        assert all(weight.grad is None and not weight.requires_grad for weight in weights)
+
+    def test_evaluations_are_those_of_inversion_and_way_back(self, generator, scan):
+        calls = []
+        real = generator.sit.velocity
+        generator.sit.velocity = lambda x, time: calls.append(len(x)) or real(x, time)
+        try:
+            result = SceneEditor(generator, EditSettings("euler", 5)).inpaint(scan, MASK, [0])
+        finally:
+            del generator.sit.velocity
+        assert result.nfe == 10
+        assert len(calls) == 10 + 5  # and the way back without an edit, which is measured
+
+    def test_masks_that_leave_nothing_are_refused(self, editor, scan):
+        for mask in (torch.zeros(16, 64, dtype=torch.bool), torch.ones(16, 64, dtype=torch.bool)):
+            with pytest.raises(ValueError, match=r"selects (nothing|all)"):
+                editor.inpaint(scan, mask, [0])
+
+
+def test_a_scene_does_not_depend_on_its_batch(generator, scan):
+    """Up to rounding of another batch size: 1e-4 in latents of size 1.
+
+    Completions are fitted step by step, which would enlarge it: they are made one by one.
+    """
+    missing = dropped_beams(GEOMETRY.projection, range(0, 16, 2))
+    few = EditSettings(steps=2)
+    together = SceneEditor(generator, few, batch_size=2)
+    alone = SceneEditor(generator, few, batch_size=1)
+    for edit, rounding in (
+        (lambda by, indices: by.inpaint(scan, MASK, indices, 5, feature=FEATURE), 1e-4),
+        (lambda by, indices: by.complete(scan, missing, indices, 5), 0),
+        (lambda by, indices: by.vary(scan, indices, 5), 1e-4),
+    ):
+        several, single = edit(together, [0, 2]), edit(alone, [2])
+        torch.testing.assert_close(several.latents[1:], single.latents, atol=rounding, rtol=0)
+        assert not several.latents[0].allclose(several.latents[1], atol=1e-1)
+
+
+def test_scenes_made_anew_lose_single_returns_by_number_and_seed(scan):
+    """88 % of the returns are kept by a decoder that gives each the logit 2."""
+    codec = RangeCodec("log2", return_channel=True)
+    _, sit, norm = tiny_networks(spread=0.05)
+    vae = VAE(**VAE_ARGS | {"in_channels": 2})
+    with torch.no_grad():
+        vae.decoder.conv_out.weight.zero_()
+        vae.decoder.conv_out.bias[:] = torch.tensor([0.0, 2.0])
+    geometry = ScanGeometry(GEOMETRY.projection, codec, GEOMETRY.grid_size)
+    generator, few = SceneGenerator(vae, sit, norm, geometry), EditSettings(steps=2)
+    together = SceneEditor(generator, few, batch_size=2)
+    alone = SceneEditor(generator, few, batch_size=1)
+    grids, weights = [torch.ones(16, 8)] * 2, sector_weights([(0, 0), (180, 1)], (2, 8))
+    for edit in (
+        lambda by, indices, seed: by.inpaint(scan, MASK, indices, seed),
+        lambda by, indices, seed: by.vary(scan, indices, seed),
+        lambda by, indices, seed: by.mix(grids, weights, indices, seed),
+    ):
+        holes = edit(together, [0, 2, 3], 5).range_m[:, MASK] < 0
+        assert holes.float().mean().item() == pytest.approx(0.12, abs=0.05)
+        assert not holes[0].equal(holes[1])
+        assert (edit(alone, [2, 3], 5).range_m[:, MASK] < 0).equal(holes[1:])
+        assert not (edit(alone, [2], 6).range_m[0, MASK] < 0).equal(holes[1])
+
+
+class TestMix:
+    def test_each_half_nears_its_own_source(self, generator):
+        """Unit vectors 0 and 1 as the features of everything left and everything right."""
+        sources = [torch.eye(8)[k].expand(16, 8).clone() for k in range(2)]
+        weights = sector_weights([(0, 0), (180, 1)], (2, 8))
+        own = SceneEditor(generator, EditSettings(steps=6, strength=0.8))
+        result = own.mix(sources, weights, range(2))
+        plain = SceneEditor(generator, EditSettings(steps=6, strength=0.0))
+        assert (result.cosine > plain.mix(sources, weights, range(2)).cosine).all()
+        with torch.no_grad():
+            features = generator.sit.project_features(result.latents, torch.zeros(2))
+        cosine = features / features.norm(dim=-1, keepdim=True)
+        toward = cosine[..., 0] - cosine[..., 1]
+        left = weights[0].bool()
+        assert toward[:, left].mean() > toward[:, ~left].mean()
+
+    def test_strength_0_is_the_plain_sampler(self, generator):
+        own = SceneEditor(generator, EditSettings("heun", 3, strength=0.0))
+        sources = [torch.ones(16, 8), torch.eye(8)[0].expand(16, 8)]
+        result = own.mix(sources, sector_weights([(0, 0), (180, 1)], (2, 8)), [3], seed=2)
+        expected = generator.generate([3], seed=2)
+        torch.testing.assert_close(result.latents, expected.latents, atol=1e-5, rtol=0)
+
+
+class TestComplete:
+    def test_known_pixels_stay_and_what_the_scan_holds_elsewhere_is_not_used(self, generator, scan):
+        editor = SceneEditor(generator, EditSettings(steps=2))
+        missing = dropped_beams(GEOMETRY.projection, range(0, 16, 2))
+        result = editor.complete(scan, missing, [0])
+        assert result.range_m[0][~missing].equal(scan[~missing])
+        other = torch.where(missing, 30.0, scan)
+        assert editor.complete(other, missing, [0]).range_m.equal(result.range_m)
+
+    def test_latents_are_fitted_to_what_is_known(self, editor, scan):
+        codec = GEOMETRY.codec
+        known = (~dropped_beams(GEOMETRY.projection, range(0, 16, 2))).float()
+        image, latents = codec.encode(scan), editor.encode(scan[None])
+
+        def error(latents):
+            with torch.no_grad():
+                raw = editor.generator.latent_norm.denormalise(latents)
+                made = editor.generator.vae.decode(raw)[0, 0]
+            return ((made - image).abs() * known).sum()
+
+        fitted = latents
+        for _ in range(5):
+            fitted = editor._fitted(fitted, image, known)
+        assert error(fitted) < 0.9 * error(latents)
+
+
+class TestVaryAndInterpolate:
+    def test_less_noise_leaves_more_of_the_scan(self, editor, scan):
+        latents = editor.encode(scan[None])
+        far = [
+            (editor.vary(scan, range(2), start=start).latents - latents).norm().item()
+            for start in (0.1, 0.5, 1.0)
+        ]
+        assert far[0] < far[1] < far[2]
+
+    def test_the_ends_come_back_and_the_middle_lies_between(self, generator, scan):
+        editor = SceneEditor(generator, EditSettings(steps=24))
+        second = scan.roll(17, dims=1)
+        result = editor.interpolate(scan, second, 5)
+        ends = editor.encode(torch.stack([scan, second]))
+        assert (result.latents[[0, -1]] - ends).abs().max() < 1e-2
+        assert result.round_trip_m < 0.05
+        far = (result.latents - ends[:1]).flatten(1).norm(dim=1)
+        assert (far.diff() > 0).all()
+
+    def test_a_single_frame_and_starts_outside_are_refused(self, editor, scan):
+        with pytest.raises(ValueError, match="at least 2"):
+            editor.interpolate(scan, scan, 1)
+        for start in (0.0, 1.5):
+            with pytest.raises(ValueError, match=r"start must be a time above 0"):
+                editor.vary(scan, [0], start=start)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"solver": "euler_maruyama"}, "runs both ways, one of euler"),
+        ({"strength": 1.5}, r"strength must lie in 0..1, got 1.5"),
+        ({"window": (0.8, 0.2)}, "window must be two times"),
+        ({"steps": 0}, "at least one step"),
+        ({"shift": 0.0}, "shift"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        EditSettings(**given)
+
+
+def test_a_checkpoint_is_edited_with_its_averaged_weights(tmp_path, scan):
+    path = tiny_checkpoint(tmp_path / "tiny.safetensors", GEOMETRY, spread=0.05)
+    found = SceneEditor.from_checkpoint(path, SETTINGS).vary(scan, 2)
+    networks = tiny_networks(spread=0.05)
+    expected = SceneEditor(SceneGenerator(*networks, GEOMETRY), SETTINGS).vary(scan, range(2))
+    assert torch.equal(found.latents, expected.latents)
+    assert torch.equal(found.points(1), points_of(expected.range_m[1], GEOMETRY.projection))

@@ -1,0 +1,247 @@
+"""Formats of scans: columns, round trips, and what is wrong with a file."""
+
+import math
+import struct
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarsim.clouds import find_files, read_file, write_file
+from lidarsim.faults import STRENGTHS, Fault
+from lidarsim.scan_files import ScanError
+from lidarsim.weather import Weather
+
+random = np.random.default_rng(0)
+NUM = 40
+POINTS = random.uniform(-30, 30, (NUM, 3)).astype(np.float32)
+INTENSITY = random.integers(0, 256, NUM).astype(np.float32)
+RING = np.repeat(np.arange(4), NUM // 4)
+ROWS = np.concatenate([POINTS, INTENSITY[:, None], RING[:, None]], axis=1, dtype=np.float32)
+FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2"), ("t", "f8")]
+TABLE = np.array([(*row, n / 3) for n, row in enumerate(ROWS)], FIELDS)
+
+
+def text(table):
+    return "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in table.tolist())
+
+
+def pcd(mode, body, table=TABLE):
+    names, kinds, sizes = zip(*((n, k[0].upper(), k[1]) for n, k in FIELDS), strict=True)
+    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(sizes)}\n"
+    head += f"TYPE {' '.join(kinds)}\nCOUNT {' '.join('1' * len(FIELDS))}\nWIDTH 2\n"
+    head += f"HEIGHT {len(table) // 2}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(table)}\n"
+    return f"{head}DATA {mode}\n".encode() + body
+
+
+def stored(data):
+    """As liblzf writes what cannot be compressed: runs of 32 literals."""
+    parts = (data[first : first + 32] for first in range(0, len(data), 32))
+    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+    return struct.pack("<II", len(packed), len(data)) + packed
+
+
+def ply(kind, order=""):
+    names = {"f4": "float", "u2": "ushort", "f8": "double"}
+    lines = [f"property {names[code]} {name}" for name, code in FIELDS]
+    head = ["ply", f"format {kind} 1.0", "comment kept", f"element vertex {NUM}", *lines]
+    body = (
+        TABLE.astype(TABLE.dtype.newbyteorder(order)).tobytes() if order else text(TABLE).encode()
+    )
+    tail = ["element face 0", "property list uchar int vertex_index", "end_header", ""]
+    return "\n".join([*head, *tail]).encode() + body
+
+
+def npy(path):
+    np.save(path, ROWS.astype("f8"))
+
+
+def write(path, content):
+    """A file of bytes, or of a function that writes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content(path) if callable(content) else path.write_bytes(content)
+
+
+FILES = {
+    "kitti.bin": (4, ROWS[:, :4].tobytes()),
+    "nuscenes.pcd.bin": (5, ROWS.tobytes()),
+    "five.bin": (5, ROWS.tobytes()),
+    "ascii.pcd": (6, pcd("ascii", text(TABLE).encode())),
+    "binary.pcd": (6, pcd("binary", TABLE.tobytes())),
+    "packed.pcd": (
+        6,
+        pcd("binary_compressed", stored(b"".join(TABLE[n].tobytes() for n, _ in FIELDS))),
+    ),
+    "ascii.ply": (6, ply("ascii")),
+    "little.ply": (6, ply("binary_little_endian", "<")),
+    "big.ply": (6, ply("binary_big_endian", ">")),
+    "rows.npy": (4, lambda path: np.save(path, ROWS[:, :4].astype("f8"))),
+    "named.npy": (6, lambda path: np.save(path, TABLE)),
+    "rows.npz": (4, lambda path: np.savez(path, ROWS[:, :4])),
+    "named.npz": (6, lambda path: np.savez(path, **{n: TABLE[n] for n, _ in FIELDS})),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
+    num_columns, content = FILES[name]
+    path, out = tmp_path / "in" / "a" / name, tmp_path / "out"
+    write(path, content)
+    file = read_file(path)
+    scan = file.scan
+    assert len(file.table.dtype.names) == num_columns
+    np.testing.assert_array_equal(scan.points, POINTS)
+    np.testing.assert_array_equal(scan.intensity, INTENSITY)
+    if num_columns > 4:
+        np.testing.assert_array_equal(scan.ring, RING)
+    if num_columns == 6:
+        np.testing.assert_allclose(scan.time_s, TABLE["t"], rtol=1e-8)
+    low, high = INTENSITY.min(), INTENSITY.max()
+    assert f"40 points, range {np.linalg.norm(POINTS, axis=1).min():.3g}.." in file.describe()
+    assert f"intensity {low:g}..{high:g}" in file.describe()
+
+    write_file(file, tmp_path / "in", out)
+    again = read_file(out / "a" / name)
+    np.testing.assert_array_equal(again.table, file.table)
+    if name not in ("packed.pcd", "ascii.ply", "ascii.pcd", "binary.pcd", "rows.npz", "named.npz"):
+        assert (out / "a" / name).read_bytes() == path.read_bytes()
+    # Half of the rows are a smaller file of the same kind.
+    write_file(replace(file, table=file.table[::2], data=None), tmp_path / "in", out)
+    np.testing.assert_array_equal(read_file(out / "a" / name).table, file.table[::2])
+
+
+NOTHING = [
+    *({}, {"visibility_m": math.inf}, {"rain_mm_h": 0.0}, {"snow_mm_h": 0.0}),
+    *({"water_film_mm": 0.0, "traffic_m_s": 25.0}, {"sun_elevation_deg": 80.0}),
+]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_no_strength_of_any_effect_or_fault_gives_the_same_file(tmp_path, name):
+    path, out = tmp_path / "in" / name, tmp_path / "out"
+    write(path, FILES[name][1])
+    file = read_file(path)
+    changes = [Weather(**weather) for weather in NOTHING]
+    changes += [Fault(kind, severity=0) for kind in STRENGTHS]
+    for change in changes:
+        write_file(file.changed(change.apply(file.scan)), tmp_path / "in", out)
+        assert (out / name).read_bytes() == path.read_bytes(), change
+
+
+def test_added_points_have_the_other_columns_of_their_shot(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, TABLE)
+    file = read_file(path)
+    result = Weather(visibility_m=20).apply(file.scan)
+    changed = file.changed(result)
+    new = result.index < 0
+    assert new.any()
+    for name in ("ring", "t"):
+        np.testing.assert_array_equal(changed.table[name], TABLE[name][result.shot])
+    np.testing.assert_array_equal(changed.scan.points[new], result.points[new])
+
+
+def bad_npz(path):
+    np.savez(path, ROWS, RING)
+
+
+NAN = ROWS[:, :4].copy()
+NAN[3, 1] = np.nan
+ZERO = ROWS[:, :4] * [1, 1, 1, -1]
+BAD = {
+    "empty.bin": (b"", "is empty"),
+    "cut.bin": (ROWS.tobytes()[:-3], "797 bytes are no rows of 4 or 5 float32"),
+    "negative.bin": (ZERO.astype("f4").tobytes(), "name the columns with --columns"),
+    "one.bin": (ROWS[:1, :4].tobytes(), "holds 1 of at least 16 points; remove it"),
+    "nan.bin": (NAN.tobytes(), "NaN or infinite values in 1 of 40 points; --drop_nan"),
+    "far.bin": ((ROWS[:, :4] * 100).tobytes(), "which are no metres: divide"),
+    "near.bin": ((ROWS[:, :4] / 100).tobytes(), "which are no metres: multiply"),
+    "scan.las": (b"LASF", "is of no known format; can be read: .bin"),
+    "short.pcd": (pcd("binary", TABLE.tobytes()[:-1]), "is damaged or of another layout"),
+    "rows.pcd": (pcd("binary", TABLE[:-1].tobytes()), "is damaged: holds 39 of 40 points"),
+    "head.pcd": (b"VERSION 0.7\n", "is damaged or of another layout"),
+    "bomb.pcd": (pcd("binary_compressed", stored(bytes(99))), "is damaged"),
+    "faces.ply": (ply("ascii").replace(b"face 0", b"face 2"), "must hold points alone"),
+    "noz.ply": (ply("ascii").replace(b"float z", b"float w"), "has no column z, only x, y, w"),
+    "int.ply": (ply("ascii").replace(b"float z", b"int z"), "must"),
+    "wide.npy": (lambda path: np.save(path, np.ones((40, 7))), "not rows of 5 floats"),
+    "time.npy": (
+        lambda path: np.save(path, np.column_stack([ROWS[:, :4], RING / 7])),
+        "not rows of 5 floats that can be x, y, z, intensity, ring: name the columns",
+    ),
+    "two.npz": (bad_npz, "must hold one scan"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_named_in_one_line(tmp_path, name):
+    content, message = BAD[name]
+    path = tmp_path / name
+    write(path, content)
+    with pytest.raises(ScanError) as raised:
+        read_file(path)
+    assert str(raised.value).startswith(f"{path}: ")
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_columns_can_be_named_and_points_without_return_dropped(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(NAN.tobytes())
+    named = read_file(path, ("x", "y", "z", "time"), drop_nan=True)
+    assert named.scan.intensity is None
+    np.testing.assert_array_equal(named.scan.time_s, np.delete(INTENSITY, 3))
+    with pytest.raises(ScanError, match="has no column z, only x, y, q, i"):
+        read_file(path, ("x", "y", "q", "i"))
+
+
+@pytest.mark.parametrize(
+    ("scan", "labels", "written"),
+    [
+        ("s/a.bin", "s/a.label", "s/a.label"),
+        ("s/a.bin", "s/labels/a.label", "s/labels/a.label"),
+        ("velodyne/a.pcd.bin", "labels/a.label", "labels/a.label"),
+        ("velodyne/100.1.bin", "labels/100.1.label", "labels/100.1.label"),
+        ("a.bin", "../labels/a.label", "a.label"),
+    ],
+)
+def test_labels_go_with_their_scan(tmp_path, scan, labels, written):
+    root, out = tmp_path / "root", tmp_path / "out"
+    values = np.arange(NUM, dtype="<u4") | 7 << 16
+    for place, data in ((scan, ROWS), (labels, values)):
+        (root / place).resolve().parent.mkdir(parents=True, exist_ok=True)
+        (root / place).resolve().write_bytes(data.tobytes())
+    folder, (path,) = find_files(root)
+    file = read_file(path)
+    np.testing.assert_array_equal(file.scan.labels, values)
+    write_file(file, folder, out)
+    assert (out / written).read_bytes() == values.tobytes()
+    (root / labels).resolve().write_bytes(values[:-1].tobytes())
+    with pytest.raises(ScanError, match=r"holds 39 labels but .* 40 points: delete the one"):
+        read_file(path)
+
+
+def test_labels_of_another_time_stamp_are_not_taken(tmp_path):
+    for name in ("100.1.bin", "100.2.bin"):
+        (tmp_path / name).write_bytes(ROWS.tobytes())
+    for name in ("100.label", "100.2.label"):
+        (tmp_path / name).write_bytes(bytes(4 * NUM))
+    assert read_file(tmp_path / "100.1.bin").labels is None
+    assert read_file(tmp_path / "100.2.bin").label_path == tmp_path / "100.2.label"
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pypcd4", None)
+    path = tmp_path / "a.pcd"
+    path.write_bytes(pcd("binary", TABLE.tobytes()))
+    with pytest.raises(ScanError, match=r"a\.pcd: \.pcd needs pypcd4: pip install 'r3dpa\[pcd\]'"):
+        read_file(path)
+
+
+def test_a_folder_without_scans_is_named(tmp_path):
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(ScanError, match=r"is no folder with scans and no scan; can be read: \.bin"):
+        find_files(tmp_path)
+    with pytest.raises(ScanError, match="nowhere: is no folder"):
+        find_files(tmp_path / "nowhere")

@@ -1,0 +1,80 @@
+"""Rings by the order, the inclination and the column of a file."""
+
+import numpy as np
+import pytest
+
+from lidarsim import Street, load_sensor, simulate_scan
+from lidarsim.faults import Fault
+from lidarsim.recorded import RecordedScan
+from lidarsim.rings import rings_of
+from lidarsim.scene import Weather
+
+
+def simulated(model, shots):
+    """Points of a scan, and the laser of each, by their place: a laser ends where azimuth falls."""
+    sensor = load_sensor(model, shots=shots)
+    scene = Street(5, 1, Weather()).scene(3, sensor.mount_height_m)
+    points = simulate_scan(scene, sensor, ("rings",), {"rolling_shutter": "off"}).points[:, :3]
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+    return points.copy(), np.append(0, (np.diff(azimuth) < -1).cumsum())
+
+
+@pytest.mark.parametrize(("model", "beams"), [("hdl64e", 64), ("hdl32e", 32)])
+def test_rings_by_the_order_of_the_file_in_any_direction(model, beams):
+    points, ring = simulated(model, 520)
+    forward, backward = (rings_of(RecordedScan(p)) for p in (points, points[::-1].copy()))
+    assert (forward.ring == ring).all()
+    assert (backward.ring[::-1] == ring).mean() > 0.998
+    for found in (forward, backward):
+        assert (found.how, found.num_rings, found.num_shots) == ("order", beams, 520)
+        assert found.sure > 0.98
+
+
+def test_rings_of_a_shuffled_scan_are_fitted_and_those_stored_are_used():
+    points, ring = simulated("hdl32e", 520)
+    order = np.random.default_rng(0).permutation(len(points))
+    fitted = rings_of(RecordedScan(points[order]))
+    assert fitted.how == "inclination"
+    assert (fitted.ring == ring[order]).all()
+    assert fitted.sure > 0.99
+    # nuScenes counts from the lowest.
+    stored = rings_of(RecordedScan(points[order], ring=31 - ring[order]))
+    assert stored.how == "stored"
+    assert (stored.ring == ring[order]).all()
+
+
+def test_a_shuffled_scan_of_lasers_at_different_heights_is_said_to_be_unsure():
+    points, _ = simulated("hdl64e", 520)
+    found = rings_of(RecordedScan(points[np.random.default_rng(0).permutation(len(points))]))
+    assert found.how == "inclination"
+    assert found.sure < 0.9
+
+
+@pytest.mark.parametrize("model", ["hdl64e", "hdl32e"])
+def test_stored_rings_are_sure_also_in_the_frame_of_the_vehicle(model):
+    points, ring = simulated(model, 520)
+    for shift in ([0, 0, 0], [0, 0, 1.8], [1.4, 0, 2.1]):
+        moved = points + np.array(shift, dtype=np.float32)
+        assert rings_of(RecordedScan(moved, ring=ring)).sure == 1
+
+
+@pytest.mark.parametrize("most", [64, 256, 10**6])
+def test_numbers_by_chance_are_no_rings(most):
+    points, _ = simulated("hdl64e", 520)
+    ring = np.random.default_rng(0).integers(-5, most, len(points))
+    scan = RecordedScan(points, ring=ring)
+    assert rings_of(scan).sure == 0
+    with pytest.raises(ValueError, match=r"only 0% of the points are sure of one .* by stored"):
+        Fault("missing_beams").apply(scan)
+
+
+def test_more_than_256_rings_are_not_sure():
+    points, ring = simulated("hdl64e", 520)
+    split = 5 * ring + np.arange(len(ring)) % 5
+    found = rings_of(RecordedScan(points, ring=split))
+    assert (found.num_rings, found.sure) == (320, 0)
+
+
+def test_one_point_has_a_ring():
+    found = rings_of(RecordedScan(np.ones((1, 3), dtype=np.float32)))
+    assert (found.num_rings, found.ring.tolist()) == (1, [0])
