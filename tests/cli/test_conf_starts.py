@@ -42,11 +42,11 @@ STARTS = {  # each after the YAML of its stage, which test_stages starts alone
 }
 R3DPA_S = {  # in the order given
     "trained": ("data", "vae_alignment"),
-    "box_more": ("data", "vae_alignment", "vae_more"),
-    "box_labels": ("data", "data_labels", "vae_alignment", "vae_alignment_labels"),
-    "box_decoder": ("data", "vae_alignment", "vae_decoder"),
-    "box_flow": ("data", "flow_matching"),
-    "box_few_step": ("data", "few_step"),
+    "more": ("data", "vae_alignment", "vae_more"),
+    "labels": ("data", "data_labels", "vae_alignment", "vae_alignment_labels"),
+    "decoder": ("data", "vae_alignment", "vae_decoder"),
+    "flow": ("data", "flow_matching"),
+    "few_step": ("data", "few_step"),
     "demo": ("demo_data", "vae_alignment", "demo_vae"),
     "demo_flow": ("demo_folder", "flow_matching", "demo_flow"),
 }
@@ -155,7 +155,7 @@ def test_experiments_with_tiny_networks(experiment, data, start, smoke_root, tmp
     "name",
     [name if name == "demo" else pytest.param(name, marks=pytest.mark.slow) for name in R3DPA_S],
 )
-def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
+def test_r3dpa_s_and_its_demo_start(name, start, smoke_root, tmp_path):
     simulate(smoke_root, 12)  # unless they are there
     given = R3DPA_S[name]
     vae, sit = (
@@ -174,7 +174,7 @@ def test_the_box_and_its_demo_start(name, start, smoke_root, tmp_path):
         settings |= {"data.init_args.root": tmp_path / "data"} | SIMULATED
     if name != "trained":
         codec = RangeCodec("log2", return_channel=True)
-        exported = None if name == "box_flow" else sit
+        exported = None if name == "flow" else sit
         settings |= start_flow(tmp_path, vae, (16, 64), exported, codec)
     configs = ["trainer", *(f"r3dpa_s/{part}" for part in ("trainer", *given))]
     start(configs, settings)

@@ -1,6 +1,6 @@
 """Two roads to one scan: weather on a recorded clear scan, and weather simulated in its scene.
 
-``python tests/weather/two_roads.py notebooks/results/weather_two_roads.json 200`` writes the study
+``python tests/lidarsim/two_roads.py notebooks/results/weather_two_roads.json 200`` writes the study
 that notebook 06 shows.
 """
 
