@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from r3dpa.cli import main
 from r3dpa.io import only_writer
@@ -122,3 +123,39 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+def unchanged(points):
+    return points
+
+
+class ScaledPoints(nn.Module):
+    """Extractor whose features are the points times a gain; counts the scans it is given."""
+
+    name = "scaled"
+    dim = 4
+    prepare = staticmethod(unchanged)
+
+    def __init__(self, gain=1.0, fail_after=None):
+        super().__init__()
+        self.settings = {"gain": gain}
+        self.fail_after = fail_after
+        self.calls = 0
+
+    def point_features(self, prepared):
+        features = []
+        for points in prepared:
+            self.calls += 1
+            if self.fail_after is not None and self.calls > self.fail_after:
+                raise RuntimeError("interrupted")
+            features.append(points * self.settings["gain"])
+        return features
+
+    def forward(self, points):
+        return self.point_features([self.prepare(points)])[0]
+
+
+@pytest.fixture
+def scaled_points():
+    """The extractor class."""
+    return ScaledPoints

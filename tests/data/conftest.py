@@ -1,43 +1,12 @@
-"""Small scans and a small extractor for the tests of r3dpa.data."""
+"""Small scans for the tests of r3dpa.data."""
 
 import numpy as np
 import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
-from torch import nn
 
 from r3dpa.data import LidarDataModule
 from r3dpa.geometry import LidarSensor, SphericalProjection
-
-
-def unchanged(points):
-    return points
-
-
-class ScaledPoints(nn.Module):
-    """Extractor whose features are the points times a gain; counts the scans it is given."""
-
-    name = "scaled"
-    dim = 4
-    prepare = staticmethod(unchanged)
-
-    def __init__(self, gain=1.0, fail_after=None):
-        super().__init__()
-        self.settings = {"gain": gain}
-        self.fail_after = fail_after
-        self.calls = 0
-
-    def point_features(self, prepared):
-        features = []
-        for points in prepared:
-            self.calls += 1
-            if self.fail_after is not None and self.calls > self.fail_after:
-                raise RuntimeError("interrupted")
-            features.append(points * self.settings["gain"])
-        return features
-
-    def forward(self, points):
-        return self.point_features([self.prepare(points)])[0]
 
 
 def random_points(seed, count=300):
@@ -71,12 +40,6 @@ def make_scans():
         return folder
 
     return make
-
-
-@pytest.fixture
-def scaled_points():
-    """The extractor class."""
-    return ScaledPoints
 
 
 @pytest.fixture
