@@ -148,7 +148,7 @@ def test_what_does_not_fit_is_refused(tmp_path, module, data):
         other.setup("fit")
     data.prepare = str
     module._trainer = trainer
-    with pytest.raises(ValueError, match=r"with prepare r3dpa\.nn\.backbones\.Masking, got"):
+    with pytest.raises(ValueError, match=r"with prepare r3dpa\.features\.Masking, got"):
         module.setup("fit")
     source = LidarDataModule(
         str(tmp_path / "scans"), extractor=torch.nn.Identity(), features_dir=str(tmp_path)
