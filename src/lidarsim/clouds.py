@@ -1,242 +1,440 @@
-"""Scans of any lidar from files, and back, with every column as it was.
+"""Point clouds of any LiDAR from files, and back, with every column as it was.
 
-``.bin`` holds float32 rows x, y, z, intensity (KITTI), the ring as fifth (nuScenes, ``.pcd.bin``),
-or other columns that are named; ``.pcd`` needs the package pypcd4; ``.ply`` is ASCII or binary, of
-vertices alone; ``.npy`` and ``.npz`` hold such rows, or columns with names. Labels lie in a
-``.label`` of SemanticKITTI: beside the scan, or in ``labels`` in or beside its folder.
+============ =====================================================================================
+suffix       content
+============ =====================================================================================
+``.bin``     float32 rows x, y, z, intensity (KITTI), the ring as fifth column (nuScenes), or other
+             columns if they are named
+``.pcd.bin`` five columns: x, y, z, intensity 0..255, ring counted from the lowest (nuScenes)
+``.pcd``     ASCII, binary or compressed; needs the package pypcd4
+``.ply``     ASCII or binary, only vertices
+``.npy``     rows ``(P, C)``, a structured array, or an organised ``(H, W, C)`` with a row per beam
+``.npz``     one such array; or ``xyz`` or ``points`` and further columns; or columns by name
+``.las``     also ``.laz``; needs the package laspy
+============ =====================================================================================
+
+Labels lie in a ``.label`` of SemanticKITTI: beside the scan, or in ``labels`` in or beside its
+folder. Everything else needs only NumPy.
 """
 
 from __future__ import annotations
 
 import io
 import os
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from lidarsim.cloud_formats import (
+    ODD_SHARE,
+    READABLE,
+    READERS,
+    ROWS,
+    ScanError,
+    Table,
+    ply_of,
+    read_bytes,
+    table_of,
+)
 from lidarsim.io import UNPICKLING_ERRORS, atomic_path, first_line
-from lidarsim.recorded import RecordedScan
-from lidarsim.scan_files import ScanError, files_below, npz_arrays, ply_table, read_bytes
-from lidarsim.weather import WeatheredScan
 
-Table = NDArray[np.void]  # (P,) rows of named columns, in the order of the file
-_Read = tuple[str, Table, Callable[[Table], bytes]]  # format, rows, and file of other rows
-_ROWS = ("x", "y", "z", "intensity", "ring")  # of rows without names
-_ADVICE = "name the columns with --columns, such as x,y,z,intensity,time"
 _NAMES = {
     **{axis: axis for axis in "xyz"},
-    "intensity": "intensity i reflectivity reflectance remission scalar_intensity",
+    "intensity": "intensity i reflectivity reflectance remission scalar_intensity signal",
     "ring": "ring line channel laser laser_id beam scalar_ring",
-    "time_s": "time_s time t timestamp time_stamp time_offset scalar_time",
+    "time_s": "time_s time t timestamp time_stamp time_offset scalar_time gps_time",
 }
+# Columns that may hold the length of x, y, z, and the largest relative difference from it.
+_RANGES, _SAME_RANGE = {"range", "range_m", "range_mm", "distance", "depth"}, 0.01
 # No lidar's ranges in metres have a greater median, or end before.
 _FAR_MEDIAN_M, _NEAR_MAX_M = 250.0, 1.5
 _FEWEST_POINTS = 16
+_LAS_FULL_INTENSITY = 65535.0
 
 
-@dataclass(frozen=True)
-class ScanFile:
-    """A scan and what is needed to write it again.
-
-    Args:
-        path: File that was read.
-        kind: Format in words.
-        table: Rows ``(P,)`` with all columns of the file.
-        columns: Name in the table of x, y, z and, where known, intensity, ring, time_s.
-        pack: Bytes of the file for other rows of this table.
-        data: Bytes of the file with these rows, if known.
-        labels: ``(P,)`` uint32 from ``label_path``, or None.
-        label_path: File of the labels.
-    """
+class CloudFile(NamedTuple):
+    """File that a cloud was read from, and how to write it again."""
 
     path: Path
-    kind: str
-    table: Table
-    columns: dict[str, str]
-    pack: Callable[[Table], bytes]
-    data: bytes | None
-    labels: NDArray[np.uint32] | None = None
+    kind: str  # format in words
+    pack: Callable[[Table], bytes]  # content of the file for other rows
+    data: bytes | None = None  # content for the rows of the cloud, if known
     label_path: Path | None = None
 
-    @property
-    def scan(self) -> RecordedScan:
-        """The points as float32, and the columns that are understood."""
-        given = {key: self.table[name] for key, name in self.columns.items()}
-        points = np.stack([given.pop(axis).astype(np.float32) for axis in "xyz"], axis=1)
-        try:
-            return RecordedScan(points, **given, labels=self.labels)
-        except ValueError as error:
-            raise ScanError(f"{self.path}: {error}") from error
 
-    def changed(self, result: WeatheredScan) -> Self:
-        """The file of a changed scan: rows of kept points, then those of added ones.
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of one scan, in the order of their file.
 
-        Other columns of an added point, such as the ring, are those of its shot.
+    Args:
+        table: Rows ``(P,)`` with all columns, named and typed as in the file.
+        names: Name in the table of x, y, z (metres) and, where known, intensity, ring, time_s.
+        labels: ``(P,)`` uint32, or None.
+        file: File that it was read from; None for a cloud that was made.
+
+    Example:
+        >>> cloud = PointCloud.of(np.ones((2, 3), np.float32), ring=[0, 1], azimuth=[0.1, 0.2])
+        >>> cloud.points.shape, cloud.ring.tolist(), list(cloud.columns)
+        ((2, 3), [0, 1], ['azimuth'])
+    """
+
+    table: Table
+    names: Mapping[str, str]
+    labels: NDArray[np.uint32] | None = None
+    file: CloudFile | None = None
+
+    @classmethod
+    def of(
+        cls, points: ArrayLike, labels: NDArray[np.uint32] | None = None, **columns: ArrayLike
+    ) -> Self:
+        """Make a cloud of points ``(P, 3)``, or ``(P, 4)`` with intensity, and columns ``(P,)``.
+
+        Raises:
+            ValueError: If the points have another shape.
         """
-        scan, rows = self.scan, self.table[result.shot]
-        away = (result.points != scan.points[result.shot]).any(axis=1)
-        for axis, values in zip("xyz", result.points.T, strict=True):
-            rows[self.columns[axis]][away] = values[away]
-        if result.intensity is not None:
-            rows[self.columns["intensity"]] = result.intensity
-        same = rows.tobytes() == self.table.tobytes()
-        return replace(self, table=rows, labels=result.labels, data=self.data if same else None)
+        rows = np.asarray(points)
+        if rows.ndim != 2 or rows.shape[1] not in (3, 4):
+            raise ValueError(f"points must be (P, 3) or (P, 4), got {rows.shape}")
+        if rows.dtype.kind != "f":
+            rows = rows.astype(np.float32)
+        named = dict(zip(ROWS, rows.T, strict=False))
+        named |= {name: np.asarray(column) for name, column in columns.items()}
+        table = table_of(named, len(rows))
+        return cls(table, _known_columns("the cloud", table), labels)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @cached_property
+    def points(self) -> NDArray[np.floating]:
+        """``(P, 3)`` metres, float64 where a coordinate is, else float32."""
+        return np.stack([self.table[self.names[axis]] for axis in "xyz"], axis=1)
+
+    @property
+    def intensity(self) -> NDArray | None:
+        """``(P,)`` in units of the file."""
+        return self._column("intensity")
+
+    @property
+    def ring(self) -> NDArray | None:
+        """``(P,)`` laser of each point, as the file numbers them."""
+        return self._column("ring")
+
+    @property
+    def time_s(self) -> NDArray | None:
+        """``(P,)`` time of each point, as the file gives it."""
+        return self._column("time_s")
+
+    @property
+    def columns(self) -> dict[str, NDArray]:
+        """Further columns ``(P,)`` by name, without padding."""
+        known = set(self.names.values())
+        names = (n for n in self.table.dtype.names or () if n not in known and n[0] != "_")
+        return {name: self.table[name] for name in names}
+
+    def _column(self, name: str) -> NDArray | None:
+        return self.table[self.names[name]] if name in self.names else None
+
+    def intensity_shares(self, full_scale: float | None = None) -> NDArray[np.float32]:
+        """Intensities ``(P,)`` as shares of a full scale, 0 where the file has none.
+
+        The default full scale is 1, or 255 for integers and where intensities exceed 1.
+
+        Raises:
+            ScanError: If intensities exceed 255 and no ``full_scale`` is given.
+        """
+        values = self.intensity
+        if values is None:
+            return np.zeros(len(self), np.float32)
+        if full_scale is None:
+            full_scale = self._full_scale(values)
+        return values.astype(np.float32) / np.float32(full_scale)
+
+    def _full_scale(self, intensity: NDArray) -> float:
+        num_above = np.count_nonzero(intensity > 1)
+        if intensity.dtype.kind == "f" and num_above <= ODD_SHARE * len(self):
+            return 1.0
+        largest = intensity.max(initial=0)
+        if largest <= 255:
+            return 255.0
+        is_las = self.file is not None and self.file.kind in (".las", ".laz")
+        if is_las and largest <= _LAS_FULL_INTENSITY:
+            return _LAS_FULL_INTENSITY
+        raise ScanError(
+            f"{self.where}: has intensities up to {largest:g}, of an unknown full scale: give it "
+            "to `r3dpa data convert --full_intensity`"
+        )
+
+    def rows(self, full_scale: float | None = None) -> NDArray[np.float32]:
+        """``(P, 4)`` x, y, z and the share of the intensity, see :meth:`intensity_shares`."""
+        points = self.points.astype(np.float32)
+        return np.column_stack([points, self.intensity_shares(full_scale)])
+
+    def with_column(self, name: str, values: NDArray) -> Self:
+        """Cloud with another column ``(P,)``, or one column more."""
+        columns = {known: self.table[known] for known in self.table.dtype.names or ()}
+        table = table_of(columns | {name: values}, len(self))
+        return replace(self, table=table, names=_known_columns(self.where, table))
+
+    def changed(
+        self,
+        index: NDArray[np.int64],
+        points: NDArray[np.floating],
+        intensity: NDArray | None = None,
+        labels: NDArray[np.uint32] | None = None,
+    ) -> Self:
+        """Cloud of the rows ``index`` ``(Q,)`` with other points, intensities and labels.
+
+        Other columns, such as the ring, keep the values of the rows; columns of ranges are
+        computed from the points.
+        """
+        rows, before = self.table[index], self.points.astype(np.float32)[index]
+        away = (points != before).any(axis=1)
+        for axis, values in zip("xyz", points.T, strict=True):
+            rows[self.names[axis]][away] = values[away]
+        for name in (n for n in self.columns if n.lower() in _RANGES):
+            unit = self._range_unit(name)
+            range_m = np.linalg.norm(points[away].astype(float), axis=1)
+            if unit is not None:
+                is_whole = rows.dtype[name].kind in "iu"
+                rows[name][away] = np.rint(unit * range_m) if is_whole else unit * range_m
+        if intensity is not None:
+            rows[self.names["intensity"]] = intensity
+        file = self.file
+        if file is not None and rows.tobytes() != self.table.tobytes():
+            file = file._replace(data=None)
+        return replace(self, table=rows, labels=labels, file=file)
+
+    def _range_unit(self, name: str) -> float | None:
+        """Factor from metres to a column of ranges; None if it holds something else."""
+        range_m = np.linalg.norm(self.points.astype(float), axis=1)
+        far = range_m > 1
+        ratio = self.table[name][far] / range_m[far]
+        unit = float(np.median(ratio)) if far.any() else 0.0
+        is_range = unit > 0 and np.mean(np.abs(ratio / unit - 1) < _SAME_RANGE) > 0.5
+        return unit if is_range else None
+
+    def check_metres(self) -> None:
+        """Refuse clouds of fewer than 16 points, and ranges that cannot be metres.
+
+        Raises:
+            ScanError: With what to do.
+        """
+        if len(self) < _FEWEST_POINTS:
+            raise ScanError(
+                f"{self.where}: holds {len(self)} of at least {_FEWEST_POINTS} points; remove it"
+            )
+        range_m = np.linalg.norm(self.points.astype(float), axis=1)
+        median, largest = float(np.median(range_m)), float(range_m.max())
+        if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
+            advice = "divide the coordinates, by 100 or 1000" if median > 1 else "multiply them"
+            raise ScanError(
+                f"{self.where}: ranges have the median {median:.3g} and reach {largest:.4g}, "
+                f"which are no metres: {advice}"
+            )
 
     def describe(self) -> str:
         """Format, columns, number of points, ranges and intensities in one line."""
         names = ", ".join(self.table.dtype.names or ())
-        parts = [f"{self.kind} ({names})", f"{len(self.table)} points"]
-        range_m = np.linalg.norm(self.scan.points, axis=1)
-        for name, values in (("range", range_m), ("intensity", self.scan.intensity)):
+        kind = "made" if self.file is None else self.file.kind
+        parts = [f"{kind} ({names})", f"{len(self)} points"]
+        range_m = np.linalg.norm(self.points.astype(np.float32), axis=1)
+        for name, values in (("range", range_m), ("intensity", self.intensity)):
             if values is not None:
                 parts.append(f"{name} {values.min():.3g}..{values.max():.4g}")
-        return ", ".join(parts + ["labels"] * (self.labels is not None))
+        if self.labels is not None:
+            parts.append("labels")
+        return ", ".join(parts)
+
+    @property
+    def where(self) -> str:
+        """Path of the file, for messages."""
+        return "the cloud" if self.file is None else str(self.file.path)
+
+
+def suffix_of(path: Path) -> str:
+    """Suffix of a scan in lower case; ``.pcd.bin`` is one."""
+    name = path.name.lower()
+    return ".pcd.bin" if name.endswith(".pcd.bin") else path.suffix.lower()
+
+
+def read_cloud(
+    path: str | Path,
+    columns: Sequence[str] = (),
+    drop_nan: bool = False,
+    with_labels: bool = True,
+) -> PointCloud:
+    """Point cloud of a file.
+
+    Args:
+        path: File of a format above.
+        columns: Names of the columns of rows without names; default: as the values show.
+        drop_nan: Leave out points with NaN or infinite numbers.
+        with_labels: Read the file of labels too, if there is one.
+
+    Raises:
+        ScanError: If the file is damaged, holds NaN, or its columns are ambiguous.
+    """
+    path = Path(path)
+    suffix, data = suffix_of(path), read_bytes(path)
+    if not data:
+        raise ScanError(f"{path}: is empty")
+    if suffix not in READERS:
+        raise ScanError(f"{path}: is of no known format; can be read: {READABLE}")
+    try:
+        kind, table, pack = READERS[suffix](path, data, tuple(columns))
+    except ScanError:
+        raise
+    except UNPICKLING_ERRORS as error:
+        reason = f"is damaged or of another layout ({first_line(error)})"
+        raise ScanError(f"{path}: {reason}") from error
+    names = _known_columns(path, table)
+    labels, label_path = _labels(path, len(table)) if with_labels else (None, None)
+    finite = _finite_rows(table, names)
+    if finite is not None:
+        if not drop_nan:
+            num_bad = np.count_nonzero(~finite)
+            raise ScanError(
+                f"{path}: has NaN or infinite values in {num_bad} of {len(table)} points; "
+                "--drop_nan leaves them out"
+            )
+        table, labels = table[finite], None if labels is None else labels[finite]
+    file = CloudFile(path, kind, pack, data if finite is None else None, label_path)
+    return PointCloud(table, names, labels, file)
+
+
+def _finite_rows(table: Table, names: Mapping[str, str]) -> NDArray[np.bool_] | None:
+    """Return a mask ``(P,)`` of the rows whose known columns are finite; None if all are."""
+    finite = np.ones(len(table), dtype=bool)
+    for name in names.values():
+        finite &= np.isfinite(table[name])
+    return None if finite.all() else finite
+
+
+def write_cloud(path: str | Path, cloud: PointCloud, full_scale: float | None = None) -> None:
+    """Write a cloud in the format of the suffix, atomically.
+
+    In the format of its own file, every column is written as it was read. ``.bin`` takes x, y, z
+    and the intensity as a share of ``full_scale``, ``.pcd.bin`` 255 times the share and the ring.
+
+    Raises:
+        ScanError: If the format cannot be written, or cannot hold the cloud.
+    """
+    content = packed(Path(path), cloud, full_scale)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def packed(path: Path, cloud: PointCloud, full_scale: float | None = None) -> bytes:
+    """Return the content of a file of a cloud, see :func:`write_cloud`."""
+    suffix, file = suffix_of(path), cloud.file
+    if file is not None and suffix_of(file.path) == suffix and full_scale is None:
+        return file.pack(cloud.table) if file.data is None else file.data
+    if suffix not in WRITERS:
+        raise ScanError(f"{path}: cannot be written; choose from {', '.join(WRITERS)}")
+    return WRITERS[suffix](cloud, full_scale)
+
+
+def _kitti_of(cloud: PointCloud, full_scale: float | None) -> bytes:
+    return cloud.rows(full_scale).tobytes()
+
+
+def _nuscenes_of(cloud: PointCloud, full_scale: float | None) -> bytes:
+    rows = cloud.rows(full_scale)
+    if cloud.ring is None:
+        raise ScanError(
+            f"{cloud.where}: has no column ring, which .pcd.bin needs: give another --to"
+        )
+    rows[:, 3] *= 255
+    return np.column_stack([rows, cloud.ring.astype(np.float32)]).tobytes()
+
+
+def _all_columns(cloud: PointCloud, full_scale: float | None) -> dict[str, NDArray]:
+    """Return x, y, z and all columns, known ones by their usual names, without padding."""
+    columns = {key: cloud.table[name] for key, name in cloud.names.items()}
+    if full_scale is not None and cloud.intensity is not None:
+        columns["intensity"] = cloud.intensity_shares(full_scale)
+    return columns | cloud.columns
+
+
+def _ply_of(cloud: PointCloud, full_scale: float | None) -> bytes:
+    return ply_of(table_of(_all_columns(cloud, full_scale), len(cloud)))
+
+
+def _npy_of(cloud: PointCloud, full_scale: float | None) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, cloud.rows(full_scale))
+    return stream.getvalue()
+
+
+def _npz_of(cloud: PointCloud, full_scale: float | None) -> bytes:
+    stream, columns = io.BytesIO(), _all_columns(cloud, full_scale)
+    others: dict[str, Any] = {name: columns[name] for name in columns if name not in "xyz"}
+    np.savez_compressed(stream, xyz=cloud.points, **others)
+    return stream.getvalue()
+
+
+def _las_of(cloud: PointCloud, full_scale: float | None, suffix: str = ".las") -> bytes:
+    try:
+        from lidarsim import clouds_las
+    except ImportError as error:
+        raise ScanError(f"{suffix} needs laspy: pip install 'r3dpa[las]'") from error
+    columns = _all_columns(cloud, None)
+    if "intensity" in columns:
+        columns["intensity"] = clouds_las.intensity_of(cloud.intensity_shares(full_scale))
+    return clouds_las.las_of(columns, suffix)
+
+
+#: Formats that can be written from any other, by suffix.
+WRITERS: dict[str, Callable[[PointCloud, float | None], bytes]] = {
+    ".bin": _kitti_of,
+    ".pcd.bin": _nuscenes_of,
+    ".ply": _ply_of,
+    ".npy": _npy_of,
+    ".npz": _npz_of,
+    ".las": _las_of,
+    ".laz": partial(_las_of, suffix=".laz"),
+}
 
 
 def find_files(source: Path) -> tuple[Path, list[Path]]:
     """Folder that names are relative to, and the scans of a file or folder, sorted."""
     if source.is_file():
         return source.parent, [source]
-    files = sorted(file for file in files_below(source) if file.suffix.lower() in _READERS)
+    everything = sorted(files_below(source))
+    files = [file for file in everything if suffix_of(file) in READERS]
     if not files:
-        readable = ", ".join(_READERS)
-        raise ScanError(f"{source}: is no folder with scans and no scan; can be read: {readable}")
+        raise ScanError(f"{source}: {_why_no_scan(source, everything)}; can be read: {READABLE}")
     return source, files
 
 
-def read_file(path: Path, columns: Sequence[str] = (), drop_nan: bool = False) -> ScanFile:
-    """Scan of a file, checked.
-
-    Args:
-        path: File of a format above.
-        columns: Names of the columns of rows without names; default: as the values show.
-        drop_nan: Leave out points with NaN or infinite numbers, which organised clouds hold for
-            shots without return.
-
-    Raises:
-        ScanError: If the file is damaged, its columns are ambiguous, or its values are no scan in
-            metres.
-    """
-    data, suffix = read_bytes(path), path.suffix.lower()
-    if not data or suffix not in _READERS:
-        reason = f"of no known format; can be read: {', '.join(_READERS)}" if data else "empty"
-        raise ScanError(f"{path}: is {reason}")
-    try:
-        kind, table, pack = _READERS[suffix](path, data, tuple(columns))
-    except ScanError:
-        raise
-    except UNPICKLING_ERRORS as error:
-        reason = f"is damaged or of another layout ({first_line(error)})"
-        raise ScanError(f"{path}: {reason}") from error
-    known = _known_columns(path, table)
-    labels, label_path = _labels(path, len(table))
-    values = [table[name].astype(np.float64) for name in known.values()]
-    finite = np.isfinite(values).all(axis=0)
-    if num_bad := np.count_nonzero(~finite):
-        if not drop_nan:
-            raise ScanError(
-                f"{path}: has NaN or infinite values in {num_bad} of {len(table)} points; "
-                "--drop_nan leaves them out"
-            )
-        table, labels = table[finite], None if labels is None else labels[finite]
-    if len(table) < _FEWEST_POINTS:
-        raise ScanError(
-            f"{path}: holds {len(table)} of at least {_FEWEST_POINTS} points; remove it"
+def _why_no_scan(source: Path, files: Sequence[Path]) -> str:
+    if files:
+        return (
+            f"is no folder with scans, it holds {len(files)} other files, such as {files[0].name}"
         )
-    range_m = np.sqrt(np.square(values[:3]).sum(axis=0))[finite]
-    median, largest = float(np.median(range_m)), float(range_m.max())
-    if median > _FAR_MEDIAN_M or largest < _NEAR_MAX_M:
-        advice = "divide the coordinates, by 100 or 1000" if median > 1 else "multiply them"
-        raise ScanError(
-            f"{path}: ranges have the median {median:.3g} and reach {largest:.4g}, which are no "
-            f"metres: {advice}"
-        )
-    return ScanFile(path, kind, table, known, pack, None if num_bad else data, labels, label_path)
+    return "is an empty folder" if source.is_dir() else "is no folder and no file"
 
 
-def write_file(file: ScanFile, root: Path, out: Path) -> dict[str, int]:
-    """Write a scan, its labels first, to the place below ``out`` that it has below ``root``.
-
-    Labels from outside ``root`` are written beside the scan.
-
-    Returns:
-        Size of each written file by its name below ``out``.
-
-    Raises:
-        ScanError: If a link leads out of ``out``.
-    """
-    path = out / file.path.relative_to(root)
-    contents: dict[Path, bytes] = {}
-    if file.labels is not None and file.label_path is not None:
-        place = Path(os.path.relpath(file.label_path, root))
-        beside = place.parts[0] == ".."
-        label_path = path.with_name(place.name) if beside else out / place
-        contents[label_path] = file.labels.astype("<u4").tobytes()
-    contents[path] = file.pack(file.table) if file.data is None else file.data
-    for written, content in contents.items():
-        refuse_outside(written, out)
-        with atomic_path(written) as temporary:
-            temporary.write_bytes(content)
-    return {written.relative_to(out).as_posix(): len(data) for written, data in contents.items()}
-
-
-def refuse_outside(path: Path, out: Path) -> None:
-    """Refuse a file to write or delete that is not below ``out``, once links are followed.
-
-    Raises:
-        ScanError: With the name of the file.
-    """
-    if not path.parent.resolve().is_relative_to(out.resolve()):
-        raise ScanError(f"{path}: leads out of {out}: give another --out")
-
-
-def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
-    """Size and time of change in ns of a scan and its labels, by their names from ``root``."""
-    stats = {file: file.stat() for file in (path, label_path_of(path)) if file and file.is_file()}
-    return {
-        Path(os.path.relpath(file, root)).as_posix(): [about.st_size, about.st_mtime_ns]
-        for file, about in stats.items()
-    }
-
-
-def refuse_shared_labels(paths: Iterable[Path]) -> None:
-    """Refuse scans of which two have the same file of labels, also in their results.
-
-    Raises:
-        ScanError: With the names of two such scans.
-    """
-    scan_of: dict[Path, Path] = {}
-    for path in sorted(paths):
-        label_path = label_path_of(path)
-        if label_path is not None and scan_of.setdefault(label_path, path) != path:
-            raise ScanError(
-                f"{label_path}: would be the labels of {scan_of[label_path]} and of {path}: keep "
-                "one of these scans, or its labels in another folder"
-            )
-
-
-def _known_columns(path: Path, table: Table) -> dict[str, str]:
-    names = {name.lower(): name for name in table.dtype.names or ()}
-    known: dict[str, str] = {}
-    for key, others in _NAMES.items():
-        name = next((names[other] for other in others.split() if other in names), None)
-        if name is None and key in "xyz":
-            raise ScanError(f"{path}: has no column {key}, only {', '.join(names.values())}")
-        if name is not None:
-            known[key], kind = name, table.dtype[name]
-            if kind.kind not in ("f" if key in "xyz" else "fiu"):
-                raise ScanError(f"{path}: column {name} is of {kind}; {key} must be one float")
-    return known
+def files_below(root: Path) -> Iterator[Path]:
+    """Files of a folder and its sub-folders, links followed, without hidden ones."""
+    seen = set()
+    for folder, below, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        # Of a folder and a link to it, the same one on every machine; of a link upwards, none.
+        below[:] = [] if real in seen else sorted(name for name in below if name[0] != ".")
+        if real not in seen:
+            yield from (Path(folder, name) for name in names if name[0] != ".")
+        seen.add(real)
 
 
 def label_path_of(path: Path) -> Path | None:
-    """File of the labels of a scan, if there is one."""
+    """Return the file of the labels of a scan, if there is one."""
     name = f"{path.stem.removesuffix('.pcd')}.label"
     folder = path.absolute().parent
     places = (folder / name, folder / "labels" / name, folder.parent / "labels" / name)
@@ -256,104 +454,16 @@ def _labels(path: Path, num_points: int) -> tuple[NDArray[np.uint32] | None, Pat
     return np.frombuffer(data, "<u4"), place
 
 
-def _with_names(path: Path, rows: NDArray, columns: tuple[str, ...]) -> Table:
-    """Rows ``(P, C)`` of floats as a table."""
-    named = columns or _ROWS[: rows.shape[-1]]
-    is_table = rows.ndim == 2 and rows.dtype.kind == "f" and rows.shape[1] == len(named)
-    if not is_table or not (columns or _can_be_rows(rows)):
-        raise ScanError(
-            f"{path}: holds {rows.dtype} of shape {rows.shape}, not rows of {len(named)} floats "
-            f"that can be {', '.join(named)}: {_ADVICE}"
-        )
-    return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in named])[:, 0]
-
-
-def _can_be_rows(rows: NDArray) -> bool:
-    """Whether columns ``(P, C)`` without names can be those of ``_ROWS``."""
-    shares, ring = rows[:, 3:], rows[:, 4:]  # NaN is for a later message
-    return not ((shares < 0).any() or (ring > 255).any() or (ring % 1 > 0).any())
-
-
-def _read_bin(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
-    counts = [len(columns)] if columns else [5] if path.stem.endswith(".pcd") else [4, 5]
-    fitting = [np.frombuffer(data, "<f4").reshape(-1, n) for n in counts if not len(data) % (4 * n)]
-    likely = [rows for rows in fitting if columns or _can_be_rows(rows)]
-    if len(likely) != 1:
-        raise ScanError(
-            f"{path}: its {len(data)} bytes are no rows of {' or '.join(map(str, counts))} float32 "
-            f"numbers that can be {', '.join(_ROWS)}: {_ADVICE}"
-        )
-    table = _with_names(path, likely[0], columns)
-    return f"{likely[0].shape[1]} columns of float32", table, np.ndarray.tobytes
-
-
-def _read_numpy(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
-    arrays = dict(npz_arrays(path)) if data[:2] == b"PK" else {}
-    array, *others = arrays.values() or [np.load(io.BytesIO(data), allow_pickle=False)]
-    if {one.shape for one in (array, *others)} != {array.shape[:1] if others else array.shape}:
-        raise ScanError(f"{path}: must hold one scan: one array of rows, or columns of one length")
-    if others:
-        array = np.empty(len(array), [(name, one.dtype) for name, one in arrays.items()])
-        for name, one in arrays.items():
-            array[name] = one
-    table = array if array.dtype.names else _with_names(path, array, columns)
-
-    def pack(table: Table) -> bytes:
-        stream, rows = io.BytesIO(), table
-        if not array.dtype.names:
-            rows = structured_to_unstructured(table)
-        packed: dict[str, Any] = {name: table[name] if others else rows for name in arrays}
-        np.savez_compressed(stream, **packed) if arrays else np.save(stream, rows)
-        return stream.getvalue()
-
-    return path.suffix, table, pack
-
-
-def _read_ply(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
-    table, header = ply_table(path)
-
-    def pack(table: Table) -> bytes:
-        text = re.sub(r"(?m)^element vertex .*", f"element vertex {len(table)}", "\n".join(header))
-        rows = _text(table) if "ascii" in header[1] else table.tobytes()
-        return f"{text}\n".encode("ascii") + rows
-
-    return f".ply, {header[1].split()[1]}", table, pack
-
-
-def _read_pcd(path: Path, data: bytes, columns: tuple[str, ...]) -> _Read:
-    try:
-        from pypcd4 import Encoding, PointCloud
-    except ImportError as error:
-        raise ScanError(f"{path}: .pcd needs pypcd4: pip install 'r3dpa[pcd]'") from error
-    cloud: Any = PointCloud.from_fileobj(cast(Any, io.BytesIO(data)))
-    about, rows = cloud.metadata, cloud.pc_data
-    if len(rows) != about.points:
-        raise ScanError(f"{path}: is damaged: holds {len(rows)} of {about.points} points")
-    # Padding has random names.
-    names = [f"_{n}" if "#" in name else name for n, name in enumerate(rows.dtype.names)]
-    table = rows.view([(name, rows.dtype[n]) for n, name in enumerate(names)])
-
-    def pack(table: Table) -> bytes:
-        kept = PointCloud(about.derive(points=len(table), width=len(table), height=1), table)
-        if about.data is Encoding.ASCII:  # the package keeps ten decimals
-            return kept.metadata.compose_header().encode() + _text(table)
-        stream = io.BytesIO()
-        kept.save(stream, about.data)
-        return stream.getvalue()
-
-    return f".pcd, {about.data.value}", table, pack
-
-
-def _text(table: Table) -> bytes:
-    """Rows of numbers, each with the fewest digits that give it again."""
-    parts = [table[name].astype(str) for name in table.dtype.names or ()]
-    return "".join(f"{' '.join(row)}\n" for row in zip(*parts, strict=True)).encode()
-
-
-_READERS: dict[str, Callable[[Path, bytes, tuple[str, ...]], _Read]] = {
-    ".bin": _read_bin,
-    ".npy": _read_numpy,
-    ".npz": _read_numpy,
-    ".ply": _read_ply,
-    ".pcd": _read_pcd,
-}
+def _known_columns(where: str | Path, table: Table) -> dict[str, str]:
+    """Return the names of the columns that are understood."""
+    names = {name.lower(): name for name in table.dtype.names or ()}
+    known: dict[str, str] = {}
+    for key, others in _NAMES.items():
+        name = next((names[other] for other in others.split() if other in names), None)
+        if name is None and key in "xyz":
+            raise ScanError(f"{where}: has no column {key}, only {', '.join(names.values())}")
+        if name is not None:
+            known[key], kind = name, table.dtype[name]
+            if kind.kind not in ("f" if key in "xyz" else "fiu"):
+                raise ScanError(f"{where}: column {name} is of {kind}; {key} must be one float")
+    return known

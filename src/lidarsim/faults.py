@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from lidarsim.draws import generator_for
 from lidarsim.recorded import RecordedScan, angles
 from lidarsim.rings import rings_of
 from lidarsim.scan import EffectRecord
-from lidarsim.weather import ADDED_CLASS, WeatheredScan, kept_part
+from lidarsim.weather import ADDED_CLASS, Seed, WeatheredScan, change_scan, kept_part
 
 Kind = Literal[
     "missing_beams", "fewer_beams", "crosstalk", "incomplete_echo", "motion_blur",
@@ -37,23 +37,24 @@ _METRES_PER_DEGREE = 0.1
 _NUM_SECTORS = 3
 _LEAST_SURE = 0.5  # share of the points whose beam is sure
 _LEAST_POINTS = 10  # of a class of vehicles
-# Classes of KITTI-360, and of SemanticKITTI, which alone has some from 45 on.
+# Classes of KITTI-360 and of SemanticKITTI; only the latter has classes from 45 on.
 _VEHICLES = (*range(26, 34),)
 _SEMANTIC_KITTI, _ITS_VEHICLES = 45, (10, 11, 13, 15, 16, 18, 20, 252, *range(256, 260))
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a severity, or of any strength.
+    """A fault of a given severity or strength.
 
     - ``missing_beams``: a share of the beams, by chance, has no return.
-    - ``fewer_beams``: another sensor; evenly spread beams stay, and of these every second shot.
+    - ``fewer_beams``: another sensor; evenly spread beams stay. A ``severity`` also drops every
+      second shot, as Robo3D does; a ``strength`` keeps all shots.
     - ``crosstalk``: a share of the points is elsewhere, normal with 3 m, of ``CROSSTALK_CLASS``.
     - ``incomplete_echo``: a share of the points of each labelled class of vehicles is lost.
     - ``motion_blur``: the scan moves along each axis, normal, and its points by a tenth of that (z:
       a twentieth).
     - ``shifted_extrinsics``: a turn about a random axis, and 0.1 m per degree in some direction.
-    - ``dropped_sectors``: three sectors, which take so much of the turn together, are dark.
+    - ``dropped_sectors``: three sectors, which together cover this angle, are dark.
 
     Robo3D draws missing beams with replacement, so that fewer are missing than it says, and adds
     crosstalk to intensities too. Source: Kong et al., "Robo3D" (ICCV 2023) and its code for the
@@ -81,15 +82,23 @@ class Fault:
 
     @property
     def amount(self) -> float:
-        """The strength, also that of a severity."""
+        """Strength, given or of the severity."""
         levels = (0.0, *STRENGTHS[self.kind][0])
         return levels[self.severity] if self.strength is None else self.strength
 
-    def apply(self, scan: RecordedScan, seed: int | tuple[int | str, ...] = 0) -> WeatheredScan:
-        """The scan with this fault; of an amount of 0, as it is.
+    @property
+    def _halves_shots(self) -> bool:
+        return self.kind == "fewer_beams" and self.strength is None and self.severity > 0
 
-        ``ValueError`` if it needs labels or beams that the scan does not show.
+    def apply(self, scan: Any, seed: Seed = 0) -> Any:
+        """Return a scan, of any kind that :meth:`Weather.apply` takes, with this fault.
+
+        Raises:
+            ValueError: If the fault needs labels or beams that the scan does not show.
         """
+        return change_scan(scan, lambda recorded: self._apply(recorded, seed))
+
+    def _apply(self, scan: RecordedScan, seed: Seed) -> WeatheredScan:
         generator = generator_for(*(seed if isinstance(seed, tuple) else (seed,)), self.kind)
         points, stays = scan.points, np.ones(len(scan), dtype=bool)
         labels = None if scan.labels is None else scan.labels.copy()
@@ -121,6 +130,8 @@ class Fault:
         kept = np.flatnonzero(stays)
         lost, moved = len(scan) - len(kept), int((points != scan.points).any(axis=1).sum())
         how = f"{self.amount:g} {STRENGTHS[self.kind][2]}"
+        if self._halves_shots:
+            how += ", and every second shot"
         record = EffectRecord(self.kind, "ran" if self.amount else "not_called", how, lost + moved)
         changed = replace(scan, points=points, labels=labels)
         return kept_part(changed, kept, (record,), {self.kind: lost}, moved)
@@ -137,7 +148,8 @@ class Fault:
         if self.kind == "missing_beams":
             return (generator.permutation(number) < kept)[rings.ring]
         chosen = (number + 1) * kept // rings.num_rings > number * kept // rings.num_rings
-        return chosen[rings.ring] & (rings.shot % 2 == 0)
+        stays = chosen[rings.ring]
+        return stays & (rings.shot % 2 == 0) if self._halves_shots else stays
 
     def _echoes(self, scan: RecordedScan, generator: np.random.Generator) -> NDArray[np.bool_]:
         if scan.labels is None:

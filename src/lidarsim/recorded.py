@@ -24,9 +24,9 @@ from lidarsim.solids import GROUND, NO_SURFACE, Floats, Solids
 from lidarsim.sweep import Echoes, Sweep
 
 Returns = Literal["strongest", "dual"]
-# No lidar on a car reaches so far.
+# No LiDAR on a car reaches farther.
 _FARTHEST_M = 1000.0
-# Intensities from this share of the full one on are taken for retro-reflectors.
+# Points of at least this share of the full intensity count as retro-reflectors.
 _SATURATED = 0.985
 _UNKNOWN_INTENSITY = 0.2
 # ln(power / min_power) of points without intensity by the least range of their row in metres: these
@@ -202,7 +202,7 @@ def _shares(scan: RecordedScan, scale: IntensityScale) -> Floats:
 
 
 def num_saturated(scan: RecordedScan, instrument: Instrument) -> int:
-    """Number of points whose intensity is that of sheeting."""
+    """Return the number of points as bright as sheeting."""
     shares = _shares(scan, scale_of(scan.intensity, instrument.full_intensity))
     return int(np.count_nonzero(shares >= _SATURATED))
 
@@ -214,7 +214,7 @@ class RecordedSweep(Sweep):
     below about six times the detection limit; it is drawn from the distribution that such points of
     simulated scans have at their range; likewise the power of saturated points, unless the response
     is linear. Rays start at the mean height of the instrument's optical centres. The time of a shot
-    is that of its column of the file, or else grows with the azimuth.
+    is read from the file, or else grows with the azimuth.
 
     Args:
         scene: Weather, and boxes of moving vehicles as the scan shows them.

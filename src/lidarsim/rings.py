@@ -22,6 +22,9 @@ _BIN_DEG, _BLUR_BINS, _PROMINENCE = 0.01, 3.0, 0.1
 # Points farther from the middle of their ring than this share of the pitch are not sure.
 _SURE_SHARE = 0.25
 _LARGE_STEP_RAD = math.radians(5)
+# A first pass has at least this many rings, and this share of its steps in one direction.
+_FEWEST_RINGS, _ONE_WAY = 4, 0.9
+_LEAP = 0.2  # over this share of the field of view
 # Median step of inclination along stored rings, over the standard deviation of all: at most 0.01 in
 # scans of three sensors, in the frame of the vehicle too, and at least 0.4 in rings by chance.
 _MOST_STEP_SHARE = 0.25
@@ -46,14 +49,15 @@ def rings_of(scan: RecordedScan) -> Rings:
         if points of a ring with almost the same azimuth have unrelated inclinations.
     ``order``
         Files that hold ring after ring: a ring ends where the azimuth wraps, in either direction.
-        Points that follow their predecessor by at most 5 degrees are sure.
+        Points that follow their predecessor by at most 5 degrees are sure. Points after the last
+        ring, such as those that weather adds, have the ring of the nearest inclination.
     ``inclination``
         Peaks of the histogram of the inclination. Points within a quarter of the pitch of their
         peak are sure. Optical centres far from each other blur the peaks: many points of a
         shuffled HDL-64E scan are not.
 
-    Rings are numbered by their mean inclination. The number of shots is that of the median step of
-    azimuth within the rings.
+    Rings are numbered by their mean inclination. The number of shots follows from the median step
+    of azimuth within the rings.
     """
     inclination, azimuth = angles(scan.points)
     if scan.ring is None:
@@ -86,10 +90,39 @@ def _in_order(
     for turned in (azimuth, -azimuth % (2 * np.pi)):
         with suppress(ValueError):
             ring = rings_in_order(inclination, turned, sensor)[0]
-            step = np.diff(turned)[np.diff(ring) == 0]
+            num_first = _first_pass(ring, inclination)
+            step = np.diff(turned[:num_first])[np.diff(ring[:num_first]) == 0]
             sure = float((np.abs(step) < _LARGE_STEP_RAD).mean()) if len(step) else 0.0
+            if num_first < len(ring):
+                first = ring[:num_first]
+                ring = np.append(first, _nearest_ring(inclination, first)[num_first:])
+                sure *= num_first / len(ring)
             return ring, "order", sure
     return None
+
+
+def _first_pass(ring: NDArray[np.int64], inclination: NDArray[np.float64]) -> int:
+    """Return the number of points before the rings start again, as added points of weather do.
+
+    There the inclination leaps back over a part of the rings, which until then lead one way.
+    """
+    mean = np.bincount(ring, inclination) / np.bincount(ring)
+    step = np.diff(mean)
+    for last in range(_FEWEST_RINGS - 1, len(step)):
+        way = np.sign(mean[last] - mean[0])
+        leaps_back = -way * step[last] > _LEAP * abs(mean[last] - mean[0])
+        # Rings that are stored in another order leap too, but soon, and most of them follow.
+        if leaps_back and (way * step[:last] > 0).mean() > _ONE_WAY and 2 * last + 2 >= len(mean):
+            return int(np.searchsorted(ring, last + 1))
+    return len(ring)
+
+
+def _nearest_ring(inclination: NDArray[np.float64], known: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Ring of each point ``(P,)`` by the mean inclination of the rings of the first points."""
+    mean = np.bincount(known, inclination[: len(known)]) / np.bincount(known)
+    order = np.argsort(mean)
+    borders = (mean[order][1:] + mean[order][:-1]) / 2
+    return order[np.searchsorted(borders, inclination)]
 
 
 def _by_inclination(inclination: NDArray[np.float64]) -> tuple[NDArray[np.int64], How, float]:

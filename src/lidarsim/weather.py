@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import random
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim import scene
+from lidarsim.clouds import PointCloud, ScanError, read_cloud
 from lidarsim.draws import Draws
 from lidarsim.effects import EFFECTS
 from lidarsim.effects.instrument import Blooming
@@ -45,25 +48,27 @@ REFUSED = {
 }
 # Instrument effects that every recorded scan has: they run where they are switched on.
 _ON_REQUEST = ("blooming", "range_noise")
-# Whether an echo is detected is asked again where its power has changed.
+# Detection is re-evaluated where the power of an echo has changed.
 _DETECTION = {"soft_raydrop", "detection_limit", "dual_return"}
 # Of labels with an instance: KITTI-360, SemanticKITTI.
 _VEHICLES = (Semantic.CAR, Semantic.TRUCK, Semantic.BUS, 10, 18, 252, 257, 258, 259)
 # A vehicle of fewer points has no box.
 _LEAST_POINTS = 20
 _INSTRUMENT = Instrument()
-# Of priors: equally likely fields, and the deepest film of a road in rain.
+# Fields of a prior, equally likely, and the deepest film of a road in rain.
 _FIELDS = ("visibility_m", "rain_mm_h", "snow_mm_h")
 _FULL_FILM_MM = 1.5
+Seed = int | tuple[int | str, ...]
+Points = TypeVar("Points")  # array, tensor or cloud
 
 
 @dataclass(frozen=True)
 class WeatheredScan:
-    """A scan in weather. Letter Q: points, those that stay in the order of the input.
+    """A scan in weather. Letter Q: points; remaining ones keep the order of the input.
 
     Args:
-        points: ``(Q, 3)`` float32, those of the input bit for bit unless ``range_noise`` runs;
-            added points last.
+        points: ``(Q, 3)`` float32; remaining points equal the input bit for bit unless
+            ``range_noise`` runs, added points come last.
         intensity: ``(Q,)`` in units and type of the input; None if it has none.
         labels: ``(Q,)`` uint32, ``ADDED_CLASS`` plus the ``Origin`` of added points; None if the
             input has none.
@@ -86,18 +91,20 @@ class WeatheredScan:
 
 @dataclass(frozen=True)
 class Weather(scene.Weather):
-    """State of air, sky and road for recorded scans, see :class:`lidarsim.scene.Weather`.
+    """Weather of simulated streets and of recorded scans, see :class:`lidarsim.scene.Weather`.
 
-    ``sun_azimuth_deg`` is counter-clockwise from the scan's x axis. The scan is taken to be one in
-    clear air over a dry road. Nothing is known of shots without a return: they stay empty, also
-    where fog, rain or snow before the sky would give one.
+    On recorded scans, ``sun_azimuth_deg`` is counter-clockwise from the scan's x axis. The scan is
+    assumed to show clear air and a dry road. Shots without a return stay empty, even where fog,
+    rain or snow in front of the sky would give one, since nothing is known of them.
 
     Args:
         traffic_m_s: Speed of vehicles that have an instance in the labels, for their spray; they
-            are taken to drive along their length and ahead rather than back.
+            are assumed to drive along their length, ahead rather than back.
 
     Example:
         >>> points = np.random.default_rng(0).uniform(5, 40, (1000, 3)).astype(np.float32)
+        >>> Weather(visibility_m=60).apply(points).shape[1]
+        3
         >>> weathered = Weather(visibility_m=60).apply(RecordedScan(points))
         >>> weathered.report["points"], len(weathered.points) > 0
         (1000, True)
@@ -109,29 +116,60 @@ class Weather(scene.Weather):
         super().__post_init__()
         scene.check_fields(self, "be 0 or greater", "traffic_m_s")
 
+    def __call__(self, points: Any) -> Any:
+        """Apply this weather as a transform of a data set, with a new seed in each call.
+
+        The seed comes from :mod:`random`, which a ``DataLoader`` seeds in each of its processes.
+        """
+        return self.apply(points, random.getrandbits(63))
+
+    @overload
+    def apply(
+        self, scan: RecordedScan | str | Path, seed: Seed = 0, *args: Any, **options: Any
+    ) -> WeatheredScan: ...
+    @overload
+    def apply(self, scan: Points, seed: Seed = 0, *args: Any, **options: Any) -> Points: ...
+
     def apply(
         self,
-        scan: RecordedScan,
-        seed: int | tuple[int | str, ...] = 0,
+        scan: Any,
+        seed: Seed = 0,
         instrument: Instrument = _INSTRUMENT,
         boxes: NDArray[np.floating] | None = None,
         effects: Mapping[str, str | bool] | None = None,
-    ) -> WeatheredScan:
-        """The scan as it would be in this weather.
+    ) -> Any:
+        """Return a scan as it would be in this weather.
 
         Args:
-            scan: The scan.
-            seed: Of the random draws; of each effect they do not depend on the others.
+            scan: Array or tensor ``(P, 3)``, or ``(P, 4)`` with intensity; a
+                :class:`PointCloud`; a :class:`RecordedScan`, or the path of a scan.
+            seed: Of the random draws; the draws of each effect do not depend on other effects.
             instrument: What is assumed of the instrument.
             boxes: ``(N, 8)`` vehicles that throw spray: centre x, y, z, length, width, height in
                 metres, heading in radians, speed in m/s.
             effects: ``off`` omits an effect; ``blooming`` and ``range_noise``, which a recorded
                 scan has already, run where they are ``on``.
 
+        Returns:
+            The kind that was given; a :class:`WeatheredScan`, which says what happened to each
+            point, for a recorded scan or a path.
+
         Raises:
             ValueError: If an effect is unknown or cannot act on a recorded scan, or boxes or
                 intensities cannot be used.
         """
+        return change_scan(
+            scan, lambda recorded: self._apply(recorded, seed, instrument, boxes, effects)
+        )
+
+    def _apply(
+        self,
+        scan: RecordedScan,
+        seed: Seed,
+        instrument: Instrument,
+        boxes: NDArray[np.floating] | None,
+        effects: Mapping[str, str | bool] | None,
+    ) -> WeatheredScan:
         off, wanted, idle = _switched(tuple((effects or {}).items()))
         vehicles = _vehicles(boxes)
         if self.traffic_m_s and self.water_film_mm and scan.labels is not None:
@@ -148,6 +186,40 @@ class Weather(scene.Weather):
         sweep = RecordedSweep(world, scan, instrument, sensor, Draws(len(scan), *key, "power"))
         records = tuple(run_effect(effect, sweep, key, off) for effect in wanted)
         return _result(scan, sweep, records)
+
+
+def recorded_scan(cloud: PointCloud) -> RecordedScan:
+    """Return the points of a cloud as float32, and the columns that are understood.
+
+    Raises:
+        ScanError: If weather and faults cannot act on them.
+    """
+    points = cloud.points.astype(np.float32)
+    try:
+        return RecordedScan(points, cloud.intensity, cloud.ring, cloud.time_s, cloud.labels)
+    except ValueError as error:
+        raise ScanError(f"{cloud.where}: {error}") from error
+
+
+def changed_cloud(cloud: PointCloud, result: WeatheredScan) -> PointCloud:
+    """Return the cloud of a changed scan; added points have the further columns of their shot."""
+    return cloud.changed(result.shot, result.points, result.intensity, result.labels)
+
+
+def change_scan(scan: Any, change: Callable[[RecordedScan], WeatheredScan]) -> Any:
+    """Apply a change to a scan of any kind, see :meth:`Weather.apply`."""
+    if isinstance(scan, RecordedScan):
+        return change(scan)
+    if isinstance(scan, str | Path):
+        return change(recorded_scan(read_cloud(scan)))
+    if isinstance(scan, PointCloud):
+        return changed_cloud(scan, change(recorded_scan(scan)))
+    is_tensor = hasattr(scan, "new_tensor")  # of torch, which is not imported here
+    array = scan.detach().cpu().numpy() if is_tensor else np.asarray(scan)
+    cloud = PointCloud.of(array)
+    table = changed_cloud(cloud, change(recorded_scan(cloud))).table
+    points = np.stack([table[name] for name in table.dtype.names or ()], axis=1)
+    return scan.new_tensor(points) if is_tensor else points
 
 
 @cache
@@ -195,7 +267,7 @@ def _numbers(num: int) -> NDArray[np.int64]:
 def _result(
     scan: RecordedScan, sweep: RecordedSweep, records: tuple[EffectRecord, ...]
 ) -> WeatheredScan:
-    """Points of the echoes that are left: the recorded ones, then those of the air."""
+    """Return the points of the remaining echoes: recorded ones, then echoes of the air."""
     echoes = list(sweep.echoes())
     seen = [np.isfinite(echo.range_m) & (echo.power > 0) for echo in echoes]
     for second, is_seen in zip(echoes[1:], seen[1:], strict=True):
@@ -295,16 +367,16 @@ def _labelled_vehicles(scan: RecordedScan, speed_m_s: float) -> tuple[Primitive,
 
 @dataclass(frozen=True)
 class WeatherPrior:
-    """Weather drawn anew for each training scan and epoch: fog, rain on a wet road, or snow.
+    """Random weather for each training scan and epoch: fog, rain on a wet road, or snow.
 
     The three are equally likely; visibility and rates are log-uniform.
 
     Args:
-        probability: Of bad weather; other scans stay as they are.
+        probability: Probability of bad weather; other scans stay as they are.
         visibility_m: Least and largest visibility in fog.
         rain_mm_h: Least and largest rate.
         snow_mm_h: Least and largest rate, as water.
-        instrument: What is assumed of the instrument.
+        instrument: Assumptions about the instrument.
     """
 
     probability: float = 0.5
@@ -324,7 +396,7 @@ class WeatherPrior:
                 Weather(**{name: limit})
 
     def draw(self, generator: np.random.Generator) -> Weather | None:
-        """Weather of one scan; None where it stays as it is."""
+        """Draw the weather of one scan; None where it stays as it is."""
         chance, kind, share, film = generator.random(4)
         if chance >= self.probability:
             return None
@@ -336,11 +408,8 @@ class WeatherPrior:
         return Weather(**values)
 
     def points(self, points: NDArray[np.float32], seed: tuple[int, ...]) -> NDArray[np.float32]:
-        """Points ``(P, 4)`` in the weather of a seed, such as that of training, epoch and scan."""
+        """Return points ``(P, 4)`` in the weather of a seed, such as (training, epoch, scan)."""
         weather = self.draw(np.random.default_rng(seed))
         if weather is None:
             return points
-        scan = RecordedScan(points[:, :3], points[:, 3])
-        result = weather.apply(scan, ("training", *seed), self.instrument)
-        assert result.intensity is not None
-        return np.column_stack([result.points, result.intensity])
+        return weather.apply(points, ("training", *seed), self.instrument)

@@ -128,6 +128,62 @@ def test_check_says_the_columns_and_beams_of_other_formats(tmp_path, capsys):
     assert lines[2].startswith(f"bad: {tmp_path / 'b.npy'}: ranges have the median")
 
 
+class TestCheck:
+    """What is no scan, what is skipped, and frames."""
+
+    @pytest.mark.parametrize(
+        ("name", "says"),
+        [
+            ("gone", "gone: is no folder and no file; can be read: .bin, "),
+            ("empty", "empty: is an empty folder; can be read: .bin, "),
+            ("texts", "texts: is no folder with scans, it holds 1 other files, such as a.csv; can"),
+            ("texts/a.csv", "a.csv: is of no known format; can be read: .bin, "),
+        ],
+    )
+    def test_what_can_be_read_is_said(self, name, says, tmp_path, capsys):
+        (tmp_path / "empty").mkdir()
+        (tmp_path / "texts").mkdir()
+        (tmp_path / "texts/a.csv").write_text("1,2,3")
+        status, lines = check(tmp_path / name, capsys)
+        assert status == 1
+        assert lines[0].startswith("bad: ")
+        assert says in lines[0]
+
+    def test_skipped_files_are_counted(self, simulated, tmp_path, capsys):
+        scan = next(simulated.rglob("data/*.bin"))
+        (tmp_path / "a.bin").write_bytes(scan.read_bytes())
+        for name in ("a.csv", "b.csv", "c.pcd", "a.label", "readme.md"):
+            (tmp_path / name).touch()
+        (tmp_path / "a.label").unlink()
+        status, lines = check(tmp_path, capsys)
+        assert status == 0
+        assert "skipped files: 2 .csv, 1 .pcd" in lines
+
+    def test_the_frame_of_a_vehicle_is_noticed(self, simulated, tmp_path, capsys):
+        points = read_scan(next(simulated.rglob("data/*.bin")))
+        for name, height in (("sensor", 0), ("vehicle", 1.73)):
+            write_bin(tmp_path / f"{name}.bin", points + np.float32([0, 0, height, 0]))
+        _, lines = check(tmp_path, capsys)
+        (note,) = [line for line in lines if line.startswith("note: ")]
+        assert "vehicle.bin: its ground lies at z = " in note
+
+    def test_beams_after_weather_are_those_of_before(self, simulated, tmp_path, capsys):
+        scan = next(simulated.rglob("data/*.bin"))
+        words = ["--out", str(tmp_path / "out"), "--weather.visibility_m", "40", "--show", "0"]
+        main(["weather", str(scan), *words])
+        _, lines = check(tmp_path / "out", capsys)
+        assert ", 64 beams by order, " in lines[0]
+
+    def test_named_columns(self, tmp_path, capsys):
+        rows = np.concatenate([points(), np.zeros((200, 2), np.float32)], axis=1)
+        rows.tofile(tmp_path / "a.bin")
+        status, lines = check(tmp_path, capsys)
+        assert status == 1
+        assert "rather of 6 columns: name the columns with --columns" in "".join(lines)
+        main(["check", str(tmp_path), "--columns", "x,y,z,intensity,ring,time"])
+        assert "(x, y, z, intensity, ring, time), 200 points" in capsys.readouterr().out
+
+
 class TestObjects:
     def test_writes_a_library_and_says_what_it_holds(self, simulated, tiny_file, tmp_path):
         out = tmp_path / "objects.safetensors"
@@ -241,8 +297,8 @@ class TestView:
         np.savez(tmp_path / "counts.npz", counts=np.zeros(3))
         np.savez(tmp_path / "empty.npz")
         for name, message in (
-            ("notes.txt", r"notes.txt: is no scan; give a .bin, .ply or .npz"),
-            ("absent", "No scan found"),
+            ("notes.txt", r"notes.txt: is of no known format; can be read: .bin, "),
+            ("absent", "no scan found"),
             ("damaged.npz", r"damaged\.npz: is damaged or no \.npz file"),
             ("counts.npz", r"counts must be points .*, got shape \(3,\)"),
             ("empty.npz", r"empty\.npz: holds no scan"),

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from tiny_networks import tiny_checkpoint
 
-from lidarsim.scan_files import read_npz, read_ply, read_scan
+from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.checkpoints import convert
 from r3dpa.cli import main
 from r3dpa.cli.parser import parse
@@ -84,7 +84,7 @@ class TestSample:
         clouds = read_npz(tmp_path / "scenes.npz")
         for name, points in values(scenes).items():
             np.testing.assert_array_equal(clouds[name], points)
-            np.testing.assert_array_equal(read_ply(tmp_path / "ply" / f"{name}.ply"), points)
+            np.testing.assert_array_equal(read_points(tmp_path / "ply" / f"{name}.ply"), points)
         before = (tmp_path / "range_m.npy").read_bytes()
         with pytest.raises(ValueError, match=r"holds scenes already.*--overwrite"):
             sample(tiny_file, tmp_path, "--seed", 1)

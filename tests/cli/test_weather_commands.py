@@ -285,7 +285,7 @@ BAD = {
     "rain": (["--weather.rain_mm_h", "10000"], "rain_mm_h must be at most"),
     "effect": ([*FOG, "--effects.glass", "on"], "effect glass cannot act on a recorded scan"),
     "sensor": ([*FOG, "--instrument.sensor", "hdl99"], "there is no sensor 'hdl99': give hdl64e"),
-    "columns": ([*FOG, "--columns", "x,y,i"], "no rows of 3 float32"),
+    "columns": ([*FOG, "--columns", "x,y,i"], "not a multiple of 12 (x, y, i as float32)"),
 }
 
 

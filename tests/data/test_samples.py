@@ -221,7 +221,7 @@ def test_no_file_runs_code(tmp_path, capsys, suffix):
         torch.save([Payload()], file)
     else:
         {"npy": np.save, "npz": np.savez}[suffix](file, objects)
-    reason = {"pcd": "no known format", "pth": "cannot be read as tensors alone"}
+    reason = {"pcd": "is damaged or of another layout", "pth": "cannot be read as tensors alone"}
     with pytest.raises(ScanError, match=rf"evil\.{suffix}.*{reason.get(suffix, '(?i:object)')}"):
         list(read_samples(file, SENSOR))
     assert capsys.readouterr().out == ""

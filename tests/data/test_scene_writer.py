@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarsim.scan_files import read_npz, read_ply, read_scan
+from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.data import scene_writer
 from r3dpa.data.scene_writer import SceneWriter
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
@@ -49,7 +49,7 @@ def test_every_format_holds_the_points_of_the_range_images(tmp_path):
     for index, (name, cloud) in enumerate(clouds.items()):
         points = points_of(range_m[index], PROJECTION).numpy()
         assert np.array_equal(cloud, points)
-        assert np.array_equal(read_ply(tmp_path / "ply" / f"{name}.ply"), points)
+        assert np.array_equal(read_points(tmp_path / "ply" / f"{name}.ply"), points)
         assert np.array_equal(read_scan(tmp_path / "bin" / f"{name}.bin")[:, :3], points)
     assert len(files(tmp_path)) == 3 + 2 * 5  # nothing hidden is left
 

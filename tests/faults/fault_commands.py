@@ -27,7 +27,7 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from lidarsim.scan_files import read_npz, read_ply, read_scan
+from lidarsim.scan_files import read_npz, read_points, read_scan
 from r3dpa.data.feature_grids import GridSettings
 
 CONTEXT = multiprocessing.get_context("forkserver")
@@ -179,7 +179,7 @@ _CHECKS: dict[str, Callable[[Path], object]] = {
     ".npy": np.load,
     ".npz": read_npz,
     ".origin": _check_beside,
-    ".ply": read_ply,
+    ".ply": read_points,
     ".rows": lambda path: rows_of(path.with_suffix(".jsonl")),
     ".safetensors": load_file,
     ".txt": lambda path: path.read_text(),

@@ -22,13 +22,14 @@ import yaml
 from PIL import Image
 
 from lidarsim import expected_scans
+from lidarsim.clouds import PointCloud, read_cloud, write_cloud
 from r3dpa.checkpoints import Checkpoint, NetworkState, read_checkpoint, save_checkpoint
 from r3dpa.data import (
     FeatureGrids,
     Scan,
     read_beside,
     read_npz,
-    read_ply,
+    read_points,
     read_samples,
     read_scan,
     write_bin,
@@ -131,10 +132,13 @@ def readers(folder: Path) -> dict[str, Reader]:
         lambda at: at.write_bytes(labels),
         lambda _: read_beside(folder / scan, "labels"),
     )
-    add(".ply", "a.ply", lambda at: write_ply(at, points), read_ply)
+    add(".ply", "a.ply", lambda at: write_ply(at, points), read_points)
     add(".npz", "a.npz", lambda at: write_npz(at, clouds), both)
     member = array.getvalue()
     add(".npz, member", "packed.npz", Path.touch, both, member, lambda c: archive({"a.npy": c}))
+    rows = PointCloud.of(points, ring=np.arange(12) % 4, range_m=points[:, 0])
+    for name in ("rows.npy", "rows.npz", "rows.ply", "rows.pcd.bin"):
+        add(name, name, lambda at: write_cloud(at, rows), read_cloud)
     add(".npy", "a.npy", lambda at: np.save(at, image), samples)
     add(".pth", "a.pth", lambda at: torch.save(torch.from_numpy(image[0]), at), samples)
     add(".txt", "a.txt", lambda at: at.write_text("1.5 2.5 0.5 0.25\n" * 4), samples)

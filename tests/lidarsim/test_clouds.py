@@ -2,16 +2,19 @@
 
 import math
 import struct
+import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-from lidarsim.clouds import find_files, read_file, write_file
+from lidarsim.changed_scans import write_below
+from lidarsim.clouds import PointCloud, find_files, read_cloud, write_cloud
 from lidarsim.faults import STRENGTHS, Fault
 from lidarsim.scan_files import ScanError
-from lidarsim.weather import Weather
+from lidarsim.weather import Weather, changed_cloud, recorded_scan
 
 random = np.random.default_rng(0)
 NUM = 40
@@ -88,8 +91,9 @@ def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     num_columns, content = FILES[name]
     path, out = tmp_path / "in" / "a" / name, tmp_path / "out"
     write(path, content)
-    file = read_file(path)
-    scan = file.scan
+    file = read_cloud(path)
+    scan = recorded_scan(file)
+    assert scan.points.dtype == np.float32
     assert len(file.table.dtype.names) == num_columns
     np.testing.assert_array_equal(scan.points, POINTS)
     np.testing.assert_array_equal(scan.intensity, INTENSITY)
@@ -101,14 +105,15 @@ def test_every_format_gives_the_columns_and_is_written_again(tmp_path, name):
     assert f"40 points, range {np.linalg.norm(POINTS, axis=1).min():.3g}.." in file.describe()
     assert f"intensity {low:g}..{high:g}" in file.describe()
 
-    write_file(file, tmp_path / "in", out)
-    again = read_file(out / "a" / name)
+    write_below(file, tmp_path / "in", out)
+    again = read_cloud(out / "a" / name)
     np.testing.assert_array_equal(again.table, file.table)
     if name not in ("packed.pcd", "ascii.ply", "ascii.pcd", "binary.pcd", "rows.npz", "named.npz"):
         assert (out / "a" / name).read_bytes() == path.read_bytes()
     # Half of the rows are a smaller file of the same kind.
-    write_file(replace(file, table=file.table[::2], data=None), tmp_path / "in", out)
-    np.testing.assert_array_equal(read_file(out / "a" / name).table, file.table[::2])
+    half = replace(file, table=file.table[::2], file=file.file._replace(data=None))
+    write_below(half, tmp_path / "in", out)
+    np.testing.assert_array_equal(read_cloud(out / "a" / name).table, file.table[::2])
 
 
 NOTHING = [
@@ -121,25 +126,66 @@ NOTHING = [
 def test_no_strength_of_any_effect_or_fault_gives_the_same_file(tmp_path, name):
     path, out = tmp_path / "in" / name, tmp_path / "out"
     write(path, FILES[name][1])
-    file = read_file(path)
+    file = read_cloud(path)
     changes = [Weather(**weather) for weather in NOTHING]
     changes += [Fault(kind, severity=0) for kind in STRENGTHS]
     for change in changes:
-        write_file(file.changed(change.apply(file.scan)), tmp_path / "in", out)
+        write_below(change.apply(file), tmp_path / "in", out)
         assert (out / name).read_bytes() == path.read_bytes(), change
 
 
 def test_added_points_have_the_other_columns_of_their_shot(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, TABLE)
-    file = read_file(path)
-    result = Weather(visibility_m=20).apply(file.scan)
-    changed = file.changed(result)
+    file = read_cloud(path)
+    result = Weather(visibility_m=20).apply(recorded_scan(file))
+    changed = changed_cloud(file, result)
     new = result.index < 0
     assert new.any()
     for name in ("ring", "t"):
         np.testing.assert_array_equal(changed.table[name], TABLE[name][result.shot])
-    np.testing.assert_array_equal(changed.scan.points[new], result.points[new])
+    np.testing.assert_array_equal(changed.points[new], result.points[new])
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("f4", 1), ("u4", 1000), ("f8", 0.01)])
+def test_ranges_follow_moved_and_added_points(kind, unit):
+    range_m = np.linalg.norm(POINTS, axis=1)
+    columns = {"intensity": INTENSITY, "range": (unit * range_m).astype(kind), "depth": RING}
+    cloud = PointCloud.of(POINTS, **columns)
+    changed = Weather(visibility_m=20).apply(cloud)
+    kept = np.isin(changed.points, POINTS).all(axis=1)
+    assert 0 < kept.sum() < len(changed)
+    expected = unit * np.linalg.norm(changed.points, axis=1)
+    step = 1 if kind == "u4" else 1e-5 * unit
+    assert np.abs(changed.columns["range"] - expected).max() <= step * (1 + 1e-6 * NUM)
+    assert set(changed.columns["depth"]) <= set(RING)  # no ranges, whatever the name
+
+
+def test_an_organised_array_is_points_with_their_beam(tmp_path):
+    xyz = POINTS.reshape(4, NUM // 4, 3).copy()
+    xyz[1, 2], xyz[2, 3] = 0, np.nan
+    shares = INTENSITY.reshape(4, -1)
+    np.save(tmp_path / "a.npy", np.concatenate([xyz, shares[..., None]], axis=2))
+    np.savez(tmp_path / "a.npz", intensity=shares, xyz=xyz, pose=np.eye(4))
+    np.savez(tmp_path / "b.npz", points=xyz, intensity=shares, ring=shares.astype("u2") % 4)
+    seen = xyz.any(axis=2) & np.isfinite(xyz).all(axis=2)
+    for name in ("a.npy", "a.npz", "b.npz"):
+        cloud = read_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.points, xyz[seen])
+        np.testing.assert_array_equal(cloud.intensity, shares[seen])
+        ring = shares.astype("u2") % 4 if name == "b.npz" else np.indices((4, NUM // 4))[0]
+        np.testing.assert_array_equal(cloud.ring, ring[seen])
+        half = replace(cloud, table=cloud.table[::2], file=cloud.file._replace(data=None))
+        write_cloud(tmp_path / f"half_{name}", half)
+        again = read_cloud(tmp_path / f"half_{name}")
+        np.testing.assert_array_equal(again.points, cloud.points[::2])
+    with np.load(tmp_path / "half_a.npz") as arrays:
+        assert arrays["pose"].tolist() == np.eye(4).tolist()
+
+
+def test_clouds_need_numpy_alone():
+    code = "import sys, lidarsim.clouds; print({'scipy', 'torch'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
 
 
 def bad_npz(path):
@@ -151,18 +197,22 @@ NAN[3, 1] = np.nan
 ZERO = ROWS[:, :4] * [1, 1, 1, -1]
 BAD = {
     "empty.bin": (b"", "is empty"),
-    "cut.bin": (ROWS.tobytes()[:-3], "797 bytes are no rows of 4 or 5 float32"),
+    "cut.bin": (
+        ROWS.tobytes()[:-3],
+        "797 bytes, not a multiple of 16 or 20 (x, y, z, intensity as float32)",
+    ),
     "negative.bin": (ZERO.astype("f4").tobytes(), "name the columns with --columns"),
     "one.bin": (ROWS[:1, :4].tobytes(), "holds 1 of at least 16 points; remove it"),
     "nan.bin": (NAN.tobytes(), "NaN or infinite values in 1 of 40 points; --drop_nan"),
     "far.bin": ((ROWS[:, :4] * 100).tobytes(), "which are no metres: divide"),
     "near.bin": ((ROWS[:, :4] / 100).tobytes(), "which are no metres: multiply"),
-    "scan.las": (b"LASF", "is of no known format; can be read: .bin"),
+    "scan.csv": (b"1,2,3", "is of no known format; can be read: .bin"),
+    "scan.las": (b"LASF", "laspy" if find_spec("laspy") is None else "is damaged"),
     "short.pcd": (pcd("binary", TABLE.tobytes()[:-1]), "is damaged or of another layout"),
     "rows.pcd": (pcd("binary", TABLE[:-1].tobytes()), "is damaged: holds 39 of 40 points"),
     "head.pcd": (b"VERSION 0.7\n", "is damaged or of another layout"),
     "bomb.pcd": (pcd("binary_compressed", stored(bytes(99))), "is damaged"),
-    "faces.ply": (ply("ascii").replace(b"face 0", b"face 2"), "must hold points alone"),
+    "faces.ply": (ply("ascii").replace(b"face 0", b"face 2"), "must hold only points"),
     "noz.ply": (ply("ascii").replace(b"float z", b"float w"), "has no column z, only x, y, w"),
     "int.ply": (ply("ascii").replace(b"float z", b"int z"), "must"),
     "wide.npy": (lambda path: np.save(path, np.ones((40, 7))), "not rows of 5 floats"),
@@ -180,7 +230,7 @@ def test_bad_files_are_named_in_one_line(tmp_path, name):
     path = tmp_path / name
     write(path, content)
     with pytest.raises(ScanError) as raised:
-        read_file(path)
+        read_cloud(path).check_metres()
     assert str(raised.value).startswith(f"{path}: ")
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
@@ -189,11 +239,11 @@ def test_bad_files_are_named_in_one_line(tmp_path, name):
 def test_columns_can_be_named_and_points_without_return_dropped(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(NAN.tobytes())
-    named = read_file(path, ("x", "y", "z", "time"), drop_nan=True)
-    assert named.scan.intensity is None
-    np.testing.assert_array_equal(named.scan.time_s, np.delete(INTENSITY, 3))
+    named = read_cloud(path, ("x", "y", "z", "time"), drop_nan=True)
+    assert named.intensity is None
+    np.testing.assert_array_equal(named.time_s, np.delete(INTENSITY, 3))
     with pytest.raises(ScanError, match="has no column z, only x, y, q, i"):
-        read_file(path, ("x", "y", "q", "i"))
+        read_cloud(path, ("x", "y", "q", "i"))
 
 
 @pytest.mark.parametrize(
@@ -213,13 +263,13 @@ def test_labels_go_with_their_scan(tmp_path, scan, labels, written):
         (root / place).resolve().parent.mkdir(parents=True, exist_ok=True)
         (root / place).resolve().write_bytes(data.tobytes())
     folder, (path,) = find_files(root)
-    file = read_file(path)
-    np.testing.assert_array_equal(file.scan.labels, values)
-    write_file(file, folder, out)
+    file = read_cloud(path)
+    np.testing.assert_array_equal(file.labels, values)
+    write_below(file, folder, out)
     assert (out / written).read_bytes() == values.tobytes()
     (root / labels).resolve().write_bytes(values[:-1].tobytes())
     with pytest.raises(ScanError, match=r"holds 39 labels but .* 40 points: delete the one"):
-        read_file(path)
+        read_cloud(path)
 
 
 def test_labels_of_another_time_stamp_are_not_taken(tmp_path):
@@ -227,8 +277,8 @@ def test_labels_of_another_time_stamp_are_not_taken(tmp_path):
         (tmp_path / name).write_bytes(ROWS.tobytes())
     for name in ("100.label", "100.2.label"):
         (tmp_path / name).write_bytes(bytes(4 * NUM))
-    assert read_file(tmp_path / "100.1.bin").labels is None
-    assert read_file(tmp_path / "100.2.bin").label_path == tmp_path / "100.2.label"
+    assert read_cloud(tmp_path / "100.1.bin").labels is None
+    assert read_cloud(tmp_path / "100.2.bin").file.label_path == tmp_path / "100.2.label"
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
@@ -236,12 +286,16 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     path = tmp_path / "a.pcd"
     path.write_bytes(pcd("binary", TABLE.tobytes()))
     with pytest.raises(ScanError, match=r"a\.pcd: \.pcd needs pypcd4: pip install 'r3dpa\[pcd\]'"):
-        read_file(path)
+        read_cloud(path)
 
 
 def test_a_folder_without_scans_is_named(tmp_path):
-    (tmp_path / "a.txt").touch()
-    with pytest.raises(ScanError, match=r"is no folder with scans and no scan; can be read: \.bin"):
+    with pytest.raises(ScanError, match=r"is an empty folder; can be read: \.bin"):
         find_files(tmp_path)
-    with pytest.raises(ScanError, match="nowhere: is no folder"):
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(
+        ScanError, match=r"it holds 1 other files, such as a\.txt; can be read: \.b"
+    ):
+        find_files(tmp_path)
+    with pytest.raises(ScanError, match="nowhere: is no folder and no file"):
         find_files(tmp_path / "nowhere")

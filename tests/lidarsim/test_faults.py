@@ -84,6 +84,21 @@ def test_severities_have_the_published_shares(severity):
     assert (~car[left]).sum() == (~car).sum()
 
 
+@pytest.mark.parametrize("strength", [0.25, 0.5, 0.75])
+def test_a_strength_of_fewer_beams_is_the_share_of_points_that_go(strength):
+    """A severity is that of Robo3D, which keeps every second shot alone."""
+    result = Fault("fewer_beams", strength=strength).apply(SCAN)
+    assert len(result.index) == len(SCAN) * (1 - strength)
+    assert "shot" not in result.effects[0].reason
+    assert "every second shot" in Fault("fewer_beams", 2).apply(SCAN).effects[0].reason
+
+
+def test_faults_take_arrays_too():
+    rows = np.column_stack([SCAN.points, SCAN.intensity])
+    found = Fault("crosstalk", 2).apply(rows, 1)
+    np.testing.assert_array_equal(found[:, :3], Fault("crosstalk", 2).apply(SCAN, 1).points)
+
+
 def test_crosstalk_blur_and_shift_move_by_their_measure():
     scan = sweep(64, 500)
     moved = Fault("crosstalk", strength=0.5).apply(scan)

@@ -7,13 +7,14 @@ from lidarsim import Street, load_sensor, simulate_scan
 from lidarsim.faults import Fault
 from lidarsim.recorded import RecordedScan
 from lidarsim.rings import rings_of
-from lidarsim.scene import Weather
+from lidarsim.scene import Weather as Conditions
+from lidarsim.weather import Weather
 
 
 def simulated(model, shots):
     """Points of a scan, and the laser of each, by their place: a laser ends where azimuth falls."""
     sensor = load_sensor(model, shots=shots)
-    scene = Street(5, 1, Weather()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 1, Conditions()).scene(3, sensor.mount_height_m)
     points = simulate_scan(scene, sensor, ("rings",), {"rolling_shutter": "off"}).points[:, :3]
     azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
     return points.copy(), np.append(0, (np.diff(azimuth) < -1).cumsum())
@@ -78,3 +79,17 @@ def test_more_than_256_rings_are_not_sure():
 def test_one_point_has_a_ring():
     found = rings_of(RecordedScan(np.ones((1, 3), dtype=np.float32)))
     assert (found.num_rings, found.ring.tolist()) == (1, [0])
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize(("model", "beams"), [("hdl64e", 64), ("hdl32e", 32)])
+def test_points_that_weather_adds_last_have_the_rings_of_the_scan(model, beams, way):
+    points, ring = simulated(model, 520)
+    scan = RecordedScan(points[::way].copy())
+    foggy = Weather(visibility_m=40).apply(scan)
+    added = foggy.index < 0
+    assert added.sum() > 500
+    found = rings_of(RecordedScan(foggy.points))
+    assert (found.how, found.num_rings, found.num_shots) == ("order", beams, 520)
+    assert (found.ring == ring[::way][foggy.shot])[~added].mean() > 0.99
+    assert found.sure == pytest.approx((~added).mean(), abs=0.02)

@@ -1,21 +1,28 @@
 """Weather on recorded scans; the published numbers are those of the sources named there."""
 
 import math
+import pickle
+import random
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset
 from two_roads import WEATHERS, compared, scene_figures
 
 from lidarsim import Origin, Street, load_sensor, simulate_scan
+from lidarsim.clouds import PointCloud, read_cloud
+from lidarsim.draws import Draws
 from lidarsim.effects import EFFECTS, medium
 from lidarsim.effects.medium import Rain, soft_waveform
 from lidarsim.ground import ground_of
-from lidarsim.recorded import Instrument, RecordedScan, scale_of
-from lidarsim.scan import effect_name
-from lidarsim.scene import Weather as SimulatedWeather
+from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, scale_of
+from lidarsim.scan import SECOND_RETURN_M, effect_name
+from lidarsim.scene import Scene
+from lidarsim.scene import Weather as Conditions
 from lidarsim.sensors.spinning import hdl64e
-from lidarsim.weather import ADDED_CLASS, REFUSED, Weather
+from lidarsim.weather import ADDED_CLASS, REFUSED, Weather, WeatherPrior
 
 CALLED = {
     "fog": {"visibility_m": 60.0},
@@ -33,7 +40,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 @pytest.fixture(scope="module")
 def scan():
     sensor = load_sensor("hdl64e", shots=520)
-    scene = Street(5, 0, SimulatedWeather()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 0, Conditions()).scene(3, sensor.mount_height_m)
     found = simulate_scan(scene, sensor, ("recorded",))
     return RecordedScan(found.points[:, :3].copy(), found.points[:, 3].copy(), labels=found.labels)
 
@@ -342,6 +349,141 @@ def test_attenuation_of_calibrated_reflectivities(scan):
     clear = (whole[kept] > 0) & (np.abs(expected % 1 - 0.5) > 1e-3)
     assert clear.sum() > 1000
     assert (result.intensity[: len(kept)][clear] == np.round(expected[clear])).all()
+
+
+@pytest.fixture(scope="module")
+def rows(scan):
+    """Points and intensities ``(P, 4)``."""
+    return np.column_stack([scan.points, scan.intensity])
+
+
+@pytest.fixture(scope="module")
+def expected(scan):
+    """The same in fog."""
+    result = Weather(visibility_m=60).apply(replace(scan, labels=None), 3)
+    return np.column_stack([result.points, result.intensity])
+
+
+class TestKinds:
+    """What is given comes back as its kind, with the same numbers."""
+
+    @pytest.mark.parametrize("kind", ["f4", "f8"])
+    def test_arrays(self, rows, expected, kind):
+        found = Weather(visibility_m=60).apply(rows.astype(kind), 3)
+        assert found.dtype == kind
+        np.testing.assert_array_equal(found.astype("f4"), expected)
+        without = Weather(visibility_m=60).apply(rows[:, :3].astype(kind), 3)
+        assert without.shape[1] == 3
+
+    def test_tensors(self, rows, expected):
+        found = Weather(visibility_m=60).apply(torch.from_numpy(rows), 3)
+        assert torch.equal(found, torch.from_numpy(expected))
+
+    def test_clouds_and_paths(self, scan, rows, expected, tmp_path):
+        (tmp_path / "a.bin").write_bytes(rows.tobytes())
+        (tmp_path / "a.label").write_bytes(scan.labels.tobytes())
+        found = Weather(visibility_m=60).apply(read_cloud(tmp_path / "a.bin"), 3)
+        assert isinstance(found, PointCloud)
+        np.testing.assert_array_equal(found.rows(), expected)
+        for path in (tmp_path / "a.bin", str(tmp_path / "a.bin")):
+            result = Weather(visibility_m=60).apply(path, 3)
+            assert result.points.tobytes() == found.points.tobytes()
+            np.testing.assert_array_equal(result.labels, found.labels)
+
+    @pytest.mark.parametrize("shape", [(10,), (10, 2), (10, 5), (2, 10, 3)])
+    def test_other_shapes_are_refused(self, shape):
+        with pytest.raises(ValueError, match=r"points must be \(P, 3\) or \(P, 4\), got"):
+            Weather(visibility_m=60).apply(np.ones(shape))
+
+    def test_a_transform_draws_anew_and_by_the_seed_of_random(self, rows):
+        weather = pickle.loads(pickle.dumps(Weather(visibility_m=60)))  # noqa: S301
+        assert weather == Weather(visibility_m=60)
+        random.seed(0)
+        one, other = (weather(rows) for _ in range(2))
+        random.seed(0)
+        np.testing.assert_array_equal(weather(rows), one)
+        assert one.tobytes() != other.tobytes()
+
+
+class Drive(Dataset):
+    """The same points twice, through a transform."""
+
+    def __init__(self, points, transform):
+        self.points, self.transform = points, transform
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        return self.transform(self.points)
+
+
+def test_a_loader_applies_weather_in_its_processes(scan):
+    points = torch.from_numpy(np.column_stack([scan.points, scan.intensity])[:2000])
+    drive = Drive(points, Weather(visibility_m=60))
+    loaders = [
+        DataLoader(drive, None, num_workers=1, generator=torch.Generator().manual_seed(0))
+        for _ in range(2)
+    ]
+    first, again = (list(loader) for loader in loaders)
+    assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
+    assert first[0].numpy().tobytes() != first[1].numpy().tobytes()
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Weather of training scans."""
+    return [WeatherPrior(1.0).draw(np.random.default_rng(seed)) for seed in range(3000)]
+
+
+class TestPrior:
+    """Rates are log-uniform, films have all depths."""
+
+    @pytest.mark.parametrize("name", ["visibility_m", "rain_mm_h", "snow_mm_h"])
+    def test_as_many_are_below_the_geometric_mean_as_above(self, drawn, name):
+        values = np.array([getattr(weather, name) for weather in drawn])
+        values = values[np.isfinite(values) & (values > 0)]
+        low, high = getattr(WeatherPrior(), name)
+        assert abs(len(values) - 1000) < 5 * math.sqrt(3000 * 2 / 9)
+        assert low <= values.min() < 1.1 * low
+        assert high / 1.1 < values.max() <= high
+        below = (values < math.sqrt(low * high)).mean()
+        assert abs(below - 0.5) < 5 * 0.5 / math.sqrt(len(values))
+
+    def test_films_in_rain_have_all_depths(self, drawn):
+        films = np.array([weather.water_film_mm for weather in drawn if weather.rain_mm_h])
+        assert all(weather.water_film_mm == 0 for weather in drawn if not weather.rain_mm_h)
+        assert 0 < films.min() < 0.05
+        assert 1.45 < films.max() < 1.5
+        assert abs(films.mean() - 0.75) < 5 * 1.5 / math.sqrt(12 * len(films))
+
+
+def test_recorded_powers_could_be_detected():
+    """The darkest points are as strong as the weakest echo that the sensor can report."""
+    points = np.zeros((2000, 3), dtype=np.float32)
+    points[:, 0] = np.linspace(1, 110, 2000)
+    points[:, 1] = np.linspace(-1, 1, 2000)
+    intensity = np.where(np.arange(2000) % 2, 0.0, 1e-3).astype(np.float32)
+    intensity[0] = 1
+    scan, instrument = RecordedScan(points, intensity), Instrument(response="linear")
+    sensor = instrument.sensor_for(scan)
+    sweep = RecordedSweep(Scene(), scan, instrument, sensor, Draws(2000, 0))
+    least = sensor.min_power * math.exp(-3 * sensor.threshold_spread)
+    assert sweep.recorded_power.min() == pytest.approx(least, rel=1e-5)
+
+
+def test_second_returns_are_apart_from_the_first(scan):
+    """Closer ones are one echo to the sensor."""
+    instrument = Instrument(returns="dual")
+    nearest_m = []
+    for weather in (Weather(visibility_m=40), Weather(snow_mm_h=3), Weather(rain_mm_h=100)):
+        result = weather.apply(scan, 1, instrument)
+        order = np.argsort(result.shot, kind="stable")
+        range_m = np.linalg.norm(result.points[order].astype(float), axis=1)
+        is_pair = np.diff(result.shot[order]) == 0
+        nearest_m.append(np.abs(np.diff(range_m)[is_pair]).min())
+    # From the optical centre and from the origin, distances differ by some centimetres.
+    assert min(nearest_m) > SECOND_RETURN_M - 0.05
 
 
 @pytest.fixture(scope="module")

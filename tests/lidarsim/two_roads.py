@@ -17,11 +17,11 @@ from lidarsim import Semantic, Street, Sweep, load_sensor
 from lidarsim.effects import ECHO_EFFECTS, RAY_EFFECTS
 from lidarsim.recorded import RecordedScan
 from lidarsim.scan import calibrated_intensity, run_effect
-from lidarsim.scene import Weather as SimulatedWeather
+from lidarsim.scene import Weather as Conditions
 from lidarsim.sweep import Origin
 from lidarsim.weather import Weather
 
-CLEAR = SimulatedWeather(clear_sky=False)
+CLEAR = Conditions(clear_sky=False)
 WEATHERS = {
     "fog 30 m": {"visibility_m": 30.0},
     "fog 60 m": {"visibility_m": 60.0},
@@ -142,7 +142,7 @@ def scene_figures(number, sensor, weathers=WEATHERS):
         columns = (shots[there.shot], there.points, there.intensity, labels_there, made_by)
         roads = [clear, figures(*columns, shots)]
         azimuth_deg = weather.get("sun_azimuth_deg", 0.0) + turned_deg
-        here = SimulatedWeather(**asdict(CLEAR) | weather | {"sun_azimuth_deg": azimuth_deg})
+        here = Conditions(**asdict(CLEAR) | weather | {"sun_azimuth_deg": azimuth_deg})
         for sweep, key, (clear_shots, *_) in zip(before, keys, in_clear, strict=True):
             roads.append(figures(*shown(turn(sweep, here, key, off)), clear_shots))
         result[name] = roads

@@ -29,6 +29,7 @@ COMMANDS = {
     "predict": Command("stages:run", "reconstruct scans with a checkpoint"),
     "data simulate": Command("lidarsim:simulate", "write simulated scans", True),
     "data check": Command("data:check", "list bad scans and missing folders of a data set"),
+    "data convert": Command("lidarsim.conversion:convert", "write scans in another format"),
     "data view": Command("data:view", "draw scans: pictures and a page with point clouds"),
     "data features": Command("features:features", "write feature grids of scans", resumable=True),
     "data objects": Command("data:objects", "write mean features of object classes for inpaint"),
@@ -72,7 +73,7 @@ def _help(group: str) -> str:
 def _find(args: list[str]) -> tuple[str, list[str]]:
     name = " ".join(args[: 2 if args[0] in _GROUPS else 1])
     rest = args[len(name.split()) :]
-    name = _ALIASES.get(name, name)
+    name = name if name in COMMANDS else _ALIASES.get(name, name)
     if name not in COMMANDS:
         sys.stderr.write(f"r3dpa: unknown command {name!r}: give one of {', '.join(COMMANDS)}\n")
         sys.exit(2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,51 +12,65 @@ from r3dpa.cli.parser import check_file, check_folder
 from r3dpa.pretrained import DEFAULT_WEIGHTS
 
 
-def check(path: Path) -> None:
+def check(path: Path, *, columns: tuple[str, ...] = ()) -> None:
     """List every bad scan and missing folder of a data set; exit with 1 if there is any.
 
-    It also says which columns scans hold, which beams they show, and how sure that is.
+    Says which columns scans hold, which beams they show and how sure that is, which files were
+    skipped, and whether points are in the frame of the vehicle.
 
     Args:
-        path: Root in the KITTI-360 layout, or any folder of ``.bin`` scans; or of other scans that
-            ``r3dpa data weather`` reads.
+        path: Root in the KITTI-360 layout, or a folder of scans of any format that can be read.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
     """
-    from lidarsim.clouds import find_files, read_file
-    from lidarsim.rings import rings_of
+    from lidarsim.clouds import files_below, find_files, read_cloud, suffix_of
     from lidarsim.scan_files import ScanError
+    from lidarsim.survey import describe_scan, skipped_files
+    from r3dpa.data.scans import RAW, evenly, scan_files
     from r3dpa.data.scans import check as check_scans
-    from r3dpa.data.scans import evenly, scan_files
 
-    files = [file for file in sorted(scan_files(path)) if file.suffix == ".bin"]
-    others: list[Path] = []
-    text, usable = "", True
-    if all(file.name.endswith(".pcd.bin") for file in files):  # none, or those of nuScenes
-        with suppress(ScanError):
+    is_layout = (path / RAW).is_dir()
+    files = list(scan_files(path)) if path.exists() else []
+    kitti = [file for file in sorted(files) if suffix_of(file) == ".bin" and not columns]
+    lines: list[str] = []
+    text, others, usable = "", list[Path](), True
+    if not kitti and not is_layout:
+        try:
             others = find_files(path)[1]
+        except ScanError as error:
+            lines.append(f"bad: {error}")
     if not others:
         text, usable = check_scans(path)
-    lines = []
-    for file in others or evenly(files, 4):
+    for file in others or evenly(kitti, 4):
         try:
-            scan = read_file(file)
-            rings = rings_of(scan.scan)
-            beams = f"{rings.num_rings} beams by {rings.how}, {rings.sure:.0%} of the points sure"
-            lines.append(f"{file}: {scan.describe()}, {beams}")
+            cloud = read_cloud(file, columns)
+            cloud.check_metres()
+            lines.append(describe_scan(cloud))
         except ScanError as error:
             lines += [] if text else [f"bad: {error}"]
             usable = usable and bool(text)
+    if not is_layout and (line := skipped_files(files_below(path), others or kitti)):
+        lines.append(line)
     sys.stdout.write("\n".join([*lines, *([text] if text else []), ""]))
     if not usable:
         sys.exit(1)
 
 
-def view(source: Path, *, out: Path | None = None, num: PositiveInt = 8) -> str:
+def view(
+    source: Path,
+    *,
+    out: Path | None = None,
+    num: PositiveInt = 8,
+    columns: tuple[str, ...] = (),
+) -> str:
     """Draw scans as range images, from above, and as a page with point clouds to turn.
 
     Args:
-        source: A ``.bin``, ``.ply`` or ``.npz`` file, or a folder of ``.bin`` scans in any layout.
+        source: A scan of any format that can be read, a folder of scans, or a ``.npz`` of scans.
         out: Folder for the pictures and the page; default: ``view/<name of the source>``.
         num: Scans to show at most, evenly spread over the folder.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring``; default: by the
+            values.
     """
     from r3dpa import viz
     from r3dpa.cli.scene_files import page_scans, write_page
@@ -65,7 +78,7 @@ def view(source: Path, *, out: Path | None = None, num: PositiveInt = 8) -> str:
     from r3dpa.geometry import LidarSensor, SphericalProjection
 
     check_folder(out)
-    readers = page_scans(source)
+    readers = page_scans(source, columns)
     scans = [read() for read in evenly(readers, num)]
     drawn = {scan.name: scan.points for scan in scans}
     resolved = source.resolve()

@@ -43,7 +43,6 @@ def gallery(
     import torch
     from tqdm import tqdm
 
-    from lidarsim.recorded import RecordedScan
     from lidarsim.weather import Weather
     from r3dpa import viz
     from r3dpa.cli.features import read_data
@@ -112,8 +111,7 @@ def gallery(
         "snow, 3 mm/h": Weather(snow_mm_h=3),
     }
     for name, weather in weathers.items():
-        found = weather.apply(RecordedScan(points_of(scene, projection).numpy()), seed)
-        range_m = range_image(torch.from_numpy(found.points), projection)[0]
+        range_m = range_image(weather.apply(points_of(scene, projection), seed), projection)[0]
         show("Weather in seed 0", name, range_m)
     page = viz.scan_page(scans, "r3dpa gallery", {}, {}, None, projection.sensor, tiles, about)
     write_text(out, page)

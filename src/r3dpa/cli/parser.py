@@ -154,7 +154,7 @@ def parse(
 
     Keyword-only arguments are options, and so are those of functions outside this package.
     """
-    positional = function.__module__.startswith("r3dpa.cli.")
+    positional = function.__module__.startswith(("r3dpa.cli.", "lidarsim.conversion"))
     description = cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]
     parser = Parser(prog=prog, description=description)
     parser.add_argument("--config", action="config", help="YAML file with options")

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import r3dpa
 from lidarsim import Origin, Semantic
-from lidarsim.scan_files import ScanError, read_beside, read_npz, read_ply, read_scan
+from lidarsim.scan_files import read_beside, read_clouds
 from r3dpa import viz
 from r3dpa.baselines import BaselineGenerator
 from r3dpa.checkpoints import Checkpoint
@@ -47,24 +47,6 @@ _COLOURS = dict(
     )
 )
 _ON_SHEET, _ON_PAGE = 16, 8
-
-
-def read_clouds(path: Path) -> dict[str, NDArray]:
-    """Points ``(P, 3)`` or ``(P, 4)`` of each scan of a ``.bin``, ``.ply`` or ``.npz`` file."""
-    if path.suffix == ".npz":
-        clouds = read_npz(path)
-    elif path.suffix in (".bin", ".ply"):
-        clouds = {path.stem: read_scan(path) if path.suffix == ".bin" else read_ply(path)}
-    else:
-        raise ScanError(f"{path}: is no scan; give a .bin, .ply or .npz file")
-    for name, points in clouds.items():
-        if points.ndim != 2 or points.shape[1] not in (3, 4):
-            raise ScanError(
-                f"{path}: {name} must be points (P, 3) or (P, 4), got shape {points.shape}"
-            )
-    if not clouds:
-        raise ScanError(f"{path}: holds no scan")
-    return clouds
 
 
 def written(path: Path) -> str:
@@ -165,17 +147,17 @@ def _written_labels(out: Path, index: int) -> NDArray | None:
     return np.fromfile(path, dtype="<u4") if path.exists() else None
 
 
-def page_scans(source: Path) -> list[Callable[[], viz.PageScan]]:
+def page_scans(source: Path, columns: Sequence[str] = ()) -> list[Callable[[], viz.PageScan]]:
     """Readers of the scans of a folder or file, in order."""
 
     def read(name: str, path: Path) -> viz.PageScan:
-        (points,) = read_clouds(path).values()
-        if path.suffix == ".ply":
+        (points,) = read_clouds(path, columns).values()
+        if path.suffix != ".bin":
             return viz.PageScan(name, points)
         return viz.PageScan(name, points, read_beside(path, "labels"), read_beside(path, "origins"))
 
     if source.suffix == ".npz" and source.is_file():
-        clouds = read_clouds(source).items()
+        clouds = read_clouds(source, columns).items()
         return [partial(viz.PageScan, f"{source.stem}/{name}", points) for name, points in clouds]
     return [partial(read, scan.name, scan.path) for scan in find_scans(source)]
 

@@ -14,11 +14,12 @@ import numpy as np
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
+from lidarsim.clouds import PointCloud
 from lidarsim.drive_files import to_json, weather_to_dict, write
 from lidarsim.drives import differences
 from lidarsim.faults import Fault, Kind
 from lidarsim.recorded import Instrument, RecordedScan
-from lidarsim.weather import Weather, WeatheredScan
+from lidarsim.weather import Weather, WeatheredScan, changed_cloud, recorded_scan
 from r3dpa.cli.parser import check_folder
 from r3dpa.io import delete_unfinished, in_processes, no_follow, only_writer
 
@@ -42,7 +43,7 @@ def weather(
     do not depend on the number of workers.
 
     Args:
-        source: Scan or folder of scans: .bin, .pcd.bin, .pcd, .ply, .npy, .npz, with .label files.
+        source: Scan or folder of scans: .bin, .pcd, .ply, .npy, .npz, .las, with .label files.
         weather: Such as ``--weather.visibility_m 60 --weather.rain_mm_h 10``.
         instrument: What is assumed of the instrument; the intensity scale is found and reported.
         effects: ``off`` or ``on`` by effect, such as ``--effects.range_noise on``.
@@ -51,7 +52,8 @@ def weather(
     # An error in the request must not be reported as one in the first scan.
     weather.apply(RecordedScan(np.ones((1, 3), np.float32)), 0, instrument, effects=effects)
     change = weather, instrument, effects
-    about = {"weather": weather_to_dict(weather), "instrument": asdict(instrument)}
+    conditions = weather_to_dict(weather) | {"traffic_m_s": weather.traffic_m_s}
+    about = {"weather": conditions, "instrument": asdict(instrument)}
     return _run(source, change, about | {"effects": effects}, FolderOptions(**options))
 
 
@@ -66,7 +68,7 @@ def corrupt(
     """Write scans with a fault of the sensor, as ``r3dpa data weather`` does.
 
     Args:
-        source: Scan or folder of scans: .bin, .pcd.bin, .pcd, .ply, .npy, .npz, with .label files.
+        source: Scan or folder of scans: .bin, .pcd, .ply, .npy, .npz, .las, with .label files.
         fault: What fails.
         severity: 0 (nothing) to 3, as in Robo3D.
         strength: In place of the severity: share of beams or points, metres, degrees.
@@ -78,7 +80,7 @@ def corrupt(
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions:
-    """Those of both commands.
+    """Options shared by ``weather`` and ``corrupt``.
 
     Args:
         out: Folder of the results.
@@ -109,12 +111,13 @@ class _Job:
     def name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def read(self, path: Path) -> tuple[Any, WeatheredScan]:
-        from lidarsim.clouds import read_file
+    def read(self, path: Path) -> tuple[PointCloud, WeatheredScan]:
+        from lidarsim.clouds import read_cloud
         from lidarsim.scan_files import ScanError
 
-        file = read_file(path, self.options.columns, self.options.drop_nan)
-        key, scan = (self.options.seed, self.name(path)), file.scan
+        cloud = read_cloud(path, self.options.columns, self.options.drop_nan)
+        cloud.check_metres()
+        key, scan = (self.options.seed, self.name(path)), recorded_scan(cloud)
         try:
             if isinstance(self.change, Fault):
                 result = self.change.apply(scan, key)
@@ -128,26 +131,27 @@ class _Job:
                 f"{path}: none of its {len(scan)} points is left, and no reader takes an empty "
                 "scan: give milder weather or a smaller strength"
             )
-        return file, result
+        return cloud, result
 
     def __call__(self, path: Path) -> dict[str, Any]:
-        from lidarsim.clouds import inputs_of, write_file
+        from lidarsim.changed_scans import inputs_of, write_below
         from lidarsim.scan_files import ScanError
 
         inputs = inputs_of(path, self.root)  # before they are read
         try:
-            file, result = self.read(path)
+            cloud, result = self.read(path)
         except ScanError as error:
             return {"scan": self.name(path), "error": str(error)}
-        results = write_file(file.changed(result), self.root, self.options.out)
+        results = write_below(changed_cloud(cloud, result), self.root, self.options.out)
         ran = {effect.name: effect.reason for effect in result.effects if effect.status == "ran"}
         files = {"scan": self.name(path), "inputs": inputs, "results": results}
-        about = {"file": file.describe(), "effects": ran, **result.report}
+        about = {"file": cloud.describe(), "effects": ran, **result.report}
         return files | about | {"written": len(result.points)}
 
 
 def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOptions) -> str:
-    from lidarsim.clouds import find_files, inputs_of
+    from lidarsim.changed_scans import inputs_of
+    from lidarsim.clouds import find_files
     from lidarsim.scan_files import ScanError
     from r3dpa.data.scans import evenly
 
@@ -198,7 +202,7 @@ def _run(source: Path, change: Any, request: dict[str, Any], options: FolderOpti
 
 def _check_out(root: Path, out: Path, files: list[Path], request: dict[str, Any]) -> None:
     """Refuse a folder of other files or results, before anything is written."""
-    from lidarsim.clouds import refuse_shared_labels
+    from lidarsim.changed_scans import refuse_shared_labels
 
     check_folder(out)
     place, above = out.resolve(), root.resolve()
@@ -242,7 +246,7 @@ def _is_done(line: dict[str, Any], inputs: dict[str, list[int]], out: Path) -> b
 
 def _delete_results(line: dict[str, Any], out: Path) -> None:
     """Delete the files of an earlier run, since new ones may have no labels in their place."""
-    from lidarsim.clouds import refuse_outside
+    from lidarsim.changed_scans import refuse_outside
 
     for name in line.get("results", ()):
         refuse_outside(out / name, out)
@@ -276,8 +280,8 @@ def _write_page(job: _Job, files: list[Path]) -> None:
     before: list[viz.PageScan] = []
     after: list[viz.PageScan] = []
     for path in files:
-        file, result = job.read(path)
-        scan = file.scan
+        cloud, result = job.read(path)
+        scan = recorded_scan(cloud)
         index = result.index[result.index >= 0]
         fate = np.full(len(scan), _LOST, dtype=np.uint8)
         fate[index] = 0

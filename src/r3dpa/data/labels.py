@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidarsim.scan_files import ScanError, read_beside, read_bytes
+from lidarsim.cloud_formats import ScanError, read_bytes
+from lidarsim.scan_files import read_beside
 from r3dpa.io import atomic_path
 
 _NAMES = {

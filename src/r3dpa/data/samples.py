@@ -5,7 +5,7 @@ suffix    content, and who writes it
 ========  ========================================================================================
 ``.bin``  float32 rows x, y, z, intensity: ``r3dpa sample``, and RangeLDM (``ldm/inference.py``,
           pixels of 90 m and more left out)
-``.ply``  binary: ``r3dpa sample``
+``.ply``  binary: ``r3dpa sample``; other formats of :mod:`lidarsim.clouds`, too
 ``.txt``  text rows x, y, z, intensity or x, y, z, r, g, b: ``pcd/*.txt`` of R3DPA and
           LiDAR-Diffusion (three decimals, colours 0)
 ``.npz``  clouds ``(P, 3)`` or ``(P, 4)`` by name: ``scenes.npz`` of ``r3dpa sample``; or images
@@ -35,20 +35,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsim.scan_files import (
-    ScanError,
-    files_below,
-    npz_arrays,
-    out_of_range,
-    read_ply,
-    read_scan,
-)
+from lidarsim.cloud_formats import ScanError, is_one_cloud, npz_arrays
+from lidarsim.clouds import files_below
+from lidarsim.scan_files import out_of_range, read_points, read_scan
 from r3dpa.data.scans import find_scans
 from r3dpa.geometry import EMPTY_RANGE_M, LidarSensor, SphericalProjection, in_range, points_of
 from r3dpa.io import UNPICKLING_ERRORS, first_line
 
 Arrays = Iterator[tuple[str, np.ndarray]]  # name within the file and cloud (P, ...) or (C, H, W)
-READABLE = "clouds as .bin, .ply, .txt, .npz; range images as .npz, .npy, .pth"
+READABLE = "clouds as .bin, .ply, .pcd, .las, .txt, .npz; range images as .npz, .npy, .pth"
 # Of the range: more than bfloat16 rounds off, far less than channels in another order differ.
 _LENGTH_TOLERANCE = 0.02
 
@@ -176,6 +171,10 @@ def _arrays_of(file: Path) -> Arrays:
     yield from read(file)
 
 
+def _cloud(file: Path) -> Arrays:
+    yield "", read_points(file)
+
+
 def _text_rows(file: Path) -> Arrays:
     try:
         rows = np.loadtxt(file, dtype=np.float32, ndmin=2)
@@ -193,6 +192,9 @@ def _npy_parts(file: Path) -> Arrays:
 
 
 def _npz_parts(file: Path) -> Arrays:
+    if is_one_cloud(file):
+        yield "", read_points(file)
+        return
     for number, (key, array) in enumerate(npz_arrays(file)):
         unnamed = key == "arr_0" and number == 0  # NumPy's name where none is given
         for part, values in _parts(f"{file}, array {key}", array):
@@ -235,7 +237,7 @@ def _tensors(file: Path) -> Arrays:
 
 _READERS: dict[str, Callable[[Path], Arrays]] = {
     ".bin": lambda file: iter([("", read_scan(file))]),
-    ".ply": lambda file: iter([("", read_ply(file))]),
+    **dict.fromkeys((".ply", ".pcd", ".las", ".laz"), _cloud),
     ".txt": _text_rows,
     ".npz": _npz_parts,
     ".npy": _npy_parts,

@@ -1,10 +1,10 @@
-"""LiDAR scans on disk: finding, reading, writing and checking them."""
+"""LiDAR scans on disk: finding and checking them."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from glob import has_magic
 from multiprocessing.pool import ThreadPool
@@ -14,7 +14,9 @@ from typing import Literal, TypeVar
 from tqdm import tqdm
 
 from lidarsim import TRAIN_DRIVES, VAL_DRIVES, drive_name, expected_scans
-from lidarsim.scan_files import ScanError, files_below, read_scan, unreadable
+from lidarsim.cloud_formats import READABLE, READERS, ScanError, unreadable
+from lidarsim.clouds import files_below, suffix_of
+from lidarsim.scan_files import read_scan
 from r3dpa.data.store import ItemKey
 from r3dpa.geometry import LidarSensor
 from r3dpa.io import refuse_name
@@ -32,7 +34,7 @@ VELODYNE = Path("velodyne_points") / "data"
 
 @dataclass(frozen=True, order=True, slots=True)
 class Scan:
-    """One sensor sweep in a ``.bin`` file.
+    """One sensor sweep in a file.
 
     ``drive`` is the KITTI-360 drive, or the folder relative to the root; ``frame`` the file name
     without its suffix.
@@ -60,7 +62,8 @@ class Scan:
 def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     """All scans of a folder (with its sub-folders), file, glob, or list of these, sorted.
 
-    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Links
+    In the KITTI-360 layout (a folder that holds ``data_3d_raw``), only the Velodyne scans. Of other
+    folders and globs, the ``.bin`` files, or else those of another format that can be read. Links
     to folders are followed; hidden files are left out. The drive of a scan is its folder relative
     to the given folder, or to the common parent of a glob or list. ``ValueError`` if nothing is
     found, one file is named twice, or a name could not be that of an output file.
@@ -71,8 +74,8 @@ def find_scans(source: str | Path | Sequence[str | Path]) -> list[Scan]:
     files = sorted(file.absolute() for entry in entries for file in scan_files(entry))
     if not files:
         raise ValueError(
-            f"No scan found in {', '.join(str(e) for e in given)}: give a folder that holds .bin "
-            "files, a .bin file, a glob such as 'drives/**/*.bin', or a list of these."
+            f"no scan found in {', '.join(str(e) for e in given)}: give a folder of scans, a scan, "
+            f"a glob such as 'drives/**/*.bin', or a list of these; can be read: {READABLE}"
         )
     twice = [str(file) for file, count in Counter(files).items() if count > 1]
     if twice:
@@ -126,12 +129,27 @@ def scan_files(entry: str | Path) -> Iterator[Path]:
         for drive in (path / RAW).iterdir():
             yield from _drive_files(drive)
     elif path.is_dir():
-        yield from filter(_is_scan, files_below(path))
+        yield from _of_one_format(path, files_below(path))
     elif path.is_file():
         yield path
     elif has_magic(str(entry)):
         root = Path(path.absolute().anchor)
-        yield from filter(_is_scan, root.glob(str(path.absolute().relative_to(root))))
+        yield from _of_one_format(path, root.glob(str(path.absolute().relative_to(root))))
+
+
+def _of_one_format(source: Path, files: Iterable[Path]) -> list[Path]:
+    """Return the ``.bin`` files, or else those of the only other format."""
+    scans: dict[str, list[Path]] = {}
+    for file in files:
+        if suffix_of(file) in READERS and not file.name.startswith("."):
+            scans.setdefault(file.suffix.lower(), []).append(file)
+    if len(scans) > 1 and ".bin" not in scans:
+        formats = ", ".join(f"{len(files)} {suffix}" for suffix, files in sorted(scans.items()))
+        raise ValueError(
+            f"{source}: holds several formats ({formats}), perhaps each scan more than once: give "
+            "a glob of one, such as '**/*.pcd'"
+        )
+    return scans.get(".bin") or [file for found in scans.values() for file in found]
 
 
 def _drive_files(drive: Path) -> Iterator[Path]:

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarsim.scan_files import DataError
+from lidarsim.cloud_formats import DataError
 from r3dpa.io import no_follow, refuse_name, write_text
 
 ItemKey = tuple[str, int, int]

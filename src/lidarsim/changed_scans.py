@@ -1,0 +1,73 @@
+"""Results of a command on a folder of scans, each below the name of its scan."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from lidarsim.cloud_formats import ScanError
+from lidarsim.clouds import PointCloud, label_path_of, packed
+from lidarsim.io import atomic_path
+
+
+def write_below(cloud: PointCloud, root: Path, out: Path) -> dict[str, int]:
+    """Write a cloud, its labels first, to the place below ``out`` that its file has below ``root``.
+
+    Labels from outside ``root`` are written beside the scan.
+
+    Returns:
+        Size of each written file by its name below ``out``.
+
+    Raises:
+        ScanError: If a link leads out of ``out``.
+    """
+    assert cloud.file is not None
+    path = out / cloud.file.path.relative_to(root)
+    contents: dict[Path, bytes] = {}
+    if cloud.labels is not None and cloud.file.label_path is not None:
+        place = Path(os.path.relpath(cloud.file.label_path, root))
+        beside = place.parts[0] == ".."
+        label_path = path.with_name(place.name) if beside else out / place
+        contents[label_path] = cloud.labels.astype("<u4").tobytes()
+    contents[path] = packed(path, cloud)
+    for written, content in contents.items():
+        refuse_outside(written, out)
+        with atomic_path(written) as temporary:
+            temporary.write_bytes(content)
+    return {written.relative_to(out).as_posix(): len(data) for written, data in contents.items()}
+
+
+def refuse_outside(path: Path, out: Path) -> None:
+    """Refuse a file to write or delete that is not below ``out``, once links are followed.
+
+    Raises:
+        ScanError: With the name of the file.
+    """
+    if not path.parent.resolve().is_relative_to(out.resolve()):
+        raise ScanError(f"{path}: leads out of {out}: give another --out")
+
+
+def inputs_of(path: Path, root: Path) -> dict[str, list[int]]:
+    """Size and time of change in ns of a scan and its labels, by their names from ``root``."""
+    stats = {file: file.stat() for file in (path, label_path_of(path)) if file and file.is_file()}
+    return {
+        Path(os.path.relpath(file, root)).as_posix(): [about.st_size, about.st_mtime_ns]
+        for file, about in stats.items()
+    }
+
+
+def refuse_shared_labels(paths: Iterable[Path]) -> None:
+    """Refuse scans of which two have the same file of labels, also in their results.
+
+    Raises:
+        ScanError: With the names of two such scans.
+    """
+    scan_of: dict[Path, Path] = {}
+    for path in sorted(paths):
+        label_path = label_path_of(path)
+        if label_path is not None and scan_of.setdefault(label_path, path) != path:
+            raise ScanError(
+                f"{label_path}: would be the labels of {scan_of[label_path]} and of {path}: keep "
+                "one of these scans, or its labels in another folder"
+            )

@@ -1,0 +1,70 @@
+"""LAS and LAZ files by the package laspy."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+_FULL_INTENSITY = 65535
+_STEP_M = 1e-4
+_OWN = {"time_s": "gps_time"}
+Table = NDArray[np.void]
+
+
+def read(data: bytes, suffix: str) -> tuple[Table, Callable[[Table], bytes]]:
+    """Return all columns of a file, x, y, z in metres, and what writes it for other rows."""
+    try:
+        las = laspy.read(io.BytesIO(data))
+    except laspy.LaspyException as error:
+        raise ValueError(error) from error
+    names = [name for name in las.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    columns = {axis: np.array(las[axis]) for axis in "xyz"}
+    columns |= {name: np.array(las[name]) for name in names}
+    layout = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+    table = np.empty(len(las.points), layout)
+    for name, column in columns.items():
+        table[name] = column
+    header = las.header
+
+    def pack(table: Table) -> bytes:
+        return _written(header, {name: table[name] for name in columns}, suffix)
+
+    return table, pack
+
+
+def intensity_of(shares: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Return shares ``(P,)`` of the full scale as intensities of 16 bits, as LAS asks for."""
+    return np.rint(shares.clip(0, 1) * _FULL_INTENSITY).astype(np.uint16)
+
+
+def las_of(columns: Mapping[str, NDArray], suffix: str) -> bytes:
+    """Return the file of columns ``(P,)`` by name, x, y, z among them.
+
+    ``time_s`` becomes the GPS time; columns that LAS does not know become extra dimensions.
+    """
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.scales = np.full(3, _STEP_M)
+    header.offsets = np.floor([columns[axis].min() for axis in "xyz"])
+    known = {*"xyz", *header.point_format.dimension_names}
+    named = {_OWN.get(name, name): column for name, column in columns.items()}
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name, column.dtype.newbyteorder("="))
+            for name, column in named.items()
+            if name not in known
+        ]
+    )
+    return _written(header, named, suffix)
+
+
+def _written(header: laspy.LasHeader, columns: Mapping[str, NDArray], suffix: str) -> bytes:
+    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(columns["x"]), header=header))
+    for name, column in columns.items():
+        las[name] = column
+    stream = io.BytesIO()
+    las.write(stream, do_compress=suffix == ".laz")
+    return stream.getvalue()

@@ -1,0 +1,91 @@
+"""Scans in other formats: ``r3dpa data convert``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from lidarsim.cloud_formats import ScanError
+from lidarsim.clouds import WRITERS, PointCloud, find_files, read_cloud, suffix_of
+from lidarsim.io import atomic_path
+from lidarsim.rings import rings_of
+from lidarsim.weather import recorded_scan
+
+Format = Literal["bin", "pcd.bin", "ply", "npy", "npz", "las", "laz"]
+_LEAST_SURE = 0.9  # share of the points whose ring must be sure to be written
+
+
+def convert(
+    source: Path,
+    out: Path,
+    *,
+    to: Format | None = None,
+    columns: Sequence[str] = (),
+    drop_nan: bool = False,
+    full_intensity: float | None = None,
+) -> str:
+    """Write scans in another format, with the labels beside them.
+
+    ``bin`` holds intensities of 0 to 1, as every command reads them, ``pcd.bin`` intensities up to
+    255 and the ring. Other formats keep units and all columns. ``las`` needs the package laspy.
+
+    Args:
+        source: Scan, or folder of scans of any format that can be read.
+        out: File for a single scan, or folder, in which scans keep their names.
+        to: Format; default: by the suffix of ``out``.
+        columns: Columns of files without names, such as ``x,y,z,intensity,ring,time``; default: by
+            the values.
+        drop_nan: Leave out points with NaN.
+        full_intensity: Intensity of the full scale; default: 1, or 255 above that.
+
+    Raises:
+        ScanError: If a scan cannot be read or written, or its file exists.
+    """
+    suffix = suffix_of(out) if to is None else f".{to}"
+    if suffix not in WRITERS:
+        choices = ", ".join(name.removeprefix(".") for name in WRITERS)
+        raise ValueError(f"{out}: unknown format {suffix!r}; choose --to from {choices}")
+    root, files = find_files(source)
+    is_file = source.is_file() and suffix_of(out) == suffix
+    targets: dict[Path, Path] = {}
+    for path in files:
+        name = path.relative_to(root)
+        target = out if is_file else out / name.with_name(_stem(name) + suffix)
+        if target in targets:
+            raise ScanError(f"{path}: would be written as {target}, as would {targets[target]}")
+        if target.exists():
+            raise ScanError(f"{target}: exists: delete it, or give another folder")
+        targets[target] = path
+    for target, path in targets.items():
+        cloud = read_cloud(path, columns, drop_nan)
+        cloud.check_metres()
+        if suffix == ".pcd.bin" and cloud.ring is None:
+            cloud = with_rings(cloud)
+        contents = {target: WRITERS[suffix](cloud, full_intensity)}
+        if cloud.labels is not None:
+            labels = target.with_name(f"{_stem(target)}.label")
+            contents[labels] = cloud.labels.astype("<u4").tobytes()
+        for written, content in contents.items():
+            with atomic_path(written) as temporary:
+                temporary.write_bytes(content)
+    return f"{len(targets)} scans written to {out} as {suffix}"
+
+
+def with_rings(cloud: PointCloud) -> PointCloud:
+    """Return a cloud with the ring of each point, counted from the lowest as in nuScenes.
+
+    Raises:
+        ScanError: If the scan does not show its rings.
+    """
+    rings = rings_of(recorded_scan(cloud))
+    if rings.sure < _LEAST_SURE:
+        raise ScanError(
+            f"{cloud.where}: has no column ring, and only {rings.sure:.0%} of its points are sure "
+            "of one: give another --to"
+        )
+    return cloud.with_column("ring", rings.num_rings - 1 - rings.ring)
+
+
+def _stem(path: Path) -> str:
+    return path.name[: -len(suffix_of(path))]
