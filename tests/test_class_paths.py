@@ -54,8 +54,6 @@ WRITTEN_BEFORE = [
     "r3dpa.modules.JointAlignment",
     "r3dpa.simulation.Simulator",
     "r3dpa.simulation.SpinningLidar",
-    "r3dpa.simulation.Weather",
-    "r3dpa.simulation.scene.Weather",
     "r3dpa.simulation.sensor.SpinningLidar",
     "r3dpa.weather.Weather",
     "r3dpa.weather.WeatherPrior",
@@ -74,9 +72,11 @@ def test_a_class_of_an_earlier_version_is_found(path):
     assert class_at(current_path(path)).__name__ == path.rpartition(".")[2]
 
 
-def test_both_classes_of_weather_stay_apart():
-    assert current_path("r3dpa.simulation.Weather") == "lidarsim.scene.Weather"
-    assert current_path("r3dpa.weather.Weather") == "lidarsim.weather.Weather"
+def test_the_weather_of_the_simulator_has_another_name():
+    """It was one of two classes called Weather."""
+    for old in ("r3dpa.simulation.Weather", "r3dpa.simulation.scene.Weather"):
+        assert current_path(old) == "lidarsim.scene.Conditions"
+    assert current_path("r3dpa.weather.Weather") == "lidarsim.Weather"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Spinning LiDAR without torch: streets, ray casting, effects, weather, faults, files, realism.
 
-Simulated scans need NumPy and SciPy alone. Two classes describe weather: that of a simulated scene
-is :class:`lidarsim.scene.Weather`, that of a recorded scan :class:`lidarsim.weather.Weather`.
+Simulated scans need NumPy and SciPy alone. :class:`Weather` is that of simulated streets and of
+recorded scans.
 """
 
 from importlib import import_module
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lidarsim.sensors import Lasers, LidarSensor, SpinningLidar, hdl64e, load_sensor
     from lidarsim.street import Street
     from lidarsim.sweep import Origin, Sweep
-    from lidarsim.weather import WeatheredScan, WeatherPrior
+    from lidarsim.weather import Weather, WeatheredScan, WeatherPrior
 
 __all__ = [
     "SIMULATOR_VERSION",
@@ -56,6 +56,7 @@ __all__ = [
     "SpinningLidar",
     "Street",
     "Sweep",
+    "Weather",
     "WeatherPrior",
     "WeatheredScan",
     "drive_name",
@@ -89,6 +90,7 @@ _MODULES = {
     "SpinningLidar": "lidarsim.sensors",
     "Street": "lidarsim.street",
     "Sweep": "lidarsim.sweep",
+    "Weather": "lidarsim.weather",
     "WeatherPrior": "lidarsim.weather",
     "WeatheredScan": "lidarsim.weather",
     "drive_name": "lidarsim.drive_files",

@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from lidarsim.io import atomic_path, delete_unfinished
 from lidarsim.scan import SimulatedScan
-from lidarsim.scene import Pose, Weather
+from lidarsim.scene import Conditions, Pose
 
 # In the order of writing: a scan whose points exist is complete.
 _SUFFIXES = {"labels": ".label", "origins": ".origin", "sim": ".json", "data": ".bin"}
@@ -156,9 +156,9 @@ def velodyne_to_world(pose: Pose) -> NDArray[np.float64]:
     return np.column_stack([heading @ pitch @ roll, (pose.x_m, pose.y_m, pose.z_m)])
 
 
-def weather_to_dict(weather: Weather) -> dict[str, Any]:
+def weather_to_dict(weather: Conditions) -> dict[str, Any]:
     """The weather as JSON holds it: a visibility of None, not infinity, without fog."""
-    values = asdict(weather)
+    values = {field.name: getattr(weather, field.name) for field in fields(Conditions)}
     if math.isinf(weather.visibility_m):
         values["visibility_m"] = None
     return values

@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple
 from lidarsim.drive_files import DriveFiles, drive_name, to_json, weather_to_dict, write
 from lidarsim.io import in_processes, only_writer, text_table
 from lidarsim.scan import Simulator, check_switches
-from lidarsim.scene import Weather
+from lidarsim.scene import Conditions
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
 
 TRAIN_DRIVES = ("0003", "0004", "0005", "0006", "0007", "0009", "0010")
@@ -90,7 +90,7 @@ def simulate(
     sensor: str | SpinningLidar = "hdl64e",
     return_mode: Literal["strongest", "dual"] | None = None,
     effects: Mapping[str, str | bool] | None = None,
-    weather: Weather | None = None,
+    weather: Conditions | None = None,
 ) -> SimulationReport:
     """Write a simulated data set in the layout of KITTI-360, complete one, or add scans to one.
 

@@ -14,7 +14,7 @@ from scipy.special import lambertw
 
 from lidarsim.draws import Draws
 from lidarsim.effects import ECHO_EFFECTS, EFFECTS, RAY_EFFECTS
-from lidarsim.scene import Scene, Weather
+from lidarsim.scene import Conditions, Scene
 from lidarsim.sensors.spinning import SpinningLidar, load_sensor
 from lidarsim.street import Street
 from lidarsim.sweep import Echoes, Effect, Origin, Sweep
@@ -117,7 +117,7 @@ class Simulator:
         ValueError: If a value is out of range or an effect unknown.
 
     Example:
-        >>> from lidarsim.scene import Weather
+        >>> from lidarsim import Weather
         >>> scan = Simulator(seed=0, weather=Weather(rain_mm_h=10)).scan(3)
         >>> scan.points.shape[1], scan.points.dtype, len(scan.labels) == len(scan.points)
         (4, dtype('float32'), True)
@@ -129,7 +129,7 @@ class Simulator:
         self,
         seed: int = 0,
         drive: int = 0,
-        weather: Weather | None = None,
+        weather: Conditions | None = None,
         sensor: str | SpinningLidar = "hdl64e",
         effects: Mapping[str, str | bool] | None = None,
     ) -> None:

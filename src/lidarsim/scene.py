@@ -188,7 +188,7 @@ class EgoMotion:
 
 
 @dataclass(frozen=True)
-class Weather:
+class Conditions:
     """State of the air, the sky and the road.
 
     Args:
@@ -227,7 +227,7 @@ class Weather:
             raise ValueError(f"sun_elevation_deg must lie in -90..90, got {self.sun_elevation_deg}")
 
 
-def draw_weather(generator: np.random.Generator) -> Weather:
+def draw_weather(generator: np.random.Generator) -> Conditions:
     """Random weather: clear over a dry road (85 %), clear over a wet one (10 %), or bad air.
 
     Bad air is fog, rain or snow, a third each. Visibility and rates are log-uniform, the other
@@ -238,7 +238,7 @@ def draw_weather(generator: np.random.Generator) -> Weather:
     elevation_deg = generator.uniform(-18.0, 62.0)
     azimuth_deg = generator.uniform(-180.0, 180.0)
     if air < _CLEAR_DRY:
-        return Weather(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, elevation_deg, azimuth_deg)
+        return Conditions(math.inf, 0.0, 0.0, 0.0, sky < _CLEAR_SKY, elevation_deg, azimuth_deg)
     visibility_m, rain_mm_h, snow_mm_h = math.inf, 0.0, 0.0
     if air >= _CLEAR_DRY + _CLEAR_WET:
         kind = int(3 * third)
@@ -248,7 +248,9 @@ def draw_weather(generator: np.random.Generator) -> Weather:
             rain_mm_h = _even_logarithm(generator, (1.0, 30.0))
         else:
             snow_mm_h, film_mm = _even_logarithm(generator, (0.5, 3.0)), 0.0
-    return Weather(visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg)
+    return Conditions(
+        visibility_m, rain_mm_h, snow_mm_h, film_mm, False, elevation_deg, azimuth_deg
+    )
 
 
 def _even_logarithm(generator: np.random.Generator, interval: Interval) -> float:
@@ -270,7 +272,7 @@ class Scene:
     primitives: tuple[Primitive, ...] = ()
     pose: Pose = Pose()  # of the sensor frame in the middle of the sweep
     motion: EgoMotion = EgoMotion()
-    weather: Weather = Weather()
+    weather: Conditions = Conditions()
     puddles: tuple[Puddle, ...] = ()  # where water stands on the ground, if the road is wet
     ego_body: tuple[Primitive, ...] = ()  # parts of the recording car in the sensor frame
     ground_m: float = 0.0  # height of the level ground below all solids

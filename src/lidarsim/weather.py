@@ -90,8 +90,8 @@ class WeatheredScan:
 
 
 @dataclass(frozen=True)
-class Weather(scene.Weather):
-    """Weather of simulated streets and of recorded scans, see :class:`lidarsim.scene.Weather`.
+class Weather(scene.Conditions):
+    """Weather of simulated streets and of recorded scans, see :class:`lidarsim.scene.Conditions`.
 
     On recorded scans, ``sun_azimuth_deg`` is counter-clockwise from the scan's x axis. The scan is
     assumed to show clear air and a dry road. Shots without a return stay empty, even where fog,

@@ -14,10 +14,10 @@ MOVED = {
     "r3dpa.nn.backbones.vit": "r3dpa.features.dinov2",
     "r3dpa.nn.velocity_network.EMA": "r3dpa.nn.ema.EMA",
     "r3dpa.simulation": "lidarsim",
-    "r3dpa.simulation.Weather": "lidarsim.scene.Weather",
+    "r3dpa.simulation.Weather": "lidarsim.scene.Conditions",
+    "r3dpa.simulation.scene.Weather": "lidarsim.scene.Conditions",
     "r3dpa.simulation.sensor": "lidarsim.sensors.spinning",
     "r3dpa.weather": "lidarsim",
-    "r3dpa.weather.Weather": "lidarsim.weather.Weather",
     "r3dpa.weather.weather": "lidarsim.weather",
 }
 

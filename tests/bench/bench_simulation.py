@@ -3,18 +3,18 @@
 import pytest
 
 from lidarsim import Street, hdl64e, simulate_scan
-from lidarsim.scene import Weather
+from lidarsim.scene import Conditions
 
 pytestmark = [pytest.mark.bench, pytest.mark.benchmark(group="simulate one scan", min_rounds=9)]
 
 STREET = (0, 2, 40)  # seed, drive, scan
 WEATHERS = {
-    "plain": Weather(),
-    "wet": Weather(water_film_mm=1.0, clear_sky=False),
-    "rain": Weather(rain_mm_h=10.0, water_film_mm=1.0, clear_sky=False),
-    "fog": Weather(visibility_m=100.0, clear_sky=False),
-    "snow": Weather(snow_mm_h=1.5, clear_sky=False),
-    "low sun": Weather(sun_elevation_deg=3.0),
+    "plain": Conditions(),
+    "wet": Conditions(water_film_mm=1.0, clear_sky=False),
+    "rain": Conditions(rain_mm_h=10.0, water_film_mm=1.0, clear_sky=False),
+    "fog": Conditions(visibility_m=100.0, clear_sky=False),
+    "snow": Conditions(snow_mm_h=1.5, clear_sky=False),
+    "low sun": Conditions(sun_elevation_deg=3.0),
 }
 
 
@@ -26,6 +26,6 @@ def bench_scan(benchmark, weather):
 
 
 def bench_scene(benchmark):
-    street = Street(0, 2, Weather())
+    street = Street(0, 2, Conditions())
     street.scene(40)  # a scan shares its blocks with the one before
     benchmark(street.scene, 41)

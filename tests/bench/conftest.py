@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from lidarsim import Street, hdl64e, simulate, simulate_scan
-from lidarsim.scene import Weather
+from lidarsim.scene import Conditions
 
 
 @pytest.fixture(scope="session")
 def points():
     """A scan ``(P, 4)`` of a dry street."""
-    scan = simulate_scan(Street(0, 2, Weather()).scene(40), hdl64e(), (0, "effects", 2, 40))
+    scan = simulate_scan(Street(0, 2, Conditions()).scene(40), hdl64e(), (0, "effects", 2, 40))
     return torch.from_numpy(scan.points)
 
 

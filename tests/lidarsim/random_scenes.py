@@ -7,6 +7,7 @@ import numpy as np
 from sweeps import box
 
 from lidarsim.scene import (
+    Conditions,
     EgoMotion,
     Material,
     Pose,
@@ -15,7 +16,6 @@ from lidarsim.scene import (
     Scene,
     Semantic,
     Shape,
-    Weather,
 )
 from lidarsim.sensors.spinning import hdl32e, hdl64e, vls128
 
@@ -120,7 +120,7 @@ def _weather(dice):
         return 0.0 if clear_air or dice.chance(0.4) else dice.among(*values)
 
     visibility_m = dice.among(math.inf, 1.0, 1e5, 1e60, dice.magnitude(5, 2e3))
-    return Weather(
+    return Conditions(
         math.inf if clear_air else visibility_m,
         some(1e-6, 100.0, dice.magnitude(0.1, 50)),
         some(1e-6, 100.0, dice.magnitude(0.1, 10)),

@@ -22,6 +22,7 @@ from lidarsim.effects import (
 )
 from lidarsim.scan import effect_name, simulate_scan
 from lidarsim.scene import (
+    Conditions,
     EgoMotion,
     Material,
     Primitive,
@@ -29,7 +30,6 @@ from lidarsim.scene import (
     Scene,
     Semantic,
     Shape,
-    Weather,
 )
 from lidarsim.sensors.spinning import Lasers, hdl64e
 from lidarsim.sweep import Echoes, Sweep
@@ -56,7 +56,7 @@ METAL = box((7.0, 2.5, 0.8), (0.1, 1.5, 0.8), reflectivity=0.2, material=Materia
 SHEET = box((9.0, -3.0, 1.5), (0.02, 1.0, 3.0), material=Material.RETROREFLECTOR)
 ROOF = box((0.0, 0.0, -0.6), (1.6, 1.4, 0.2), material=Material.CONCRETE)
 PUDDLES = (Puddle(15.0, 2.0, 4.0), Puddle(0.0, 4.0, 1.0))
-SUNNY = Weather(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=100.0)
+SUNNY = Conditions(water_film_mm=0.8, sun_elevation_deg=3.0, sun_azimuth_deg=100.0)
 _LASERS = [getattr(hdl64e().lasers, field.name)[::2] for field in fields(Lasers)]
 SENSOR = replace(hdl64e(shots=1080), lasers=Lasers(*_LASERS))
 
@@ -121,7 +121,7 @@ def case(*solids, sensor=SENSOR, instead=None, **scene):
 
 
 def weather(**values):
-    return case(WALL, CAR, weather=Weather(**values))
+    return case(WALL, CAR, weather=Conditions(**values))
 
 
 def changed(**values):
@@ -158,7 +158,7 @@ LIMITS = {
         WALL, POLE, sensor=changed(min_power=1e-2 * x or 1e-30, divergence_rad=0.0)
     ),
     "surface_texture": lambda x: case(WALL, CROWN, instead=SurfaceTexture(0.36 * x, 0.86 * x)),
-    "wet_ground": lambda x: case(WALL, weather=Weather(water_film_mm=x), puddles=PUDDLES),
+    "wet_ground": lambda x: case(WALL, weather=Conditions(water_film_mm=x), puddles=PUDDLES),
     "retro_reflection": lambda x: case(SHEET, instead=RetroReflection(retroreflection=70 * x)),
     # What a pane shows or mirrors is dark: one sees the pane, as without the effect.
     "glass": lambda x: case(
@@ -173,7 +173,7 @@ LIMITS = {
     "rain": lambda x: weather(rain_mm_h=50 * x),
     "snow": lambda x: weather(snow_mm_h=5 * x),
     "spray": lambda x: case(
-        *(WALL, CAR), weather=Weather(water_film_mm=1.0), instead=Spray(0.2 * x)
+        *(WALL, CAR), weather=Conditions(water_film_mm=1.0), instead=Spray(0.2 * x)
     ),
     "sun_glare": lambda x: case(WALL, weather=SUNNY, instead=SunGlare(rise=3e3 * x, noise=x)),
     "blooming": lambda x: case(SHEET, instead=Blooming(halo_deg=1.0, spill=0.5 * x)),

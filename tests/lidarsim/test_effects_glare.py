@@ -12,13 +12,13 @@ from sweeps import applied, box
 from lidarsim.draws import Draws
 from lidarsim.effects import Blooming, DiffuseReflection, RetroReflection, SunGlare
 from lidarsim.scan import simulate_scan
-from lidarsim.scene import Material, Pose, Scene, Semantic, Weather
+from lidarsim.scene import Conditions, Material, Pose, Scene, Semantic
 from lidarsim.sensors.spinning import hdl64e
 from lidarsim.sweep import Origin, Sweep
 
 SENSOR = hdl64e()
 COARSE = hdl64e(shots=720)
-LOW = Weather(sun_elevation_deg=5.0, sun_azimuth_deg=90.0)
+LOW = Conditions(sun_elevation_deg=5.0, sun_azimuth_deg=90.0)
 HOUSE = box((0, 20, 5), (20, 4, 5), semantic=Semantic.BUILDING, reflectivity=0.3)
 
 

@@ -15,7 +15,7 @@ from lidarsim.effects import (
     SoftRaydrop,
 )
 from lidarsim.scan import simulate_scan
-from lidarsim.scene import EgoMotion, Material, Scene, Semantic, Weather
+from lidarsim.scene import Conditions, EgoMotion, Material, Scene, Semantic
 from lidarsim.sensors.spinning import hdl64e
 from lidarsim.street import Street
 from lidarsim.sweep import Origin, Sweep
@@ -89,7 +89,7 @@ def test_limits_of_power_and_range():
 def test_strongest_returns_are_the_first_of_dual_returns():
     """In a scene with edges, a pane, leaves and rain: every source of second echoes."""
     street = Street(0, 3).scene(40)
-    scene = replace(street, weather=Weather(rain_mm_h=30.0), motion=EgoMotion(10.0, 0.1))
+    scene = replace(street, weather=Conditions(rain_mm_h=30.0), motion=EgoMotion(10.0, 0.1))
     key = ("seed", 7)
     strongest = simulate_scan(scene, SENSOR, key)
     dual = simulate_scan(scene, replace(SENSOR, return_mode="dual"), key)

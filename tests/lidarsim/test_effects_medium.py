@@ -10,7 +10,7 @@ from lidarsim.draws import Draws
 from lidarsim.effects import DiffuseReflection, DualReturn, Fog, Rain, Snow, Spray
 from lidarsim.effects.medium import soft_waveform
 from lidarsim.scan import effect_name
-from lidarsim.scene import Material, Scene, Semantic, Weather
+from lidarsim.scene import Conditions, Material, Scene, Semantic
 from lidarsim.sensors.spinning import Lasers, hdl64e
 from lidarsim.solids import NO_SURFACE
 from lidarsim.sweep import Origin, Sweep
@@ -23,10 +23,10 @@ OF_CAR = {"semantic": Semantic.CAR, "instance": 7, "velocity_m_s": (15.0, 0.0)}
 CAR = box((25.0, 1.0, 0.95), (2.0, 0.9, 0.75), reflectivity=0.2, **OF_CAR)
 # Effect and a weather that calls for it.
 CALLED = (
-    (Fog(), Weather(visibility_m=60)),
-    (Rain(), Weather(rain_mm_h=20)),
-    (Snow(), Weather(snow_mm_h=2)),
-    (Spray(), Weather(water_film_mm=1.0)),
+    (Fog(), Conditions(visibility_m=60)),
+    (Rain(), Conditions(rain_mm_h=20)),
+    (Snow(), Conditions(snow_mm_h=2)),
+    (Spray(), Conditions(water_film_mm=1.0)),
 )
 NAMES = [effect_name(effect) for effect, _ in CALLED]
 
@@ -72,7 +72,7 @@ def test_last_ground_ring_in_fog(visibility_m, last_m):
     steep_first = tuple(map(float, -np.arctan(slope[::-1])))
     lasers = Lasers(steep_first, none, none, none, none, (1.0,) * len(slope))
     sensor = replace(SENSOR, lasers=lasers, shots=8, pulse_s=0.0)
-    scene = Scene(ground_reflectivity=0.1, weather=Weather(visibility_m=visibility_m))
+    scene = Scene(ground_reflectivity=0.1, weather=Conditions(visibility_m=visibility_m))
     after = (
         applied(Fog(), scene, sensor) if math.isfinite(visibility_m) else surfaces(scene, sensor)
     )
@@ -91,7 +91,7 @@ def test_waveform_of_fog():
 
 
 def test_soft_echoes_of_the_sky_follow_the_waveform():
-    sweep = applied(Fog(), Scene(weather=Weather(visibility_m=50)))
+    sweep = applied(Fog(), Scene(weather=Conditions(visibility_m=50)))
     ranges = sweep.first.range_m[np.isinf(surfaces(Scene()).first.range_m)]
     edges, waveform = soft_waveform(50.0, SENSOR)
     steps = np.append(0.0, ((waveform[1:] + waveform[:-1]) / 2).cumsum())
@@ -105,7 +105,7 @@ def test_soft_echoes_of_the_sky_follow_the_waveform():
 
 
 def test_no_fog_is_heard_before_a_target_nearer_than_is_reported():
-    sweep = Sweep(Scene(weather=Weather(visibility_m=20)), SENSOR)
+    sweep = Sweep(Scene(weather=Conditions(visibility_m=20)), SENSOR)
     sweep.first.range_m[:] = SENSOR.min_range_m - 0.1
     Fog().apply(sweep, slice(None), Draws(sweep.num_rays, "draws"))
     assert not sweep.first.power.any()
@@ -145,8 +145,8 @@ def strongest_drops(num_rays, target_m, reflectivity, intercept, slope, extincti
 @pytest.mark.parametrize(
     ("effect", "weather", "intercept", "slope"),
     [
-        (Rain(), Weather(rain_mm_h=20), 8000.0, 4.1 * 20**-0.21),
-        (Snow(), Weather(snow_mm_h=1), 7600.0, 2.55),
+        (Rain(), Conditions(rain_mm_h=20), 8000.0, 4.1 * 20**-0.21),
+        (Snow(), Conditions(snow_mm_h=1), 7600.0, 2.55),
     ],
     ids=["rain", "snow"],
 )
@@ -190,7 +190,7 @@ def test_the_echo_of_a_drop_is_weakened_there_and_back():
 
 def test_plume_of_a_car():
     """A car of 1.8 m width at 15 m/s, rear at x = 14 m: the plume spans 5..14 m, |y - 1| < 0.9."""
-    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=Weather(water_film_mm=1.2))
+    scene = Scene((replace(CAR, centre=(16.0, 1.0, 0.95)),), weather=Conditions(water_film_mm=1.2))
     sensor = replace(SENSOR, spin_hz=1e6)  # no time for the car to move
     before, after = surfaces(scene, sensor), applied(Spray(), scene, sensor)
     # Rays at the car's rear have 9 m of spray with 0.2 * 0.5 per metre before them.
@@ -218,7 +218,7 @@ def test_plume_of_a_car():
 def test_one_plume_per_vehicle():
     roof = replace(CAR, centre=(25.0, 1.0, 2.0), half_size=(1.0, 0.8, 0.3))
     beside = replace(CAR, centre=(25.0, -3.0, 0.95), instance=0)
-    wet = Weather(water_film_mm=1.2)
+    wet = Conditions(water_film_mm=1.2)
     one = applied(Spray(), Scene((CAR,), weather=wet))
     same = applied(Spray(), Scene((CAR, roof), weather=wet))
     two = applied(Spray(), Scene((CAR, beside), weather=wet))
@@ -229,14 +229,14 @@ def test_one_plume_per_vehicle():
 
 def test_slow_vehicles_and_dry_roads_spray_nothing():
     slow = replace(CAR, velocity_m_s=(0.0, 10.0))
-    for scene in (Scene((slow,), weather=Weather(water_film_mm=1.0)), Scene((CAR,))):
+    for scene in (Scene((slow,), weather=Conditions(water_film_mm=1.0)), Scene((CAR,))):
         assert Spray().called_by(scene, SENSOR) is None
 
 
 def test_plume_moves_with_its_car():
     """Seen from a car at 40 m/s that passes on the left, 25 ms after the middle of the sweep."""
     car = replace(CAR, centre=(8.0, 5.0, 0.95), velocity_m_s=(40.0, 0.0))
-    after = applied(Spray(), Scene((car,), weather=Weather(water_film_mm=1.2)))
+    after = applied(Spray(), Scene((car,), weather=Conditions(water_film_mm=1.2)))
     spray = np.flatnonzero(after.first.origin == Origin.SPRAY)
     x = after.position(spray)[0]
     left = np.abs(x) < 3

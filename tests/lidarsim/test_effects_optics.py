@@ -13,7 +13,7 @@ from lidarsim.effects import (
     WetGround,
 )
 from lidarsim.effects.surface import fresnel_reflectance
-from lidarsim.scene import Material, Pose, Puddle, Scene, Semantic, Weather
+from lidarsim.scene import Conditions, Material, Pose, Puddle, Scene, Semantic
 from lidarsim.sensors.spinning import hdl64e
 from lidarsim.sweep import Origin
 
@@ -170,7 +170,7 @@ def test_wet_ground_loses_power():
     plain = swept(effects=[])
     ground = plain.on_ground()
     for film_mm, share in ((1.2, 1.0), (5.0, 1.0), (0.3, 0.25)):
-        wet = swept(effects=[WetGround()], weather=Weather(water_film_mm=film_mm))
+        wet = swept(effects=[WetGround()], weather=Conditions(water_film_mm=film_mm))
         ratio = wet.first.power[ground] / plain.first.power[ground]
         degrees = np.degrees(np.arccos(wet.cos_incidence[ground]))
         at_88 = ratio[np.abs(degrees - 88).argmin()]
@@ -189,7 +189,7 @@ def test_image_in_a_puddle(heading_rad, pitch_rad):
     wall = box((*(turn @ [15.5, 0] + here), 2), (0.5, 20, 2), yaw_rad=heading_rad)
     puddle = Puddle(*(turn @ [10, 1] + here), 2.0)
     pose = Pose(*here, 1.73, heading_rad, pitch_rad)
-    wet = {"pose": pose, "weather": Weather(water_film_mm=2.0)}
+    wet = {"pose": pose, "weather": Conditions(water_film_mm=2.0)}
     sweep = swept(wall, puddles=(puddle,), effects=[WetGround()], **wet)
     dry = swept(wall, effects=[WetGround()], **wet)
     rays = with_origin(sweep, Origin.MIRROR)
@@ -209,7 +209,7 @@ def test_water_stands_level_on_a_slope():
     asphalt = {"semantic": Semantic.ROAD, "reflectivity": 0.1, "material": Material.ASPHALT}
     road = box((10, 0, -0.2), (6, 6, 0.3), grade=(0.08, 0.0), **asphalt)
     wall = box((20.5, 0, 3), (0.5, 20, 3))
-    wet = {"weather": Weather(water_film_mm=2.0), "puddles": (Puddle(10.0, 0.0, 2.0),)}
+    wet = {"weather": Conditions(water_film_mm=2.0), "puddles": (Puddle(10.0, 0.0, 2.0),)}
     dry, sweep = swept(road, wall), swept(road, wall, effects=[WetGround()], **wet)
     rays = with_origin(sweep, Origin.MIRROR)
     assert len(rays) > 20

@@ -7,7 +7,7 @@ from sweeps import inside
 from lidarsim import raycast
 from lidarsim.drive_files import velodyne_to_world
 from lidarsim.raycast import cast, cast_single, normals
-from lidarsim.scene import EgoMotion, Pose, Primitive, Scene, Semantic, Shape, Weather
+from lidarsim.scene import Conditions, EgoMotion, Pose, Primitive, Scene, Semantic, Shape
 from lidarsim.sensors.spinning import Rays, hdl64e
 from lidarsim.solids import GROUND, NO_SURFACE, Windows, level, solids_of
 
@@ -258,10 +258,10 @@ NAN = float("nan")
         (lambda: Pose(pitch_rad=0.3), r"0\.2 rad"),
         (lambda: Pose(x_m=NAN), "x_m must be finite, got nan"),
         (lambda: EgoMotion(yaw_rate_rad_s=NAN), "yaw_rate_rad_s must be finite"),
-        (lambda: Weather(visibility_m=0.001), "visibility_m must be 1 or greater"),
-        (lambda: Weather(visibility_m=NAN), "visibility_m"),
-        (lambda: Weather(snow_mm_h=-1), "snow_mm_h"),
-        (lambda: Weather(sun_elevation_deg=91), "sun_elevation_deg"),
+        (lambda: Conditions(visibility_m=0.001), "visibility_m must be 1 or greater"),
+        (lambda: Conditions(visibility_m=NAN), "visibility_m"),
+        (lambda: Conditions(snow_mm_h=-1), "snow_mm_h"),
+        (lambda: Conditions(sun_elevation_deg=91), "sun_elevation_deg"),
     ],
 )
 def test_impossible_scenes_are_refused(make, message):

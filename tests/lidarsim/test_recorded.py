@@ -9,12 +9,12 @@ from lidarsim import Semantic, Street, load_sensor, simulate_scan
 from lidarsim.draws import Draws
 from lidarsim.ground import ground_of
 from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep
-from lidarsim.scene import Primitive, Scene, Shape, Weather
+from lidarsim.scene import Conditions, Primitive, Scene, Shape
 
 
 def test_the_ground_is_found():
     sensor = load_sensor("hdl64e", shots=520)
-    scene = Street(5, 1, Weather()).scene(3, sensor.mount_height_m)
+    scene = Street(5, 1, Conditions()).scene(3, sensor.mount_height_m)
     scan = simulate_scan(scene, sensor, ("recorded",))
     is_ground, normal = ground_of(scan.points[:, :3])
     code, range_m = scan.labels & 0xFFFF, np.linalg.norm(scan.points[:, :3], axis=1)

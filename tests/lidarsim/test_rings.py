@@ -7,7 +7,7 @@ from lidarsim import Street, load_sensor, simulate_scan
 from lidarsim.faults import Fault
 from lidarsim.recorded import RecordedScan
 from lidarsim.rings import rings_of
-from lidarsim.scene import Weather as Conditions
+from lidarsim.scene import Conditions
 from lidarsim.weather import Weather
 
 

@@ -8,6 +8,7 @@ from sweeps import box
 from lidarsim import scan as module
 from lidarsim.scan import Simulator, calibrated_intensity, simulate_scan
 from lidarsim.scene import (
+    Conditions,
     EgoMotion,
     Material,
     Pose,
@@ -15,13 +16,12 @@ from lidarsim.scene import (
     Scene,
     Semantic,
     Shape,
-    Weather,
 )
 from lidarsim.sensors.spinning import Lasers, hdl64e
 from lidarsim.street import Street
 from lidarsim.sweep import Origin
 
-DRY = Weather()
+DRY = Conditions()
 WALL = box((11, 0, 2), (1, 30, 4), material=Material.CONCRETE)
 # Nothing but geometry and the limit of detection.
 EXACT = {"laser_calibration": "off", "range_noise": "off", "soft_raydrop": "off"}
@@ -63,7 +63,7 @@ def test_labels_name_the_object_and_points_in_the_air_have_none():
     assert on_car.sum() > 50
     assert (scanned.labels[on_car] == Semantic.CAR | 1234 << 16).all()
     assert (scanned.labels[~on_car] == Semantic.ROAD).all()
-    foggy = Scene((WALL,), weather=Weather(visibility_m=40))
+    foggy = Scene((WALL,), weather=Conditions(visibility_m=40))
     scanned = simulate_scan(foggy, hdl64e(360), (0,))
     in_fog = scanned.origins == Origin.FOG
     assert in_fog.sum() > 500
@@ -86,7 +86,7 @@ def test_moving_sensor_stores_points_as_if_it_stood():
 
 
 def test_switches():
-    scene = Scene((WALL,), weather=Weather(visibility_m=40))
+    scene = Scene((WALL,), weather=Conditions(visibility_m=40))
     clear = simulate_scan(replace(scene, weather=DRY), hdl64e(90), (0,))
     off = simulate_scan(scene, hdl64e(90), (0,), {"fog": "off"})
     np.testing.assert_array_equal(off.points, clear.points)
@@ -142,9 +142,9 @@ def test_scans_look_like_those_of_a_real_hdl64():
 
 
 def test_a_simulator_gives_the_scans_of_its_drive():
-    simulator = Simulator(3, 5, Weather(rain_mm_h=10), hdl64e(32), {"range_noise": "off"})
+    simulator = Simulator(3, 5, Conditions(rain_mm_h=10), hdl64e(32), {"range_noise": "off"})
     scan = simulator.scan(7)
-    scene = Street(3, 5, Weather(rain_mm_h=10)).scene(7)
+    scene = Street(3, 5, Conditions(rain_mm_h=10)).scene(7)
     key = (3, "effects", 5, 7)
     expected = simulate_scan(scene, hdl64e(32), key, {"range_noise": False})
     assert scan.points.tobytes() == expected.points.tobytes()

@@ -15,7 +15,7 @@ from lidarsim import drive_files, drives
 from lidarsim.drive_files import drive_name, velodyne_to_world
 from lidarsim.drives import TRAIN_DRIVES, VAL_DRIVES, expected_scans, simulate, split_scans
 from lidarsim.scan import simulate_scan
-from lidarsim.scene import Pose, Weather
+from lidarsim.scene import Conditions, Pose
 from lidarsim.sensors.spinning import hdl32e, hdl64e
 from lidarsim.street import Street
 from r3dpa.io import only_writer
@@ -62,7 +62,7 @@ def test_layout_and_contents(tmp_path):
 
 def test_files_of_a_scan_say_what_was_simulated(tmp_path):
     """And its pose. YAML 1.1 reads a bare ``on`` as true and ``off`` as false."""
-    weather, sensor = Weather(rain_mm_h=4.0), SMALL["sensor"]
+    weather, sensor = Conditions(rain_mm_h=4.0), SMALL["sensor"]
     effects = {"range_noise": False, "rolling_shutter": True, "soft_raydrop": "auto"}
     simulate(tmp_path, 3, seed=2, drives=["0003"], weather=weather, effects=effects, **SMALL)
     scene = Street(2, 3, weather).scene(2, sensor.mount_height_m)
@@ -144,7 +144,7 @@ def test_another_request_is_refused_with_both_values(tmp_path):
         ({"sensor": hdl64e(40)}, r"\(sensor\.shots 32 there, 40 now\)"),
         ({"sensor": hdl32e()}, r"sensor\.lasers\.inclination_rad 64 values there"),
         ({"effects": {}}, r"\(effects\.range_noise 'off' there, None now\)"),
-        ({"weather": Weather()}, r"\(weather None there, {'visibility_m': None, "),
+        ({"weather": Conditions()}, r"\(weather None there, {'visibility_m': None, "),
     ):
         with pytest.raises(ValueError, match=message):
             simulate(tmp_path, **base | change)

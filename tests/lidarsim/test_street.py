@@ -7,12 +7,12 @@ import pytest
 from sweeps import inside
 
 from lidarsim import Material, Semantic, Shape, Street
-from lidarsim.scene import Weather, draw_weather
+from lidarsim.scene import Conditions, draw_weather
 from lidarsim.street import streets as street_module
 from lidarsim.street.course import BLOCK_M, course_of
 
 GROUND = (Semantic.ROAD, Semantic.SIDEWALK, Semantic.TERRAIN)
-DRY = Weather()
+DRY = Conditions()
 
 
 def standing(scene):
@@ -253,12 +253,12 @@ def test_weather_lasts_and_puddles_lie_on_wet_roads():
     stretches = [street.weather_of(100 * stretch) for stretch in range(40)]
     assert all(street.weather_of(100 * s + 99) == stretches[s] for s in range(40))
     assert len(set(stretches)) == 40
-    dry, wet = (Street(5, 2, Weather(water_film_mm=film)).scene(60) for film in (0.0, 0.5))
+    dry, wet = (Street(5, 2, Conditions(water_film_mm=film)).scene(60) for film in (0.0, 0.5))
     assert not dry.puddles
     assert wet.puddles
     assert wet.primitives == dry.primitives
     # Puddles stay where they are.
-    assert set(wet.puddles) & set(Street(5, 2, Weather(water_film_mm=1.0)).scene(65).puddles)
+    assert set(wet.puddles) & set(Street(5, 2, Conditions(water_film_mm=1.0)).scene(65).puddles)
 
 
 def test_negative_numbers_are_refused():

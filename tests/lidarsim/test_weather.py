@@ -19,8 +19,7 @@ from lidarsim.effects.medium import Rain, soft_waveform
 from lidarsim.ground import ground_of
 from lidarsim.recorded import Instrument, RecordedScan, RecordedSweep, scale_of
 from lidarsim.scan import SECOND_RETURN_M, effect_name
-from lidarsim.scene import Scene
-from lidarsim.scene import Weather as Conditions
+from lidarsim.scene import Conditions, Scene
 from lidarsim.sensors.spinning import hdl64e
 from lidarsim.weather import ADDED_CLASS, REFUSED, Weather, WeatherPrior
 

@@ -17,7 +17,7 @@ from lidarsim import Semantic, Street, Sweep, load_sensor
 from lidarsim.effects import ECHO_EFFECTS, RAY_EFFECTS
 from lidarsim.recorded import RecordedScan
 from lidarsim.scan import calibrated_intensity, run_effect
-from lidarsim.scene import Weather as Conditions
+from lidarsim.scene import Conditions
 from lidarsim.sweep import Origin
 from lidarsim.weather import Weather
 

@@ -12,12 +12,12 @@ from numpy.random import Generator
 
 from lidarsim.draws import generator_for
 from lidarsim.scene import (
+    Conditions,
     EgoMotion,
     Pose,
     Primitive,
     Puddle,
     Scene,
-    Weather,
     check_fields,
     draw_weather,
 )
@@ -66,7 +66,7 @@ class Street:
 
     seed: int
     drive: int
-    weather: Weather | None = None
+    weather: Conditions | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, "be 0 or greater", "seed", "drive")
@@ -109,7 +109,7 @@ class Street:
             course.road_reflectivity,
         )
 
-    def weather_of(self, scan: int) -> Weather:
+    def weather_of(self, scan: int) -> Conditions:
         """The weather of one scan."""
         if scan < 0:
             raise ValueError(f"scan must be 0 or greater, got {scan}")

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 from lidarsim import simulate
 from lidarsim.scan_files import read_scan
-from lidarsim.scene import Weather
+from lidarsim.scene import Conditions
 from lidarsim.weather import WeatherPrior
 from r3dpa.data.augmentation import Augmentation, AugmentedDataset
 from r3dpa.data.datasets import CachedImages, DrawnPoints, LidarDataset
@@ -302,7 +302,7 @@ class SimulatedDataModule(KITTI360DataModule):
         simulation_seed: int = 0,
         simulation_sensor: str = "hdl64e",
         effects: dict[str, str | bool] | None = None,
-        weather: Weather | None = None,
+        weather: Conditions | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(root, **kwargs)
