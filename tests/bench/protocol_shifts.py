@@ -92,10 +92,11 @@ def measure_choices(samples, module, scans, spaces=("fgeo",)):
         measured = measure(scenes, references[key], networks, Resampling(), **options)
         metrics = {}
         for row in measured.rows:
-            if not choice.factor and row.value is not None and row.interval:
-                if row.direction == "lower":
-                    unchanged[row.name] = row
-            if row.value is not None and row.name in unchanged:
+            if row.value is None:
+                continue
+            if not choice.factor and row.interval and row.direction == "lower":
+                unchanged[row.name] = row
+            if row.name in unchanged:
                 base = unchanged[row.name]
                 metrics[row.name] = {
                     "value": row.value,

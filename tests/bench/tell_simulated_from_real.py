@@ -33,7 +33,7 @@ from lidarsim.scan_files import read_scan
 from r3dpa.data.scans import evenly, kitti360_scans
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection, range_image
 from r3dpa.io import text_table
-from r3dpa.metrics.classifier import _network
+from r3dpa.metrics.classifier import two_sample_network
 from r3dpa.viz import range_image_picture
 
 PROJECTION = SphericalProjection(LidarSensor())
@@ -74,7 +74,7 @@ def train(real_m, simulated_m, seed):
     """Network whose answer is above 0 for simulated images."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    network = _network()
+    network = two_sample_network()
     adam = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE)
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, STEPS)
     target = torch.cat([torch.zeros(HALF_BATCH), torch.ones(HALF_BATCH)])

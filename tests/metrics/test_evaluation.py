@@ -332,7 +332,9 @@ def test_one_metric_of_two_sets_is_that_of_an_evaluation():
         assert scene_distance(name, scenes(0), scenes(1), PROTOCOL) == rows[name].value
     made = [through_sensor(scene, PROTOCOL)[:2] for scene in scenes(1, 8)]  # names and points
     assert scene_distance("FGEO coverage", made, made, PROTOCOL) == 1
-    with pytest.raises(ValueError, match="unknown metric 'FGEO best'; choose from FGEO, FGEO precision"):
+    with pytest.raises(
+        ValueError, match="unknown metric 'FGEO best'; choose from FGEO, FGEO precision"
+    ):
         scene_distance("FGEO best", made, made, PROTOCOL)
     with pytest.raises(ValueError, match="FGEO KID: needs 4 scenes"):
         scene_distance("FGEO KID", made[:2], made, PROTOCOL)

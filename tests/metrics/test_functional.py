@@ -194,7 +194,7 @@ def test_cells_of_a_grid():
     """Index 0 is the lower limit, borders belong to the upper cell, limits are outside."""
     points = cloud((-3.9, -3.9), (0.0, 0.5), (0.9, 0.0), (3.9, -1e-6), (4.0, 0.0), (-4.0, 0.0))
     assert GRID.cells(points).tolist() == [0, 4 * 8 + 4, 7 * 8 + 3]
-    assert len(GRID.kept(points)) == 4
+    assert len(GRID.points_inside(points)) == 4
     assert GRID.side == 8
     assert BEVGrid(4.0, 0.7).cells(cloud((-3.9, -3.9), (3.9, 3.9))).tolist() == [0, 10 * 12 + 10]
 

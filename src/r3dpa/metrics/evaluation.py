@@ -103,9 +103,7 @@ def evaluate(
         resampling: Seed, and cost of the intervals.
     """
     resampling = resampling or Resampling()
-    measured = measure(
-        scenes, reference, spaces, resampling, allow_few, skip_bad, baseline_metrics
-    )
+    measured = measure(scenes, reference, spaces, resampling, allow_few, skip_bad, baseline_metrics)
     floors: dict[str, MetricResult] = {}
     if isinstance(reference, ReferenceStatistics):
         floors = measure_floors(
@@ -311,7 +309,7 @@ def _remarks(
     floors: Mapping[str, MetricResult],
     resampling: Resampling,
 ) -> dict[str, Any]:
-    """What a reader of the numbers must know: counts, verdict, warning, rows and scenes left out."""
+    """Collect what qualifies the numbers: counts, verdict, warning, rows and scenes left out."""
     remarks: dict[str, Any] = {}
     num_scenes, wanted = len(measured.names), reference.protocol.num_samples
     if measured.has_more:

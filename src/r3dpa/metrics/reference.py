@@ -289,9 +289,7 @@ def compute_reference(
 
 def cards_of(spaces: Iterable[SceneFeatures]) -> dict[str, dict[str, Any]]:
     """Return the cards of feature spaces by name, as a reference file stores them."""
-    return {
-        space.name: {**space.card, "dim": space.dim, "label": space.label} for space in spaces
-    }
+    return {space.name: {**space.card, "dim": space.dim, "label": space.label} for space in spaces}
 
 
 def split_halves(names: Sequence[str]) -> dict[str, int]:

@@ -463,9 +463,14 @@ def _cells(row: MetricResult) -> tuple[str, ...]:
         row.printed_interval or "-",
         row.printed(row.floor),
         row.direction,
-        *("-" if count is None else f"{count:,}" for count in (row.num_samples, row.num_references)),
+        _printed_count(row.num_samples),
+        _printed_count(row.num_references),
         row.note,
     )
+
+
+def _printed_count(count: int | None) -> str:
+    return "-" if count is None else f"{count:,}"
 
 
 def _range_of_floors(column: Sequence[MetricResult | None]) -> str:
