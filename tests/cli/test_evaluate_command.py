@@ -162,7 +162,7 @@ def test_official_weights_are_given_by_space(data, no_figures, samples, tmp_path
     assert both.about["backbones"]["FSVD"]["backbone"] == "MinkowskiNet"
     torch.nn.init.ones_(network.head.bias)
     torch.save({official_name(k): v for k, v in network.state_dict().items()}, weights)
-    with pytest.raises(ValueError, match="fsvd is not that of the reference: weights"):
+    with pytest.raises(ValueError, match="fsvd differs from the reference: weights"):
         evaluate(*words, "--ckpt.fsvd", weights)
 
 

@@ -67,7 +67,7 @@ def test_frechet_of_draws_is_that_of_their_moments(count, width):
 def test_one_sample_has_no_covariance():
     with pytest.raises(ValueError, match="real features: 1 samples, a covariance needs"):
         frechet_distance_of(torch.zeros(1, 2), torch.zeros(5, 2))
-    with pytest.raises(ValueError, match=r"x: expected \(N, F\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"x: expected \(N, F\), one row per sample, got \(3,\)"):
         Moments.of(torch.zeros(3), "x")
 
 
