@@ -188,20 +188,19 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from r3dpa.io import write_text
 
     check_file(out)
-    statistics: list[dict[str, ScanStatistics]] = []
-    for name, source in (("A", scans), ("B", reference)):
-        of_drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-        for scan in tqdm(find_scans(source), name, unit="scan", disable=None):
+
+    def statistics_by_drive(folder: Path, name: str) -> dict[str, ScanStatistics]:
+        drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
+        for scan in tqdm(find_scans(folder), name, unit="scan", disable=None):
             points = read_scan(scan.path)
             try:
-                of_drives[scan.drive] += scan_statistics(points)
+                drives[scan.drive] += scan_statistics(points)
             except ValueError as error:
                 raise ScanError(f"{scan.path}: {error}") from error
-        statistics.append(of_drives)
-    notes = [f"A: {scans}", f"B: {reference}"]
-    if len(statistics[1]) == 1:
-        notes.append("B is a single drive: there is no floor; give a reference of two drives")
-    table = realism_table(statistics[0], statistics[1], notes)
+        return drives
+
+    drives, real_drives = statistics_by_drive(scans, "A"), statistics_by_drive(reference, "B")
+    table = realism_table(drives, real_drives, [f"A: {scans}", f"B: {reference}"])
     if out is not None:
         write_text(out, json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table
