@@ -178,7 +178,7 @@ def test_chamfer_is_the_mean_over_200_real_scans():
     assert row.value == pytest.approx(sum(expected) / 200)
 
 
-def test_rows_tell_what_else_their_interval_is_of():
+def test_means_over_real_scans_note_what_their_interval_covers():
     """Means over real scans do not know how other generated scenes would differ."""
     rows = [
         row
@@ -266,7 +266,7 @@ def test_few_samples(num_real, message):
     assert "scenes for 6 features: dominated by their small number" in row.note
 
 
-def test_no_copy_of_the_empty_histograms_is_kept():
+def test_histograms_have_no_empty_copy_for_reset():
     """torchmetrics keeps the empty states: 16 groups of the published grid take 256 MB."""
     metric = metric_of("bev", num_groups=5)
     for name in ("real_bins", "generated_bins"):

@@ -98,7 +98,7 @@ def test_the_same_scenes_have_no_distance(reference):
         assert rows[f"TOY {name}"].value == 1.0
 
 
-def test_distances_of_the_baselines_are_there_on_request(reference):
+def test_distances_of_the_baselines_are_computed_on_request(reference):
     """They need nothing that references of R3DPA do not hold."""
     rows = rows_of(scenes(1), reference, baseline_metrics=True)
     others = {"JSD points", "MMD kernel", "MMD 0.5 m"}
@@ -138,7 +138,7 @@ def test_intervals_are_as_wide_as_fresh_sets_differ():
         assert 0.4 < ratio < 2.5, (name, ratio)
 
 
-def test_results_repeat_and_tell_what_they_are_of(reference):
+def test_results_repeat_and_record_their_provenance(reference):
     told = {"solver": "heun", "steps": 5, "seed": 3, "weights": "ema"}
     run = evaluated(scenes(1), reference, made_with=told)
     assert run.rows == fresh().rows
@@ -284,7 +284,7 @@ def test_poor_is_half_the_precision_of_real_scans(value, is_poor):
     assert line.startswith("not realistic: X recall 0.39 (real scans 0.8)") == is_poor
 
 
-def test_scenes_of_another_sensor_are_told(reference):
+def test_scenes_of_another_sensor_are_warned_of(reference):
     """Every second pixel of both axes is a quarter of the returns."""
     coarse = list(scenes(1))
     for scene in coarse:

@@ -334,6 +334,12 @@ def test_published_values_are_unscaled_and_print_as_in_the_paper():
     assert re.sub(" +", " ", last) == f" R3DPA (published) & {numbers}"
 
 
+def test_references_without_a_data_set_say_why_published_numbers_are_left_out():
+    text = report(Evaluation("ours", (MetricResult("FRID", 5.0),)), {"split": "all"})
+    assert "(published)" not in text
+    assert text.splitlines()[-1].startswith("- published numbers left out: the reference does not")
+
+
 @pytest.mark.parametrize(("dataset", "shown"), [("KITTI-360", True), (None, False)])
 def test_published_numbers_stand_beside_references_of_their_data_set(dataset, shown):
     evaluation = Evaluation("ours", (MetricResult("FRID", 5.0),))

@@ -38,6 +38,11 @@ _INTERVAL = (
     "against the same real scans"
 )
 _FLOOR = "real vs. real (floor)"
+#: Of references that were computed before they named their data set.
+_UNKNOWN_DATASET = (
+    "- published numbers left out: the reference does not say whether it is of KITTI-360; "
+    "compute it again with `r3dpa data reference`\n"
+)
 _DISTANCES = (*PUBLISHED_SCALES, "FWID", "FGEO")
 #: Provenance of an evaluation, by default unknown.
 _ABOUT: dict[str, Any] = {
@@ -355,7 +360,10 @@ def report(
         earlier: Evaluations to stand beside it. Default: the published ones, if the reference is of
             their data set.
     """
-    return f"{evaluation}\n\n{_comparison(evaluation, reference, earlier)}"
+    text = f"{evaluation}\n\n{_comparison(evaluation, reference, earlier)}"
+    if "dataset" not in reference and not earlier:
+        text += _UNKNOWN_DATASET
+    return text
 
 
 def save_reports(
