@@ -46,6 +46,9 @@ _PRUNING_SLACK = 64  # scenes beyond twice the limit before a state is cut down 
 class SceneMetric(Metric):
     """Distance between generated scenes and real scans; base class of all metrics of scenes.
 
+    Call ``update`` with batches of either side, then ``compute``; a batch alone has no distance, so
+    that ``forward`` raises.
+
     States come in pairs, ``real_<name>`` and ``generated_<name>``. States that grow with the scenes
     hold at most ``limits[side]`` of them: those whose names have the lowest hashes. This subset is
     as good as a random one, but does not depend on order, batches or interruptions.
@@ -115,11 +118,11 @@ class SceneMetric(Metric):
             ValueError: If the shape differs from that of the state.
         """
         if name in self._no_rows:
-            expected, given = self._no_rows[name].shape[1:], value.shape[1:]
+            expected = (len(value), *self._no_rows[name].shape[1:])
         else:
-            expected, given = getattr(self, name).shape, value.shape
-        if given != expected:
-            raise ValueError(f"{name} of shape {tuple(value.shape)} ends not in {tuple(expected)}")
+            expected = tuple(getattr(self, name).shape)
+        if tuple(value.shape) != expected:
+            raise ValueError(f"{name} of shape {tuple(value.shape)}, expected {expected}")
         setattr(self, name, [value] if name in self._no_rows else value)
 
     def adopt_real(self, *others: SceneMetric) -> None:
