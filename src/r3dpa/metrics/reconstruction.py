@@ -148,6 +148,14 @@ class LabelQuality(Metric):
     ``compute`` returns ``miou``, the mean of :func:`class_iou` over the classes that occur;
     ``iou <class>`` of each of these; ``intensity_error``, the mean absolute error where both images
     have a return.
+
+    Example:
+        >>> range_m, classes = torch.full((1, 3), 10.0), torch.tensor([[0, 0, 11]])
+        >>> reconstructed = Pixels(range_m, classes=torch.tensor([[0, 11, 11]]))
+        >>> quality = LabelQuality()
+        >>> quality.update(Pixels(range_m, classes=classes), reconstructed)
+        >>> quality.compute()
+        {'miou': 0.5, 'iou road': 0.5, 'iou car': 0.5}
     """
 
     full_state_update = False
