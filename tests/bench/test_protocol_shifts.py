@@ -4,8 +4,8 @@ import protocol_shifts
 import torch
 from protocol_shifts import markdown, measure_choices
 
+from lidarsim.scan_files import write_bin
 from r3dpa.data import LidarDataModule
-from r3dpa.data.scans import write_bin
 from r3dpa.geometry import LidarSensor, SphericalProjection, points_of
 from r3dpa.metrics.scene import PUBLISHED
 
