@@ -182,7 +182,7 @@ def test_without_a_usable_scene_the_losses_are_reported(words, tmp_path, emptied
     emptied(0, 1, 2)
     main(words(tmp_path, *QUIET, *GEOMETRIC))
     printed = capsys.readouterr().out
-    assert "nothing is compared with real scans: 1 generated scenes" in printed
+    assert "nothing is compared with real scans: 1 generated scene," in printed
     assert "3 cannot be used, the first is 000000: no pixel" in printed
     assert "test/range_error_m" in printed
     assert not (tmp_path / "evaluation" / "evaluation.json").exists()

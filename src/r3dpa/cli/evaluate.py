@@ -101,13 +101,13 @@ def evaluate(
         samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
             or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
         reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``.
-        spaces: Feature spaces; default: those of the reference that need no file or have one in
+        spaces: Feature spaces; default: all of the reference that need no weights or have them in
             ``ckpt``.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         skip_bad: Leave out samples that cannot be used, and list them.
         allow_few: Accept fewer samples than features, for a trial.
         baseline_metrics: Also JSD and MMD as R2DM, R2Flow and LiDM define them, by other names.
-        label: Name of the generator in tables; default: that of ``samples``.
+        label: Name of the generator in tables; default: the name of ``samples``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
         split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
