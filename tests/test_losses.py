@@ -6,6 +6,7 @@ import torch
 from r3dpa.losses import (
     alignment_loss,
     balanced_gradient,
+    centred_features,
     discriminator_loss,
     flow_matching_loss,
     generator_loss,
@@ -71,6 +72,13 @@ def test_empty_cells_weaken_the_alignment_loss_unless_skipped():
     skipped = alignment_loss(features, grid, skip_empty_cells=True)
     torch.testing.assert_close(skipped, torch.tensor([-1.0, 0.0]))
     torch.testing.assert_close(skipped[:1], alignment_loss(features[:1, 2:], grid[:1, 2:]))
+
+
+def test_cell_whose_features_sum_to_zero_is_not_empty():
+    grid = torch.tensor([[[1.0, -1.0], [0.0, 0.0]]])
+    assert alignment_loss(grid, grid, skip_empty_cells=True).item() == pytest.approx(-1)
+    centred = centred_features(torch.tensor([[[1.0, -1.0], [3.0, 1.0], [0.0, 0.0]]]))
+    assert centred.tolist() == [[[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]]]
 
 
 @pytest.mark.numerics

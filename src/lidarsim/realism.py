@@ -246,12 +246,22 @@ class RealismTable:
 
     def __str__(self) -> str:
         table = text_table(map(_cells, self.rows), _COLUMNS, align="ll" + "r" * 8)
-        missed = ", ".join(f"{row.name} ({row.ratio:.1f}x)" for row in self.misses)
+        lines = [table, ""]
         num_judged = sum(row.within is not None for row in self.rows)
-        verdict = f"{num_judged - len(self.misses)} of {num_judged} measures within 3 x the floor"
-        unknown = [f"n/a: {row.name}: {row.reason}" for row in self.rows if row.reason]
-        missing = [f"beyond 3 x the floor: {missed}"] if missed else []
-        return "\n".join([table, "", verdict, *missing, *unknown, *self.notes])
+        if num_judged:
+            num_within = num_judged - len(self.misses)
+            lines.append(f"{num_within} of {num_judged} measures within 3 x the floor")
+        if self.misses:
+            misses = [f"{row.name} ({row.ratio:.1f}x)" for row in self.misses]
+            lines.append(f"beyond 3 x the floor: {', '.join(misses)}")
+        names_by_reason: dict[str, list[str]] = {}
+        for row in self.rows:
+            if row.reason:
+                names_by_reason.setdefault(row.reason, []).append(row.name)
+        for reason, names in names_by_reason.items():
+            is_of_all = len(names) == len(self.rows)
+            lines.append(f"n/a: {'all measures' if is_of_all else ', '.join(names)}: {reason}")
+        return "\n".join([*lines, *self.notes])
 
     def to_dict(self) -> dict[str, Any]:
         """Rows and notes for JSON, null where a number is unknown."""
@@ -288,7 +298,11 @@ def realism_table(
         if math.isnan(distance):
             reason = reason or "no bin holds enough returns in a drive of A and in one of B"
         elif math.isnan(floor):
-            reason = reason or "no two drives of B can be compared, so there is no floor"
+            if len(reference) == 1:
+                no_floor = "B is a single drive, so there is no floor; give two drives or more"
+            else:
+                no_floor = "no two drives of B can be compared, so there is no floor"
+            reason = reason or no_floor
         if not reason and floor:
             ratio = distance / floor
         elif not reason:
@@ -320,8 +334,10 @@ def _text(value: float) -> str:
 
 def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatistics) -> str:
     sizes = [statistics.num_scans for statistics in drives.values()]
-    total = f"{name}: {pooled.num_scans} scans of {len(drives)} drive{'s' * (len(drives) > 1)}, "
-    total += f"{min(sizes)} to {max(sizes)} each"
+    total = f"{name}: {_plural(pooled.num_scans, 'scan')} of {_plural(len(drives), 'drive')}"
+    if len(sizes) > 1:
+        low, high = min(sizes), max(sizes)
+        total += f", {low} each" if low == high else f", {low} to {high} each"
     parts = {
         "not in ring order": pooled.num_scans - pooled.num_ring_scans,
         "with another number of rings": pooled.num_ring_scans - pooled.num_beam_scans,
@@ -330,3 +346,7 @@ def _counted(name: str, drives: Mapping[str, ScanStatistics], pooled: ScanStatis
     }
     left_out = [f"{count} {what}" for what, count in parts.items() if count]
     return f"{total}; left out where needed: {', '.join(left_out)}" if left_out else total
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

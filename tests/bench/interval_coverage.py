@@ -131,7 +131,7 @@ def matching_values():
     metric.update(range_images(1000, 0), real=True)
     metric.update(range_images(40, 0), real=False)
     matching = metric.matching()
-    real, made = (clouds(metric.kept(side)[1]) for side in ("real", "generated"))
+    real, made = (metric.clouds(side) for side in ("real", "generated"))
     pairs = zip(real, matching.nearest.tolist(), strict=True)
     chamfer = [chamfer_squared(cloud, made[index]) for cloud, index in pairs]
     return {"MMD": matching.squared_normalised, "CD 3D": torch.tensor(chamfer).double()}

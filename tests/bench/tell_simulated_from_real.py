@@ -2,7 +2,7 @@
 
     python tests/bench/tell_simulated_from_real.py REAL SIMULATED --out FOLDER
 
-The network of ``r3dpa.metrics.classifier`` sees range images (64 x 1024, 1 to 56 m, log range and
+The network of ``scan_classifier.py`` sees range images (64 x 1024, 1 to 56 m, log range and
 return mask). It is trained on all recordings of REAL but one and as many simulated scans of the
 training drives, and tested on the recording left out and on scans of the validation drives, once
 for each recording. Accuracy is the mean of both recalls: 0.5 is perfect simulation. "Without ..."
@@ -26,6 +26,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
+from scan_classifier import two_sample_network
 from street_fullness import height_above_ground, recordings, shorten
 from torch import Tensor
 
@@ -33,7 +34,6 @@ from lidarsim.scan_files import read_scan
 from r3dpa.data.scans import evenly, kitti360_scans
 from r3dpa.geometry import LidarSensor, RangeCodec, SphericalProjection, range_image
 from r3dpa.io import text_table
-from r3dpa.metrics.classifier import _network
 from r3dpa.viz import range_image_picture
 
 PROJECTION = SphericalProjection(LidarSensor())
@@ -74,7 +74,7 @@ def train(real_m, simulated_m, seed):
     """Network whose answer is above 0 for simulated images."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    network = _network()
+    network = two_sample_network()
     adam = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE)
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, STEPS)
     target = torch.cat([torch.zeros(HALF_BATCH), torch.ones(HALF_BATCH)])

@@ -207,7 +207,7 @@ class TestRealism:
         words = ["--scans", simulated, "--reference", simulated, "--out", out]
         main(["realism", *map(str, words)])
         rows = json.loads(out.read_text())["rows"]
-        assert "A: 4 scans of 2 drives, 2 to 2 each" in capsys.readouterr().out
+        assert "A: 4 scans of 2 drives, 2 each" in capsys.readouterr().out
         assert all(row["pooled"] == 0 for row in rows)
         # Two drives: pairs (0, 0), (0, 1), (1, 0), (1, 1), so the median is half the floor.
         assert all(row["ratio"] == pytest.approx(0.5) for row in rows if row["floor"])

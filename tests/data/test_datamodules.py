@@ -121,6 +121,13 @@ def write_rings(folder, heights_deg):
         write_bin(folder / f"{frame:06d}.bin", torch.cat(rings)[:, :3])
 
 
+def test_only_kitti360_itself_is_the_data_set_of_published_numbers(tmp_path):
+    assert KITTI360DataModule(str(tmp_path)).dataset == "KITTI-360"
+    assert LidarDataModule(str(tmp_path)).dataset is None
+    (tmp_path / "simulation.json").touch()
+    assert KITTI360DataModule(str(tmp_path)).dataset is None
+
+
 def test_rings_do_not_depend_on_the_limit(tmp_path):
     generator = torch.Generator().manual_seed(0)
     tilt = torch.randn(12, 1, generator=generator) / 4

@@ -147,7 +147,7 @@ def test_left_over_weights_are_named(path):
         with pytest.raises(ValueError, match=r"0 missing .* 1 unexpected \['extra'\]"):
             release.load(path)
     torch.save({"state_dict": RELEASES["minkowski"].weights()}, path)
-    with pytest.raises(ValueError, match=r"not those of this SPVCNN: 21 missing \['point_trans"):
+    with pytest.raises(ValueError, match=r"do not fit this SPVCNN: 21 missing \['point_trans"):
         SPVCNN.from_checkpoint(path)
 
 

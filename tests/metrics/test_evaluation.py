@@ -8,11 +8,12 @@ import torch
 
 from r3dpa.geometry import LidarSensor
 from r3dpa.metrics.evaluation import TooFewScenesError, evaluate, scene_distance
+from r3dpa.metrics.floors import verdict
 from r3dpa.metrics.functional import frechet_distance_of
 from r3dpa.metrics.functional_bev import histogram_distance
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of
 from r3dpa.metrics.resampling import Resampling
-from r3dpa.metrics.results import EvaluationTable
+from r3dpa.metrics.results import EvaluationTable, MetricResult
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -97,7 +98,7 @@ def test_the_same_scenes_have_no_distance(reference):
         assert rows[f"TOY {name}"].value == 1.0
 
 
-def test_distances_of_the_baselines_are_there_on_request(reference):
+def test_distances_of_the_baselines_are_computed_on_request(reference):
     """They need nothing that references of R3DPA do not hold."""
     rows = rows_of(scenes(1), reference, baseline_metrics=True)
     others = {"JSD points", "MMD kernel", "MMD 0.5 m"}
@@ -137,7 +138,7 @@ def test_intervals_are_as_wide_as_fresh_sets_differ():
         assert 0.4 < ratio < 2.5, (name, ratio)
 
 
-def test_results_repeat_and_tell_what_they_are_of(reference):
+def test_results_repeat_and_record_their_provenance(reference):
     told = {"solver": "heun", "steps": 5, "seed": 3, "weights": "ema"}
     run = evaluated(scenes(1), reference, made_with=told)
     assert run.rows == fresh().rows
@@ -158,7 +159,7 @@ def test_few_scenes_are_refused_or_marked(reference):
     assert (rows["TOY inf"].value, rows["TOY inf"].note) == (None, "needs 16 scenes of both kinds")
     assert rows["TOY KID"].value is None
     assert rows["TOY recall"].note == "needs 6 scenes of both kinds"
-    with pytest.raises(ValueError, match="1 generated scenes; a comparison needs at least 2"):
+    with pytest.raises(ValueError, match="1 generated scene, a comparison needs at least 2"):
         rows_of(scenes(1, 1), reference, allow_few=True)
     small = reference_of(list(scenes(count=2)))
     with pytest.raises(ValueError, match="2 real scans for the 3 features of TOY"):
@@ -207,7 +208,7 @@ def test_bad_scenes_are_errors_alone_or_without_the_option(reference):
     message = r"bad/4: none of 1 points has.*\. --skip_bad leaves such scenes out"
     with pytest.raises(ValueError, match=message):
         rows_of([*scenes(1, 5), BAD[3][0]], reference)
-    with pytest.raises(TooFewScenesError, match=r"0 generated .* 8 cannot .* bad/1: no pixel"):
+    with pytest.raises(TooFewScenesError, match=r"no generated .* 8 cannot .* bad/1: no pixel"):
         rows_of([bad for bad, _ in BAD], reference, skip_bad=True)
 
 
@@ -232,16 +233,58 @@ def test_floors_of_few_scenes_are_not_kept_for_more():
     assert notes == ["floor of 8 and 20 scans", "floor of 20 and 20 scans"]
 
 
-def test_the_verdict_is_one_line_above_the_table(reference):
-    assert fresh().about["extra"]["verdict"].startswith("near the floor in JSD")
-    lost = evaluated(scenes(1, noise=12.0), reference)
-    line = lost.about["extra"]["verdict"]
+def test_verdict_is_one_line_above_the_table():
+    large = reference_of(list(scenes(count=64)), replace(PROTOCOL, num_samples=80))
+    near = evaluated(scenes(1), large).about["extra"]["verdict"]
+    assert near.startswith("near the floor in JSD")
+    noisy = evaluated(scenes(1, noise=12.0), large)
+    line = noisy.about["extra"]["verdict"]
     assert re.match(r"not realistic: TOY precision 0\.\d+ \(real scans 1\), ", line)
-    assert str(lost).splitlines()[1] == f"verdict: {line}"
-    assert "{" not in str(lost)  # JSON is in the file alone
+    assert str(noisy).splitlines()[1] == f"verdict: {line}"
+    assert "{" not in str(noisy)  # JSON is in the file alone
 
 
-def test_scenes_of_another_sensor_are_told(reference):
+@pytest.mark.parametrize(
+    ("num_scenes", "num_scans", "start"),
+    [
+        (4, 64, "too few to tell: 4 scenes, floors between 4 scans; give at least 32 scenes"),
+        (32, 62, "too few to tell: 32 scenes, floors between 31 scans"),
+        (32, 64, "near the floor in"),
+    ],
+)
+def test_verdict_needs_enough_scenes_and_scans(num_scenes, num_scans, start):
+    """Four scenes are near every floor, whatever they look like."""
+    reference = reference_of(list(scenes(count=num_scans)), replace(PROTOCOL, num_samples=80))
+    run = evaluated(scenes(1, num_scenes), reference, allow_few=True)
+    assert run.about["extra"]["verdict"].startswith(start)
+
+
+def floor_of(value, name="X"):
+    return {name: MetricResult(name, value, num_samples=40, num_references=40)}
+
+
+@pytest.mark.parametrize(
+    ("value", "half_width", "expected"),
+    [
+        (1.49, 0.0, "near the floor in X"),
+        (1.51, 0.0, "above it in 1 distance, most in X (1.51 x)"),
+        (2.4, 1.0, "near the floor in X"),
+        (2.6, 1.0, "above it in 1 distance, most in X (2.6 x)"),
+    ],
+)
+def test_near_is_one_and_a_half_floors_plus_half_the_interval(value, half_width, expected):
+    row = MetricResult("X", value, interval=(value - half_width, value + half_width))
+    assert verdict([row], floor_of(1.0), 40) == expected
+
+
+@pytest.mark.parametrize(("value", "is_poor"), [(0.41, False), (0.39, True)])
+def test_poor_is_half_the_precision_of_real_scans(value, is_poor):
+    row = MetricResult("X recall", value, direction="higher")
+    line = verdict([row], floor_of(0.8, "X recall"), 40)
+    assert line.startswith("not realistic: X recall 0.39 (real scans 0.8)") == is_poor
+
+
+def test_scenes_of_another_sensor_are_warned_of(reference):
     """Every second pixel of both axes is a quarter of the returns."""
     coarse = list(scenes(1))
     for scene in coarse:
@@ -289,7 +332,9 @@ def test_one_metric_of_two_sets_is_that_of_an_evaluation():
         assert scene_distance(name, scenes(0), scenes(1), PROTOCOL) == rows[name].value
     made = [through_sensor(scene, PROTOCOL)[:2] for scene in scenes(1, 8)]  # names and points
     assert scene_distance("FGEO coverage", made, made, PROTOCOL) == 1
-    with pytest.raises(ValueError, match="no metric 'FGEO best'; of FGEO there are FGEO precision"):
+    with pytest.raises(
+        ValueError, match="unknown metric 'FGEO best'; choose from FGEO, FGEO precision"
+    ):
         scene_distance("FGEO best", made, made, PROTOCOL)
     with pytest.raises(ValueError, match="FGEO KID: needs 4 scenes"):
         scene_distance("FGEO KID", made[:2], made, PROTOCOL)

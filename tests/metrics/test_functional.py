@@ -67,7 +67,7 @@ def test_frechet_of_draws_is_that_of_their_moments(count, width):
 def test_one_sample_has_no_covariance():
     with pytest.raises(ValueError, match="real features: 1 samples, a covariance needs"):
         frechet_distance_of(torch.zeros(1, 2), torch.zeros(5, 2))
-    with pytest.raises(ValueError, match=r"x: expected \(N, F\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"x: expected \(N, F\), one row per sample, got \(3,\)"):
         Moments.of(torch.zeros(3), "x")
 
 
@@ -194,7 +194,7 @@ def test_cells_of_a_grid():
     """Index 0 is the lower limit, borders belong to the upper cell, limits are outside."""
     points = cloud((-3.9, -3.9), (0.0, 0.5), (0.9, 0.0), (3.9, -1e-6), (4.0, 0.0), (-4.0, 0.0))
     assert GRID.cells(points).tolist() == [0, 4 * 8 + 4, 7 * 8 + 3]
-    assert len(GRID.kept(points)) == 4
+    assert len(GRID.points_inside(points)) == 4
     assert GRID.side == 8
     assert BEVGrid(4.0, 0.7).cells(cloud((-3.9, -3.9), (3.9, 3.9))).tolist() == [0, 10 * 12 + 10]
 

@@ -128,7 +128,7 @@ class TestEvaluateOfficial:
         with pytest.raises(ValueError, match=r"no moments of frid \(rangevit_w_i\)"):
             evaluate(scenes(1, 3), statistics, [intense], label="made")
         with pytest.raises(ValueError, match=r"val.rangevit_wo_i: has 3 features, but frid has 4"):
-            statistics.of_space(replace(FRID, dim=4))
+            statistics.moments_of(replace(FRID, dim=4))
 
 
 class TestLoad:

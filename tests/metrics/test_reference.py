@@ -7,7 +7,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from r3dpa.geometry import LidarSensor
-from r3dpa.metrics.feature_distances import metrics_of
+from r3dpa.metrics.collection import metrics_by_name
 from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference, split_halves
 from r3dpa.metrics.scene import DEFAULT, EvaluationScene, through_sensor
 from r3dpa.metrics.scene_features import SceneFeatures
@@ -49,7 +49,7 @@ def filled(count=11):
 def whole(reference):
     metrics = reference.metrics()
     reference.fill(metrics)
-    return metrics_of(metrics)
+    return metrics_by_name(metrics)
 
 
 def test_moments_and_histograms_are_those_of_all_scans():
@@ -74,9 +74,9 @@ def test_kept_scans_are_few_and_the_halves_have_different_drives():
     assert [len(reference.names_of_half(half)) for half in (0, 1)] == [7, 4]
     images, kept = {scene.name: scene.range_m for scene in scenes()}, []
     for index, half in enumerate(reference.halves):
-        places, _ = metrics_of(half)["matching"].kept("real")
+        places, _ = metrics_by_name(half)["matching"].subset("real")
         kept += [reference.names_of_half(index)[place] for place in places]
-    _, stored = whole(reference)["matching"].kept("real")
+    _, stored = whole(reference)["matching"].subset("real")
     for name, image in zip(kept, stored, strict=True):
         assert torch.equal(image, images[name])
 
@@ -111,10 +111,10 @@ def test_as_many_scans_are_kept_as_the_protocol_asks_for(sizes, limit, kept):
     protocol = replace(PROTOCOL, num_samples=limit, num_mmd_references=limit)
     reference = ReferenceStatistics(protocol, cards_of([TOY]), names, {})
     reference.update((EvaluationScene(n, None, torch.full((16, 64), 9.0)) for n in names), [TOY])
-    metrics = [*map(metrics_of, reference.halves), whole(reference)]
+    metrics = [*map(metrics_by_name, reference.halves), whole(reference)]
     wanted = (*kept, sum(kept))
     assert tuple(len(part["toy_frechet"].rows("real")) for part in metrics) == wanted
-    assert tuple(len(part["matching"].kept("real")[0]) for part in metrics) == wanted
+    assert tuple(len(part["matching"].subset("real")[0]) for part in metrics) == wanted
 
 
 def test_a_reference_comes_back_from_its_file(tmp_path):
@@ -195,7 +195,7 @@ def test_other_features_are_refused():
     stored.check([TOY])
     with pytest.raises(ValueError, match="no features of fgeo, only of toy"):
         stored.check([replace(TOY, name="fgeo")])
-    with pytest.raises(ValueError, match="toy is not that of the reference: weights x not abc"):
+    with pytest.raises(ValueError, match="toy differs from the reference: weights x not abc"):
         stored.check([replace(TOY, card={**CARD, "weights": "x"})])
 
 

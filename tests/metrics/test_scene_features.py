@@ -217,7 +217,7 @@ def test_official_files_become_spaces(tmp_path):
 @pytest.mark.parametrize(
     ("name", "ckpt", "message"),
     [
-        ("fid", None, "no feature space 'fid'; there are frid, fld"),
+        ("fid", None, "unknown feature space 'fid'; choose from frid, fld"),
         ("frid", None, r"frid needs its official weights: give --ckpt\.frid FILE"),
         ("fgeo", "x.ckpt", "fgeo has no weights: leave x.ckpt out"),
         ("fld", "x.ckpt", "x.ckpt: no such file"),

@@ -117,6 +117,7 @@ class SceneScorer(L.Callback):
             about = {
                 "data": str(datamodule.scans),
                 "split": "all",
+                "dataset": datamodule.dataset,
                 "scans_sha256": _stamp(scans),  # names may stay
                 "commit": source_commit(),
             }
@@ -161,10 +162,10 @@ class SceneScorer(L.Callback):
             return
         shutil.rmtree(folder / "sampled")
         evaluation = comparison.evaluation
-        save_reports(evaluation, statistics.about.get("split"), folder)
+        save_reports(evaluation, statistics.about, folder)
         if comparison.figures:
             save_figures(folder, **comparison.figures)
-        trainer.print(report(evaluation, statistics.about.get("split")))
+        trainer.print(report(evaluation, statistics.about))
         values = {
             f"test/{row.name.replace(' ', '_')}": row.value
             for row in evaluation.rows

@@ -45,7 +45,6 @@ COMMANDS = {
     "edit vary": Command("edit:vary", "generate scenes similar to a scan"),
     "edit interpolate": Command("edit:interpolate", "generate the scenes between two scans"),
     "evaluate": Command("evaluate:evaluate", "compare samples of any generator with real scans"),
-    "protocols": Command("evaluate:protocols", "show what each choice of a protocol shifts"),
     "models": Command("r3dpa.pretrained:models", "list trained weights, or show their card"),
     "convert": Command("runs:convert", "convert checkpoints from and to the official layout"),
     "report": Command("runs:report", "draw the loss curves of a run and list the losses"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,14 +36,14 @@ def reference(
             ``fpvd``, and ``frd``, ``frid_r2flow``, ``frid_lidm`` and ``fpd`` of the baselines, need
             the weights of the official networks.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
-        split: Which scans of the data.
-        limit: Number of scans at most, spread evenly.
+        split: Part of the data.
+        limit: Maximum scans, evenly spaced.
         protocol: ``published`` prepares scans as the published numbers do: points on the corners
             of pixels, and pictures of LIP-Loc that wrap around.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
     """
     from r3dpa.cli.features import read_data
-    from r3dpa.data.scans import Scan, evenly
+    from r3dpa.data.scans import evenly
     from r3dpa.io import source_commit
     from r3dpa.metrics.evaluation import feature_spaces
     from r3dpa.metrics.reference import ReferenceStatistics, cards_of, compute_reference
@@ -55,16 +56,24 @@ def reference(
     train, val = module.limited_split()
     scans = evenly({"train": train, "val": val, "all": sorted(train + val)}[split], limit)
     if len(scans) < 2:
-        raise ValueError(f"{data}: {len(scans)} scans of the split {split}; at least 2 are needed")
+        given = "1 scan" if len(scans) == 1 else "no scans"
+        raise ValueError(f"{data}: {given} in split {split}; at least 2 are needed")
     setting = replace(PROTOCOLS[protocol], sensor=module.sensor)
-    found = feature_spaces(spaces, ckpt, setting, device)
-    about = {"data": str(data), "split": split, "limit": limit, "commit": source_commit()}
-    job = ReferenceStatistics(setting, cards_of(found), [scan.name for scan in scans], about)
+    networks = feature_spaces(spaces, ckpt, setting, device)
+    about = {
+        "data": str(data),
+        "split": split,
+        "limit": limit,
+        "dataset": module.dataset,
+        "commit": source_commit(),
+    }
+    job = ReferenceStatistics(setting, cards_of(networks), [scan.name for scan in scans], about)
 
-    def scene(scan: Scan) -> EvaluationScene:
-        return EvaluationScene(scan.name, module.points(scan))
+    def scenes_from(start: int) -> Iterator[EvaluationScene]:
+        for scan in scans[start:]:
+            yield EvaluationScene(scan.name, module.points(scan))
 
-    statistics = compute_reference(job, lambda start: map(scene, scans[start:]), found, out)
+    statistics = compute_reference(job, scenes_from, networks, out)
     return f"{out}: {statistics.describe()}; {', '.join(statistics.spaces)}; protocol {protocol}"
 
 
@@ -86,24 +95,24 @@ def evaluate(
     """Compare the samples of any generator with real scans.
 
     Prints every metric with its confidence interval and its floor, the distance of real scans from
-    real scans, and a table beside the published numbers.
+    real scans, and a table, beside the published numbers if the real scans are KITTI-360.
 
     Args:
         samples: File or folder: ``r3dpa sample``, R3DPA, LiDAR-Diffusion, R2DM, R2Flow, RangeLDM,
             or any clouds as ``.bin``, ``.ply``, ``.txt`` or ``.npz``.
         reference: File of ``r3dpa data reference``, or R3DPA's own ``data_statistics.npy``.
-        spaces: Feature spaces; default: those of the reference that need no file or have one in
+        spaces: Feature spaces; default: all of the reference that need no weights or have them in
             ``ckpt``.
         ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
         skip_bad: Leave out samples that cannot be used, and list them.
-        allow_few: Accept fewer samples than features: only to try it.
+        allow_few: Accept fewer samples than features, for a trial.
         baseline_metrics: Also JSD and MMD as R2DM, R2Flow and LiDM define them, by other names.
-        label: Name of the generator in tables; default: that of ``samples``.
+        label: Name of the generator in tables; default: the name of ``samples``.
         device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
         out: Folder for the numbers (JSON, CSV), tables (Markdown, LaTeX) and figures.
         split: Part of ``data_statistics.npy``; default: ``val`` if it holds both.
-        beside: Files ``evaluation.json`` of earlier comparisons, to stand in the table in place of
-            the published numbers.
+        beside: Files ``evaluation.json`` of earlier comparisons, shown in the table in place of the
+            published numbers.
     """
     from tqdm import tqdm
 
@@ -117,7 +126,7 @@ def evaluate(
     earlier = [Evaluation.load(path) for path in beside]
     made_with = _made_with(samples)  # refuses damaged metadata before the work starts
     statistics = metrics.load_reference(reference, split)
-    found = metrics.reference_spaces(statistics, spaces, ckpt, device)
+    networks = metrics.reference_spaces(statistics, spaces, ckpt, device)
     setting = statistics.protocol
     files = read_samples(
         samples, setting.sensor, unprojection=setting.unprojection, skip_bad=skip_bad
@@ -125,7 +134,7 @@ def evaluate(
     comparison = metrics.evaluate(
         (EvaluationScene(*sample) for sample in tqdm(files, "samples", disable=None)),
         statistics,
-        found,
+        networks,
         label=label or samples.stem,
         source=str(samples),
         made_with=made_with,
@@ -137,86 +146,29 @@ def evaluate(
     if files.bad:  # the reader refused these, so that they never became scenes
         evaluation.about["extra"]["bad_samples"] = [*files.bad, *evaluation.bad_samples]
     if out is not None:
-        save_reports(evaluation, statistics.about.get("split"), out, earlier)
+        save_reports(evaluation, statistics.about, out, earlier)
         if comparison.figures:
             save_figures(out, **comparison.figures)
-    return report(evaluation, statistics.about.get("split"), earlier)
-
-
-def protocols(
-    *,
-    samples: Path,
-    data: Path,
-    spaces: tuple[str, ...] = ("fgeo",),
-    ckpt: dict[str, Path] | None = None,
-    limit: PositiveInt | None = None,
-    device: str = "auto",
-    out: Path | None = None,
-) -> Any:
-    """Print how far each choice of a protocol shifts the metrics of the same samples.
-
-    Published numbers of one generator differ by paper, and so do their protocols: pixel centre,
-    range cut, projection, number of samples, split of the real scans. One choice at a time is
-    changed from the protocol of R3DPA; shifts stand beside the interval of the unchanged value.
-
-    Args:
-        samples: As for ``r3dpa evaluate``.
-        data: Folder of real scans, or a data YAML.
-        spaces: Feature spaces; ``fwid`` and ``fgeo`` need no file.
-        ckpt: Weights by space, such as ``--ckpt.frid model.ckpt``.
-        limit: Number of real scans of each split at most, spread evenly.
-        device: ``cpu``, ``cuda``, ``cuda:1`` or ``auto``.
-        out: JSON file for the table.
-    """
-    import torch
-
-    from r3dpa.cli.features import read_data
-    from r3dpa.data.samples import read_samples
-    from r3dpa.data.scans import evenly
-    from r3dpa.io import command, machine, source_commit, versions, write_text
-    from r3dpa.metrics.evaluation import feature_spaces
-    from r3dpa.metrics.protocol_shifts import protocol_shifts
-    from r3dpa.metrics.scene import PROTOCOLS, EvaluationScene
-
-    check_file(out)
-    module = read_data(data)
-    train, val = (evenly(part, limit) for part in module.limited_split())
-    scans = {scan.name: scan for scan in sorted(train + val)}
-    shifts = protocol_shifts(
-        lambda protocol: (
-            EvaluationScene(*sample)
-            for sample in read_samples(samples, protocol.sensor, protocol.unprojection, True)
-        ),
-        {"all": [*scans], "train": [s.name for s in train], "val": [s.name for s in val]},
-        lambda name: module.points(scans[name]),
-        lambda protocol: feature_spaces(spaces, ckpt, protocol, device),
-        replace(PROTOCOLS["published"], sensor=module.sensor),
-        {"data": str(data), "commit": source_commit()},
-    )
-    if out is not None:
-        card = {"command": command(), "machine": machine(), "commit": source_commit()}
-        card |= {"samples": str(samples), "data": str(data), "versions": versions(torch)}
-        content = card | {"choices": shifts.entries()}
-        write_text(out, json.dumps(content, indent=1, allow_nan=False) + "\n")
-    return shifts
+    return report(evaluation, statistics.about, earlier)
 
 
 def _made_with(samples: Path) -> dict[str, Any]:
-    """Entries of the metadata of ``r3dpa sample``; empty for samples of others."""
-    path = (samples if (samples / "metadata.json").is_file() else samples.parent) / "metadata.json"
+    """Read what made the samples from the metadata of ``r3dpa sample``; empty without any."""
+    folder = samples if (samples / "metadata.json").is_file() else samples.parent
+    path = folder / "metadata.json"
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        metadata = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: is damaged ({error}); repair or remove it") from error
-    if not isinstance(found, dict) or "r3dpa" not in found:
+    if not isinstance(metadata, dict) or "r3dpa" not in metadata:
         return {}
-    sampler = found.get("sampler") or {}
-    kept = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
-    made_with = {key: found.get(key) for key in kept}
+    sampler = metadata.get("sampler") or {}
+    keys = ("seed", "precision", "feature_source", "checkpoint", "stage", "step", "weights", "nfe")
+    made_with = {key: metadata.get(key) for key in keys}
     made_with |= {key: sampler.get(key) for key in ("solver", "steps")}
-    return made_with | {"sampler": sampler, "made_by_commit": found.get("commit")}
+    return made_with | {"sampler": sampler, "made_by_commit": metadata.get("commit")}
 
 
 def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
@@ -236,20 +188,19 @@ def realism(*, scans: Path, reference: Path, out: Path | None = None) -> Any:
     from r3dpa.io import write_text
 
     check_file(out)
-    statistics: list[dict[str, ScanStatistics]] = []
-    for name, source in (("A", scans), ("B", reference)):
-        of_drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
-        for scan in tqdm(find_scans(source), name, unit="scan", disable=None):
+
+    def statistics_by_drive(folder: Path, name: str) -> dict[str, ScanStatistics]:
+        drives: dict[str, ScanStatistics] = defaultdict(ScanStatistics)
+        for scan in tqdm(find_scans(folder), name, unit="scan", disable=None):
             points = read_scan(scan.path)
             try:
-                of_drives[scan.drive] += scan_statistics(points)
+                drives[scan.drive] += scan_statistics(points)
             except ValueError as error:
                 raise ScanError(f"{scan.path}: {error}") from error
-        statistics.append(of_drives)
-    notes = [f"A: {scans}", f"B: {reference}"]
-    if len(statistics[1]) == 1:
-        notes.append("B is a single drive: there is no floor; give a reference of two drives")
-    table = realism_table(statistics[0], statistics[1], notes)
+        return drives
+
+    drives, real_drives = statistics_by_drive(scans, "A"), statistics_by_drive(reference, "B")
+    table = realism_table(drives, real_drives, [f"A: {scans}", f"B: {reference}"])
     if out is not None:
         write_text(out, json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n")
     return table

@@ -152,6 +152,11 @@ class LidarDataModule(LoaderModule):
         return None
 
     @property
+    def dataset(self) -> str | None:
+        """Name of the published data set that the scans come from; None for others."""
+        return None
+
+    @property
     def geometry(self) -> ScanGeometry:
         """Projection, codec and grid size, known after ``setup``."""
         return ScanGeometry(self.projection, self.codec, self.grid_size)
@@ -275,6 +280,11 @@ class KITTI360DataModule(LidarDataModule):
         # Given here, they are no options of the YAML: the split is fixed.
         super().__init__(scans=root, val_every=None, val_drives=None, **kwargs)
         self.root = root
+
+    @property
+    def dataset(self) -> str | None:
+        """``KITTI-360``; None for simulated scans, which have the same layout."""
+        return None if (Path(self.root) / "simulation.json").is_file() else "KITTI-360"
 
     def split(self) -> tuple[list[Scan], list[Scan]]:
         """Scans of the official training and validation drives that are present."""

@@ -27,7 +27,7 @@ class FrozenNetwork(nn.Module):
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Adds the file to a ``ValueError`` of the block."""
+    """Prefix errors of the block with the name of the file."""
     try:
         yield
     except ValueError as error:
@@ -35,9 +35,9 @@ def naming(path: str | Path) -> Iterator[None]:
 
 
 def read_released(path: Path, released: str = _MODEL) -> Any:
-    """Content of a file of ``torch.save``, tensors on the CPU."""
+    """Read a file of ``torch.save``, tensors on the CPU, without running code in it."""
     if not path.is_file():
-        raise ValueError(f"no such file; give {released}.")
+        raise ValueError(f"no such file; give {released}")
     try:
         # Memory-mapped, so that optimiser states are not read.
         return torch.load(
@@ -47,48 +47,48 @@ def read_released(path: Path, released: str = _MODEL) -> Any:
         reason = str(error).partition("\n")[0]
         raise ValueError(
             f"is damaged, or holds more than tensors and plain values ({reason}); give {released}, "
-            "or save its weights alone."
+            "or save its weights alone"
         ) from error
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:
-    """Entry ``state_dict`` of a training checkpoint, see :func:`read_released`."""
+    """Read the entry ``state_dict`` of a training checkpoint, see :func:`read_released`."""
     content = read_released(path)
     weights = content.get("state_dict") if isinstance(content, Mapping) else None
     if not isinstance(weights, Mapping) or not all(
         isinstance(value, Tensor) for value in weights.values()
     ):
-        raise ValueError(f"holds no entry state_dict with tensors; give {_MODEL}.")
+        raise ValueError(f"holds no entry state_dict with tensors; give {_MODEL}")
     return dict(weights)
 
 
 def load_strictly(
     network: nn.Module, weights: Mapping[str, Tensor], official_name: Callable[[str], str]
 ) -> None:
-    """Loads every key of an official state dict.
+    """Load every key of an official state dict.
 
     Official weights may have additional last axes of size 1: some linear layers are convolutions.
     """
-    own = network.state_dict()
-    keys = {official_name(key): key for key in own}
+    state = network.state_dict()
+    keys = {official_name(key): key for key in state}
     missing = [name for name in keys if name not in weights]
     unexpected = [name for name in weights if name not in keys]
     if missing or unexpected:
         raise ValueError(
-            f"the weights are not those of this {type(network).__name__}: {len(missing)} missing "
-            f"{missing[:5]}, {len(unexpected)} unexpected {unexpected[:5]}."
+            f"the weights do not fit this {type(network).__name__}: {len(missing)} missing "
+            f"{missing[:5]}, {len(unexpected)} unexpected {unexpected[:5]}"
         )
     loaded = {}
     for name, key in keys.items():
-        shape, expected = tuple(weights[name].shape), tuple(own[key].shape)
+        shape, expected = tuple(weights[name].shape), tuple(state[key].shape)
         if shape[: len(expected)] != expected or any(size != 1 for size in shape[len(expected) :]):
-            raise ValueError(f"weight {name} has shape {shape}, but {expected} is expected.")
+            raise ValueError(f"weight {name} has shape {shape}, but {expected} is expected")
         loaded[key] = weights[name].reshape(expected)
     network.load_state_dict(loaded)
 
 
 def renamed(names: Mapping[str, str]) -> Callable[[str], str]:
-    """Function that replaces the beginning of a key by the first entry of the table that fits.
+    """Return a function that replaces the beginning of a key by the first entry that fits.
 
     Keys of the table are regular expressions, and ``{}`` in their values stands for a group.
     """

@@ -1,11 +1,10 @@
 """How near generated scenes are to real ones.
 
-FWID is the Fréchet distance between scenes described by WaffleIron-S, FGEO the one between scenes
-described by geometric features: the point features of each scene, averaged over its points, give
-one vector of 128 or 64 numbers, and the distance is that of two Gaussians fitted to the vectors of
-both sets. Neither needs a file from elsewhere, and neither has published numbers. How a scene
-becomes a vector stands in :mod:`r3dpa.metrics.scene_features`, the formula in
-:func:`r3dpa.metrics.functional.frechet_distance`.
+FWID and FGEO are Fréchet distances between two sets of scenes in a feature space. A scene is the
+mean of its point features, 128 numbers of WaffleIron-S (FWID) or 64 geometric ones (FGEO), and a
+Gaussian is fitted to the vectors of each set. Neither needs weights from elsewhere, and neither has
+published numbers. :mod:`r3dpa.metrics.scene_features` turns scenes into vectors,
+:func:`r3dpa.metrics.functional.frechet_distance` has the formula.
 """
 
 from r3dpa.metrics.distances import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +12,14 @@ from typing import Any, NamedTuple
 import torch
 
 from r3dpa.io import source_commit
-from r3dpa.metrics.distances import RANGE_BIN_M, MinimumMatchingDistance
-from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
+from r3dpa.metrics.collection import (
+    batches_with_features,
+    metrics_by_name,
+    scene_metrics,
+    update_with,
+)
+from r3dpa.metrics.distances import RANGE_BIN_M
+from r3dpa.metrics.floors import add_floor, measure_floors, verdict, warn_of_other_sensor
 from r3dpa.metrics.functional_bev import Matching
 from r3dpa.metrics.official_statistics import OfficialSplit, OfficialStatistics
 from r3dpa.metrics.reference import ReferenceStatistics
@@ -25,16 +31,21 @@ from r3dpa.metrics.scene_features import FREE_SPACES, SceneFeatures, feature_spa
 AnyReference = ReferenceStatistics | OfficialStatistics
 
 _GROUPS = 16  # of histograms, which their intervals leave out in turn
-_UNBIASED = (" inf", " KID")  # distances whose mean does not depend on how many scenes there are
-_SHOWN_MATCHES = 3
-_SHARES = ("precision", "recall")
-_NEAR, _POOR = 1.5, 0.5  # times the floor; times the share that real scans reach
-_ALIKE = 0.6  # ratio of the numbers of returns below which scenes are of another sensor
-_ROWS = {"JSD": "cells", "TV": "cells", "W1 range": "ranges"}
-_ROWS |= {"MMD": "matching", "CD 3D": "matching"}
-_ROWS |= dict.fromkeys(("JSD points", "MMD kernel", "MMD 0.5 m"), "baselines")
-_KINDS = {"": "frechet", "inf": "inf", "KID": "kid"}  # of a feature space; others are shares
+_SHOWN_MATCHES = 3  # best and worst, in the figure
 _SKIP_BAD = ". --skip_bad leaves such scenes out, and lists them (`r3dpa test`: --scorer.skip_bad)"
+#: Metric of the collection that gives a row without a feature space.
+_METRIC_OF_ROW = {
+    "JSD": "cells",
+    "TV": "cells",
+    "W1 range": "ranges",
+    "MMD": "matching",
+    "CD 3D": "matching",
+    "JSD points": "baselines",
+    "MMD kernel": "baselines",
+    "MMD 0.5 m": "baselines",
+}
+#: The same for the second word of a row of a feature space; all others are shares.
+_METRIC_OF_WORD = {"": "frechet", "inf": "inf", "KID": "kid"}
 
 
 class TooFewScenesError(ValueError):
@@ -46,6 +57,17 @@ class Comparison(NamedTuple):
 
     evaluation: Evaluation
     figures: dict[str, Any] | None  # for r3dpa.viz.evaluation.save_figures; None without real scans
+
+
+class Measured(NamedTuple):
+    """Metrics filled with generated and real scenes, and their rows."""
+
+    metrics: dict[str, Any]  # of scene_metrics, by name
+    rows: list[MetricResult]
+    matching: Matching | None  # None without a real side
+    names: list[str]  # of the scenes that were used
+    bad: list[str]  # name and fault of each scene that was left out
+    has_more: bool  # whether there are more scenes than the protocol counts
 
 
 def evaluate(
@@ -63,16 +85,16 @@ def evaluate(
 ) -> Comparison:
     """Compare generated scenes with real ones under the protocol of the reference.
 
-    The floor of a distance is that between the halves of the reference, with as many scenes as are
-    evaluated, or as many as a half keeps; for precision and its relatives the note of the row has
-    what the halves reach. Official statistics give no floors, and do not name their weights: those
-    of ``spaces`` must be the same.
+    The floor of a distance is the distance between the halves of the reference, with as many scenes
+    as are evaluated, or as many as a half keeps; for precision and its relatives the note of the
+    row has what the halves reach. Official statistics give no floors, and do not name their
+    weights: ``spaces`` must use the same ones.
 
     Args:
         scenes: Read once; the first ``num_samples`` of the protocol count.
         reference: Complete statistics of the real scans.
         spaces: Feature spaces, each one of the reference.
-        label: Of the generator or run.
+        label: Name of the generator or run.
         source: Origin of the scenes.
         made_with: Provenance for JSON: ``solver``, ``steps``, ``seed`` and anything else.
         allow_few: Accept fewer scenes than features.
@@ -81,71 +103,75 @@ def evaluate(
         resampling: Seed, and cost of the intervals.
     """
     resampling = resampling or Resampling()
+    measured = measure(scenes, reference, spaces, resampling, allow_few, skip_bad, baseline_metrics)
+    floors: dict[str, MetricResult] = {}
+    if isinstance(reference, ReferenceStatistics):
+        floors = measure_floors(
+            reference,
+            [space.name for space in spaces],
+            list(measured.metrics),
+            len(measured.names),
+            len(measured.metrics["matching"].subset("generated")[0]),
+            resampling,
+        )
+    provenance = {"source": source, **_provenance(made_with or {})}
+    extra = provenance["extra"] | _remarks(measured, reference, floors, resampling)
+    about = provenance | {
+        "backbones": {space.label: dict(space.card) for space in spaces},
+        "protocol": asdict(reference.protocol),
+        "reference": reference.describe(),
+        "commit": source_commit(),
+        "extra": extra,
+    }
+    rows = tuple(add_floor(row, floors) for row in measured.rows)
+    figures = None
+    if isinstance(reference, ReferenceStatistics) and measured.matching:
+        figures = _figure_data(measured, measured.matching, reference)
+    return Comparison(Evaluation(label, rows, about), figures)
+
+
+def measure(
+    scenes: Iterable[EvaluationScene],
+    reference: AnyReference,
+    spaces: Sequence[SceneFeatures],
+    resampling: Resampling,
+    allow_few: bool = False,
+    skip_bad: bool = False,
+    baseline_metrics: bool = False,
+) -> Measured:
+    """Compute all metrics of scenes against a reference; arguments as of :func:`evaluate`."""
     reference.check(spaces)
     protocol = reference.protocol
-    metrics = scene_metrics(
+    collection = scene_metrics(
         protocol,
         {space.name: space.dim for space in spaces},
         num_groups=_GROUPS,
         max_images=(None, protocol.num_mmd_samples),
     )
-    bad: list[str] | None = [] if skip_bad else None
+    bad: list[str] = []
     stream, names = iter(scenes), []
-    counted = islice(usable_scenes(stream, protocol, bad, _SKIP_BAD), protocol.num_samples)
-    for batch, features in with_features(counted, spaces):
-        update_with(metrics, batch, features, real=False)
+    usable = usable_scenes(stream, protocol, bad if skip_bad else None, _SKIP_BAD)
+    for batch, features in batches_with_features(islice(usable, protocol.num_samples), spaces):
+        update_with(collection, batch, features, real=False)
         names += [scene.name for scene in batch]
-    more = next(stream, None) is not None
-    check_counts(len(names), reference, spaces, allow_few, bad or ())
+    has_more = next(stream, None) is not None
+    check_counts(len(names), reference, spaces, allow_few, bad)
 
-    reference.fill(metrics, spaces)
-    by_name = metrics_of(metrics)
+    reference.fill(collection, spaces)
+    metrics = metrics_by_name(collection)
     if not baseline_metrics:
-        by_name.pop("baselines")
-    match = by_name["matching"]
-    known = match.matching() if match.has_reference else None
+        del metrics["baselines"]
+    matching = None
     rows: list[MetricResult] = []
-    for metric in by_name.values():
-        if metric is match and known:
-            rows += match.results(resampling, known)
-        elif metric.has_reference:
+    for name, metric in metrics.items():
+        if not metric.has_reference:
+            continue
+        if name == "matching":
+            matching = metric.matching()
+            rows += metric.results(resampling, matching)
+        else:
             rows += metric.results(resampling)
-
-    extra = dict(made_with or {})
-    keys = ("solver", "steps", "seed", "precision", "feature_source")
-    about = {key: extra.pop(key, None) for key in keys}
-    if more:
-        extra["scenes"] = f"only the first {len(names)} were used, as many as the protocol counts"
-    elif len(names) < protocol.num_samples:
-        extra["scenes"] = f"{len(names)}, where the protocol asks for {protocol.num_samples}"
-    floors: dict[str, MetricResult] = {}
-    if isinstance(reference, ReferenceStatistics):
-        num_images = len(match.kept("generated")[0])
-        key = tuple(by_name), len(names), num_images, resampling
-        if key not in reference.floors:
-            reference.floors[key] = _floors(reference, spaces, *key)
-        floors = reference.floors[key]
-        extra["verdict"] = _verdict(rows, floors)
-    else:
-        extra["left_out"] = reference.left_out
-    extra["resampling"] = dict(vars(resampling))
-    if warning := _other_sensor(match):
-        extra["warning"] = warning
-    if bad:
-        extra["bad_samples"] = bad
-    about |= {
-        "backbones": {space.label: dict(space.card) for space in spaces},
-        "protocol": asdict(protocol),
-        "reference": reference.describe(),
-        "commit": source_commit(),
-        "source": source,
-        "extra": extra,
-    }
-    evaluation = Evaluation(label, tuple(_with_floor(row, floors) for row in rows), about)
-    figures = None
-    if isinstance(reference, ReferenceStatistics) and known:
-        figures = _figures(by_name, reference, known, names)
-    return Comparison(evaluation, figures)
+    return Measured(metrics, rows, matching, names, bad, has_more)
 
 
 def scene_distance(
@@ -156,35 +182,42 @@ def scene_distance(
     ckpt: str | Path | None = None,
     device: str = "cpu",
 ) -> float:
-    """One metric between two sets of scenes, without a reference file, intervals and floors.
+    """Compute one metric between two sets of scenes, without a reference file.
 
     Args:
-        name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; those of the
-            baselines, ``JSD points``, ``MMD kernel`` and ``MMD 0.5 m``; a feature space, such as
-            ``FWID``, for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
+        name: As in the tables: ``JSD``, ``TV``, ``MMD``, ``CD 3D``, ``W1 range``; ``JSD points``,
+            ``MMD kernel`` and ``MMD 0.5 m`` of the baselines; a feature space, such as ``FWID``,
+            for its Fréchet distance, or ``FWID KID``, ``FWID precision``, ...
         real: Scenes as ``(name, points)``, or what :func:`r3dpa.data.samples.read_samples` gives.
         generated: The same.
         protocol: Preparation of the scenes.
         ckpt: Official weights of the feature space.
-        device: Of its network.
+        device: Device of its network.
+
+    Raises:
+        ValueError: If the metric is unknown, or needs more scenes.
 
     Example:
         >>> cloud = torch.tensor([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
-        >>> scene_distance("JSD", [("real", cloud)], [("made", cloud), ("again", cloud)])
+        >>> scene_distance("JSD", [("real", cloud)], [("a", cloud), ("b", cloud)])
         0.0
     """
-    space, _, kind = name.partition(" ")
-    spaces = [] if name in _ROWS else [scene_features(space.lower(), ckpt, protocol, device)]
+    space, _, word = name.partition(" ")
+    if name in _METRIC_OF_ROW:
+        spaces, metric_name = [], _METRIC_OF_ROW[name]
+    else:
+        spaces = [scene_features(space.lower(), ckpt, protocol, device)]
+        metric_name = f"{space.lower()}_{_METRIC_OF_WORD.get(word, 'shares')}"
     limits = (protocol.num_mmd_references, protocol.num_mmd_samples)
-    metrics = scene_metrics(protocol, {s.name: s.dim for s in spaces}, max_images=limits)
+    collection = scene_metrics(protocol, {s.name: s.dim for s in spaces}, max_images=limits)
     for scenes, is_real in ((real, True), (generated, False)):
         usable = usable_scenes((EvaluationScene(*scene) for scene in scenes), protocol)
-        for batch, features in with_features(usable, spaces):
-            update_with(metrics, batch, features, is_real)
-    metric = metrics_of(metrics)[_ROWS.get(name) or f"{space.lower()}_{_KINDS.get(kind, 'shares')}"]
+        for batch, features in batches_with_features(usable, spaces):
+            update_with(collection, batch, features, is_real)
+    metric = metrics_by_name(collection)[metric_name]
     rows = {row.name: row for row in metric.results(Resampling(num_resamples=0))}
     if name not in rows:
-        raise ValueError(f"there is no metric {name!r}; of {space} there are {', '.join(rows)}")
+        raise ValueError(f"unknown metric {name!r}; choose from {space}, {', '.join(rows)}")
     value = rows[name].value
     if value is None:
         raise ValueError(f"{name}: {rows[name].note}")
@@ -198,12 +231,16 @@ def check_counts(
     allow_few: bool,
     bad: Sequence[str] = (),
 ) -> None:
-    """A ``TooFewScenesError`` below two scenes, a ``ValueError`` below the number of features."""
+    """Refuse a comparison of too few scenes.
+
+    Raises:
+        TooFewScenesError: Below two scenes.
+        ValueError: Without ``allow_few``, if scenes or scans are not more than the features.
+    """
     if num_scenes < 2:
-        left_out = f" {len(bad)} cannot be used, the first is {bad[0]}" if bad else ""
-        raise TooFewScenesError(
-            f"{num_scenes} generated scenes; a comparison needs at least 2.{left_out}"
-        )
+        given = "1 generated scene" if num_scenes == 1 else "no generated scenes"
+        left_out = f"; {len(bad)} cannot be used, the first is {bad[0]}" if bad else ""
+        raise TooFewScenesError(f"{given}, a comparison needs at least 2{left_out}")
     counts = {"generated scenes": num_scenes, "real scans": len(reference.names) or math.inf}
     few = [
         f"{count} {what} for the {space.dim} features of {space.label}"
@@ -213,14 +250,14 @@ def check_counts(
     ]
     if few and not allow_few:
         raise ValueError(
-            f"{'; '.join(few)}: the covariance would be singular, and the distance tell mostly how "
-            "few there are. Give more, choose a smaller space, or allow it with --allow_few "
+            f"{'; '.join(few)}: the covariance would be singular, and the distance dominated by "
+            "sample size; give more, choose a smaller space, or allow it with --allow_few "
             "(`r3dpa test`: --scorer.allow_few true)"
         )
 
 
 def load_reference(path: Path, split: OfficialSplit | None = None) -> AnyReference:
-    """Complete reference, official if it is ``.npy``; ``split`` is of the official file alone."""
+    """Load a complete reference, official if it is ``.npy``; only that one has a ``split``."""
     if path.suffix == ".npy":
         return OfficialStatistics.load(path, split)
     if split is not None:
@@ -237,12 +274,20 @@ def reference_spaces(
     device: str,
     protocol: str | None = None,
 ) -> list[SceneFeatures]:
-    """Feature spaces of a comparison; default: those of the reference that have what they need."""
+    """Return the feature spaces of a comparison.
+
+    Args:
+        statistics: The reference.
+        names: Spaces; default: those of the reference that need no weights, or have them.
+        ckpt: Official weights by space.
+        device: Device of the networks.
+        protocol: Expected protocol of the reference; None for any.
+    """
     given = statistics.protocol.name
     if protocol not in (None, given):
         raise ValueError(
             f"the reference is of the protocol {given}, not {protocol}: compute another one "
-            f"with `r3dpa data reference --protocol {protocol}`, or ask for no protocol"
+            f"with `r3dpa data reference --protocol {protocol}`, or name no protocol"
         )
     if names is None:
         names = [name for name in statistics.spaces if name in (*FREE_SPACES, *(ckpt or {}))]
@@ -251,126 +296,69 @@ def reference_spaces(
     return spaces
 
 
-def _floors(
-    reference: ReferenceStatistics,
-    spaces: Sequence[SceneFeatures],
-    metric_names: Sequence[str],
-    num_samples: int,
-    num_images: int,
+def _provenance(made_with: Mapping[str, Any]) -> dict[str, Any]:
+    """Provenance in the keys of an evaluation; all others are ``extra``."""
+    extra = dict(made_with)
+    keys = ("solver", "steps", "seed", "precision", "feature_source")
+    return {key: extra.pop(key, None) for key in keys} | {"extra": extra}
+
+
+def _remarks(
+    measured: Measured,
+    reference: AnyReference,
+    floors: Mapping[str, MetricResult],
     resampling: Resampling,
-) -> dict[str, MetricResult]:
-    """Rows of the first half of the reference as if it were generated, against the second."""
-    if min(len(reference.names_of_half(index)) for index in (0, 1)) < 2:
-        return {}
-    names = [space.name for space in spaces]
-    metrics = reference.metrics(names, max_images=(None, num_images))
-    held, other, own = map(metrics_of, (*reference.halves, metrics))
-    for name, metric in own.items():
-        metric.adopt_real(other[name])
-    places, images = held["matching"].kept("real")
-    of_first = reference.names_of_half(0)
-    own["matching"].update(images, real=False, names=[of_first[place] for place in places])
-    if num_samples <= len(images):
-        chosen = images[held["matching"].lowest("real", num_samples)]
-        own["cells"].update(own["matching"].clouds(chosen), real=False)
-        own["ranges"].update(chosen, real=False)
-    else:  # only sums are left of the others
-        for name in ("cells", "ranges"):
-            own[name].generated_bins[0] = held[name].real_bins
-            own[name].generated_count = held[name].real_count.clone()
-    for name in names:
-        rows = held[f"{name}_frechet"].rows("real")
-        chosen = torch.randperm(len(rows), generator=resampling.generator())[:num_samples]
-        own[f"{name}_frechet"].update(rows[chosen], real=False)
-    without = replace(resampling, num_resamples=0)
-    filled = metrics_of(metrics)
-    found = [row for name in metric_names for row in filled[name].results(without)]
-    return {row.name: row for row in found}
-
-
-def _verdict(rows: Sequence[MetricResult], floors: Mapping[str, MetricResult]) -> str:
-    """Distances near their floor, and whether the scenes are realistic, in one line."""
-    near, far, poor = [], [], []
-    for row in rows:
-        floor = floors.get(row.name)
-        if floor is None or floor.value is None or row.value is None:
-            continue
-        if row.direction == "lower":
-            if row.value <= _NEAR * max(floor.value, 0.0) + row.half_width:
-                near.append(row.name)
-            elif floor.value > 0:
-                far.append((row.value / floor.value, row.name))
-        elif row.name.endswith(_SHARES) and row.value < _POOR * floor.value:
-            poor.append(f"{row.name} {row.value:.2g} (real scans {floor.value:.2g})")
-    worst = ", ".join(f"{name} ({ratio:.3g} x)" for ratio, name in sorted(far, reverse=True)[:3])
-    parts = [f"near the floor in {', '.join(near)}"] if near else []
-    parts += [f"above it in {len(far)} distances, most in {worst}"] if far else []
-    if not parts:
-        return "no floors to compare with"
-    if poor:
-        return f"not realistic: {', '.join(poor)}" + (f", though {parts[0]}" if near else "")
-    return "; ".join(parts)
-
-
-def _other_sensor(match: MinimumMatchingDistance) -> str:
-    """A warning if scenes and real scans differ in their number of returns by much."""
-    if not match.count("real"):
-        return ""
-    images = (match.kept(side)[1] for side in ("generated", "real"))
-    made, real = (int((range_m > 0).sum(dim=(1, 2)).median()) for range_m in images)
-    if _ALIKE <= made / max(real, 1) <= 1 / _ALIKE:
-        return ""
-    return (
-        f"{made:,} returns in a scene (median), but {real:,} in a real scan: scenes of another "
-        "sensor need a reference for it, `r3dpa data reference --data` with a YAML of that sensor"
-    )
-
-
-def _with_floor(row: MetricResult, floors: Mapping[str, MetricResult]) -> MetricResult:
-    floor = floors.get(row.name)
-    if floor is None or floor.value is None or row.value is None:
-        return row
-    counts = f"{floor.num_samples} and {floor.num_references} scans"
-    if row.direction == "higher":
-        text = f"real scans reach {floor.value:.3g} ({counts})"
-        return replace(row, note="; ".join(filter(None, [row.note, text])))
-    text = f"floor of {counts}"
-    if not row.name.endswith(_UNBIASED) and floor.num_samples != row.num_samples:
-        fewer = (floor.num_samples or 0) < (row.num_samples or 0)
-        text += f", rather {'high' if fewer else 'low'}: the value is of {row.num_samples} scenes"
-    return replace(row, floor=max(floor.value, 0.0), note="; ".join(filter(None, [row.note, text])))
-
-
-def _figures(
-    metrics: Mapping[str, Any],
-    reference: ReferenceStatistics,
-    matching: Matching,
-    names: Sequence[str],
 ) -> dict[str, Any]:
-    """Data of the figures; ``matching`` is of the real scans that are kept."""
-    grid, ranges, match = reference.protocol.grid, metrics["ranges"], metrics["matching"]
-    halves = [metrics_of(half) for half in reference.halves]
-    cells = [metrics["cells"].generated_bins.sum(dim=0), metrics["cells"].real_bins]
-    (places, samples), (_, scans) = match.kept("generated"), match.kept("real")
-    of_scans = [
+    """Collect what qualifies the numbers: counts, verdict, warning, rows and scenes left out."""
+    remarks: dict[str, Any] = {}
+    num_scenes, wanted = len(measured.names), reference.protocol.num_samples
+    if measured.has_more:
+        remarks["scenes"] = f"only the first {num_scenes} were used, as many as the protocol counts"
+    elif num_scenes < wanted:
+        remarks["scenes"] = f"{num_scenes}, where the protocol asks for {wanted}"
+    if isinstance(reference, ReferenceStatistics):
+        remarks["verdict"] = verdict(measured.rows, floors, num_scenes)
+    else:
+        remarks["left_out"] = reference.left_out
+    remarks["resampling"] = asdict(resampling)
+    if warning := warn_of_other_sensor(measured.metrics["matching"]):
+        remarks["warning"] = warning
+    if measured.bad:
+        remarks["bad_samples"] = measured.bad
+    return remarks
+
+
+def _figure_data(
+    measured: Measured, matching: Matching, reference: ReferenceStatistics
+) -> dict[str, Any]:
+    """Data of the figures; ``matching`` is of the real scans whose images are in the states."""
+    cells, ranges = measured.metrics["cells"], measured.metrics["ranges"]
+    places, samples = measured.metrics["matching"].subset("generated")
+    _, scans = measured.metrics["matching"].subset("real")
+    halves = [metrics_by_name(half) for half in reference.halves]
+    scan_names = [
         reference.names_of_half(index)[place]
         for index, half in enumerate(halves)
-        for place in half["matching"].kept("real")[0]
+        for place in half["matching"].subset("real")[0]
     ]
-    pairs = []
+    matches = []
     for index in matching.squared_normalised.argsort().tolist():
         nearest = int(matching.nearest[index])
-        pair = f"{names[places[nearest]]} and {of_scans[index]}"
+        pair = f"{measured.names[places[nearest]]} and {scan_names[index]}"
         title = f"{pair}: {matching.squared_normalised[index]:.3g}"
-        pairs.append((title, samples[nearest].numpy(), scans[index].numpy()))
-    counted = [half["ranges"] for half in halves if half["ranges"].count("real")]
+        matches.append((title, samples[nearest].numpy(), scans[index].numpy()))
+    grid, num_bins = reference.protocol.grid, len(ranges.real_bins)
+    halves_with_scans = [half["ranges"] for half in halves if half["ranges"].count("real")]
     return {
-        "cells": tuple(part.view(grid.side, grid.side).numpy() for part in cells),
+        "cells": (
+            cells.generated_bins.sum(dim=0).view(grid.side, grid.side).numpy(),
+            cells.real_bins.view(grid.side, grid.side).numpy(),
+        ),
         "half_m": grid.half_m,
-        "edges_m": (torch.arange(len(ranges.real_bins) + 1).double() * RANGE_BIN_M).numpy(),
+        "edges_m": (torch.arange(num_bins + 1).double() * RANGE_BIN_M).numpy(),
         "ranges": (ranges.generated_bins.sum(dim=0).numpy(), ranges.real_bins.numpy()),
-        "halves": torch.stack([half.real_bins for half in counted]).numpy(),
-        "best": pairs[:_SHOWN_MATCHES],
-        "worst": pairs[::-1][:_SHOWN_MATCHES],
+        "halves": torch.stack([half.real_bins for half in halves_with_scans]).numpy(),
+        "best": matches[:_SHOWN_MATCHES],
+        "worst": matches[::-1][:_SHOWN_MATCHES],
         "sensor": reference.protocol.sensor,
     }

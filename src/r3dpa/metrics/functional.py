@@ -1,7 +1,7 @@
 """Distances between two sets of feature vectors or two histograms: pure functions in float64.
 
-Every function refuses what it cannot judge (NaN, too few samples) with a ``ValueError``; nothing
-is left out in silence. Letters: N samples, F feature width.
+Every function raises ValueError for input that it cannot judge (NaN, too few samples); nothing is
+left out in silence. Letters: N samples, F feature width.
 """
 
 from __future__ import annotations
@@ -23,9 +23,15 @@ _BLOCK = 1024  # rows of a distance matrix held at once
 
 
 def checked_features(features: Tensor, name: str = "features", at_least: int = 1) -> Tensor:
-    """Features ``(N, F)`` as float64; a ``ValueError`` if one is not finite or N is too small."""
+    """Return features ``(N, F)`` as float64.
+
+    Raises:
+        ValueError: If one is not finite, or N is too small.
+    """
     if features.ndim != 2:
-        raise ValueError(f"{name}: expected (N, F), got {tuple(features.shape)}; one row a sample")
+        raise ValueError(
+            f"{name}: expected (N, F), one row per sample, got {tuple(features.shape)}"
+        )
     if len(features) < at_least:
         raise ValueError(f"{name}: {len(features)} samples, at least {at_least} are needed")
     features = features.double()
@@ -40,7 +46,11 @@ def checked_features(features: Tensor, name: str = "features", at_least: int = 1
 
 
 def checked_pair(real: Tensor, generated: Tensor, at_least: int = 1) -> tuple[Tensor, Tensor]:
-    """Both sets as :func:`checked_features`; a ``ValueError`` if their widths differ, too."""
+    """Return both sets as :func:`checked_features`.
+
+    Raises:
+        ValueError: Also if their widths differ.
+    """
     real = checked_features(real, "real features", at_least)
     generated = checked_features(generated, "generated features", at_least)
     if real.shape[1] != generated.shape[1]:
@@ -69,14 +79,14 @@ class Moments:
 
     @classmethod
     def of(cls, features: Tensor, name: str = "features") -> Self:
-        """Moments of ``(N, F)`` features; a ``ValueError`` names NaN rows."""
+        """Compute the moments of ``(N, F)`` features; raises as :func:`checked_features`."""
         features = checked_features(features, name)
         mean = features.mean(dim=0)
         centred = features - mean
         return cls(features.new_full((), len(features)), mean, centred.T @ centred)
 
     def merge(self, other: Self) -> Self:
-        """Moments of both sets together; either may be empty."""
+        """Return the moments of both sets together; either may be empty."""
         if self.mean.shape != other.mean.shape:
             raise ValueError(
                 f"moments of {len(self.mean)} and of {len(other.mean)} features do not merge"
@@ -88,24 +98,28 @@ class Moments:
         return type(self)(count, self.mean + step * share, self.scatter + other.scatter + between)
 
     def covariance(self, name: str = "features") -> Tensor:
-        """Covariance ``(F, F)`` with N - 1; a ``ValueError`` for fewer than two samples."""
+        """Return the covariance ``(F, F)`` with N - 1.
+
+        Raises:
+            ValueError: For fewer than two samples.
+        """
         if self.count < 2:
             raise ValueError(f"{name}: {int(self.count)} samples, a covariance needs at least 2")
         return self.scatter / (self.count - 1)
 
     def pack(self) -> Tensor:
-        """All numbers in one vector ``(1 + F + F * F,)``, for states and exchange."""
+        """Return all numbers in one vector ``(1 + F + F * F,)``, for states and exchange."""
         return torch.cat([self.count.reshape(1), self.mean, self.scatter.flatten()])
 
     @classmethod
     def unpack(cls, packed: Tensor) -> Self:
-        """Moments from :meth:`pack`."""
+        """Inverse of :meth:`pack`."""
         width = (math.isqrt(4 * len(packed) - 3) - 1) // 2
         return cls(packed[0], packed[1 : width + 1], packed[width + 1 :].view(width, width))
 
 
 def merge_packed(packed: Tensor) -> Tensor:
-    """One packed vector from ``(K, 1 + F + F * F)`` packed moments, merged in order."""
+    """Merge ``(K, 1 + F + F * F)`` packed moments in order, to one packed vector."""
     return reduce(Moments.merge, map(Moments.unpack, packed)).pack()
 
 
@@ -128,22 +142,22 @@ def frechet_distance(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tenso
 
 
 def frechet_of_draws(mean: Tensor, covariance: Tensor, rows: Tensor) -> Callable[[Tensor], float]:
-    """Fréchet distance of a normal distribution to drawn rows of ``(N, F)`` features, by indices.
+    """Return a function of indices: the Fréchet distance of a normal distribution to those rows.
 
-    As :func:`frechet_distance`, but the root of the covariance is taken once, and the other one
-    never: the rows themselves, centred, have the same singular values. For 4096 features that
-    saves minutes per draw.
+    As :func:`frechet_distance`, but the root of the covariance is taken once, and the root of the
+    covariance of the rows ``(N, F)`` never: the rows themselves, centred, have the same singular
+    values. For 4096 features that saves minutes per draw.
     """
     mean, rows = mean.double(), rows.double()
-    rotated, own = rows @ _root(covariance.double()), covariance.double().trace()
+    rotated, variance = rows @ _root(covariance.double()), covariance.double().trace()
 
     def distance(drawn: Tensor) -> float:
         x, y = rows[drawn], rotated[drawn]
         centre, degrees = x.mean(dim=0), len(drawn) - 1
         common = torch.linalg.svdvals(y - y.mean(dim=0)).sum() / math.sqrt(degrees)
         spread = (x - centre).square().sum() / degrees
-        found = (mean - centre).square().sum() + own + spread - 2 * common
-        return max(found.item(), 0.0)
+        squared = (mean - centre).square().sum() + variance + spread - 2 * common
+        return max(squared.item(), 0.0)
 
     return distance
 
@@ -157,7 +171,7 @@ def _root(covariance: Tensor) -> Tensor:
 
 
 def frechet_distance_of(real: Tensor, generated: Tensor) -> float:
-    """Fréchet distance of two sets of features ``(N, F)``, by their means and covariances."""
+    """Return the Fréchet distance of two sets of features ``(N, F)`` by means and covariances."""
     a, b = Moments.of(real, "real features"), Moments.of(generated, "generated features")
     return frechet_distance(
         a.mean, a.covariance("real features"), b.mean, b.covariance("generated features")
@@ -185,14 +199,14 @@ def fd_infinity(real: Tensor, generated: Tensor, generator: torch.Generator) -> 
         )
     inverse = torch.linspace(1 / smallest, 1 / largest, _NUM_SIZES, dtype=torch.float64)
     sizes = [round(1 / value) for value in inverse.tolist()]
-    distances = [
-        frechet_distance_of(
-            *(x[torch.randperm(len(x), generator=generator)[:size]] for x in (real, generated))
-        )
-        for size in sizes
-    ]
+    distances = []
+    for size in sizes:
+        real_rows = real[torch.randperm(len(real), generator=generator)[:size]]
+        rows = generated[torch.randperm(len(generated), generator=generator)[:size]]
+        distances.append(frechet_distance_of(real_rows, rows))
     line = linregress([1 / size for size in sizes], distances)
-    return float(line.intercept), float(np.nan_to_num(line.intercept_stderr))  # NaN for equal ones
+    error = float(np.nan_to_num(line.intercept_stderr))  # NaN for equal distances
+    return float(line.intercept), error
 
 
 def squared_mmd(real: Tensor, generated: Tensor) -> Tensor:
@@ -224,10 +238,10 @@ def squared_mmd_error(real: Tensor, generated: Tensor) -> float:
         itself = (rows.square().sum(dim=1) / y.shape[1] + 1) ** 3
         pairs.append(_cubic_kernel(rows, y).sum(dim=1) - itself)
         across.append(_cubic_kernel(rows, x).mean(dim=1))
-    of_pairs, of_real, num = torch.cat(pairs), torch.cat(across), len(y)
-    within = (of_pairs.sum() - 2 * of_pairs) / ((num - 1) * (num - 2))
-    without = within - 2 * (of_real.sum() - of_real) / (num - 1)
-    return without.std().item() * (num - 1) / math.sqrt(num)
+    to_generated, to_real, num = torch.cat(pairs), torch.cat(across), len(y)
+    within = (to_generated.sum() - 2 * to_generated) / ((num - 1) * (num - 2))
+    without_sample = within - 2 * (to_real.sum() - to_real) / (num - 1)
+    return without_sample.std().item() * (num - 1) / math.sqrt(num)
 
 
 def _cubic_kernel(x: Tensor, y: Tensor) -> Tensor:
@@ -263,7 +277,7 @@ def polynomial_mmd(
 
 
 def shared_balls(real: Tensor, generated: Tensor, num_neighbors: int = 5) -> dict[str, Tensor]:
-    """Samples in the balls of the other set; a ball reaches to the k-th neighbour in its own set.
+    """Find samples in balls of the other set; a ball reaches to the k-th neighbour in its set.
 
     A sample on the edge of a ball is outside.
 

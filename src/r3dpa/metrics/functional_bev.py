@@ -29,7 +29,7 @@ _TABLES = 32  # of lower bounds held at once
 
 @dataclass(frozen=True)
 class BEVGrid:
-    """Square grid around the sensor seen from above; by default that of the published JSD and MMD.
+    """Square grid around the sensor seen from above; default: the grid of published JSD and MMD.
 
     Args:
         half_m: Limit of x and y to both sides in metres; points on or beyond it are outside.
@@ -44,31 +44,35 @@ class BEVGrid:
         """Cells along x, and along y."""
         return math.ceil(2 * self.half_m / self.cell_m)
 
-    def kept(self, points: Tensor, name: str = "cloud") -> Tensor:
-        """Those of the points ``(P, 3 or more)`` that lie on the grid, at least one."""
-        found = _checked_points(points, name)
-        found = found[(found[:, :2].abs() < self.half_m).all(dim=1)]
-        if len(found) == 0:
+    def points_inside(self, points: Tensor, name: str = "cloud") -> Tensor:
+        """Return the points ``(P, 3 or more)`` that lie on the grid.
+
+        Raises:
+            ValueError: If there are none, or a coordinate is not finite; names the cloud.
+        """
+        inside = _checked_points(points, name)
+        inside = inside[(inside[:, :2].abs() < self.half_m).all(dim=1)]
+        if len(inside) == 0:
             raise ValueError(
                 f"{name}: none of {len(points)} points has x and y within {self.half_m:g} m; "
                 "check the unit and the frame, or leave the cloud out and say so"
             )
-        return found
+        return inside
 
     def cells(self, points: Tensor, name: str = "cloud") -> Tensor:
-        """Cells ``(n,)`` int64 that hold a point, ``x index * side + y index``, ascending.
+        """Return cells ``(n,)`` int64 that hold a point, ``x index * side + y index``, ascending.
 
         Index 0 is at the lower limit. The division has the precision of the points, as in the
-        official code, which decides on points between two cells. Errors are those of :meth:`kept`.
+        official code, which decides on points between two cells. Raises as :meth:`points_inside`.
         """
-        inside = self.kept(points, name)[:, :2]
+        inside = self.points_inside(points, name)[:, :2]
         # A tensor, not a number: division by a number may become a product with its inverse.
         indices = torch.floor(inside / inside.new_full((), self.cell_m)).long()
         indices = (indices - math.ceil(-self.half_m / self.cell_m)).clamp(0, self.side - 1)
         return (indices[:, 0] * self.side + indices[:, 1]).unique()
 
     def histogram(self, clouds: Iterable[Tensor]) -> Tensor:
-        """Number of clouds that occupy each cell: ``(side, side)`` int64."""
+        """Count the clouds that occupy each cell: ``(side, side)`` int64."""
         cells = [self.cells(points, f"cloud {index}") for index, points in enumerate(clouds)]
         return torch.cat(cells).bincount(minlength=self.side**2).view(self.side, self.side)
 
@@ -97,7 +101,11 @@ class HistogramDistance(NamedTuple):
 
 
 def histogram_distance(counts_a: Tensor, counts_b: Tensor) -> HistogramDistance:
-    """All distances of two histograms of counts of one shape; a ``ValueError`` if one is empty."""
+    """Compute all distances of two histograms of counts of one shape.
+
+    Raises:
+        ValueError: If one is empty.
+    """
     for name, counts in (("first", counts_a), ("second", counts_b)):
         if not counts.any():
             raise ValueError(f"{name} histogram is empty; count at least one cloud")
@@ -115,12 +123,12 @@ def point_histogram(
     nearest_m: float = 3.0,
     farthest_m: float = 70.0,
 ) -> Tensor:
-    """Points ``(P, 3 or more)`` in each cell seen from above, ``(num_bins, num_bins)`` float32.
+    """Count points ``(P, 3 or more)`` by cell seen from above: ``(num_bins, num_bins)`` float32.
 
-    Only points strictly between the two distances from the sensor count, and the upper border of
-    the grid, ``half_m`` to both sides, belongs to it.
-    Of LiDARGen (Zyrianov et al. 2022), as R2DM and R2Flow use it: :class:`BEVGrid` counts
-    clouds, not points.
+    Only points strictly between the two distances from the sensor count. The grid reaches to
+    ``half_m`` on both sides, upper border included. Unlike :class:`BEVGrid`, which counts clouds.
+
+    Source: LiDARGen (Zyrianov et al. 2022), as R2DM and R2Flow use it.
     """
     xyz = _checked_points(points, "cloud")[:, :3].float().cpu()
     distance = xyz.norm(dim=1)
@@ -148,12 +156,12 @@ def chamfer_squared(points_a: Tensor, points_b: Tensor) -> float:
     """Chamfer distance of two clouds ``(P, 3 or more)``, square metres: the published "CD".
 
     Mean squared distance to the nearest point of the other cloud, averaged over both directions.
-    An empty cloud or NaN is a ``ValueError``.
+
+    Raises:
+        ValueError: If a cloud is empty or holds NaN.
     """
-    a, b = (
-        _checked_points(points, name)[:, :3].double().cpu().numpy()
-        for points, name in ((points_a, "points_a"), (points_b, "points_b"))
-    )
+    a = _checked_points(points_a, "points_a")[:, :3].double().cpu().numpy()
+    b = _checked_points(points_b, "points_b")[:, :3].double().cpu().numpy()
     there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
     return float((there**2).mean() + (back**2).mean()) / 2
 
@@ -168,7 +176,7 @@ class Matching(NamedTuple):
 def minimum_matching(
     references: Sequence[Tensor], samples: Sequence[Tensor], grid: BEVGrid
 ) -> Matching:
-    """Smallest Chamfer distance from each reference to any sample, on occupied cells.
+    """Find the smallest Chamfer distance from each reference to any sample, on occupied cells.
 
     Clouds are vectors of :meth:`BEVGrid.cells` on one grid. The distance of two is
     ``(mean_x min_y |x - y|^2 + mean_y min_x |x - y|^2) / 2`` over the indices of their cells
@@ -208,7 +216,7 @@ def minimum_matching(
 def _lower_bounds(
     clouds: Sequence[Cells], targets: Sequence[Cells], side: int, pool: ThreadPoolExecutor
 ) -> NDArray[np.float64]:
-    """Lower bounds ``(clouds, targets)`` of the mean squared distance of cells to a target's cells.
+    """Bound the mean squared distance of cells to a target's cells from below, by pair.
 
     Cells of blocks whose centres are d cells apart are at least ``d - sqrt(2) (block - 1)`` apart.
     """

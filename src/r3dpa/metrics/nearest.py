@@ -20,10 +20,10 @@ class Nearest(NamedTuple):
 
 
 def nearest_images(range_m: Tensor, references: Iterable[Tensor]) -> Nearest:
-    """Nearest of many range images, by the means of log2(1 + range) over 16 x 64 cells.
+    """Find the nearest of many range images, by the means of log2(1 + range) over 16 x 64 cells.
 
     The distance is the root mean square difference of the cells: 0 for a copy, 1 for a scene twice
-    as far away throughout. Compare it with that of held-out scans to the same references.
+    as far away throughout. Compare it with the distance of held-out scans to the same references.
 
     Args:
         range_m: ``(N, H, W)`` metres, not above 0 without a return, which counts as range 0.

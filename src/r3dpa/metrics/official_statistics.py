@@ -20,7 +20,8 @@ from torch import Tensor
 from torchmetrics import MetricCollection
 
 from r3dpa.io import UNPICKLING_ERRORS
-from r3dpa.metrics.feature_distances import metrics_of
+from r3dpa.metrics.collection import metrics_by_name
+from r3dpa.metrics.results import PUBLISHED_DATASET
 from r3dpa.metrics.scene import PUBLISHED
 from r3dpa.metrics.scene_features import SceneFeatures
 
@@ -47,63 +48,82 @@ class OfficialStatistics:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Data and split."""
-        return {"data": self.path.name, "split": self.split}
+        """Data, split, and the data set that all official files are of."""
+        return {"data": self.path.name, "split": self.split, "dataset": PUBLISHED_DATASET}
 
     def describe(self) -> str:
-        """File and split, in one line."""
+        """Return file and split, in one line."""
         return f"official statistics {self.path.name}, split {self.split}, scans not listed"
 
     @property
     def spaces(self) -> list[str]:
         """Names of the feature spaces that the file has moments of."""
-        found = [name for name, key in _EVALUATORS.items() if key in self.moments]
-        return ["frid"] * any(key in self.moments for key in _FRID.values()) + found
+        names = [name for name, key in _EVALUATORS.items() if key in self.moments]
+        if any(key in self.moments for key in _FRID.values()):
+            names.insert(0, "frid")
+        return names
 
     @property
     def left_out(self) -> str:
         """Rows that cannot be computed from the file."""
         absent = ["floors", "W1 range", "CD 3D", "FD-infinity, KID, precision and its relatives"]
-        absent += ["JSD", "TV"] * (self.cells is None) + ["MMD"] * (not self.clouds)
+        if self.cells is None:
+            absent += ["JSD", "TV"]
+        if not self.clouds:
+            absent.append("MMD")
         return f"the official file does not hold what these need: {', '.join(absent)}"
 
-    def of_space(self, space: SceneFeatures) -> tuple[Tensor, Tensor]:
-        """Mean and covariance of a space; a ``ValueError`` if it is absent or of another width."""
+    def moments_of(self, space: SceneFeatures) -> tuple[Tensor, Tensor]:
+        """Return mean and covariance of a space.
+
+        Raises:
+            ValueError: If the space is absent or of another width.
+        """
         channels = space.card.get("in_channels", 4)
         key = _FRID.get(channels) if space.name == "frid" else _EVALUATORS.get(space.name)
-        found = self.moments.get(key or "")
-        if found is None:
+        moments = self.moments.get(key or "")
+        if moments is None:
             raise ValueError(
                 f"{self.path}, field {self.split}: has no moments of {space.name} ({key or 'ours'})"
                 f", only of {', '.join(self.moments) or 'none'}; choose among these spaces"
             )
-        if len(found[0]) != space.dim:
+        if len(moments[0]) != space.dim:
             raise ValueError(
-                f"{self.path}, field {self.split}.{key}: has {len(found[0])} features, but "
+                f"{self.path}, field {self.split}.{key}: has {len(moments[0])} features, but "
                 f"{space.name} has {space.dim}; give the weights that it was made with"
             )
-        return found
+        return moments
 
     def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
-        """Refuses spaces that the file lacks."""
+        """Check that the file has moments of these spaces; see :meth:`moments_of`."""
         for space in spaces:
-            self.of_space(space)
+            self.moments_of(space)
 
     def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures]) -> None:
-        """Sets the real side of the metrics that the file has something for."""
-        by_name = metrics_of(metrics)
+        """Set the real side of the metrics that the file has statistics for."""
+        by_name = metrics_by_name(metrics)
         if self.cells is not None:
             by_name["cells"].real_bins = self.cells
-        by_name["matching"].reference_cells = list(self.clouds)
-        by_name["cells"].has_file = self.cells is not None
-        by_name["matching"].has_file = bool(self.clouds)
+            by_name["cells"].has_official_reference = True
+        if self.clouds:
+            by_name["matching"].reference_cells = list(self.clouds)
+            by_name["matching"].has_official_reference = True
         for space in spaces:
             metric = by_name[f"{space.name}_frechet"]
-            metric.reference, metric.has_file = self.of_space(space), True
+            metric.reference = self.moments_of(space)
+            metric.has_official_reference = True
 
     @classmethod
     def load(cls, path: str | Path, split: OfficialSplit | None = None) -> OfficialStatistics:
-        """Reads the file without executing anything in it; ``val`` comes first without a split."""
+        """Read the file without executing anything in it.
+
+        Args:
+            path: The official ``data_statistics.npy``.
+            split: Part of the file; default: ``val`` if it has both.
+
+        Raises:
+            ValueError: Naming the file and the fault.
+        """
         path = Path(path)
         try:
             stream = io.BytesIO(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Statistics of real scans, computed once and kept in one file."""
+"""Statistics of real scans, computed once and stored in one file."""
 
 from __future__ import annotations
 
@@ -20,8 +20,13 @@ from torchmetrics import MetricCollection
 from tqdm import tqdm
 
 from r3dpa.io import UNPICKLING_ERRORS, atomic_path, first_line, only_writer, refuse_name
+from r3dpa.metrics.collection import (
+    batches_with_features,
+    metrics_by_name,
+    scene_metrics,
+    update_with,
+)
 from r3dpa.metrics.distances import SceneMetric
-from r3dpa.metrics.feature_distances import metrics_of, scene_metrics, update_with, with_features
 from r3dpa.metrics.results import MetricResult
 from r3dpa.metrics.scene import EvaluationScene, Protocol, usable_scenes
 from r3dpa.metrics.scene_features import SceneFeatures
@@ -38,12 +43,22 @@ class ReferenceStatistics:
 
     The halves are of different drives if there are several, see :func:`split_halves`.
 
+    Args:
+        protocol: Preparation of the scans.
+        spaces: Cards of the feature spaces, see :func:`cards_of`.
+        names: Names of the scans, ``drive/frame``.
+        about: Origin of the scans: ``data``, ``split``, ``dataset`` (``KITTI-360`` if the published
+            numbers are of these scans) and anything else for JSON.
+
     Attributes:
         halves: Metrics of :func:`scene_metrics` with the real scans of each half. Together they
-            keep features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
-        spaces: Cards of the feature spaces, see :func:`cards_of`.
+            hold features of up to ``num_samples`` scans and images of up to ``num_mmd_references``.
         num_done: Scans added so far.
-        floors: Distances between the halves that were computed, kept by their settings.
+        floors: Cache of the floors by their settings, see
+            :func:`r3dpa.metrics.floors.measure_floors`.
+
+    Raises:
+        ValueError: For fewer than two scans, or a name given twice.
     """
 
     def __init__(
@@ -53,39 +68,43 @@ class ReferenceStatistics:
         names: Sequence[str],
         about: dict[str, Any],
     ) -> None:
-        twice = [name for name, count in Counter(names).items() if count > 1]
-        if twice or len(names) < 2:
-            raise ValueError(
-                f"a reference needs at least 2 scans with names of their own, got {len(names)}"
-                + (f"; given twice: {', '.join(twice[:5])}" if twice else "")
-            )
-        self.protocol, self.spaces, self.about, self.num_done = protocol, spaces, about, 0
+        if len(names) < 2:
+            raise ValueError(f"a reference needs at least 2 scans, got {len(names)}")
+        repeated = [name for name, count in Counter(names).items() if count > 1]
+        if repeated:
+            raise ValueError(f"names of scans given twice: {', '.join(repeated[:5])}")
+        self.protocol, self.spaces, self.about = protocol, spaces, about
+        self.num_done = 0
         self.floors: dict[tuple[Any, ...], dict[str, MetricResult]] = {}
-        self.names, self._half_of = tuple(names), split_halves(names)
-        sizes = [len(self.names_of_half(index)) for index in (0, 1)]
-        rows, images = (
-            _kept_of_halves(limit, sizes)
-            for limit in (protocol.num_samples, protocol.num_mmd_references)
-        )
+        self.names = tuple(names)
+        self._half_of = split_halves(names)
+        max_rows = limits_of_halves(protocol.num_samples, self.sizes_of_halves)
+        max_images = limits_of_halves(protocol.num_mmd_references, self.sizes_of_halves)
         self.halves = tuple(
-            self.metrics(max_rows=rows[i], max_images=(images[i], None)) for i in (0, 1)
+            self.metrics(max_rows=rows, max_images=(images, None))
+            for rows, images in zip(max_rows, max_images, strict=True)
         )
 
     def metrics(self, spaces: Iterable[str] | None = None, **options: Any) -> MetricCollection:
-        """Empty metrics of the protocol and of some or all feature spaces."""
+        """Return empty metrics of the protocol and of some or all feature spaces."""
         chosen = self.spaces if spaces is None else spaces
         widths = {name: self.spaces[name]["dim"] for name in chosen}
         return scene_metrics(self.protocol, widths, **options)
 
     def fill(self, metrics: MetricCollection, spaces: Sequence[SceneFeatures] = ()) -> None:
-        """Sets the real side of metrics to the scans of both halves."""
-        parts = [metrics_of(half) for half in self.halves]
-        for name, metric in metrics_of(metrics).items():
+        """Set the real side of metrics to the scans of both halves."""
+        parts = [metrics_by_name(half) for half in self.halves]
+        for name, metric in metrics_by_name(metrics).items():
             metric.adopt_real(*(part[name] for part in parts))
 
     def names_of_half(self, index: int) -> list[str]:
-        """Names of the scans of a half, in their order."""
+        """Return the names of the scans of a half, in their order."""
         return [name for name in self.names if self._half_of[name] == index]
+
+    @property
+    def sizes_of_halves(self) -> tuple[int, int]:
+        """Number of scans of each half."""
+        return len(self.names_of_half(0)), len(self.names_of_half(1))
 
     @property
     def complete(self) -> bool:
@@ -93,7 +112,11 @@ class ReferenceStatistics:
         return self.num_done == len(self.names)
 
     def check(self, spaces: Sequence[SceneFeatures] = ()) -> None:
-        """Refuses incomplete statistics, and spaces that they lack or that are not the same."""
+        """Check that the statistics are complete and have these spaces.
+
+        Raises:
+            ValueError: If not, or if a space has other weights or another protocol.
+        """
         if not self.complete:
             raise ValueError(
                 f"the reference holds {self.num_done} of {len(self.names)} scans; repeat its "
@@ -105,17 +128,20 @@ class ReferenceStatistics:
                     f"the reference has no features of {space.name}, only of "
                     f"{', '.join(self.spaces) or 'none'}: choose among these, or compute it again"
                 )
-            theirs, own = self.spaces[space.name], cards_of([space])[space.name]
-            differing = [key for key in {**theirs, **own} if theirs.get(key) != own.get(key)]
-            if differing:
-                given = ", ".join(f"{k} {own.get(k)} not {theirs.get(k)}" for k in differing)
+            stored, given = self.spaces[space.name], cards_of([space])[space.name]
+            differences = [
+                f"{key} {given.get(key)} not {stored.get(key)}"
+                for key in stored | given
+                if stored.get(key) != given.get(key)
+            ]
+            if differences:
                 raise ValueError(
-                    f"{space.name} is not that of the reference: {given}. Give the same weights "
-                    "and protocol, or compute the reference again"
+                    f"{space.name} differs from the reference: {', '.join(differences)}; give the "
+                    "same weights and protocol, or compute the reference again"
                 )
 
     def describe(self) -> str:
-        """Split, count and hash of the names, in one line."""
+        """Return data, split, count and hash of the names, in one line."""
         digest = hashlib.sha256("\n".join(self.names).encode()).hexdigest()[:12]
         parts = [str(self.about[key]) for key in ("data", "split") if self.about.get(key)]
         return ", ".join([*parts, f"{len(self.names)} scans", f"names {digest}"])
@@ -130,18 +156,21 @@ class ReferenceStatistics:
 
         Args:
             scenes: The scans ``names[num_done:]``, in that order.
-            spaces: Those that the statistics were prepared for.
+            spaces: All feature spaces of the statistics.
             partial: File to save to every 500 scans.
+
+        Raises:
+            ValueError: If a scan cannot be used or is not the next one.
         """
         saved = self.num_done
-        for batch, features in with_features(usable_scenes(scenes, self.protocol), spaces):
+        for batch, features in batches_with_features(usable_scenes(scenes, self.protocol), spaces):
             expected = self.names[self.num_done : self.num_done + len(batch)]
             if tuple(scene.name for scene in batch) != expected:
                 raise ValueError(f"{batch[0].name}: not the next scan; give all, in order")
             for index, part in enumerate(self.halves):
-                own = [i for i, name in enumerate(expected) if self._half_of[name] == index]
-                of_half = {name: values[own] for name, values in features.items()}
-                update_with(part, [batch[i] for i in own], of_half, real=True)
+                chosen = [i for i, name in enumerate(expected) if self._half_of[name] == index]
+                features_of_half = {name: values[chosen] for name, values in features.items()}
+                update_with(part, [batch[i] for i in chosen], features_of_half, real=True)
             self.num_done += len(batch)
             if partial is not None and self.num_done - saved >= _EVERY:
                 self.save(partial)
@@ -150,18 +179,18 @@ class ReferenceStatistics:
     def _states(self) -> Iterator[tuple[str, SceneMetric, str, Tensor]]:
         """Key in the file, metric, name and value of each state; a feature space has one set."""
         for half, collection in enumerate(self.halves):
-            metrics = metrics_of(collection)
+            metrics = metrics_by_name(collection)
             for name in ("cells", "ranges", "matching", *(f"{s}_frechet" for s in self.spaces)):
                 for state, value in metrics[name].real_states().items():
                     yield f"{half}.{name}.{state}", metrics[name], state, value
 
     def save(self, path: str | Path) -> None:
-        """Writes everything to one ``.safetensors`` file, its card in the metadata."""
+        """Write everything to one ``.safetensors`` file, its card in the metadata."""
         tensors: dict[str, Tensor] = {}
         for key, _, name, value in self._states():
             if name == "real_bins":  # nearly all are empty
-                filled = value.nonzero()[:, 0]
-                value = torch.stack([filled, value[filled].long()])
+                occupied = value.nonzero()[:, 0]
+                value = torch.stack([occupied, value[occupied].long()])
             tensors[key] = value.contiguous()
         card = {
             "version": _VERSION,
@@ -176,7 +205,11 @@ class ReferenceStatistics:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote, complete or not."""
+        """Read what ``save`` wrote, complete or not.
+
+        Raises:
+            ValueError: Naming the file and the fault.
+        """
         try:
             with safe_open(path, framework="pt") as file:
                 card = json.loads(file.metadata()[_ABOUT])
@@ -192,10 +225,10 @@ class ReferenceStatistics:
                 if key not in tensors:
                     raise ValueError(f"tensor {key} is missing")
                 if name == "real_bins":
-                    filled, counts = tensors[key]
-                    value[filled] = counts.to(value)
+                    occupied, counts = tensors[key]
+                    value[occupied] = counts.to(value)
                 else:
-                    metric.load_state(name, tensors[key])
+                    metric.load_real_state(name, tensors[key])
         except (*UNPICKLING_ERRORS, SafetensorError) as error:
             raise ValueError(
                 f"{path} holds no reference statistics ({first_line(error)}): give the "
@@ -211,10 +244,18 @@ def compute_reference(
     out: Path,
     renew: bool = False,
 ) -> ReferenceStatistics:
-    """Computes the statistics of a job's scans into a file; reads or resumes an existing one.
+    """Compute the statistics of scans into a file; read or resume an existing one.
 
-    ``job`` is empty; ``scans_from`` gives its scans from a number on. A ``ValueError`` if another
-    process writes ``out`` or, without ``renew``, which replaces it, if the file is of another job.
+    Args:
+        job: Empty statistics.
+        scans_from: Gives the scans of the job from a number on.
+        spaces: All feature spaces of the job.
+        out: File to write.
+        renew: Replace a file of another job.
+
+    Raises:
+        ValueError: If another process writes ``out`` or, without ``renew``, if the file is damaged
+            or of another job.
     """
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")
     with only_writer(out.with_name(f".{out.name}.lock"), f"computes {out}"):
@@ -227,14 +268,14 @@ def compute_reference(
                 for key in ("protocol", "spaces", "names", "about"):
                     if getattr(stored, key) != getattr(job, key):
                         raise ValueError(
-                            f"{path} is of another job: its {key} differ. Repeat that command to "
+                            f"{path} is of another job: its {key} differ; repeat that command to "
                             "complete it, delete the file to start anew, or give another --out"
                         )
                 statistics = stored
             except ValueError as error:
                 if not renew:
                     raise
-                _log.warning("made anew: %s", error)
+                _log.warning("computed anew: %s", error)
                 path.unlink()
         if not (statistics.complete and out.exists()):
             start, total = statistics.num_done, len(statistics.names)
@@ -247,15 +288,16 @@ def compute_reference(
 
 
 def cards_of(spaces: Iterable[SceneFeatures]) -> dict[str, dict[str, Any]]:
-    """Cards of feature spaces by name, as a reference file stores them."""
-    return {s.name: {**s.card, "dim": s.dim, "label": s.label} for s in spaces}
+    """Return the cards of feature spaces by name, as a reference file stores them."""
+    return {space.name: {**space.card, "dim": space.dim, "label": space.label} for space in spaces}
 
 
 def split_halves(names: Sequence[str]) -> dict[str, int]:
-    """Half, 0 or 1, of each scan: whole drives, which a name has before its last ``/``.
+    """Assign each scan to half 0 or 1, by whole drives: the part of its name before the last ``/``.
 
-    Neighbouring scans of a drive are alike. Drives go to the smaller half, the largest first; a
-    drive with over two thirds of all scans is divided so that both halves have equally many.
+    Neighbouring scans of a drive are alike, so a drive in both halves would make the floors too
+    low. Drives go to the smaller half, the largest first; a drive with over two thirds of all scans
+    is divided so that both halves have equally many.
     """
     drives: dict[str, list[str]] = {}
     for name in sorted(names):
@@ -271,7 +313,7 @@ def split_halves(names: Sequence[str]) -> dict[str, int]:
     return {name: half for half, scans in enumerate(halves) for name in scans}
 
 
-def _kept_of_halves(limit: int, sizes: Sequence[int]) -> tuple[int, int]:
-    """Limits of the halves: half the limit, and the scans that the other half lacks."""
+def limits_of_halves(limit: int, sizes: tuple[int, int]) -> tuple[int, int]:
+    """Divide ``limit`` scans between halves: equally, unless the second half lacks some."""
     first = min(sizes[0], max(-(-limit // 2), limit - sizes[1]))
     return first, min(sizes[1], limit - first)

@@ -21,8 +21,8 @@ class Resampling:
     """Seed and cost of the 95 % intervals of an evaluation.
 
     Args:
-        seed: Of each metric that draws subsets, on its own.
-        num_resamples: Of each interval: leave out one of as many groups of samples. 0 for no
+        seed: Seed of each metric that draws subsets.
+        num_resamples: Number of groups of samples; each resample leaves out one. 0 for no
             intervals.
     """
 
@@ -30,14 +30,14 @@ class Resampling:
     num_resamples: int = 16
 
     def generator(self) -> torch.Generator:
-        """A new generator with the seed."""
+        """Return a new generator with the seed."""
         return torch.Generator().manual_seed(self.seed)
 
     def interval(self, statistic: Callable[[Tensor], float], size: int) -> Ends | None:
-        """Interval of a function of indices below ``size``; None for fewer than three groups.
+        """Return the interval of a function of indices below ``size``; None below three groups.
 
-        Each of the G resamples leaves out a group of m samples; those that are over when G does not
-        divide their number are never left out. With Student's t of G - 1 degrees of freedom::
+        Each of the G resamples leaves out a group of m samples; the remainder, where G does not
+        divide their number, is never left out. With Student's t of G - 1 degrees of freedom::
 
             variance = (size - m)^2 / (size * m) * variance of the resamples
             ends     = value -+ t * sqrt(variance)
@@ -63,7 +63,7 @@ class Resampling:
         return value - half, value + half
 
     def of_mean(self, values: Tensor) -> Ends | None:
-        """Student's interval of the mean of ``(n,)`` values, one for each sample."""
+        """Return Student's interval of the mean of ``(n,)`` values, one for each sample."""
         if len(values) < 2 or not self.num_resamples:
             return None
         mean = values.mean().item()
@@ -71,14 +71,14 @@ class Resampling:
         return mean - half, mean + half
 
     def of_share(self, hits: Tensor) -> Ends | None:
-        """Wilson's interval of the share of ones among ``(n,)`` zeros and ones."""
+        """Return Wilson's interval of the share of ones among ``(n,)`` zeros and ones."""
         if len(hits) < 2 or not self.num_resamples:
             return None
-        counted = binomtest(int(hits.sum()), len(hits))
-        low, high = counted.proportion_ci(_LEVEL, method="wilson")
+        test = binomtest(int(hits.sum()), len(hits))
+        low, high = test.proportion_ci(_LEVEL, method="wilson")
         return float(low), float(high)
 
 
 def quantile_of_t(degrees: int) -> float:
-    """Deviations of Student's distribution that hold 95 % of it, to each side."""
+    """Return the deviations of Student's distribution that hold 95 % of it, to each side."""
     return float(student.ppf((1 + _LEVEL) / 2, degrees))

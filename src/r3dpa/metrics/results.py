@@ -27,15 +27,22 @@ Split = Literal["train-val", "val-only"]
 Mark = Literal["", "best", "second", "tie"]
 
 _PUBLISHED: Any = json.loads(files(__package__).joinpath("published.json").read_text("utf-8"))
+#: Data set of the published numbers, as ``about["dataset"]`` of a reference names it.
+PUBLISHED_DATASET = "KITTI-360"
 #: Power of ten of the printed column of each metric of the paper.
 PUBLISHED_SCALES: dict[str, int] = _PUBLISHED["scales"]
 _SHOWN_BAD = 20  # samples left out that are printed
-# How often they hold: notebooks/results/interval_coverage.json.
+# Measured in notebooks/results/interval_coverage.json.
 _INTERVAL = (
     "95 % interval (measured to hold in 90 to 99 %) over draws of as many generated scenes "
     "against the same real scans"
 )
 _FLOOR = "real vs. real (floor)"
+#: Of references that were computed before they named their data set.
+_UNKNOWN_DATASET = (
+    "- published numbers left out: the reference does not say whether it is of KITTI-360; "
+    "compute it again with `r3dpa data reference`\n"
+)
 _DISTANCES = (*PUBLISHED_SCALES, "FWID", "FGEO")
 #: Provenance of an evaluation, by default unknown.
 _ABOUT: dict[str, Any] = {
@@ -47,10 +54,10 @@ _ABOUT: dict[str, Any] = {
     "seed": None,
     "precision": None,
     "commit": None,
-    "feature_source": None,  # features that the generator was aligned to
+    "feature_source": None,  # features that the generator was aligned with
     "published": False,
     "source": "",  # files of the samples, or line of the publication
-    "extra": {},  # anything else, such as "bad_samples": those left out, each with the reason
+    "extra": {},  # anything else, such as "bad_samples": names and faults of samples left out
 }
 _MARKDOWN: dict[Mark, str] = {"": "{}", "best": "**{}**", "second": "_{}_", "tie": "= {}"}
 _LATEX_ESCAPES = str.maketrans(LATEX_ESCAPE_RULES)
@@ -83,11 +90,15 @@ class MetricResult:
     note: str = ""
 
     def __post_init__(self) -> None:
-        numbers = [self.value or 0.0, self.floor or 0.0, *(self.interval or ())]
-        if not all(map(math.isfinite, numbers)) or numbers[2:] != sorted(numbers[2:]):
-            raise ValueError(f"{self}: give finite numbers, the lower end of the interval first")
-        if self.interval is not None:  # a list, in JSON
-            object.__setattr__(self, "interval", tuple(self.interval))
+        numbers = [self.value or 0.0, self.floor or 0.0]
+        if self.interval is not None:
+            low, high = self.interval
+            numbers += [low, high]
+            if low > high:
+                raise ValueError(f"{self}: give the lower end of the interval first")
+            object.__setattr__(self, "interval", (low, high))  # a list, in JSON
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"{self}: give finite numbers")
 
     @property
     def half_width(self) -> float:
@@ -95,8 +106,8 @@ class MetricResult:
         return 0.0 if self.interval is None else (self.interval[1] - self.interval[0]) / 2
 
     @property
-    def badness(self) -> float:
-        """The value with a sign that makes smaller ones better; infinite if it is None."""
+    def sort_key(self) -> float:
+        """Value with the sign that makes smaller ones better; infinite if it is None."""
         if self.value is None:
             return math.inf
         return self.value if self.direction == "lower" else -self.value
@@ -110,10 +121,10 @@ class MetricResult:
         """
         intervals = math.hypot(self.half_width, other.half_width)
         allowed = max(intervals, self.floor or 0.0, other.floor or 0.0)
-        return abs(self.badness - other.badness) <= allowed
+        return abs(self.sort_key - other.sort_key) <= allowed
 
     def printed(self, number: float | None) -> str:
-        """A number of this metric in its column: two decimals, more if it is small."""
+        """Format a number of this metric for its column: two decimals, more if it is small."""
         if number is None:
             return "-"
         number /= 10.0**self.scale
@@ -122,15 +133,18 @@ class MetricResult:
     @property
     def printed_interval(self) -> str:
         """``[low, high]``; empty without an interval."""
-        return ", ".join(map(self.printed, self.interval)).join("[]") if self.interval else ""
+        if self.interval is None:
+            return ""
+        low, high = self.interval
+        return f"[{self.printed(low)}, {self.printed(high)}]"
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """All numbers of one set of samples against one reference; ``str`` gives them as a table.
 
-    ``about`` is the provenance, with the keys of ``_ABOUT`` and values that JSON can hold; those
-    left out get its defaults.
+    ``about`` is the provenance, with the keys and default values of ``_ABOUT``. Values must be such
+    as JSON can hold.
     """
 
     label: str
@@ -138,7 +152,8 @@ class Evaluation:
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        about = json.loads(json.dumps(_ABOUT | self.about, allow_nan=False))
+        as_json = json.dumps(_ABOUT | self.about, allow_nan=False)
+        about = json.loads(as_json)  # equal to what a saved evaluation loads
         object.__setattr__(self, "rows", tuple(self.rows))
         object.__setattr__(self, "about", about)
 
@@ -150,48 +165,57 @@ class Evaluation:
     @property
     def name(self) -> str:
         """Label in tables."""
-        return " ".join(self.label.split()) + " (published)" * self.published
+        label = " ".join(self.label.split())
+        return f"{label} (published)" if self.published else label
 
     @property
     def bad_samples(self) -> list[str]:
-        """Name and reason of each sample that was left out."""
+        """Name and fault of each sample that was left out."""
         return self.about["extra"].get("bad_samples", [])
 
     def row(self, name: str) -> MetricResult | None:
-        """Result of a metric; None without such a row or without a value."""
-        return next((r for r in self.rows if r.name == name and r.value is not None), None)
+        """Return the result of a metric; None without such a row or without a value."""
+        for row in self.rows:
+            if row.name == name and row.value is not None:
+                return row
+        return None
 
     def only(self, names: Sequence[str]) -> Self:
-        """The evaluation with the rows of these metrics alone."""
+        """Return the evaluation with the rows of these metrics alone."""
         return replace(self, rows=tuple(row for row in self.rows if row.name in names))
 
     def __str__(self) -> str:
         heads = ("metric", "value", "interval", "floor", "better", "samples", "references", "note")
         table = text_table(map(_cells, self.rows), heads, align="lrrrlrrl")
-        extra = dict(self.about["extra"])
-        head = [f"{key}: {extra.pop(key)}" for key in ("verdict", "warning") if extra.get(key)]
-        bad = extra.pop("bad_samples", [])
+        extra = self.about["extra"]
+        head = [f"{key}: {extra[key]}" for key in ("verdict", "warning") if extra.get(key)]
+        lines = []
+        if any(row.interval for row in self.rows):
+            lines.append(f"interval: {_INTERVAL}, unless noted; too wide near the floor")
         about = {**self.about, "protocol": self.about["protocol"].get("name"), **extra}
-        lines = [
-            f"{key}: {value}"
-            for key, value in about.items()
-            if isinstance(value, str | int | float) and not isinstance(value, bool)
-        ]
+        for key, value in about.items():
+            is_plain = isinstance(value, str | int | float) and not isinstance(value, bool)
+            if is_plain and key not in ("verdict", "warning"):
+                lines.append(f"{key}: {value}")
+        bad = self.bad_samples
         if bad:
             lines.append(f"samples that cannot be used and are left out: {len(bad)}")
+            lines += bad[:_SHOWN_BAD]
         if len(bad) > _SHOWN_BAD:
-            bad = [*bad[:_SHOWN_BAD], f"and {len(bad) - _SHOWN_BAD} more"]
-        if any(row.interval for row in self.rows):
-            lines.insert(0, f"interval: {_INTERVAL}, unless noted; too wide near the floor")
-        return "\n".join([self.label, *head, "", table, "", *lines, *bad])
+            lines.append(f"and {len(bad) - _SHOWN_BAD} more")
+        return "\n".join([self.label, *head, "", table, "", *lines])
 
     def save(self, path: str | Path) -> None:
-        """Writes the evaluation as JSON."""
+        """Write the evaluation as JSON."""
         write_text(path, json.dumps(asdict(self), indent=2, ensure_ascii=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote; a ``ValueError`` names the file and the fault."""
+        """Read what ``save`` wrote.
+
+        Raises:
+            ValueError: Naming the file and the fault.
+        """
         try:
             stored = json.loads(Path(path).read_text(encoding="utf-8"))
             stored["rows"] = tuple(MetricResult(**row) for row in stored["rows"])
@@ -221,27 +245,32 @@ class EvaluationTable:
     @cached_property
     def columns(self) -> dict[str, list[MetricResult | None]]:
         """Results of each metric that has a value, one per evaluation; those of the paper first."""
-        given = [row.name for e in self.evaluations for row in e.rows]
-        names = dict.fromkeys((*PUBLISHED_SCALES, *given))
+        names = list(PUBLISHED_SCALES)
+        for evaluation in self.evaluations:
+            names += [row.name for row in evaluation.rows if row.name not in names]
         columns = {name: [e.row(name) for e in self.evaluations] for name in names}
         return {name: column for name, column in columns.items() if any(column)}
 
     def marks(self, metric: str) -> list[Mark]:
-        """Mark of each evaluation in a column."""
+        """Return the mark of each evaluation in a column."""
         marks: list[Mark] = [""] * len(self.evaluations)
-        left = {
+        ranked = {
             index: result
             for index, result in enumerate(self.columns[metric])
             if result is not None and not self.evaluations[index].published
         }
-        places: tuple[Mark, ...] = ("best", "second") if len(left) > 1 else ()
+        if len(ranked) < 2:
+            return marks
+        places: tuple[Mark, ...] = ("best", "second")
         for place in places:
-            best = min(left.values(), key=lambda result: result.badness)
-            tied = [index for index, result in left.items() if result.ties_with(best)]
+            best = min(ranked.values(), key=lambda result: result.sort_key)
+            tied = [index for index, result in ranked.items() if result.ties_with(best)]
             if len(tied) > 1:
-                return ["tie" if index in tied else mark for index, mark in enumerate(marks)]
+                for index in tied:
+                    marks[index] = "tie"
+                break
             marks[tied[0]] = place
-            del left[tied[0]]
+            del ranked[tied[0]]
         return marks
 
     def __str__(self) -> str:
@@ -251,9 +280,9 @@ class EvaluationTable:
 
         heads = []
         for result in map(_first, self.columns.values()):
-            scale = f"1e{result.scale}" * bool(result.scale)
-            kind = ", ".join(filter(None, [scale, result.unit, result.direction]))
-            heads.append(f"{result.name} ({kind})")
+            scale = f"1e{result.scale}" if result.scale else ""
+            kind = [word for word in (scale, result.unit, result.direction) if word]
+            heads.append(f"{result.name} ({', '.join(kind)})")
         table = text_table(self._lines(cell), ["", *heads], "l" + "r" * len(heads), "pipe")
         marks = "**best**, _second_, = tie: no further apart than the floor or the intervals"
         interval = f"[low, high]: {_INTERVAL} (MMD: real scans drawn, generated scenes fixed)"
@@ -268,11 +297,11 @@ class EvaluationTable:
         arrows = {"lower": r"$\downarrow$", "higher": r"$\uparrow$"}
         heads = []
         for result in map(_first, self.columns.values()):
-            scale = rf"$\times 10^{{{result.scale}}}$" * bool(result.scale)
+            scale = rf"$\times 10^{{{result.scale}}}$" if result.scale else ""
             name = result.name.translate(_LATEX_ESCAPES)
             heads.append(f"{name} {arrows[result.direction]} {scale}{result.unit}")
-        found = self._lines(lambda result, mark: _LATEX[mark].format(result.printed(result.value)))
-        lines = [[first.translate(_LATEX_ESCAPES), *cells] for first, *cells in found]
+        lines = self._lines(lambda result, mark: _LATEX[mark].format(result.printed(result.value)))
+        lines = [[name.translate(_LATEX_ESCAPES), *cells] for name, *cells in lines]
         table = text_table(lines, ["Method", *heads], "l" + "r" * len(heads), "latex_raw")
         for rule in ("toprule", "midrule", "bottomrule"):
             table = table.replace(r"\hline", f"\\{rule}", 1)
@@ -281,64 +310,81 @@ class EvaluationTable:
     @property
     def notes(self) -> list[str]:
         """Differences between the evaluations, samples left out, reasons of absent values."""
-        own = [e for e in self.evaluations if not e.published]
-        published = {e.about["reference"]: None for e in self.evaluations if e.published}
-        notes = [f"published: against {name}, not ranked" for name in published]
-        notes += [
-            f"not the same {key}: {', '.join(e.label for e in own)}"
-            for key in ("protocol", "reference", "backbones")
-            if any(e.about[key] != own[0].about[key] for e in own[1:])
-        ]
-        counts: dict[str, list[str]] = {}
-        for e in self.evaluations:
-            numbers = sorted({row.num_samples for row in e.rows if row.num_samples})
-            text = " or ".join(f"{number:,}" for number in numbers) or "an unknown number"
-            counts.setdefault(text, []).append(e.name)
-        if len(counts) > 1:
-            listed = "; ".join(f"{text} of {', '.join(names)}" for text, names in counts.items())
-            notes.append(f"not the same number of scenes: {listed}")
-        for e in own:
+        measured = [e for e in self.evaluations if not e.published]
+        references = dict.fromkeys(e.about["reference"] for e in self.evaluations if e.published)
+        notes = [f"published: against {name}, not ranked" for name in references]
+        for key in ("protocol", "reference", "backbones"):
+            if any(e.about[key] != measured[0].about[key] for e in measured[1:]):
+                notes.append(f"not the same {key}: {', '.join(e.label for e in measured)}")
+        notes += self._notes_on_counts()
+        for e in measured:
             if e.bad_samples:
                 left_out = f"samples that cannot be used and are left out: {len(e.bad_samples)}"
                 notes.append(f"{e.name}: {left_out}")
             notes += [f"{e.name}, {row.name}: {row.note}" for row in e.rows if row.value is None]
         return notes
 
+    def _notes_on_counts(self) -> list[str]:
+        names_by_count: dict[str, list[str]] = {}
+        for e in self.evaluations:
+            numbers = sorted({row.num_samples for row in e.rows if row.num_samples})
+            count = " or ".join(f"{number:,}" for number in numbers) or "an unknown number"
+            names_by_count.setdefault(count, []).append(e.name)
+        if len(names_by_count) < 2:
+            return []
+        parts = [f"{count} of {', '.join(names)}" for count, names in names_by_count.items()]
+        return [f"not the same number of scenes: {'; '.join(parts)}"]
+
     def _lines(self, cell: Callable[[MetricResult, Mark], str]) -> list[list[str]]:
         """Lines of cells: the published evaluations, the others, the floors."""
-        cells = []
+        columns = []
         for metric, column in self.columns.items():
-            known = sorted(r.floor for r in column if r is not None and r.floor is not None)
-            floors = dict.fromkeys(map(_first(column).printed, known[:1] + known[-1:]))
-            marked = zip(column, self.marks(metric), strict=True)
-            texts = [cell(result, mark) if result else "-" for result, mark in marked]
-            cells.append([*texts, " to ".join(floors) or "-"])
+            texts = []
+            for result, mark in zip(column, self.marks(metric), strict=True):
+                texts.append("-" if result is None else cell(result, mark))
+            columns.append([*texts, _range_of_floors(column)])
         names = [e.name.replace("|", "/") for e in self.evaluations]
-        lines = [list(line) for line in zip([*names, _FLOOR], *cells, strict=True)]
-        return lines if any(text != "-" for text in lines[-1][1:]) else lines[:-1]
+        lines = [list(line) for line in zip([*names, _FLOOR], *columns, strict=True)]
+        has_floors = any(text != "-" for text in lines[-1][1:])
+        return lines if has_floors else lines[:-1]
 
 
-def report(evaluation: Evaluation, split: str | None, earlier: Sequence[Evaluation] = ()) -> str:
-    """All numbers of an evaluation, and its distances beside earlier or the published ones."""
-    return f"{evaluation}\n\n{_comparison(evaluation, split, earlier)}"
+def report(
+    evaluation: Evaluation, reference: Mapping[str, Any], earlier: Sequence[Evaluation] = ()
+) -> str:
+    """Return all numbers of an evaluation, and its distances beside others.
+
+    Args:
+        evaluation: Numbers of one set of samples.
+        reference: ``about`` of its reference.
+        earlier: Evaluations to stand beside it. Default: the published ones, if the reference is of
+            their data set.
+    """
+    text = f"{evaluation}\n\n{_comparison(evaluation, reference, earlier)}"
+    if "dataset" not in reference and not earlier:
+        text += _UNKNOWN_DATASET
+    return text
 
 
 def save_reports(
-    evaluation: Evaluation, split: str | None, out: Path, earlier: Sequence[Evaluation] = ()
+    evaluation: Evaluation,
+    reference: Mapping[str, Any],
+    out: Path,
+    earlier: Sequence[Evaluation] = (),
 ) -> None:
-    """Writes ``evaluation.json`` and ``metrics.csv`` (all rows), ``table.md`` and ``table.tex``.
+    """Write ``evaluation.json`` and ``metrics.csv`` (all rows), ``table.md`` and ``table.tex``.
 
-    The latter two have the distances beside earlier or the published ones.
+    The two tables have the distances beside others, see :func:`report`.
     """
     evaluation.save(out / "evaluation.json")
     save_csv((evaluation,), out / "metrics.csv")
-    table = _comparison(evaluation, split, earlier)
+    table = _comparison(evaluation, reference, earlier)
     write_text(out / "table.md", str(table))
     write_text(out / "table.tex", table.latex())
 
 
 def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
-    """Writes every row of every evaluation as a line, with values as they were computed."""
+    """Write every row of every evaluation as a line, with values as they were computed."""
     keys = [key.name for key in fields(MetricResult) if key.name not in ("name", "interval")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -352,37 +398,40 @@ def save_csv(evaluations: Iterable[Evaluation], path: Path) -> None:
 
 
 def _comparison(
-    evaluation: Evaluation, split: str | None, earlier: Sequence[Evaluation]
+    evaluation: Evaluation, reference: Mapping[str, Any], earlier: Sequence[Evaluation]
 ) -> EvaluationTable:
     if earlier:
-        return EvaluationTable([one.only(_DISTANCES) for one in (*earlier, evaluation)])
-    own = evaluation.only(_DISTANCES)
-    names = [row.name for row in own.rows]
-    published = published_evaluations("val-only" if split == "val" else "train-val")
-    others = [other.only(names) for other in published]
-    return EvaluationTable((*(other for other in others if other.rows), own))
+        return EvaluationTable([e.only(_DISTANCES) for e in (*earlier, evaluation)])
+    distances = evaluation.only(_DISTANCES)
+    if reference.get("dataset") != PUBLISHED_DATASET:
+        return EvaluationTable([distances])
+    names = [row.name for row in distances.rows]
+    split: Split = "val-only" if reference.get("split") == "val" else "train-val"
+    published = [e.only(names) for e in published_evaluations(split)]
+    return EvaluationTable([*(e for e in published if e.rows), distances])
 
 
 def published_evaluations(split: Split) -> tuple[Evaluation, ...]:
-    """Rows of the main table of the paper, without intervals and floors.
+    """Return the main table of the paper, without intervals and floors.
 
     MMD was computed against validation scans alone and belongs to ``"val-only"``.
 
     Source: R3DPA (ICRA 2026), table of unconditional generation on KITTI-360.
     """
-    return tuple(
-        published_evaluation(
+    evaluations = []
+    for method in _PUBLISHED["methods"]:
+        counts = dict.fromkeys(method[split], (method["num_samples"], None))
+        evaluation = published_evaluation(
             method["label"],
             method[split],
-            f"KITTI-360, {split}",
+            f"{PUBLISHED_DATASET}, {split}",
             _PUBLISHED["source"],
-            dict.fromkeys(method[split], (method["num_samples"], None))
-            | {"MMD": _PUBLISHED["counts_of_mmd"]},
+            counts | {"MMD": _PUBLISHED["counts_of_mmd"]},
             solver=method["solver"],
             steps=method["steps"],
         )
-        for method in _PUBLISHED["methods"]
-    )
+        evaluations.append(evaluation)
+    return tuple(evaluations)
 
 
 def published_evaluation(
@@ -393,30 +442,53 @@ def published_evaluation(
     counts: Mapping[str, tuple[int | None, int | None]] | None = None,
     **about: Any,
 ) -> Evaluation:
-    """Evaluation of numbers as the paper printed them, with counts of scenes by metric."""
+    """Return an evaluation of numbers as a paper printed them, with counts of scenes by metric."""
     rows = []
     for name, number in printed.items():
-        value = float(f"{number}e{PUBLISHED_SCALES[name]}")  # decimal shift, free of rounding
-        scale, (samples, real) = PUBLISHED_SCALES[name], (counts or {}).get(name, (None, None))
-        row = MetricResult(name, value, scale=scale, num_samples=samples, num_references=real)
+        scale = PUBLISHED_SCALES[name]
+        value = float(f"{number}e{scale}")  # decimal shift, free of rounding
+        samples, scans = (counts or {}).get(name, (None, None))
+        row = MetricResult(name, value, scale=scale, num_samples=samples, num_references=scans)
         rows.append(row)
-    about |= {"protocol": {"name": "published"}, "reference": reference, "source": source}
-    return Evaluation(label, tuple(rows), about | {"published": True})
+    about |= {
+        "protocol": {"name": "published"},
+        "reference": reference,
+        "source": source,
+        "published": True,
+    }
+    return Evaluation(label, tuple(rows), about)
 
 
 def _cells(row: MetricResult) -> tuple[str, ...]:
-    counts = ["-" if n is None else f"{n:,}" for n in (row.num_samples, row.num_references)]
-    scale, unit = f" x1e{row.scale}" * bool(row.scale), f" ({row.unit})" * bool(row.unit)
+    name = row.name
+    if row.scale:
+        name += f" x1e{row.scale}"
+    if row.unit:
+        name += f" ({row.unit})"
     return (
-        f"{row.name}{scale}{unit}",
+        name,
         row.printed(row.value),
         row.printed_interval or "-",
         row.printed(row.floor),
         row.direction,
-        *counts,
+        _printed_count(row.num_samples),
+        _printed_count(row.num_references),
         row.note,
     )
 
 
+def _printed_count(count: int | None) -> str:
+    return "-" if count is None else f"{count:,}"
+
+
+def _range_of_floors(column: Sequence[MetricResult | None]) -> str:
+    """Smallest and largest floor of a column; ``-`` without any."""
+    floors = [result.floor for result in column if result and result.floor is not None]
+    if not floors:
+        return "-"
+    low, high = (_first(column).printed(floor) for floor in (min(floors), max(floors)))
+    return low if low == high else f"{low} to {high}"
+
+
 def _first(column: Sequence[MetricResult | None]) -> MetricResult:
-    return next(filter(None, column))
+    return next(result for result in column if result is not None)

@@ -80,19 +80,21 @@ class EvaluationScene(NamedTuple):
 
 
 def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScene:
-    """The scene as the sensor of the protocol would have seen it.
+    """Return the scene as the sensor of the protocol would have seen it.
 
-    Every scene becomes a range image, and its points are those of the pixels: a real scan loses
-    hidden returns and its points move onto rays, as those of generated images do. A range image is
-    taken as it is, without any points beside it. Points on pixel centres keep their pixels; points
-    on corners may move next door by rounding (give the images then).
+    Every scene becomes a range image, and its points become the points of the pixels: a real scan
+    loses hidden returns and its points move onto rays, where generated ones lie. A range image is
+    taken as it is; points given beside it are ignored. Points on pixel centres keep their pixels;
+    points on corners may move to a neighbour by rounding (give the images then).
 
     Source: the official ``evaluate.py`` of valeoai/R3DPA passes real scans through range images.
 
     Returns:
         The scene with all fields: points ``(P, 3)`` and range ``(H, W)`` float32 on the CPU,
-        ``EMPTY_RANGE_M`` without a return; the intensity ``(H, W)`` if it was known. A
-        ``ValueError`` names a scene that cannot be used.
+        ``EMPTY_RANGE_M`` without a return; the intensity ``(H, W)`` if it was known.
+
+    Raises:
+        ValueError: If the scene cannot be used; names it.
     """
     projection, sensor = protocol.projection, protocol.sensor
     if scene.range_m is not None:
@@ -106,8 +108,8 @@ def through_sensor(scene: EvaluationScene, protocol: Protocol) -> EvaluationScen
         valid = (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
         range_m, intensity = torch.where(valid, range_m, EMPTY_RANGE_M), scene.intensity
         if intensity is not None:
-            kept = torch.where(valid, intensity.detach().float().cpu(), 0.0)
-            intensity = _finite(scene.name, "intensity", kept)
+            intensity = torch.where(valid, intensity.detach().float().cpu(), 0.0)
+            intensity = _finite(scene.name, "intensity", intensity)
     elif scene.points is not None:
         points = _finite(scene.name, "cloud", scene.points)
         if points.ndim != 2 or points.shape[1] not in (3, 4):
@@ -135,15 +137,16 @@ def usable_scenes(
     bad: list[str] | None = None,
     advice: str = "",
 ) -> Iterator[EvaluationScene]:
-    """Scenes through the sensor that every metric can use; the others' faults go to ``bad``.
+    """Yield scenes through the sensor that every metric can use; faults of others go to ``bad``.
 
-    Without ``bad``, a ``ValueError`` as of :func:`through_sensor` and :meth:`BEVGrid.kept`.
+    Raises:
+        ValueError: Without ``bad``, at the first scene that cannot be used, with ``advice``.
     """
     for scene in scenes:
         try:
             seen = through_sensor(scene, protocol)
             assert seen.points is not None
-            protocol.grid.kept(seen.points, seen.name)
+            protocol.grid.points_inside(seen.points, seen.name)
         except ValueError as error:
             if bad is None:
                 raise ValueError(f"{error}{advice}") from error

@@ -44,10 +44,18 @@ from r3dpa.metrics.scene import DEFAULT, EvaluationScene, Protocol
 
 #: Names that :func:`scene_features` knows.
 SPACES = (
-    *("frid", "fld", "fsvd", "fpvd", "fwid", "fgeo"),
-    *("frd", "frid_r2flow", "frid_lidm", "fpd"),
+    "frid",
+    "fld",
+    "fsvd",
+    "fpvd",
+    "fwid",
+    "fgeo",
+    "frd",
+    "frid_r2flow",
+    "frid_lidm",
+    "fpd",
 )
-#: Of these, the ones that need no file.
+#: Spaces that need no weights from elsewhere.
 FREE_SPACES = ("fwid", "fgeo")
 # Generated scenes have no intensity: all points get the mean of real scans.
 _INTENSITY = CENTRES[-1]
@@ -69,7 +77,11 @@ class SceneFeatures:
 
     @torch.inference_mode()
     def __call__(self, scenes: Sequence[EvaluationScene]) -> Tensor:
-        """Features ``(B, F)`` float32 on the CPU; NaN is a ``ValueError`` that names the scene."""
+        """Return features ``(B, F)`` float32 on the CPU.
+
+        Raises:
+            ValueError: If features are not finite; names the scene.
+        """
         # GPUs round the factors of a convolution to 10 bits (TF32) unless disabled.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             features = self.extract(scenes).float().cpu()
@@ -85,13 +97,17 @@ class SceneFeatures:
 def scene_features(
     name: str, ckpt: str | Path | None = None, protocol: Protocol = DEFAULT, device: str = "cpu"
 ) -> SceneFeatures:
-    """Feature space by its name; a ``ValueError`` names what is unknown, missing or unfit."""
+    """Return a feature space by its name.
+
+    Raises:
+        ValueError: If the name is unknown, or the weights are missing or of another network.
+    """
     if name not in SPACES:
-        raise ValueError(f"there is no feature space {name!r}; there are {', '.join(SPACES)}")
+        raise ValueError(f"unknown feature space {name!r}; choose from {', '.join(SPACES)}")
     if name == "fgeo" and ckpt is not None:
         raise ValueError(f"fgeo has no weights: leave {ckpt} out")
     if name in FREE_SPACES:
-        return _of_points(name, None if ckpt is None else Path(ckpt), device)
+        return point_extractor_space(name, None if ckpt is None else Path(ckpt), device)
     if ckpt is None:
         raise ValueError(
             f"{name} needs its official weights: give --ckpt.{name} FILE (`r3dpa test`: "
@@ -113,7 +129,11 @@ def scene_features(
 def feature_spaces(
     names: Iterable[str], ckpt: Mapping[str, Any] | None, protocol: Protocol, device: str
 ) -> list[SceneFeatures]:
-    """Feature spaces by name; a ``ValueError`` as :func:`scene_features`, or for an unused file."""
+    """Return feature spaces by name.
+
+    Raises:
+        ValueError: As :func:`scene_features`, or for weights of a space that is not among them.
+    """
     names, files = list(dict.fromkeys(names)), ckpt or {}
     for name in files:
         if name not in names:
@@ -132,7 +152,7 @@ def range_vit_space(network: RangeViT) -> SceneFeatures:
     def extract(scenes: Sequence[EvaluationScene]) -> Tensor:
         if network.in_channels < 5:
             return network(_stack(scenes, "range_m", device), None)
-        intensity = _intensities(scenes, "RangeViT", device, "; give those of rangevit_wo_i")
+        intensity = _intensities(scenes, "RangeViT", device, "; give the weights rangevit_wo_i")
         return network(_stack(scenes, "range_m", device), intensity)
 
     card = _card(network, "decoder, means of bands of rows", "pixel corners, -1 where empty")
@@ -222,8 +242,8 @@ def voxel_space(network: MinkowskiNet, protocol: Protocol) -> SceneFeatures:
     return SceneFeatures(name, NUM_BINS * network.widths[-1], card, extract)
 
 
-def _of_points(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
-    """Means of the features of a point extractor, without their lift to a higher dimension."""
+def point_extractor_space(name: str, ckpt: Path | None, device: str) -> SceneFeatures:
+    """FWID's and FGEO's features: means over points, without the lift to a higher dimension."""
     extractor: Any = (WaffleIronS(ckpt) if name == "fwid" else GeometricFeatures()).to(device)
     if name == "fwid":
         dim, layer = extractor.network.width, "normalised tokens, mean over points"

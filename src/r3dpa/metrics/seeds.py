@@ -1,4 +1,4 @@
-"""Evaluations of the same training with several seeds: means, and differences in pairs."""
+"""Evaluations of one training with several seeds: means, and differences paired by seed."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from r3dpa.metrics.results import Evaluation
 
 
 def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
-    """One evaluation of several, at least one, that differ in their seed alone.
+    """Average evaluations, at least one, that differ in their seed alone.
 
-    Intervals are Student's, of the mean over the seeds; a single seed keeps those of its scenes. A
-    metric without a value in one seed has none.
+    Intervals are Student's, of the mean over the seeds; a single seed keeps the intervals over its
+    scenes. A metric without a value in one seed has none.
     """
     first = evaluations[0]
     if len(evaluations) == 1:
         return replace(first, label=label)
     rows = []
     for row in first.rows:
-        found = [other for e in evaluations if (other := e.row(row.name)) is not None]
-        values = [other.value for other in found if other.value is not None]
+        of_seeds = [e.row(row.name) for e in evaluations]
+        values = [r.value for r in of_seeds if r is not None and r.value is not None]
         if len(values) < len(evaluations):
             rows.append(replace(row, value=None, interval=None, note="not in every seed"))
             continue
-        mean, half = fmean(values), _students(values)
-        notes = "; ".join(dict.fromkeys(other.note for other in found if other.note))
-        rows.append(replace(row, value=mean, interval=(mean - half, mean + half), note=notes))
+        mean, half = fmean(values), _half_width(values)
+        notes = dict.fromkeys(r.note for r in of_seeds if r is not None and r.note)
+        interval = (mean - half, mean + half)
+        rows.append(replace(row, value=mean, interval=interval, note="; ".join(notes)))
     bad = [name for e in evaluations for name in e.bad_samples]
     extra = first.about["extra"] | {"bad_samples": bad, "seeds": len(evaluations)}
     return Evaluation(label, tuple(rows), first.about | {"seed": None, "extra": extra})
@@ -38,10 +39,11 @@ def mean_of_seeds(label: str, evaluations: Sequence[Evaluation]) -> Evaluation:
 def relative_change(
     ours: Mapping[int, Evaluation], theirs: Mapping[int, Evaluation], metric: str
 ) -> tuple[float, Ends] | None:
-    """Difference of two trainings in a metric over the value of the second, and its 95 % interval.
+    """Return the difference of two trainings relative to the second, and its 95 % interval.
 
     The mean over the seeds that both have, with Student's interval of the differences seed by seed;
-    with a single seed that of the scenes, without the noise of training. None without a value.
+    with a single seed the interval over the scenes, without the noise of training. None without a
+    value.
     """
     changes, half = [], 0.0
     for seed in ours.keys() & theirs.keys():
@@ -51,11 +53,13 @@ def relative_change(
             half = math.hypot(a.half_width, b.half_width) / abs(b.value)
     if not changes:
         return None
-    mean, half = fmean(changes), _students(changes) if len(changes) > 1 else half
+    mean = fmean(changes)
+    if len(changes) > 1:
+        half = _half_width(changes)
     return mean, (mean - half, mean + half)
 
 
-def _students(values: Sequence[float]) -> float:
+def _half_width(values: Sequence[float]) -> float:
     """Half the width of Student's 95 % interval of a mean."""
     num = len(values)
     return quantile_of_t(num - 1) * stdev(values) / math.sqrt(num)

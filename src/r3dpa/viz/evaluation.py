@@ -20,7 +20,7 @@ from r3dpa.viz.figures import strip_sheet
 from r3dpa.viz.pictures import BACKGROUND, Array, as_numpy, bright_part, range_image_picture, save
 
 Match = tuple[str, Array, Array]
-"""Title, generated range image ``(H, W)`` in metres, and that of the nearest real scan."""
+"""Title, generated range image ``(H, W)`` in metres, range image of the nearest real scan."""
 
 SAMPLES, REFERENCES = "tab:orange", "tab:blue"
 MAX_CELLS = 250  # drawn along a side; finer histograms are summed over squares of cells
@@ -29,13 +29,13 @@ DECADES = 4  # of the logarithmic scales
 
 
 def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> Figure:
-    """Points of samples and of real scans seen from above, and the difference of their shares.
+    """Draw samples and real scans seen from above, and the difference of their shares.
 
-    Both share one logarithmic scale of four decades; that of the difference is linear near 0.
+    Both share one logarithmic scale of four decades; the scale of the difference is linear near 0.
 
     Args:
         samples: ``(X, X)`` counts, not all 0; index 0 is at the lower limit of x and of y.
-        references: The same of real scans.
+        references: ``(X, X)`` counts of real scans.
         half_m: Limit of x (forward) and of y (left) to both sides, in metres.
     """
     side = len(samples)
@@ -80,7 +80,7 @@ def bev_histograms(samples: Array, references: Array, half_m: float = 50.0) -> F
 
 
 def range_histogram(edges_m: Array, samples: Array, references: Array, halves: Array) -> Figure:
-    """Returns per metre of range, and the ratio of samples to real scans, if a bin has any.
+    """Draw the returns per metre of range, and the ratio of samples to real scans.
 
     The band is the floor: the range of parts of the real scans.
 
@@ -131,7 +131,7 @@ def range_histogram(edges_m: Array, samples: Array, references: Array, halves: A
 
 
 def matches_figure(best: Sequence[Match], worst: Sequence[Match], sensor: LidarSensor) -> Figure:
-    """The best and the worst matches, at least one: each sample above the nearest real scan."""
+    """Draw the best and the worst matches, at least one: samples above the nearest real scans."""
     pictures = []
     for kind, matches in (("best", best), ("worst", worst)):
         for title, sample_m, reference_m in matches:
@@ -152,7 +152,7 @@ def save_figures(
     worst: Sequence[Match],
     sensor: LidarSensor,
 ) -> None:
-    """Writes ``birds_eye.png`` of ``cells``, ``ranges.png`` and ``matches.png`` to ``folder``."""
+    """Write ``birds_eye.png`` of ``cells``, ``ranges.png`` and ``matches.png`` to ``folder``."""
     save(bev_histograms(*cells, half_m), folder / "birds_eye.png")
     save(range_histogram(edges_m, *ranges, halves), folder / "ranges.png")
     save(matches_figure(best, worst, sensor), folder / "matches.png")

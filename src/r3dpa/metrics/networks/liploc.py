@@ -47,7 +47,7 @@ class LIPLoc(FrozenNetwork):
     Args:
         picture_side: Rows and columns of the square pictures, a multiple of ``patch_side``.
         patch_side: Rows and columns of a patch.
-        width: Token width D, also that of the features (``dim``).
+        width: Token width D, also the width of the features (``dim``).
         depth: Number of transformer blocks.
         num_heads: Attention heads.
     """
@@ -74,7 +74,7 @@ class LIPLoc(FrozenNetwork):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path, *, num_heads: int | None = None) -> Self:
-        """Network with the weights and sizes of ``encoder_lidar`` in an official ``model.ckpt``."""
+        """Load weights and sizes of ``encoder_lidar`` from an official ``model.ckpt``."""
         with naming(path):
             weights = {
                 name.removeprefix(_ENCODER): value
@@ -122,7 +122,7 @@ def _sizes(weights: Mapping[str, Tensor]) -> dict[str, int]:
     if patches is None or positions is None or patches.ndim != 4 or positions.ndim != 3:
         raise ValueError(
             f"holds no LIP-Loc with a ViT: no {_ENCODER}patch_embed.proj.weight or "
-            f"{_ENCODER}pos_embed."
+            f"{_ENCODER}pos_embed"
         )
     patch_side = patches.shape[-1]
     return {

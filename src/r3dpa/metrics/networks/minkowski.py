@@ -155,7 +155,7 @@ class MinkowskiNet(nn.Module):
         return features
 
     def _encode(self, features: Tensor, voxels: Voxels) -> list[tuple[Voxels, Tensor]]:
-        """Voxels and features of strides 1, 2, 4, 8, 16, from those of the stem."""
+        """Compute voxels and features of strides 1, 2, 4, 8, 16 from the output of the stem."""
         levels = [(voxels, features)]
         for stage in self.encoder:
             change, voxels = voxels.to_coarser, voxels.coarser
@@ -305,7 +305,7 @@ def _sizes(weights: Mapping[str, Tensor]) -> tuple[list[int], int, int]:
         return widths, weights[_STEM].shape[1], len(weights["classifier.0.weight"])
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(
-            f"holds no such U-Net ({type(error).__name__}: {error}); give {_RELEASED}."
+            f"holds no such U-Net ({type(error).__name__}: {error}); give {_RELEASED}"
         ) from error
 
 
@@ -316,7 +316,7 @@ def _network_weights(content: Any) -> dict[str, Tensor]:
     if weights is None or len(prefixes) != 1:
         raise ValueError(
             f"must hold one network, but {len(prefixes)} weights are named {_STEM}; "
-            f"give {_RELEASED}."
+            f"give {_RELEASED}"
         )
     prefix = prefixes[0]
     return {key.removeprefix(prefix): weights[key] for key in keys if key.startswith(prefix)}

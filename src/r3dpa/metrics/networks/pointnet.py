@@ -78,7 +78,11 @@ class PointNet(FrozenNetwork):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> Self:
-        """Network of SpareNet's ``cls_model_39.pth``; a ``ValueError`` names the file."""
+        """Load SpareNet's ``cls_model_39.pth``.
+
+        Raises:
+            ValueError: If the file does not fit; names it.
+        """
         network = cls()
         with naming(path):
             load_strictly(network, read_released(Path(path), "cls_model_39.pth"), lambda key: key)

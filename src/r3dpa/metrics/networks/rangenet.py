@@ -41,10 +41,10 @@ class RangeNet(FrozenNetwork):
 
     Args:
         layers: 21 or 53, of the encoder.
-        in_channels: Of range, x, y, z in metres and remission, 1..5.
+        in_channels: Number of channels, of range, x, y, z in metres and remission, 1..5.
         num_classes: Classes of the head; 0 leaves it out.
-        mean: Of each channel, for :meth:`normalise`.
-        deviation: Of each channel.
+        mean: Mean of each channel, for :meth:`normalise`.
+        deviation: Standard deviation of each channel.
     """
 
     image_mean: Tensor
@@ -79,14 +79,19 @@ class RangeNet(FrozenNetwork):
 
     @classmethod
     def from_weights(cls, weights: Mapping[str, Tensor], **constants: Any) -> Self:
-        """Network of a state dict with the names of RangeNet++ or R2Flow, loaded strictly.
+        """Load a state dict with the names of RangeNet++ or R2Flow, strictly.
 
-        ``constants`` are ``mean`` and ``deviation``. A ``ValueError`` names what does not fit.
+        Args:
+            weights: The state dict.
+            constants: ``mean`` and ``deviation``.
+
+        Raises:
+            ValueError: If the weights do not fit.
         """
         ours = {our_name(key): value for key, value in weights.items()}
         stem, head = ours.get("stem.0.weight"), ours.get("head.1.bias", ())
         if stem is None:
-            raise ValueError(f"holds no weights of RangeNet++; give {_RELEASED}.")
+            raise ValueError(f"holds no weights of RangeNet++; give {_RELEASED}")
         layers: Any = 53 if any(key.startswith("enc3.residual_blocks.7.") for key in ours) else 21
         network = cls(layers, stem.shape[1], len(head), **constants)
         load_strictly(network, ours, lambda key: key)
@@ -94,10 +99,12 @@ class RangeNet(FrozenNetwork):
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> Self:
-        """Network of a released archive or its folder, or of a file with one state dict.
+        """Load a released archive or its folder, or a file with one state dict.
 
-        Mean and deviation come from ``arch_cfg.yaml``, where there is one. A ``ValueError`` names
-        the file and what is wrong with it.
+        Mean and deviation come from ``arch_cfg.yaml``, where there is one.
+
+        Raises:
+            ValueError: If the weights cannot be read or do not fit; names the file.
         """
         try:
             return cls._of_parts(_read_parts(Path(path)))
@@ -121,16 +128,16 @@ class RangeNet(FrozenNetwork):
 
     def encode(self, image: Tensor) -> list[Tensor]:
         """Activations of the stem and of the five levels ``(B, 32 * 2^i, H, W / 2^i)``."""
-        kept = [self.stem(image)]
+        levels = [self.stem(image)]
         for level in range(1, 6):
-            kept.append(self.get_submodule(f"enc{level}")(kept[-1]))
-        return kept
+            levels.append(self.get_submodule(f"enc{level}")(levels[-1]))
+        return levels
 
     def feature_map(self, image: Tensor) -> Tensor:
         """Result of the decoder ``(B, 32, H, W)``, of which all features are taken."""
-        *kept, hidden = self.encode(image)
+        *skipped, hidden = self.encode(image)
         for level in range(5, 0, -1):
-            hidden = self.get_submodule(f"dec{level}")(hidden) + kept[level - 1]
+            hidden = self.get_submodule(f"dec{level}")(hidden) + skipped[level - 1]
         return hidden
 
     def forward(self, image: Tensor) -> Tensor:
@@ -159,7 +166,7 @@ def picked_places(size: int, num: int = NUM_PICKED) -> list[int]:
 
 
 def our_name(official: str) -> str:
-    """R2Flow's name of a weight of RangeNet++; its own names are returned as they are."""
+    """Return R2Flow's name of a weight of RangeNet++; names of R2Flow stay."""
     name = re.sub(r"^conv1\.", "stem.0.", official)
     name = re.sub(r"^bn1\.", "stem.1.", name)
     name = re.sub(r"^1\.", "head.1.", name)
@@ -168,28 +175,30 @@ def our_name(official: str) -> str:
     return re.sub(r"\.residual_?(\d*)\.(conv|bn)([12])\.", _residual_name, name)
 
 
-def _residual_name(found: re.Match[str]) -> str:
-    place = f"{int(found[3]) - 1}.{int(found[2] == 'bn')}"
-    return f".residual_blocks.{found[1] or 0}.residual.{place}."
+def _residual_name(match: re.Match[str]) -> str:
+    block, layer, number = match.groups()
+    place = f"{int(number) - 1}.{1 if layer == 'bn' else 0}"
+    return f".residual_blocks.{block or 0}.residual.{place}."
 
 
 def _read_parts(path: Path) -> dict[str, Any]:
-    """Contents of the released files by name, or ``weights`` of a single file."""
+    """Read the released files by name, or ``weights`` from a single file."""
     if path.is_dir():
-        found = {name: (path / name).read_bytes() for name in _PARTS if (path / name).is_file()}
+        files = {name: (path / name).read_bytes() for name in _PARTS if (path / name).is_file()}
     elif path.is_file() and tarfile.is_tarfile(path):
         with tarfile.open(path) as archive:
-            files = {PurePosixPath(m.name).name: archive.extractfile(m) for m in archive}
-            found = {name: file.read() for name in _PARTS if (file := files.get(name))}
+            members = {PurePosixPath(m.name).name: archive.extractfile(m) for m in archive}
+            files = {name: file.read() for name in _PARTS if (file := members.get(name))}
     else:
         content = read_released(path, _RELEASED)
         return {"weights": content.get("state_dict", content) if isinstance(content, dict) else {}}
-    return {
-        name: yaml.safe_load(content)
-        if name.endswith(".yaml")
-        else torch.load(BytesIO(content), map_location="cpu", weights_only=True)
-        for name, content in found.items()
-    }
+    parts = {}
+    for name, content in files.items():
+        if name.endswith(".yaml"):
+            parts[name] = yaml.safe_load(content)
+        else:
+            parts[name] = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+    return parts
 
 
 def _activated(layer: nn.Conv2d | nn.ConvTranspose2d) -> nn.Sequential:

@@ -56,7 +56,7 @@ class RangeViT(FrozenNetwork):
     LiDAR-Diffusion's FRID uses another network; its scores are not comparable.
 
     Args:
-        sensor: Image size, field of view and range limits. Default: those of R3DPA.
+        sensor: Image size, field of view and range limits. Default: as in R3DPA.
         in_channels: Number of input channels, of range, x, y, z and intensity, 1..5.
         width: Token width D.
         depth: Number of transformer blocks.
@@ -130,7 +130,7 @@ class RangeViT(FrozenNetwork):
     ) -> Self:
         """Network with the weights of an official ``model.ckpt``, which determine most sizes.
 
-        Others are those of the release, unless ``num_heads`` or ``sizes`` give them.
+        Other sizes are the released ones, unless ``num_heads`` or ``sizes`` give them.
         """
         with naming(path):
             weights = read_state_dict(Path(path))
@@ -217,7 +217,7 @@ def load_official(network: RangeViT, weights: Mapping[str, Tensor]) -> None:
 
 def _shape(weights: Mapping[str, Tensor], name: str) -> torch.Size:
     if name not in weights or weights[name].ndim != 4:
-        raise ValueError(f"holds no RangeViT with convolutional stem: no convolution {name}.")
+        raise ValueError(f"holds no RangeViT with convolutional stem: no convolution {name}")
     return weights[name].shape
 
 

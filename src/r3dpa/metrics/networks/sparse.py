@@ -120,24 +120,24 @@ class Voxels:
         offsets = kernel_offsets(3)
         pairs: list[tuple[Tensor, Tensor] | None] = [None] * len(offsets)
 
-        def keep(offset: tuple[int, int, int], found: Tensor, rows: Tensor) -> None:
-            outputs = found.nonzero().squeeze(1)
+        def add_pairs(offset: tuple[int, int, int], occupied: Tensor, rows: Tensor) -> None:
+            outputs = occupied.nonzero().squeeze(1)
             inputs, index = rows[outputs], offsets.index(offset)
             pairs[index] = (inputs, outputs)
             # A neighbour sees this voxel at the opposite offset, which is as far from the end.
             pairs[-1 - index] = (outputs, inputs)
 
         rows = torch.arange(1, len(self) + 1, device=self.keys.device)
-        keep((0, 0, 1), self._padded[rows] == self.keys + self.stride, rows)
+        add_pairs((0, 0, 1), self._padded[rows] == self.keys + self.stride, rows)
         for x, y in _COLUMNS:
             # z is fastest in the keys: three voxels on top of each other lie in adjacent rows, so
             # that one search finds all that are occupied.
             keys = self.keys + self.stride * (x * _UNITS[0] + y * _UNITS[1] - _UNITS[2])
             rows = torch.searchsorted(self.keys, keys)
             for z in (-1, 0, 1):
-                found = self._padded[rows] == keys
-                keep((x, y, z), found, rows)
-                rows, keys = rows + found, keys + self.stride
+                occupied = self._padded[rows] == keys
+                add_pairs((x, y, z), occupied, rows)
+                rows, keys = rows + occupied, keys + self.stride
         return KernelMap(pairs, len(self), len(self))
 
     @cached_property
@@ -201,9 +201,9 @@ class SparseConv(nn.Module):
         if kernel_map is None:
             return features @ self.kernel
         matrices = list(zip(kernel_map.pairs, self.kernel, strict=True))
-        own = [features @ matrix for pair, matrix in matrices if pair is None]
-        if own:
-            dtype, result = own[0].dtype, at_least_float32(own[0])
+        centre = [features @ matrix for pair, matrix in matrices if pair is None]
+        if centre:
+            dtype, result = centre[0].dtype, at_least_float32(centre[0])
         else:
             dtype = (features[:0] @ self.kernel[0]).dtype  # autocast may change it
             wide = torch.promote_types(dtype, torch.float32)
@@ -236,7 +236,7 @@ def voxelize(
     if not xyz.isfinite().all():
         raise ValueError(
             f"{int((~xyz.isfinite().all(dim=1)).sum())} of {len(xyz)} points are NaN or infinite: "
-            "drop them first."
+            "drop them first"
         )
     ranges = xyz.norm(dim=1)
     xyz = xyz[(ranges >= range_min_m) & (ranges <= range_max_m)]

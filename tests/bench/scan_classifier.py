@@ -26,7 +26,7 @@ class Accuracy(NamedTuple):
 def classifier_accuracy(
     real_m: Tensor, generated_m: Tensor, *, epochs: int = 8, batch_size: int = 16, seed: int = 0
 ) -> Accuracy:
-    """Held-out accuracy of a small network trained to separate two sets of range images.
+    """Return the held-out accuracy of a small network trained to separate two sets of images.
 
     Four strided convolutions whose columns wrap around, a global mean and a linear layer, on log
     range and return mask. 70 % of each set are for training, where scenes are rotated at random.
@@ -36,10 +36,13 @@ def classifier_accuracy(
 
     Args:
         real_m: ``(N, H, W)`` metres, -1 without a return.
-        generated_m: The other set; as many images are used of both.
+        generated_m: The other set; both are cut to the size of the smaller one.
         epochs: Passes over the training images.
         batch_size: Images per step, half of each set.
-        seed: Of split, weights and order.
+        seed: Seed of split, weights and order.
+
+    Raises:
+        ValueError: If the images differ in size, or a set has fewer than four.
     """
     if real_m.shape[1:] != generated_m.shape[1:]:
         sizes = f"{tuple(real_m.shape[1:])} and {tuple(generated_m.shape[1:])}"
@@ -56,14 +59,17 @@ def classifier_accuracy(
         held_out.append(images[order[cut:]])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _network()
+        network = two_sample_network()
     adam = torch.optim.AdamW(network.parameters(), lr=2e-3)
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, epochs * max(1, cut // half))
     target = torch.cat([torch.zeros(half), torch.ones(half)])
     for _ in range(epochs):
         orders = [torch.randperm(cut, generator=generator) for _ in train]
         for first in range(0, cut - half + 1, half):
-            picked = [s[o[first : first + half]] for s, o in zip(train, orders, strict=True)]
+            picked = [
+                images[order[first : first + half]]
+                for images, order in zip(train, orders, strict=True)
+            ]
             shift = int(torch.randint(real_m.shape[-1], (), generator=generator))
             logits = network(_CODEC.to_image(torch.cat(picked).roll(shift, -1)))[:, 0]
             adam.zero_grad()
@@ -81,7 +87,11 @@ def classifier_accuracy(
     return Accuracy(value, (value * (1 - value) / len(correct)) ** 0.5)
 
 
-def _network() -> nn.Sequential:
+def two_sample_network() -> nn.Sequential:
+    """Build the network, random: images ``(B, 2, H, W)`` of range and return to ``(B, 1)`` logits.
+
+    Columns wrap around.
+    """
     layers: list[nn.Module] = []
     before = _CODEC.channels
     for width in _WIDTHS:

@@ -1,7 +1,6 @@
 import pytest
 import torch
-
-from r3dpa.metrics.classifier import classifier_accuracy
+from scan_classifier import classifier_accuracy
 
 
 def scenes(count, seed, speckle=0.0):
